@@ -1,0 +1,32 @@
+"""Estimators: arrays in, beliefs out; they know no environment.
+
+``make(name, tags=..., noise=..., process=...)`` gives a filter; swapping one for another is a
+change of name.
+"""
+
+from functools import partial
+
+from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
+from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
+from rbl_gym.estimators.manifold import IteratedEkf, PoseState
+
+for _name, _constraint in {
+    "kf": "none",
+    "uc-kf": "newton",
+    "et-kf": "threshold",
+    "kf-ortho": "always",
+}.items():
+    register(_name, partial(KalmanFamily, constraint=_constraint))
+register("iekf", IteratedEkf)
+
+__all__ = [
+    "Filter",
+    "IteratedEkf",
+    "KalmanFamily",
+    "KalmanState",
+    "PoseBelief",
+    "PoseState",
+    "make",
+    "names",
+    "register",
+]

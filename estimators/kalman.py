@@ -1,0 +1,458 @@
+"""The Kalman filters of the tracking paper on the 12 states ``x = [vec Q; t]``.
+
+KF, UC-KF, ET-KF and KF-ortho are one filter with a different `constrain` step after the
+linear update. The linear algebra below is filterpy's (one body, the reference) or the batched
+engine (any leading axes); both read the compressed statistic of `squared_range`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import rotations
+from rbl_gym.bounds import symmetric
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_links,
+    check_number,
+    check_one_of,
+)
+from rbl_gym.estimators.belief import PoseBelief, inverse
+from rbl_gym.estimators.least_squares import procrustes, unvec, vec
+from rbl_gym.estimators.squared_range import (
+    Statistic,
+    compressed,
+    geometric_rank,
+    information,
+    statistic,
+)
+from rbl_gym.motion import ProcessNoise
+from rbl_gym.ranging import NoiseLaw
+
+# Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
+_VAGUE_ENTRY_VARIANCE = 1 / 3
+
+
+class KalmanState(NamedTuple):
+    """State of the family, with leading batch axes.
+
+    Attributes
+    ----------
+    mean
+        (..., 12), ``[vec Q; t]``, columns of Q first.
+    covariance
+        (..., 12, 12).
+    constrained
+        (...), whether the last update put the rotation back onto SO(3).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    constrained: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanFamily:
+    """A Kalman filter on squared ranges, with a constraint step (tracking paper, (16)-(27)).
+
+    Parameters
+    ----------
+    tags
+        (N, 3), metres, body frame, as given (centred tags decouple rotation and translation).
+    noise
+        Law of the ranges; weights come from the measured ranges.
+    process
+        Noise of the motion.
+    constraint
+        ``"none"`` KF; ``"newton"`` UC-KF: the rotation of the weighted problem (26), then the
+        translation (27); ``"threshold"`` ET-KF: projection where ``|Q^T Q - I|_F > threshold``;
+        ``"always"`` KF-ortho: projection after every update. The projection is fed back.
+    sigma_q_scale
+        Process noise of an entry of Q over that of the rotation; 1 as printed, sqrt(2/3) is
+        consistent.
+    threshold
+        Of the event-triggered filter.
+    coupled
+        UC-KF only: solve the coupled problem (23) in place of (26)-(27). It is what is solved
+        anyway where the tags' weights differ (lost links, per-link noise).
+    weights
+        Fixed inverse variances of the squared ranges [1/m^4], (M,) or (M, N); None: from the
+        measured ranges.
+    engine
+        ``"batched"`` or ``"filterpy"`` (one body).
+    """
+
+    tags: FloatArray
+    noise: NoiseLaw
+    process: ProcessNoise
+    constraint: str = "none"
+    sigma_q_scale: float = 1.0
+    threshold: float = 0.15
+    coupled: bool = False
+    weights: ArrayLike | None = None
+    engine: str = "batched"
+
+    def __post_init__(self) -> None:
+        check_one_of("constraint", self.constraint, list(_CONSTRAINTS))
+        check_one_of("engine", self.engine, list(_ENGINES))
+        check_number("sigma_q_scale", self.sigma_q_scale, low=0.0)
+        check_number("threshold", self.threshold, low=0.0)
+        if self.weights is not None:
+            weights = check_array("weights", self.weights, ("M",))
+            if (weights < 0).any():
+                raise ValueError(f"weights must not be negative, got {weights.min()}")
+
+    def initial(
+        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
+    ) -> KalmanState:
+        """State of a prior; covariance (..., 6, 6) of the pose or (..., 12, 12) of the state.
+
+        A pose covariance becomes ``blkdiag(2/3 tr(P_w) I9, P_v)``: isotropic and of full rank.
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, a matrix that is no rotation, a covariance that is not positive.
+        """
+        rotation = rotations.check_rotation("rotation", rotation)
+        translation = check_array("translation", translation, (3,))
+        covariance = check_covariance(covariance, (6, 12))
+        if covariance.shape[-1] == 6:
+            covariance = expand_covariance(covariance)
+        batch = np.broadcast_shapes(
+            rotation.shape[:-2], translation.shape[:-1], covariance.shape[:-2]
+        )
+        mean = np.empty((*batch, 12))
+        mean[..., :9], mean[..., 9:] = vec(rotation), translation
+        return KalmanState(
+            mean, np.broadcast_to(covariance, (*batch, 12, 12)).copy(), np.zeros(batch, bool)
+        )
+
+    def predict(self, state: KalmanState, twist: ArrayLike, dt: float) -> KalmanState:
+        """State after `dt` seconds of the twist (..., 6): eqs (10)-(15), Omega carrying dt."""
+        twist = check_array("twist", twist, (6,))
+        dt = check_number("dt", dt, low=0.0)
+        step = rotations.exp(twist[..., :3] * dt)
+        F = np.zeros((*step.shape[:-2], 12, 12))
+        for k in range(3):
+            F[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = step
+        F[..., 9:, 9:] = np.eye(3)
+        std = self.process.std()
+        sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
+        Q = dt * np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
+        mean, covariance = _ENGINES[self.engine].predict(
+            state.mean, state.covariance, F, twist[..., 3:] * dt, np.diag(Q)
+        )
+        return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
+
+    def update(
+        self,
+        state: KalmanState,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None = None,
+    ) -> KalmanState:
+        """State after one epoch of ranges (..., M, N).
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, NaN, ranges that are not positive, and where anchors and tags
+            cannot determine the 12 states and the state is too vague to stand in (the
+            message names the rank).
+        """
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
+        self._check_determined(state, anchors)
+        if self.weights is None:
+            weights = 1 / check_variance(self.noise.squared_range_variance(ranges, mask), mask)
+        else:
+            weights = np.asarray(self.weights, dtype=np.float64)
+            weights = weights[..., None] if weights.ndim == 1 else weights
+        stat = statistic(ranges, anchors, self.tags, weights, mask)
+        mean, covariance = _ENGINES[self.engine].update(state.mean, state.covariance, stat)
+        return _CONSTRAINTS[self.constraint](self, state, KalmanState(
+            mean, covariance, np.zeros(mean.shape[:-1], bool)
+        ), stat)  # fmt: skip
+
+    def belief(self, state: KalmanState) -> PoseBelief:
+        """Pose, its covariance, and the raw matrix.
+
+        The covariance is that of the projected output, ``J^+ P J^+T``; of UC-KF, whose mean
+        is constrained already, ``(J^T P^-1 J)^-1``.
+        """
+        matrix = unvec(state.mean[..., :9])
+        on_group = self.constraint in ("newton", "always")
+        rotation = rotations.nearest(matrix)
+        J = state_jacobian(rotation)
+        transposed = np.swapaxes(J, -1, -2)
+        if self.constraint == "newton":
+            covariance = inverse(transposed @ np.linalg.solve(state.covariance, J))
+        else:
+            # J^T J = blkdiag(2 I, I): the pseudo-inverse needs no solver.
+            pinv = transposed * np.array([0.5] * 3 + [1.0] * 3)[:, None]
+            covariance = symmetric(pinv @ state.covariance @ np.swapaxes(pinv, -1, -2))
+        translation = state.mean[..., 9:].copy()
+        return PoseBelief(rotation, translation, covariance, rotation if on_group else matrix)
+
+    def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
+        variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
+        extent = np.ptp(anchors, axis=-2).max(axis=-1)
+        vague = (variance[..., :9].max(axis=-1) > _VAGUE_ENTRY_VARIANCE) | (
+            variance[..., 9:].max(axis=-1) > extent**2
+        )
+        if not vague.any():
+            return
+        rank = geometric_rank(anchors, self.tags)
+        if ((rank < 12) & vague).any():
+            raise ValueError(
+                f"anchors and tags determine only rank {int(rank.min())} of the filter's 12 "
+                f"states (it needs 4 anchors and 4 tags, neither coplanar), and the prior is "
+                f"too vague to stand in; got {anchors.shape[-2]} anchors, {len(self.tags)} tags. "
+                "Use 'iekf', or a tighter prior covariance"
+            )
+
+
+# --- engines: the same linear algebra, for many bodies and by filterpy for one ------------
+
+
+class _Batched:
+    """The information form ``(I + P G)^-1 P``: exact for vague priors, any leading axes."""
+
+    @staticmethod
+    def predict(
+        mean: FloatArray, P: FloatArray, F: FloatArray, shift: FloatArray, Q: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        mean = (F @ mean[..., None])[..., 0]
+        mean[..., 9:] += shift
+        return mean, symmetric(F @ P @ np.swapaxes(F, -1, -2)) + Q
+
+    @staticmethod
+    def update(mean: FloatArray, P: FloatArray, stat: Statistic) -> tuple[FloatArray, FloatArray]:
+        matrix, vector = information(stat)
+        P = symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
+        innovation = vector[..., None] - matrix @ mean[..., None]
+        return mean + (P @ innovation)[..., 0], P
+
+
+class _FilterPy:
+    """filterpy's KalmanFilter on the compressed measurement; one body."""
+
+    @classmethod
+    def predict(
+        cls, mean: FloatArray, P: FloatArray, F: FloatArray, shift: FloatArray, Q: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        kf = cls._filter(mean, P)
+        kf.F, kf.Q = F, Q
+        # Without B filterpy ignores u in silence.
+        kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
+        kf.predict(u=shift[:, None])
+        return cls._result(kf)
+
+    @classmethod
+    def update(
+        cls, mean: FloatArray, P: FloatArray, stat: Statistic
+    ) -> tuple[FloatArray, FloatArray]:
+        kf = cls._filter(mean, P)
+        z, H = compressed(stat)
+        kf.R = np.eye(12)
+        # A one-dimensional z would silently broadcast the state to a matrix.
+        kf.update(z[:, None], H=H)
+        return cls._result(kf)
+
+    @staticmethod
+    def _filter(mean: FloatArray, P: FloatArray) -> Any:
+        from filterpy.kalman import KalmanFilter  # slow to import, and not always needed
+
+        if mean.ndim != 1:
+            raise ValueError(
+                f"engine 'filterpy' tracks one body, got a state of shape {mean.shape}; "
+                "use engine='batched'"
+            )
+        kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
+        kf.x, kf.P = mean[:, None].copy(), P.copy()
+        return kf
+
+    @staticmethod
+    def _result(kf: Any) -> tuple[FloatArray, FloatArray]:
+        mean, P = np.asarray(kf.x), np.asarray(kf.P)
+        if mean.shape != (12, 1) or P.shape != (12, 12):
+            raise RuntimeError(f"filterpy returned shapes {mean.shape} and {P.shape}")
+        if not (np.isfinite(mean).all() and np.isfinite(P).all()):
+            raise ValueError("the filter's state is no longer finite")
+        return mean[:, 0].copy(), symmetric(P)
+
+
+_ENGINES: dict[str, type[_Batched] | type[_FilterPy]] = {
+    "batched": _Batched,
+    "filterpy": _FilterPy,
+}
+
+
+# --- constraints: what happens to the rotation after the linear update --------------------
+
+
+def _no_constraint(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    return posterior
+
+
+def _project(posterior: KalmanState, where: BoolArray) -> KalmanState:
+    mean = posterior.mean.copy()
+    mean[..., :9] = np.where(
+        where[..., None], vec(rotations.nearest(unvec(mean[..., :9]))), mean[..., :9]
+    )
+    return KalmanState(mean, posterior.covariance, where)
+
+
+def _always(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    return _project(posterior, np.ones(posterior.mean.shape[:-1], bool))
+
+
+def _above_threshold(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    matrix = unvec(posterior.mean[..., :9])
+    defect = np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)
+    return _project(posterior, np.linalg.norm(defect, axis=(-2, -1)) > family.threshold)
+
+
+def _newton(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
+
+    The covariance stays that of the linear update, (22) as printed: an overestimate.
+    """
+    if stat.is_common and not family.coupled:
+        rotation, translation = _decoupled(prior, stat)
+    else:
+        rotation, translation = _coupled(posterior)
+    mean = np.concatenate([vec(rotation), translation], axis=-1)
+    return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
+
+
+def _decoupled(prior: KalmanState, stat: Statistic) -> tuple[FloatArray, FloatArray]:
+    """Rotation from the centred tags and its prior block (26), then the translation (27)."""
+    P_q = inverse(prior.covariance[..., :9, :9])
+    P_t = inverse(prior.covariance[..., 9:, 9:])
+    tags = stat.tags - stat.tags.mean(axis=-2, keepdims=True)
+    G = stat.G[..., 0, :, :]
+    gram = np.swapaxes(tags, -1, -2) @ tags
+    kron = np.einsum("...kl,...ij->...kilj", gram, G)
+    weight = P_q + kron.reshape(*kron.shape[:-4], 9, 9)
+    pull = (P_q @ prior.mean[..., :9, None])[..., 0] + vec(np.swapaxes(stat.b, -1, -2) @ tags)
+    rotation = _fit_rotation(weight, np.linalg.solve(weight, pull[..., None])[..., 0])
+    n_tags = stat.b.shape[-2]
+    turned = (rotation @ stat.tags.sum(axis=-2)[..., None])[..., 0]
+    right = (
+        (P_t @ prior.mean[..., 9:, None])[..., 0]
+        + stat.b.sum(axis=-2)
+        - (G @ turned[..., None])[..., 0]
+    )
+    return rotation, np.linalg.solve(P_t + n_tags * G, right[..., None])[..., 0]
+
+
+def _coupled(posterior: KalmanState) -> tuple[FloatArray, FloatArray]:
+    """The pose nearest to the linear posterior in its own covariance, (23)."""
+    q, t = posterior.mean[..., :9], posterior.mean[..., 9:]
+    weight = inverse(posterior.covariance[..., :9, :9])
+    rotation = _fit_rotation(weight, q)
+    moved = weight @ (vec(rotation) - q)[..., None]
+    return rotation, t + (posterior.covariance[..., 9:, :9] @ moved)[..., 0]
+
+
+def _fit_rotation(weight: FloatArray, q: FloatArray) -> FloatArray:
+    return procrustes(weight, q, rotations.nearest(unvec(q)))[0]
+
+
+_CONSTRAINTS: dict[str, Callable[..., KalmanState]] = {
+    "none": _no_constraint,
+    "newton": _newton,
+    "threshold": _above_threshold,
+    "always": _always,
+}
+
+
+# --- between 6 and 12 states ---------------------------------------------------------------
+
+
+def state_jacobian(rotation: FloatArray) -> FloatArray:
+    """Derivative (..., 12, 6) of ``[vec Q; t]`` by the pose error (w, v)."""
+    J = np.zeros((*rotation.shape[:-2], 12, 6))
+    for k in range(3):
+        J[..., 3 * k : 3 * k + 3, :3] = -rotations.hat(rotation[..., :, k])
+    J[..., 9:, 3:] = np.eye(3)
+    return J
+
+
+def expand_covariance(covariance: FloatArray) -> FloatArray:
+    """Pose covariance (..., 6, 6) to that of the 12 states, ``blkdiag(2/3 tr(P_w) I9, P_v)``."""
+    expanded = np.zeros((*covariance.shape[:-2], 12, 12))
+    trace = np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1)
+    index = np.arange(9)
+    expanded[..., index, index] = (2 / 3) * trace[..., None]
+    expanded[..., 9:, 9:] = covariance[..., 3:, 3:]
+    return expanded
+
+
+# --- checks shared by all filters ----------------------------------------------------------
+
+
+def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
+    """A symmetric positive definite covariance of one of the sizes, or a ValueError."""
+    covariance = check_array("covariance", covariance, ("n", "n"))
+    if covariance.shape[-1] not in sizes or covariance.shape[-2] != covariance.shape[-1]:
+        wanted = " or ".join(f"(..., {n}, {n})" for n in sizes)
+        raise ValueError(f"covariance must have shape {wanted}, got {covariance.shape}")
+    skew = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()
+    if skew > 1e-8 * np.abs(covariance).max():
+        raise ValueError(f"covariance must be symmetric, is off by {skew:.3g}")
+    smallest = np.linalg.eigvalsh(covariance).min()
+    if smallest <= 0:
+        raise ValueError(f"covariance must be positive definite, smallest eigenvalue {smallest:g}")
+    return covariance
+
+
+def check_epoch(
+    ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None, tags: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray | None]:
+    """One epoch as (ranges, anchors, links): links None where all measured, else 0 behind False.
+
+    Raises
+    ------
+    ValueError
+        On shapes that do not fit, NaN or inf behind a True link, a range that is not positive.
+    """
+    anchors = check_array("anchors", anchors, ("M", 3))
+    shape = (anchors.shape[-2], tags.shape[-2])
+    mask = check_links(links, shape)
+    if mask is not None:
+        ranges = np.where(mask, np.asarray(ranges, dtype=np.float64), 0.0)
+        if mask.all():
+            mask = None
+    ranges = check_array("ranges", ranges, shape)
+    wrong = ranges <= 0 if mask is None else (ranges <= 0) & mask
+    if wrong.any():
+        index = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise ValueError(f"ranges must be positive where measured, got {ranges[index]} at {index}")
+    return ranges, anchors, mask
+
+
+def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
+    """The variances, 1 where no link uses them, or a ValueError if one is not positive."""
+    if links is not None:
+        used = links if variance.shape[-1] == links.shape[-1] else links.any(-1, keepdims=True)
+        variance = np.where(used, variance, 1.0)
+    if not (variance > 0).all():
+        raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
+    return variance

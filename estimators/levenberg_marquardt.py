@@ -1,0 +1,86 @@
+"""Gauss-Newton with damping for poses: one loop for every estimator on SO(3) x R^3, batched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym import rotations
+from rbl_gym.checks import BoolArray, FloatArray
+
+
+class Linearization(NamedTuple):
+    """Cost (...), gradient (..., 6) and Gauss-Newton Hessian (..., 6, 6) by (w, v) at a pose."""
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class Solution(NamedTuple):
+    """Pose, its linearization, and whether the last step was below the tolerance (...)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    at: Linearization
+    converged: BoolArray
+
+
+def minimize_pose(
+    linearize: Callable[[FloatArray, FloatArray], Linearization],
+    rotation: FloatArray,
+    translation: FloatArray,
+    iterations: int,
+    tolerance: float = 1e-10,
+) -> Solution:
+    """Minimise a sum of squares over poses, ``Q <- exp(w) Q``, ``t <- t + v``.
+
+    Plain Gauss-Newton while the cost falls; where it would rise the step is refused and the
+    damping grows tenfold (Marquardt's scaling).
+
+    Parameters
+    ----------
+    linearize
+        The problem: pose to `Linearization`.
+    rotation, translation
+        The starts, (..., 3, 3) and (..., 3).
+    iterations
+        At the most; stops when every trial has converged.
+    tolerance
+        On the largest entry of the step, in radians and in units of the translation.
+    """
+    at = linearize(rotation, translation)
+    batch = at.cost.shape
+    rotation = np.broadcast_to(rotation, (*batch, 3, 3))
+    translation = np.broadcast_to(translation, (*batch, 3))
+    damping = np.zeros(batch)
+    converged = np.zeros(batch, bool)
+    index = np.arange(6)
+    for _ in range(iterations):
+        damped = at.hessian.copy()
+        diagonal = damped[..., index, index]
+        damped[..., index, index] += (damping[..., None] + 1e-14) * diagonal + 1e-300
+        step = -np.linalg.solve(damped, at.gradient[..., None])[..., 0]
+        candidate = rotations.exp(step[..., :3]) @ rotation, translation + step[..., 3:]
+        new = linearize(*candidate)
+        better = new.cost <= at.cost * (1 + 1e-12)
+        small = np.abs(step).max(axis=-1) < tolerance
+        if better.all():
+            (rotation, translation), at = candidate, new
+        else:
+            rotation = np.where(better[..., None, None], candidate[0], rotation)
+            translation = np.where(better[..., None], candidate[1], translation)
+            at = Linearization(
+                np.where(better, new.cost, at.cost),
+                np.where(better[..., None], new.gradient, at.gradient),
+                np.where(better[..., None, None], new.hessian, at.hessian),
+            )
+        damping = np.where(
+            better, np.where(damping > 1e-5, 0.1 * damping, 0.0), np.maximum(10 * damping, 1e-3)
+        )
+        converged = small
+        if converged.all():
+            break
+    return Solution(rotation, translation, at, converged)

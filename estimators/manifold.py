@@ -1,0 +1,278 @@
+"""The iterated extended Kalman filter on SO(3) x R^3 with raw ranges.
+
+Every update is the maximum a posteriori pose of the epoch by Gauss-Newton, with the prior
+residual ``log(Q Q_pred^T)``; it reaches the posterior Cramer-Rao bound where the linear
+filters of the tracking paper, which project ``|s|^2`` out, cannot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import bounds, ranging, rotations
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.estimators.belief import PoseBelief, inverse
+from rbl_gym.estimators.kalman import check_covariance, check_epoch, check_variance
+from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
+from rbl_gym.estimators.squared_range import statistic
+from rbl_gym.motion import ProcessNoise, propagate
+from rbl_gym.ranging import NoiseLaw
+
+# Beyond this standard deviation (rad) of the prior rotation, no single linearisation is right.
+VAGUE_ROTATION_RAD = 0.5
+# Whitened innovation at which Huber's loss turns from squares to absolute values.
+HUBER = 1.5
+
+
+class PoseState(NamedTuple):
+    """Pose and covariance, (..., 3, 3), (..., 3), (..., 6, 6) of the error (w, v)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class IteratedEkf:
+    """Iterated extended Kalman filter of the pose on raw ranges.
+
+    Parameters
+    ----------
+    tags
+        (N, 3), metres, body frame, as given.
+    noise
+        Law of the ranges; variances are taken at the measured ranges.
+    process
+        Noise of the motion.
+    iterations
+        Gauss-Newton iterations of an update; one alone is overconfident at high turn noise.
+    robust
+        Huber's loss on the whitened innovations (threshold 1.5): for real radios.
+    """
+
+    tags: FloatArray
+    noise: NoiseLaw
+    process: ProcessNoise
+    iterations: int = 4
+    robust: bool = False
+
+    def __post_init__(self) -> None:
+        check_number("iterations", self.iterations, low=1)
+
+    def initial(
+        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
+    ) -> PoseState:
+        """State of a prior, covariance (..., 6, 6).
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, a matrix that is no rotation, a covariance that is not positive.
+        """
+        rotation = rotations.check_rotation("rotation", rotation)
+        translation = check_array("translation", translation, (3,))
+        covariance = check_covariance(covariance, (6,))
+        batch = np.broadcast_shapes(
+            rotation.shape[:-2], translation.shape[:-1], covariance.shape[:-2]
+        )
+        return PoseState(
+            np.broadcast_to(rotation, (*batch, 3, 3)).copy(),
+            np.broadcast_to(translation, (*batch, 3)).copy(),
+            np.broadcast_to(covariance, (*batch, 6, 6)).copy(),
+        )
+
+    def predict(self, state: PoseState, twist: ArrayLike, dt: float) -> PoseState:
+        """State after `dt` seconds of the twist (..., 6), ``P <- F P F^T + Q``."""
+        twist = check_array("twist", twist, (6,))
+        dt = check_number("dt", dt, low=0.0)
+        rotation, translation = propagate(state.rotation, state.translation, twist, dt)
+        covariance = bounds.predict_covariance(state.covariance, twist, dt, self.process)
+        return PoseState(rotation, translation, covariance)
+
+    def update(
+        self,
+        state: PoseState,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None = None,
+    ) -> PoseState:
+        """State after one epoch of ranges (..., M, N).
+
+        Where the prior rotation is vaguer than `VAGUE_ROTATION_RAD`, the update starts from
+        many poses and keeps the best.
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, NaN, ranges that are not positive; and where the prior is vague
+            and the anchors or tags cannot determine a pose (the message names the rank).
+        """
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
+        weights = 1 / check_variance(self.noise.variance(ranges, mask), mask)
+        weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
+        if mask is not None:
+            weights = weights * mask
+        problem = MapProblem(state, inverse(state.covariance), ranges, weights, anchors, self.tags,
+                             HUBER if self.robust else None)  # fmt: skip
+        start = state.rotation, state.translation
+        variance = np.linalg.eigvalsh(state.covariance[..., :3, :3])[..., -1]
+        vague = variance > VAGUE_ROTATION_RAD**2
+        if vague.any():
+            _check_determined(anchors, self.tags)
+            start = global_start(problem, vague)
+        solution = minimize_pose(problem.linearize, *start, iterations=self.iterations)
+        return PoseState(solution.rotation, solution.translation, inverse(solution.at.hessian))
+
+    def belief(self, state: PoseState) -> PoseBelief:
+        """The state as a belief (copies)."""
+        rotation = state.rotation.copy()
+        return PoseBelief(rotation, state.translation.copy(), state.covariance.copy(), rotation)
+
+
+@dataclass(frozen=True, eq=False)
+class MapProblem:
+    """Maximum a posteriori pose of one epoch; arrays with leading batch axes.
+
+    Cost: half the squared whitened range residuals (or Huber's loss of them) plus half the
+    prior's Mahalanobis distance, residual ``(log(Q Q_pred^T), t - t_pred)``.
+    """
+
+    prior: PoseState
+    prior_information: FloatArray
+    ranges: FloatArray
+    weights: FloatArray
+    anchors: FloatArray
+    tags: FloatArray
+    huber: float | None = None
+
+    def linearize(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
+        """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
+        positions = ranging.tag_positions(rotation, translation, self.tags)
+        distance, unit = bounds.directions(self.anchors, positions)
+        residual = distance - self.ranges
+        weights = self.weights
+        if self.huber is None:
+            cost = 0.5 * np.einsum("...mn,...mn->...", weights, residual**2)
+        else:
+            whitened = np.abs(residual) * np.sqrt(weights)
+            factor = self.huber / np.maximum(whitened, self.huber)
+            weights = weights * factor
+            # Huber: x^2 / 2 inside, k x - k^2 / 2 outside; factor = min(1, k / x).
+            cost = (factor * whitened**2 - 0.5 * (factor * whitened) ** 2).sum(axis=(-2, -1))
+        weighted = weights[..., None] * unit
+        J = bounds.tag_jacobian(rotation, self.tags)
+        hessian = bounds.lift(J, np.einsum("...mni,...mnj->...nij", weighted, unit))
+        per_tag = np.einsum("...mni,...mn->...ni", weighted, residual)
+        gradient = np.einsum("...nia,...ni->...a", J, per_tag)
+        return self._add_prior(rotation, translation, Linearization(cost, gradient, hessian))
+
+    def _add_prior(
+        self, rotation: FloatArray, translation: FloatArray, data: Linearization
+    ) -> Linearization:
+        turn = rotations.error(rotation, self.prior.rotation)
+        error = np.concatenate([turn, translation - self.prior.translation], axis=-1)
+        D = np.zeros((*error.shape, 6))
+        D[..., :3, :3] = rotations.left_jacobian_inverse(turn)
+        D[..., 3:, 3:] = np.eye(3)
+        pulled = np.swapaxes(D, -1, -2) @ self.prior_information
+        pull = (self.prior_information @ error[..., None])[..., 0]
+        return Linearization(
+            data.cost + 0.5 * np.einsum("...i,...i->...", error, pull),
+            data.gradient + (pulled @ error[..., None])[..., 0],
+            data.hessian + pulled @ D,
+        )
+
+    def take(self, where: BoolArray) -> MapProblem:
+        """The trials of a mask (...) on one flat axis, with a further axis of 1 for starts."""
+
+        def pick(array: FloatArray, trailing: int) -> FloatArray:
+            shape = (*where.shape, *array.shape[array.ndim - trailing :])
+            return np.broadcast_to(array, shape)[where][:, None]
+
+        return MapProblem(
+            PoseState(
+                pick(self.prior.rotation, 2),
+                pick(self.prior.translation, 1),
+                pick(self.prior.covariance, 2),
+            ),
+            pick(self.prior_information, 2),
+            pick(self.ranges, 2),
+            pick(self.weights, 2),
+            pick(self.anchors, 2),
+            self.tags,
+            self.huber,
+        )
+
+
+def _octahedral_rotation_vectors() -> FloatArray:
+    """The 24 rotations of the cube as rotation vectors (24, 3): a coarse net over SO(3)."""
+    quarter = [rotations.exp(0.5 * np.pi * axis) for axis in np.eye(3)]
+    group = [np.eye(3)]
+    for element in group:
+        for turn in quarter:
+            candidate = np.round(turn @ element)
+            if not any(np.array_equal(candidate, known) for known in group):
+                group.append(candidate)
+    return rotations.log(np.array(group))
+
+
+_NET = _octahedral_rotation_vectors()
+
+
+def global_start(problem: MapProblem, vague: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Poses to start from: for vague priors the best of a net of local solves, else the prior.
+
+    The net is 24 rotations spread as far as the prior is wide on each axis; every one gets
+    the translation that the squared ranges and the prior imply (a linear problem), then a few
+    Gauss-Newton steps on the full cost.
+    """
+    batch = np.broadcast_shapes(vague.shape, problem.ranges.shape[:-2], problem.anchors.shape[:-2])
+    vague = np.broadcast_to(vague, batch)
+    part = problem.take(vague)
+    rotation = _spread(part.prior)
+    translation = _translation_given(rotation, part)
+    solution = minimize_pose(part.linearize, rotation, translation, iterations=12, tolerance=1e-6)
+    best = np.argmin(solution.at.cost, axis=-1)
+    row = np.arange(len(best))
+    start_rotation = np.broadcast_to(problem.prior.rotation, (*batch, 3, 3)).copy()
+    start_translation = np.broadcast_to(problem.prior.translation, (*batch, 3)).copy()
+    start_rotation[vague] = solution.rotation[row, best]
+    start_translation[vague] = solution.translation[row, best]
+    return start_rotation, start_translation
+
+
+def _spread(prior: PoseState) -> FloatArray:
+    """Rotations (B, 24, 3, 3) around the prior, on each axis as far as it is uncertain."""
+    values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
+    reach = np.minimum(np.sqrt(values) / VAGUE_ROTATION_RAD, 1.0)
+    shape = (vectors * reach[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return rotations.exp((shape @ _NET[..., None])[..., 0]) @ prior.rotation
+
+
+def _translation_given(rotation: FloatArray, problem: MapProblem) -> FloatArray:
+    """Translation of the linear squared-range model with its prior, the rotation given."""
+    # To first order var(r^2) = 4 r^2 var(r).
+    scale = 4 * np.where(problem.weights > 0, problem.ranges, 1.0) ** 2
+    stat = statistic(problem.ranges, problem.anchors, problem.tags, problem.weights / scale)
+    information = inverse(problem.prior.covariance[..., 3:, 3:])
+    turned = problem.tags @ np.swapaxes(rotation, -1, -2)
+    per_tag = stat.b - (stat.G @ turned[..., None])[..., 0]
+    right = (information @ problem.prior.translation[..., None])[..., 0] + per_tag.sum(axis=-2)
+    return np.linalg.solve(information + stat.G.sum(axis=-3), right[..., None])[..., 0]
+
+
+def _check_determined(anchors: FloatArray, tags: FloatArray) -> None:
+    """A ValueError where no number of full epochs can tell a pose: collinear anchors or tags."""
+    for name, points in (("anchors", anchors), ("tags", tags)):
+        spread = points - points.mean(axis=-2, keepdims=True)
+        values = np.linalg.svd(spread, compute_uv=False)
+        rank = (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1)
+        if (rank < 2).any():
+            raise ValueError(
+                f"{name} must be at least 3 and not collinear where the prior rotation is vague, "
+                f"got {points.shape[-2]} of rank {int(rank.min())}; give a tighter prior"
+            )

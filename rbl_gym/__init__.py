@@ -1,0 +1,14 @@
+"""rbl-gym: localization of rigid bodies by radio, as Gymnasium environments and estimators.
+
+Importing it registers the environments' ids and nothing heavy.
+"""
+
+from pathlib import Path
+
+__version__ = "0.1.0"
+
+# In a checkout the estimators and wrappers stand beside the package, not inside it; this lets
+# them be found from the checkout's root under any install mode. Never true in site-packages.
+_root = Path(__file__).resolve().parent.parent
+if (_root / "pyproject.toml").is_file() and (_root / "estimators").is_dir():
+    __path__.append(str(_root))

@@ -1,0 +1,208 @@
+"""Cramer-Rao bounds of the pose: Fisher information on SO(3) x R^3, posterior bound, the score.
+
+The pose error is ``(w, v)``: ``Q_hat = exp(w) Q`` (world frame, rad), ``t_hat = t + v`` (m);
+information and covariance are 6 x 6 in that order. All functions broadcast.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import ranging, rotations
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_links
+from rbl_gym.motion import ProcessNoise
+
+
+def tag_jacobian(rotation: FloatArray, tags: FloatArray) -> FloatArray:
+    """Derivative (..., N, 3, 6) of the tag positions by the pose error: ``[-[Q c_n]x, I]``."""
+    turned = tags @ np.swapaxes(rotation, -1, -2)
+    J = np.zeros((*turned.shape, 6))
+    J[..., :3] = -rotations.hat(turned)
+    J[..., 3:] = np.eye(3)
+    return J
+
+
+def directions(anchors: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (..., M, N) and unit vectors (..., M, N, 3) from anchors to positions.
+
+    The unit vector is zero where an anchor and a position coincide.
+    """
+    difference = positions[..., None, :, :] - anchors[..., :, None, :]
+    distance = np.sqrt(np.einsum("...i,...i->...", difference, difference))
+    return distance, difference / np.where(distance > 0, distance, 1.0)[..., None]
+
+
+def lift(J: FloatArray, per_tag: FloatArray) -> FloatArray:
+    """Pose information ``sum_n J_n^T U_n J_n`` from that of each tag's position (..., N, 3, 3)."""
+    return np.einsum("...nia,...nib->...ab", J, per_tag @ J, optimize=False)
+
+
+def range_information(
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    links: ArrayLike | None = None,
+) -> FloatArray:
+    """Fisher information (..., 6, 6) of one epoch of ranges about the pose.
+
+    The variance is taken at the true range; what its own dependence on the range would tell
+    is left out, as in the papers.
+
+    Parameters
+    ----------
+    anchors, tags, rotation, translation
+        (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3); metres.
+    noise
+        Law of the ranges.
+    links
+        Mask (..., M, N), True = measured.
+
+    Raises
+    ------
+    ValueError
+        On a wrong shape or a value that is not finite.
+    """
+    anchors = check_array("anchors", anchors, ("M", 3))
+    tags = check_array("tags", tags, ("N", 3))
+    rotation = check_array("rotation", rotation, (3, 3))
+    translation = check_array("translation", translation, (3,))
+    mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
+    return information_at(anchors, tags, rotation, translation, noise, mask)
+
+
+def information_at(
+    anchors: FloatArray,
+    tags: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    noise: ranging.NoiseLaw,
+    links: BoolArray | None = None,
+) -> FloatArray:
+    """`range_information` on arrays that are known to be good (the environment's inner loop)."""
+    positions = ranging.tag_positions(rotation, translation, tags)
+    distance, unit = directions(anchors, positions)
+    weight = 1 / np.broadcast_to(noise.variance(distance), distance.shape)
+    if links is not None:
+        weight = weight * links
+    per_tag = np.einsum("...mni,...mnj->...nij", weight[..., None] * unit, unit)
+    return lift(tag_jacobian(rotation, tags), per_tag)
+
+
+def pose_crb(
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    prior_information: ArrayLike | None = None,
+    links: ArrayLike | None = None,
+) -> FloatArray:
+    """Cramer-Rao bound (..., 6, 6) of the pose from one epoch of ranges.
+
+    The inverse of `range_information` plus the prior information (..., 6, 6), if any. Never a
+    pseudo-inverse: it would reward anchors that see nothing.
+
+    Raises
+    ------
+    ValueError
+        As `range_information`, and where the information is singular, with its rank.
+    """
+    information = range_information(anchors, tags, rotation, translation, noise, links)
+    if prior_information is not None:
+        information = information + check_array("prior_information", prior_information, (6, 6))
+    rank = information_rank(information)
+    if (rank < 6).any():
+        where = tuple(int(i) for i in np.argwhere(rank < 6)[0])
+        raise ValueError(
+            f"the geometry does not determine the pose: information of rank {int(rank.min())} "
+            f"of 6 at batch index {where}; add anchors or tags, or prior_information"
+        )
+    return np.linalg.inv(information)
+
+
+def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.ndarray:
+    """Number (...) of directions an information matrix (..., n, n) determines, free of units."""
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    scaled = information / (scale[..., :, None] * scale[..., None, :])
+    return (np.linalg.eigvalsh(scaled) > tolerance).sum(axis=-1)
+
+
+def posterior_crb_step(
+    J: ArrayLike,
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    twist: ArrayLike,
+    dt: float,
+    process: ProcessNoise,
+    links: ArrayLike | None = None,
+) -> FloatArray:
+    """One step of the posterior Cramer-Rao recursion (Tichavsky et al. 1998) at the true pose.
+
+    Parameters
+    ----------
+    J
+        Posterior information (..., 6, 6) of the epoch before.
+    anchors, tags, rotation, translation, links
+        At the new epoch; the pose is the true one.
+    noise
+        Law of the ranges.
+    twist, dt, process
+        Motion of the interval that ends at the new epoch, and its noise.
+
+    Returns
+    -------
+    Information (..., 6, 6) after the new epoch; its inverse is the bound.
+    """
+    J = check_array("J", J, (6, 6))
+    twist = check_array("twist", twist, (6,))
+    predicted = predict_information(J, twist, dt, process)
+    return predicted + range_information(anchors, tags, rotation, translation, noise, links)
+
+
+def predict_information(
+    J: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
+) -> FloatArray:
+    """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J."""
+    turned = _turn(J, twist, dt)
+    Q = process.covariance(twist, dt)
+    return symmetric(np.linalg.solve(np.eye(6) + turned @ Q, turned))
+
+
+def predict_covariance(
+    P: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
+) -> FloatArray:
+    """Pose covariance after a step of motion, ``F P F^T + Q``, ``F = blkdiag(exp(w dt), I)``."""
+    return _turn(P, twist, dt) + process.covariance(twist, dt)
+
+
+def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
+    """``F matrix F^T``: the error is global, so the step turns its rotation part only."""
+    step = rotations.exp(twist[..., :3] * np.asarray(dt, float)[..., None])
+    F = np.zeros((*step.shape[:-2], 6, 6))
+    F[..., :3, :3] = step
+    F[..., 3:, 3:] = np.eye(3)
+    return F @ matrix @ np.swapaxes(F, -1, -2)
+
+
+def symmetric(matrix: FloatArray) -> FloatArray:
+    """The symmetric part, to keep rounding from growing in recursions."""
+    return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
+
+
+def score(covariance: ArrayLike, rotation: ArrayLike, tags: ArrayLike) -> FloatArray:
+    """Root mean square tag error b (...) in metres that a pose covariance (..., 6, 6) implies.
+
+    ``b^2 = mean_n tr(J_n P J_n^T)``, ``J_n = [-[Q c_n]x, I]``: one number for position and
+    orientation together.
+    """
+    J = tag_jacobian(np.asarray(rotation, dtype=np.float64), np.asarray(tags, dtype=np.float64))
+    mean_square = np.einsum("...nia,...nib->...ab", J, J) / J.shape[-3]
+    trace = np.einsum("...ab,...ab->...", mean_square, covariance)
+    return np.sqrt(np.maximum(trace, 0.0))

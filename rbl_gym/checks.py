@@ -1,0 +1,103 @@
+"""Checks of arguments: in comes a finite float64 array of the right shape, or an error goes out.
+
+Every error names the argument, the shape it should have, the shape it has, and the first
+offending value with its index.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> FloatArray:
+    """Return `value` as a finite float64 array whose trailing axes match `shape`.
+
+    Parameters
+    ----------
+    name
+        The argument's name, for the message.
+    value
+        What came.
+    shape
+        Trailing axes: an int is an exact size, a string a free one of at least 1
+        (``("M", 3)`` accepts ``(..., M, 3)``). Leading axes are free.
+
+    Raises
+    ------
+    ValueError
+        If `value` is not numeric, has other trailing axes, or holds NaN or inf.
+    """
+    array = as_float(name, value)
+    sizes = array.shape[array.ndim - len(shape) :]
+    if array.ndim < len(shape) or any(
+        (got != want if isinstance(want, int) else got < 1)
+        for got, want in zip(sizes, shape, strict=True)
+    ):
+        wanted = ", ".join(["...", *map(str, shape)])
+        raise ValueError(f"{name} must have shape ({wanted}), got {array.shape}")
+    return check_finite(name, array)
+
+
+def as_float(name: str, value: Any) -> FloatArray:
+    """`value` as a float64 array, or a ValueError that names it."""
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiub":
+            raise TypeError(array.dtype)
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of real numbers, got {value!r:.80}") from error
+
+
+def check_finite(name: str, array: FloatArray) -> FloatArray:
+    """`array` unchanged, or a ValueError with the first entry that is NaN or inf."""
+    if not math.isfinite(array.sum()) and not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name} must be finite, got {array[index]} at index {index}")
+    return array
+
+
+def check_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
+    """`value` as a finite float in ``[low, high]``, or a ValueError that names it."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number, got {value!r:.80}") from error
+    if not math.isfinite(number) or not low <= number <= high:
+        bounds = f" in [{low:g}, {high:g}]" if low > -math.inf or high < math.inf else ""
+        raise ValueError(f"{name} must be a finite number{bounds}, got {number}")
+    return number
+
+
+def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:
+    """`links` as a boolean mask that broadcasts against ranges of `shape`; None stays None.
+
+    Raises
+    ------
+    ValueError
+        If the mask holds anything but 0 and 1, or does not end in the ranges' (M, N).
+    """
+    if links is None:
+        return None
+    mask = np.asarray(links)
+    if mask.shape[-2:] != shape[-2:]:
+        raise ValueError(f"links must have shape (..., {shape[-2]}, {shape[-1]}), got {mask.shape}")
+    if mask.dtype != np.bool_:
+        if mask.dtype.kind not in "iuf" or not np.isin(mask, (0, 1)).all():
+            raise ValueError("links must be boolean (True: measured), got other values")
+        mask = mask.astype(np.bool_)
+    return mask
+
+
+def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) -> str:
+    """`value` if it is among `choices`, or a ValueError that lists them."""
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
+    return value

@@ -1,0 +1,290 @@
+"""Motion of a rigid body: kinematics of the tracking paper, process noise, trajectories.
+
+A twist (..., 6) is the angular velocity in the world frame [rad/s] and the velocity [m/s].
+Kinematics (tracking paper, (10)-(15), Omega carrying the time step tau):
+``Q_k = exp(omega tau) Q_{k-1}``, ``t_k = t_{k-1} + v tau``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import rotations
+from rbl_gym.checks import FloatArray, check_array, check_number
+
+
+@dataclass(frozen=True)
+class ProcessNoise:
+    """Random part of the motion: standard deviations after 1 s; the variance grows with time.
+
+    Parameters
+    ----------
+    rotation_rad, translation_m
+        A float, or three of them for the world's axes (a planar body has zeros among them).
+
+    Raises
+    ------
+    ValueError
+        If a value is negative or not finite, or there are neither 1 nor 3.
+    """
+
+    rotation_rad: float | tuple[float, float, float] = 0.0
+    translation_m: float | tuple[float, float, float] = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_rad", "translation_m"):
+            value = check_array(name, getattr(self, name), ())
+            if value.shape not in ((), (3,)):
+                raise ValueError(f"{name} must be one number or three, got shape {value.shape}")
+            if (value < 0).any():
+                raise ValueError(f"{name} must not be negative, got {value.tolist()}")
+            # Lists come out of JSON; tuples keep the configuration hashable.
+            object.__setattr__(
+                self, name, float(value) if value.ndim == 0 else tuple(value.tolist())
+            )
+
+    def std(self) -> FloatArray:
+        """The six standard deviations after 1 s: rotation (rad), then translation (m)."""
+        rotation = np.broadcast_to(self.rotation_rad, 3)
+        return np.concatenate([rotation, np.broadcast_to(self.translation_m, 3)])
+
+    def covariance(self, twist: FloatArray, dt: ArrayLike) -> FloatArray:
+        """Covariance (..., 6, 6) that one step adds to the pose error (w, v).
+
+        ``dt blkdiag(Jl S_w Jl^T, S_v)`` with Jl the left Jacobian of the step's rotation:
+        the noise is on the angular velocity, the error on the rotation it makes.
+        """
+        dt = np.asarray(dt, dtype=np.float64)[..., None]
+        variance = self.std() ** 2
+        jacobian = rotations.left_jacobian(twist[..., :3] * dt)
+        batch = np.broadcast_shapes(twist.shape[:-1], dt.shape[:-1])
+        covariance = np.zeros((*batch, 6, 6))
+        covariance[..., :3, :3] = dt[..., None] * (
+            (jacobian * variance[:3]) @ np.swapaxes(jacobian, -1, -2)
+        )
+        index = np.arange(3, 6)
+        covariance[..., index, index] = dt * variance[3:]
+        return covariance
+
+
+class Trajectory(NamedTuple):
+    """Nominal motion: start rotation (..., 3, 3), translation (..., 3), twists (..., T, 6)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    twists: FloatArray
+
+
+class Path(NamedTuple):
+    """Poses at T + 1 epochs: rotation (..., T + 1, 3, 3), translation (..., T + 1, 3)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+
+
+def propagate(
+    rotation: FloatArray, translation: FloatArray, twist: FloatArray, dt: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """The pose one step of `dt` seconds later under a constant twist."""
+    dt = np.asarray(dt, dtype=np.float64)[..., None]
+    return rotations.exp(twist[..., :3] * dt) @ rotation, translation + twist[..., 3:] * dt
+
+
+def simulate(
+    trajectory: Trajectory, dt: float, process: ProcessNoise, normals: FloatArray | None = None
+) -> Path:
+    """True poses along a trajectory with process noise on every step.
+
+    Parameters
+    ----------
+    trajectory
+        Start and nominal twists.
+    dt
+        Step, seconds.
+    process
+        Law of the noise; it acts on the twist, with variance growing with time.
+    normals
+        Standard normals (..., T, 6); None: no process noise.
+    """
+    twists = trajectory.twists
+    if normals is not None:
+        twists = twists + normals * (process.std() / np.sqrt(dt))
+    steps = rotations.exp(twists[..., :3] * dt)
+    rotation = np.empty((*steps.shape[:-3], steps.shape[-3] + 1, 3, 3))
+    rotation[..., 0, :, :] = trajectory.rotation
+    for k in range(steps.shape[-3]):
+        np.matmul(steps[..., k, :, :], rotation[..., k, :, :], out=rotation[..., k + 1, :, :])
+    translation = np.empty((*twists.shape[:-2], twists.shape[-2] + 1, 3))
+    translation[..., 0, :] = 0.0
+    np.cumsum(twists[..., 3:] * dt, axis=-2, out=translation[..., 1:, :])
+    translation += trajectory.translation[..., None, :]
+    return Path(rotation, translation)
+
+
+def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike) -> FloatArray:
+    """Twists (..., T, 6) that lead from each pose to the next, dt a scalar or (..., T)."""
+    dt = np.asarray(dt, dtype=np.float64)[..., None]
+    turn = rotations.error(rotation[..., 1:, :, :], rotation[..., :-1, :, :])
+    return np.concatenate([turn / dt, np.diff(translation, axis=-2) / dt], axis=-1)
+
+
+def constant_twist(
+    rotation: ArrayLike, translation: ArrayLike, twist: ArrayLike, steps: int
+) -> Trajectory:
+    """The same twist at every step (the tracking paper's motion)."""
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    twist = check_array("twist", twist, (6,))
+    twists = np.repeat(twist[..., None, :], _check_steps(steps), axis=-2)
+    return Trajectory(rotation, translation, twists)
+
+
+def random_twist(
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    speed_m_s: float,
+    turn_rate_rad_s: float,
+    steps: int,
+    rng: np.random.Generator,
+    hold: int = 10,
+) -> Trajectory:
+    """Constant speed in a direction, and a turn rate about an axis, drawn anew every `hold` steps.
+
+    Speed and turn rate are exact (directions are uniform on the sphere), so that the reach of
+    the body stays bounded by ``speed * time``.
+    """
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    steps, hold = _check_steps(steps), _check_steps(hold, "hold")
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    directions = rng.standard_normal((*batch, -(-steps // hold), 2, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    rates = np.array([turn_rate_rad_s, speed_m_s])[:, None]
+    twists = (directions * rates).reshape(*batch, -1, 6)
+    return Trajectory(rotation, translation, np.repeat(twists, hold, axis=-2)[..., :steps, :])
+
+
+def waypoints(
+    rotation: ArrayLike,
+    points: ArrayLike,
+    speed_m_s: float,
+    dt: float,
+    steps: int,
+    spin_rad_s: ArrayLike = (0.0, 0.0, 0.0),
+) -> Trajectory:
+    """Constant speed along the polyline through `points`, resting at its end, constant spin.
+
+    Parameters
+    ----------
+    rotation
+        At the start (..., 3, 3).
+    points
+        (..., K, 3), K >= 2; the first is the start.
+    speed_m_s, dt, steps
+        Speed along the line, step in seconds, number of steps.
+    spin_rad_s
+        Angular velocity (..., 3) in the world frame.
+    """
+    rotation = rotations.check_rotation("rotation", rotation)
+    points = check_array("points", points, ("K", 3))
+    if points.shape[-2] < 2:
+        raise ValueError(f"points must hold at least 2 way-points, got shape {points.shape}")
+    speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
+    dt = check_number("dt", dt, low=1e-12)
+    spin = check_array("spin_rad_s", spin_rad_s, (3,))
+    legs = np.linalg.norm(np.diff(points, axis=-2), axis=-1)
+    reached = np.cumsum(legs, axis=-1)
+    travelled = speed_m_s * dt * np.arange(_check_steps(steps) + 1)
+    leg = (reached[..., None, :] <= travelled[:, None]).sum(axis=-1)
+    leg = np.minimum(leg, legs.shape[-1] - 1)
+    begin = np.take_along_axis(reached - legs, leg, axis=-1)
+    length = np.maximum(np.take_along_axis(legs, leg, axis=-1), 1e-12)
+    fraction = np.clip((travelled - begin) / length, 0.0, 1.0)[..., None]
+    start = np.take_along_axis(points, leg[..., None], axis=-2)
+    stop = np.take_along_axis(points, leg[..., None] + 1, axis=-2)
+    velocity = np.diff(start + fraction * (stop - start), axis=-2) / dt
+    spin = np.broadcast_to(spin[..., None, :], velocity.shape)
+    return Trajectory(rotation, points[..., 0, :], np.concatenate([spin, velocity], axis=-1))
+
+
+def lawn_mower_points(low: ArrayLike, high: ArrayLike, spacing_m: float) -> FloatArray:
+    """Way-points (K, 3) of parallel lanes along x, `spacing_m` apart, at the mid height."""
+    low, high = check_array("low", low, (3,)), check_array("high", high, (3,))
+    spacing_m = check_number("spacing_m", spacing_m, low=1e-9)
+    lanes = max(int(np.floor((high[1] - low[1]) / spacing_m)) + 1, 1)
+    y = np.repeat(low[1] + spacing_m * np.arange(lanes), 2)
+    x = np.where(np.arange(2 * lanes) % 4 % 3 == 0, low[0], high[0])
+    return np.stack([x, y, np.full(2 * lanes, 0.5 * (low[2] + high[2]))], axis=-1)
+
+
+def orbit(
+    centre: ArrayLike,
+    radius_m: float,
+    speed_m_s: float,
+    dt: float,
+    steps: int,
+    phase: ArrayLike = 0.0,
+) -> Trajectory:
+    """A horizontal circle, the body's x axis along the motion; `phase` (rad) may be batched."""
+    centre = check_array("centre", centre, (3,))
+    radius_m = check_number("radius_m", radius_m, low=1e-9)
+    dt = check_number("dt", dt, low=1e-12)
+    rate = check_number("speed_m_s", speed_m_s, low=0.0) / radius_m
+    angle = np.asarray(phase, float)[..., None] + rate * dt * np.arange(_check_steps(steps) + 1)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    places = centre[..., None, :] + radius_m * circle
+    twists = np.zeros((*angle.shape[:-1], steps, 6))
+    twists[..., 2] = rate
+    twists[..., 3:] = np.diff(places, axis=-2) / dt
+    heading = np.zeros((*angle.shape[:-1], 3))
+    heading[..., 2] = angle[..., 0] + np.pi / 2
+    return Trajectory(rotations.exp(heading), places[..., 0, :], twists)
+
+
+def recorded(
+    times: ArrayLike, rotation: ArrayLike, translation: ArrayLike, dt: float
+) -> Trajectory:
+    """A recorded track, resampled every `dt` seconds: linear in position, geodesic in rotation.
+
+    Parameters
+    ----------
+    times
+        (L,), seconds, strictly increasing, L >= 2.
+    rotation, translation
+        (L, 3, 3) and (L, 3).
+    """
+    times = check_array("times", times, ("L",))
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, ("L", 3))
+    if times.ndim != 1 or len(times) < 2 or (np.diff(times) <= 0).any():
+        raise ValueError("times must be (L,) with L >= 2 and strictly increasing")
+    dt = check_number("dt", dt, low=1e-12)
+    at = np.arange(times[0], times[-1] + 1e-9 * dt, dt)
+    if len(at) < 2:
+        raise ValueError(f"times must span at least one step of dt = {dt}, got {np.ptp(times)}")
+    path = interpolate(times, rotation, translation, at)
+    return Trajectory(path.rotation[0], path.translation[0], twists_between(*path, dt))
+
+
+def interpolate(
+    times: FloatArray, rotation: FloatArray, translation: FloatArray, at: FloatArray
+) -> Path:
+    """Poses at the times `at`, linear in position, geodesic in rotation; the ends are held."""
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+    span = times[before + 1] - times[before]
+    fraction = np.clip((at - times[before]) / span, 0.0, 1.0)[:, None]
+    turn = rotations.error(rotation[before + 1], rotation[before])
+    step = translation[before + 1] - translation[before]
+    return Path(
+        rotations.exp(fraction * turn) @ rotation[before], translation[before] + fraction * step
+    )
+
+
+def _check_steps(steps: int, name: str = "steps") -> int:
+    if steps != int(steps) or steps < 1:
+        raise ValueError(f"{name} must be a positive int, got {steps!r}")
+    return int(steps)

@@ -1,0 +1,254 @@
+"""The range model: distances from anchors to tags, noise laws, links that fail.
+
+Shapes: anchors (..., M, 3), tags (..., N, 3) in the body frame, ranges and links (..., M, N).
+A noise law knows the variance of a range and of a squared range; where the variance is
+common to all tags of an anchor it comes back as (..., M, 1), which is how the estimators
+recognise the papers' case.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import BoolArray, FloatArray, check_number
+
+
+class NoiseLaw(Protocol):
+    """What every noise law offers; ranges (..., M, N) in metres, links the mask beside them."""
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of each range [m^2], (..., M, N) or (..., M, 1) where common to the tags."""
+        ...
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance of each squared range [m^4], (..., M, N) or (..., M, 1)."""
+        ...
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Noisy ranges from true distances and standard normals of the same shape."""
+        ...
+
+
+@dataclass(frozen=True)
+class RangeNoise:
+    """Gaussian noise on the range, variance ``floor_m^2 + (proportional r)^2``.
+
+    Parameters
+    ----------
+    floor_m
+        Standard deviation at zero range, metres.
+    proportional
+        Growth of the standard deviation with the range, metres per metre.
+    reference_tag
+        None: ``r`` is each link's own range. An index: ``r`` is the range of that tag, for
+        all tags of an anchor, as the papers do (static paper, eq. (2)).
+
+    Raises
+    ------
+    ValueError
+        If a parameter is negative or not finite, or both are zero.
+    """
+
+    floor_m: float = 0.05
+    proportional: float = 0.0
+    reference_tag: int | None = None
+
+    def __post_init__(self) -> None:
+        check_number("floor_m", self.floor_m, low=0.0)
+        check_number("proportional", self.proportional, low=0.0)
+        if self.floor_m == 0 and self.proportional == 0:
+            raise ValueError("floor_m and proportional must not both be zero: noise-free ranges")
+        if self.reference_tag is not None and self.reference_tag != int(self.reference_tag):
+            raise ValueError(f"reference_tag must be None or an int, got {self.reference_tag!r}")
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        r = self._scale(ranges, links)
+        return self.floor_m**2 + (self.proportional * r) ** 2
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
+        r = self._scale(ranges, links)
+        return 4 * r**2 * (self.floor_m**2 + (self.proportional * r) ** 2)
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of this law, never below zero."""
+        return np.maximum(distances + np.sqrt(self.variance(distances)) * normals, 0.0)
+
+    def _scale(self, ranges: FloatArray, links: BoolArray | None) -> FloatArray:
+        if self.reference_tag is None:
+            return ranges
+        return reference_range(ranges, self.reference_tag, links)
+
+
+@dataclass(frozen=True)
+class SquaredRangeNoise:
+    """The tracking paper's law: ``r^2 + n`` with ``n ~ N(0, (sigma_m |a_m - s_1|)^2)``.
+
+    Parameters
+    ----------
+    sigma_m
+        Ratio of the squared range's standard deviation to the range of the first tag, metres.
+    """
+
+    sigma_m: float = 0.0316
+
+    def __post_init__(self) -> None:
+        check_number("sigma_m", self.sigma_m, low=1e-300)
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order."""
+        r = ranges if links is None else np.where(links, ranges, 1.0)
+        return self.squared_range_variance(ranges, links) / (4 * r**2)
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance of the squared ranges [m^4], (..., M, 1)."""
+        return (self.sigma_m * reference_range(ranges, 0, links)) ** 2
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of this law; a negative square counts as zero."""
+        noise = self.sigma_m * distances[..., :1] * normals
+        return np.sqrt(np.maximum(distances**2 + noise, 0.0))
+
+
+def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None) -> FloatArray:
+    """Range (..., M, 1) of the reference tag to every anchor.
+
+    Where that link is missing, the mean of the anchor's measured ranges stands in for it, and
+    1 where an anchor has no link at all (its weight is zero anyway).
+
+    Raises
+    ------
+    ValueError
+        If there is no such tag.
+    """
+    n_tags = ranges.shape[-1]
+    if not -n_tags <= tag < n_tags:
+        raise ValueError(f"reference_tag must be below the number of tags {n_tags}, got {tag}")
+    reference = ranges[..., tag : tag + 1 or None]
+    if links is None or links.all():
+        return reference
+    links = np.broadcast_to(links, ranges.shape)
+    count = links.sum(axis=-1, keepdims=True)
+    mean = np.where(links, ranges, 0.0).sum(axis=-1, keepdims=True) / np.maximum(count, 1)
+    stand_in = np.where(count > 0, mean, 1.0)
+    return np.where(links[..., tag : tag + 1 or None], reference, stand_in)
+
+
+@dataclass(frozen=True)
+class LinkModel:
+    """What happens to a link besides noise; the default is that nothing does.
+
+    Parameters
+    ----------
+    drop_probability
+        Chance that a link gives no range at an epoch.
+    reach_m
+        Distance beyond which there is no range; None: unlimited.
+    nlos_probability
+        Chance that a range is taken over a reflected path.
+    nlos_bias_m
+        What a reflected path adds to the range, metres.
+    """
+
+    drop_probability: float = 0.0
+    reach_m: float | None = None
+    nlos_probability: float = 0.0
+    nlos_bias_m: float = 5.0
+
+    def __post_init__(self) -> None:
+        check_number("drop_probability", self.drop_probability, low=0.0, high=1.0)
+        check_number("nlos_probability", self.nlos_probability, low=0.0, high=1.0)
+        check_number("nlos_bias_m", self.nlos_bias_m, low=0.0)
+        if self.reach_m is not None:
+            check_number("reach_m", self.reach_m, low=0.0)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether uniforms are needed to decide the links."""
+        return self.drop_probability > 0 or self.nlos_probability > 0
+
+
+class Measurement(NamedTuple):
+    """One epoch of ranges (..., M, N) [m], 0 where `links` is False; `nlos`: biased ones."""
+
+    ranges: FloatArray
+    links: BoolArray
+    nlos: BoolArray
+
+
+def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
+    """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
+    turned = np.asarray(tags) @ np.swapaxes(np.asarray(rotation), -1, -2)
+    return turned + np.asarray(translation)[..., None, :]
+
+
+def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
+    """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
+    difference = np.asarray(positions)[..., None, :, :] - np.asarray(anchors)[..., :, None, :]
+    return np.sqrt(np.einsum("...i,...i->...", difference, difference))
+
+
+def measure(
+    true_distances: FloatArray,
+    noise: NoiseLaw,
+    normals: FloatArray,
+    link_model: LinkModel | None = None,
+    uniforms: FloatArray | None = None,
+) -> Measurement:
+    """One epoch of measurements from true distances and given random numbers.
+
+    Parameters
+    ----------
+    true_distances
+        (..., M, N), metres.
+    noise, link_model
+        The laws; without a link model every link measures.
+    normals
+        Standard normals (..., M, N).
+    uniforms
+        Uniforms on [0, 1) of shape (..., 2, M, N), for drops and NLOS; needed where
+        ``link_model.is_random``.
+    """
+    ranges = noise.sample(true_distances, normals)
+    links = np.ones(ranges.shape, dtype=np.bool_)
+    nlos = np.zeros(ranges.shape, dtype=np.bool_)
+    if link_model is None:
+        return Measurement(ranges, links, nlos)
+    if link_model.is_random:
+        if uniforms is None:
+            raise ValueError("uniforms must be given for a link model with probabilities, got None")
+        links &= uniforms[..., 0, :, :] >= link_model.drop_probability
+        nlos = uniforms[..., 1, :, :] < link_model.nlos_probability
+        ranges = ranges + np.where(nlos, link_model.nlos_bias_m, 0.0)
+    if link_model.reach_m is not None:
+        links &= true_distances <= link_model.reach_m
+    return Measurement(np.where(links, ranges, 0.0), links, nlos & links)
+
+
+def simulate(
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: NoiseLaw,
+    rng: np.random.Generator,
+    link_model: LinkModel | None = None,
+) -> Measurement:
+    """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`."""
+    true = distances(anchors, tag_positions(rotation, translation, tags))
+    normals = rng.standard_normal(true.shape)
+    uniforms = None
+    if link_model is not None and link_model.is_random:
+        uniforms = rng.random((*true.shape[:-2], 2, *true.shape[-2:]))
+    return measure(true, noise, normals, link_model, uniforms)
