@@ -12,3 +12,15 @@ __version__ = "0.1.0"
 _root = Path(__file__).resolve().parent.parent
 if (_root / "pyproject.toml").is_file() and (_root / "estimators").is_dir():
     __path__.append(str(_root))
+
+
+def _register_environments() -> None:
+    from gymnasium.envs.registration import register, registry
+
+    entry_points = {"RBL/Tracking-v0": "rbl_gym.envs.tracking:TrackingEnv"}
+    for env_id, entry_point in entry_points.items():
+        if env_id not in registry:
+            register(id=env_id, entry_point=entry_point)
+
+
+_register_environments()

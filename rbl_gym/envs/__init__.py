@@ -1,0 +1,1 @@
+"""Environments: measurements out, anchor commands in; they know no estimator."""

@@ -1,0 +1,184 @@
+"""RBL/Tracking-v0: one rigid body among anchors that measure ranges to its tags."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike
+
+from rbl_gym import bounds, scenes, simulation
+from rbl_gym.checks import FloatArray, check_array, check_one_of
+
+REWARDS = ("bound", "none")
+
+
+class TrackingEnv(gym.Env[dict[str, np.ndarray], Any]):
+    """A rigid body moves; anchors measure noisy ranges to its tags; where is it, and how turned?
+
+    ## Description
+    A body carries N tags at known places. At every epoch M anchors at known places measure
+    ranges to the tags. The environment emits the measurements and what else an estimator may
+    know; it knows no estimator itself. Within a step: anchors move, the body moves, ranges
+    are taken, the bound and the reward follow.
+
+    ## Action space
+    Anchors that move (`scene.anchor_speed_m_s` > 0): ``Box(-1, 1, (3 M,), float32)``, a
+    velocity per anchor in units of the speed limit (cut to length 1); zero keeps them. The
+    place is projected onto the scene's anchor region. Fixed anchors: ``Discrete(1)``.
+
+    ## Observation space
+    A ``Dict``:
+
+    | key | shape | type | meaning |
+    |---|---|---|---|
+    | `ranges` | (M, N) | float64 | metres, 0 where there is no link |
+    | `links` | (M, N) | int8 | 1 where a range was measured |
+    | `anchors` | (M, 3) | float64 | places of the anchors at this epoch, metres |
+    | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
+
+    ## Reward
+    ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square
+    tag error in metres, at the true pose: how good any estimator could be with these anchors.
+    ``reward="none"``: 0, for wrappers that compute their own.
+
+    ## Starting state
+    Start pose, way-points, turn rate, and anchors that the scene leaves open are drawn at
+    reset. `info` of the reset holds the prior (`prior_rotation`, `prior_translation`,
+    `prior_covariance`), which refers to epoch 0 before its update.
+
+    ## Info
+    `rotation`, `translation`: the true pose; `nlos`: which ranges came over a reflected path;
+    `epoch`; `score_m`: b (with ``reward="bound"``).
+
+    ## Episode end
+    Never terminates; truncates after `scene.steps` steps.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+
+    env = gym.make("rbl_gym:RBL/Tracking-v0", scene="drone_yard")
+    env = gym.make(
+        "rbl_gym:RBL/Tracking-v0",
+        scene={"name": "uwb_room", "steps": 50, "links": {"drop_probability": 0.2}},
+        reward="none",
+    )
+    ```
+    `scene`: a name of `rbl_gym.scenes.SCENES` or a dict of overrides, see
+    `rbl_gym.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
+
+    ## Version history
+    * v0: first version.
+    """  # noqa: E501 (a table row cannot be broken)
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own form)
+
+    def __init__(
+        self,
+        scene: str | Mapping[str, Any] = "uwb_room",
+        reward: str = "bound",
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        self.scene = scenes.get(scene)
+        self.reward_mode = check_one_of("reward", reward, REWARDS)
+        self.render_mode = render_mode
+        self.observation_space = observation_space(self.scene)
+        self.action_space = action_space(self.scene)
+        self._tags = np.asarray(self.scene.tags)
+        self._episode: simulation.Episode | None = None
+        self._epoch = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode; the measurements are those of epoch 0."""
+        super().reset(seed=seed)
+        episode = simulation.draw_episode(self.scene, self.np_random)
+        self._episode = episode
+        self._epoch = 0
+        self._anchors = episode.anchors.copy()
+        self._information: FloatArray | None = None
+        observation, info, _ = self._observe(episode)
+        info["prior_rotation"] = episode.prior_rotation.copy()
+        info["prior_translation"] = episode.prior_translation.copy()
+        info["prior_covariance"] = episode.prior_covariance.copy()
+        return observation, info
+
+    def step(
+        self, action: ArrayLike
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Move the anchors, then the body, then measure."""
+        if self._episode is None or self._epoch >= self.scene.steps:
+            raise gym.error.ResetNeeded("the episode is over or never began: call reset()")
+        if self.scene.anchor_speed_m_s > 0:
+            velocities = check_array("action", action, (3 * self.scene.n_anchors,))
+            self._anchors = simulation.move_anchors(self.scene, self._anchors, velocities)
+        self._epoch += 1
+        observation, info, reward = self._observe(self._episode)
+        return observation, reward, False, self._epoch >= self.scene.steps, info
+
+    def _observe(
+        self, episode: simulation.Episode
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any], float]:
+        k = self._epoch
+        measured = simulation.measure(self.scene, episode, k, self._anchors)
+        info: dict[str, Any] = {
+            "rotation": episode.rotation[k].copy(),
+            "translation": episode.translation[k].copy(),
+            "nlos": measured.nlos,
+            "epoch": k,
+        }
+        reward = 0.0
+        if self.reward_mode == "bound":
+            self._information = simulation.posterior_information(
+                self.scene, episode, k, self._anchors, measured.links, self._information
+            )
+            covariance = np.linalg.inv(self._information)
+            info["score_m"] = float(bounds.score(covariance, episode.rotation[k], self._tags))
+            reward = -float(np.log(info["score_m"]))
+        observation = {
+            "ranges": measured.ranges,
+            "links": measured.links.astype(np.int8),
+            "anchors": self._anchors.copy(),
+            "twist": episode.twists[k].copy(),
+        }
+        return observation, info, reward
+
+
+def observation_space(scene: scenes.Scene) -> spaces.Dict:
+    """Finite bounds of a scene's observations."""
+    links = (scene.n_anchors, len(scene.tags))
+    low, high = scene.anchor_region.bounds()
+    if scene.anchors is not None:
+        low = np.minimum(low, np.min(scene.anchors, axis=0))
+        high = np.maximum(high, np.max(scene.anchors, axis=0))
+    # check_env wants room between the bounds; a water surface has none.
+    low, high = np.where(high > low, low, low - 1), np.where(high > low, high, high + 1)
+    twist = np.abs(scene.twist)
+    # No sampled rotation turns by more than pi a step.
+    twist[:3] = np.maximum(twist[:3], np.pi / scene.dt)
+    twist[3:] = np.maximum(twist[3:], scene.speed_m_s) + 1e-9
+    return spaces.Dict(
+        {
+            "ranges": spaces.Box(0.0, scene.range_limit_m, links, np.float64),
+            "links": spaces.MultiBinary(links),
+            "anchors": spaces.Box(
+                np.tile(low, (scene.n_anchors, 1)), np.tile(high, (scene.n_anchors, 1)),
+                dtype=np.float64,
+            ),
+            "twist": spaces.Box(-twist, twist, dtype=np.float64),
+        }
+    )  # fmt: skip
+
+
+def action_space(scene: scenes.Scene) -> spaces.Space[Any]:
+    """Velocities of movable anchors, or the one action of fixed ones."""
+    if scene.anchor_speed_m_s > 0:
+        return spaces.Box(-1.0, 1.0, (3 * scene.n_anchors,), np.float32)
+    return spaces.Discrete(1)

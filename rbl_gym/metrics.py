@@ -1,0 +1,67 @@
+"""How good a belief is: pose errors, consistency, the papers' error measures; batched."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import special
+
+from rbl_gym import rotations
+from rbl_gym.checks import FloatArray
+
+
+def pose_error(
+    rotation_hat: FloatArray,
+    translation_hat: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+) -> FloatArray:
+    """Error (..., 6) = (w, v): ``Q_hat = exp(w) Q`` in radians, ``t_hat = t + v`` in metres."""
+    turn = rotations.error(rotation_hat, rotation)
+    shift = np.asarray(translation_hat) - np.asarray(translation)
+    return np.concatenate(np.broadcast_arrays(turn, shift), axis=-1)
+
+
+def tag_error(
+    rotation_hat: FloatArray,
+    translation_hat: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    tags: FloatArray,
+) -> FloatArray:
+    """Root mean square (...) over the tags of their displacement, metres."""
+    turned = np.asarray(tags) @ np.swapaxes(np.asarray(rotation_hat) - rotation, -1, -2)
+    shift = (np.asarray(translation_hat) - translation)[..., None, :]
+    return np.sqrt(np.mean(np.sum((turned + shift) ** 2, axis=-1), axis=-1))
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised estimation error squared (...), ``e^T P^-1 e``; mean 6 for a consistent pose."""
+    solved = np.linalg.solve(covariance, error[..., None])[..., 0]
+    return np.einsum("...i,...i->...", error, solved)
+
+
+def mean_angular_error(matrix: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Mean angle (...) in radians between the columns of an estimate and of the rotation.
+
+    The static paper's measure; by atan2, so small angles are not lost, and the estimate need
+    not be orthogonal.
+    """
+    columns = np.swapaxes(np.asarray(matrix), -1, -2), np.swapaxes(np.asarray(rotation), -1, -2)
+    return rotations.angle_between(*columns).mean(axis=-1)
+
+
+def expected_mean_angular_error(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
+    """The mean angular error (...) in radians of a Gaussian error of this pose covariance.
+
+    A column moves in the plane across it by a zero-mean Gaussian with eigenvalues l1 >= l2:
+    its mean length is ``sqrt(2 l1 / pi) E(1 - l2 / l1)``, E the complete elliptic integral of
+    the second kind (parameter m).
+    """
+    body = np.swapaxes(rotation, -1, -2) @ covariance[..., :3, :3] @ rotation
+    lengths = []
+    for column in range(3):
+        across = [axis for axis in range(3) if axis != column]
+        block = body[..., across, :][..., across]
+        l2, l1 = np.moveaxis(np.linalg.eigvalsh(block), -1, 0)
+        lengths.append(np.sqrt(2 * l1 / np.pi) * special.ellipe(1 - l2 / l1))
+    return np.mean(lengths, axis=0)

@@ -1,0 +1,195 @@
+"""EstimatePose: run a named filter on the measurements of an environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+
+from rbl_gym import bounds, estimators, metrics, scenes
+from rbl_gym.checks import check_one_of
+from rbl_gym.estimators import PoseBelief
+
+REWARDS = ("belief", "error")
+OBSERVATIONS = ("dict", "flat")
+# A flat observation is of order one; what is far outside says no more than that.
+_FLAT_LIMIT = 10.0
+
+
+class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Turns measurements into a pose belief, and the belief into the reward.
+
+    Wraps an environment whose observation has `ranges`, `links`, `anchors` and `twist` and
+    whose unwrapped form has a `scene` (`RBL/Tracking-v0`). The environment's own reward is
+    switched off. No vector version yet: wrap the sub-environments.
+
+    Parameters
+    ----------
+    env
+        The environment.
+    filter
+        Name of a filter (`rbl_gym.estimators.names`).
+    options
+        Its options, a JSON-able dict, for instance ``{"robust": True}``.
+    reward
+        ``"belief"``: ``-log b`` of the posterior belief, b its root mean square tag error in
+        metres (`rbl_gym.bounds.score`). ``"error"``: minus the real root mean square tag
+        error in metres.
+    observation
+        ``"dict"``: the environment's, with `belief_rotation` (3, 3), `belief_translation`
+        (3,), `belief_covariance` (6, 6) added. ``"flat"``: one float32 vector for a policy, see
+        `flat_observation`.
+
+    Info
+    ----
+    `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees` (6 degrees of freedom) and
+    `score_m` (b of the belief), beside what the environment says.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from rbl_gym.wrappers import EstimatePose
+    >>> env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene="drone_yard"), "iekf")
+    >>> observation, info = env.reset(seed=1)
+    >>> observation, reward, terminated, truncated, info = env.step(0)
+    >>> info["position_error_m"] < 1.0
+    True
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        filter: str = "iekf",
+        options: Mapping[str, Any] | None = None,
+        reward: str = "belief",
+        observation: str = "dict",
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, filter=filter, options=options, reward=reward, observation=observation
+        )
+        gym.Wrapper.__init__(self, env)
+        scene = getattr(env.unwrapped, "scene", None)
+        if not isinstance(scene, scenes.Scene):
+            raise ValueError(f"env must have a rbl_gym Scene as its scene, got {env.unwrapped!r}")
+        self._scene = scene
+        self._reward = check_one_of("reward", reward, REWARDS)
+        self._kind = check_one_of("observation", observation, OBSERVATIONS)
+        self._tags = np.asarray(scene.tags)
+        self._filter = estimators.make(
+            filter,
+            tags=self._tags,
+            noise=scene.noise,
+            process=scene.process,
+            **(options or {}),
+        )
+        self._state: Any = None
+        if hasattr(env.unwrapped, "reward_mode"):
+            env.unwrapped.reward_mode = "none"  # pyright: ignore[reportAttributeAccessIssue]
+        self.observation_space = self._make_space()
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start the filter from the environment's prior and give it the first epoch."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        prior = (info["prior_rotation"], info["prior_translation"], info["prior_covariance"])
+        self._state = self._filter.initial(*prior)
+        belief = self._update(observation)
+        self._judge(belief, info)
+        return self._observation(observation, belief), info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step the environment, predict with its twist, update with its ranges."""
+        observation, _, terminated, truncated, info = self.env.step(action)
+        self._state = self._filter.predict(self._state, observation["twist"], self._scene.dt)
+        belief = self._update(observation)
+        self._judge(belief, info)
+        reward = (
+            -float(np.log(info["score_m"])) if self._reward == "belief" else -info["tag_error_m"]
+        )
+        return self._observation(observation, belief), reward, terminated, truncated, info
+
+    def _update(self, observation: dict[str, np.ndarray]) -> PoseBelief:
+        self._state = self._filter.update(
+            self._state, observation["ranges"], observation["anchors"], observation["links"]
+        )
+        return self._filter.belief(self._state)
+
+    def _judge(self, belief: PoseBelief, info: dict[str, Any]) -> None:
+        """Errors against the true pose, into `info`."""
+        truth = info["rotation"], info["translation"]
+        error = metrics.pose_error(belief.rotation, belief.translation, *truth)
+        info["rotation_error_rad"] = float(np.linalg.norm(error[:3]))
+        info["position_error_m"] = float(np.linalg.norm(error[3:]))
+        info["tag_error_m"] = float(
+            metrics.tag_error(belief.rotation, belief.translation, *truth, self._tags)
+        )
+        info["nees"] = float(metrics.nees(error, belief.covariance))
+        info["score_m"] = float(bounds.score(belief.covariance, belief.rotation, self._tags))
+
+    def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
+        if self._kind == "flat":
+            return flat_observation(observation, belief, self._scene)
+        return {
+            **observation,
+            "belief_rotation": belief.rotation,
+            "belief_translation": belief.translation,
+            "belief_covariance": belief.covariance,
+        }
+
+    def _make_space(self) -> spaces.Space[Any]:
+        inner = self.env.observation_space
+        if not isinstance(inner, spaces.Dict) or not {"ranges", "links", "anchors", "twist"} <= set(
+            inner.keys()
+        ):
+            raise ValueError(
+                f"env must observe ranges, links, anchors and twist, its space is {inner}"
+            )
+        if self._kind == "flat":
+            size = 21 + 4 * self._scene.n_anchors
+            return spaces.Box(-_FLAT_LIMIT, _FLAT_LIMIT, (size,), np.float32)
+        # Beliefs have no bound of their own; these are finite and never met.
+        return spaces.Dict(
+            {
+                **inner.spaces,
+                "belief_rotation": spaces.Box(-1.001, 1.001, (3, 3), np.float64),
+                "belief_translation": spaces.Box(-1e9, 1e9, (3,), np.float64),
+                "belief_covariance": spaces.Box(-1e18, 1e18, (6, 6), np.float64),
+            }
+        )
+
+
+def flat_observation(
+    observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: scenes.Scene
+) -> np.ndarray:
+    """Belief and anchors as one float32 vector (..., 21 + 4 M), relative and of order one.
+
+    In order: estimated position scaled to the scene's volume (3); twist over pi/10 a step and
+    over the speed (6); log standard deviations of the pose error (6); the first two columns
+    of the estimated rotation (6); anchors relative to the estimate over the scene's extent (3
+    M); log of their distances over that extent (M). Cut to +-10.
+    """
+    corners = np.array([*scene.volume.bounds(), *scene.anchor_region.bounds()])
+    extent = np.linalg.norm(np.ptp(corners, axis=0)) / 2
+    low, high = scene.volume.bounds()
+    half = np.maximum(0.5 * (high - low), 1e-3 * extent)
+    speed = max(scene.speed_m_s, float(np.abs(scene.twist[3:]).max()), 1e-3)
+    scale = np.array([np.pi / 10 / scene.dt] * 3 + [speed] * 3)
+    std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
+    relative = observation["anchors"] - belief.translation[..., None, :]
+    distance = np.linalg.norm(relative, axis=-1)
+    batch = belief.translation.shape[:-1]
+    parts = [
+        (belief.translation - 0.5 * (low + high)) / half,
+        observation["twist"] / scale,
+        np.log(np.maximum(std, 1e-12)),
+        np.swapaxes(belief.rotation, -1, -2)[..., :2, :].reshape(*batch, 6),
+        (relative / extent).reshape(*batch, -1),
+        np.log(np.maximum(distance / extent, 1e-6)),
+    ]
+    flat = np.concatenate(parts, axis=-1)
+    return np.clip(flat, -_FLAT_LIMIT, _FLAT_LIMIT).astype(np.float32)
