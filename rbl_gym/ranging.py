@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_number
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
 
 class NoiseLaw(Protocol):
@@ -119,6 +119,38 @@ class SquaredRangeNoise:
         """Ranges with noise of this law; a negative square counts as zero."""
         noise = self.sigma_m * distances[..., :1] * normals
         return np.sqrt(np.maximum(distances**2 + noise, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class LinkNoise:
+    """A standard deviation for every link, as radios report them.
+
+    Parameters
+    ----------
+    std_m
+        (..., M, N), metres; entries of links that are not measured do not matter.
+    """
+
+    std_m: FloatArray
+
+    def __post_init__(self) -> None:
+        std = check_array("std_m", self.std_m, ("M", "N"))
+        if (std < 0).any():
+            raise ValueError(f"std_m must not be negative, got {std.min()}")
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        return np.broadcast_to(self.std_m**2, np.broadcast_shapes(self.std_m.shape, ranges.shape))
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
+        return 4 * ranges**2 * self.std_m**2
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of this law, never below zero."""
+        return np.maximum(distances + self.std_m * normals, 0.0)
 
 
 def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None) -> FloatArray:

@@ -104,16 +104,24 @@ def left_jacobian_inverse(w: ArrayLike) -> FloatArray:
 def log(Q: ArrayLike) -> FloatArray:
     """Rotation vector (..., 3), ``|w| <= pi``, of the rotation matrix ``Q`` (..., 3, 3).
 
-    Through the unit quaternion (Shepperd's choice of the largest component), hence accurate
-    near the identity and near pi alike.
+    Accurate near the identity by the skew-symmetric part, near pi by the unit quaternion.
     """
-    q = quaternion(Q)
-    vector = q[..., 1:]
+    Q = np.asarray(Q, dtype=np.float64)
+    vector = vee(Q)
     sine = np.sqrt(np.einsum("...i,...i->...", vector, vector))
-    angle = 2 * np.arctan2(sine, q[..., 0])
+    cosine = 0.5 * (np.einsum("...ii->...", Q) - 1)
+    if (cosine < -0.9).any():
+        # The sine alone no longer carries the axis: go by the half angle, whose sine is large.
+        q = quaternion(Q)
+        vector = q[..., 1:]
+        sine = np.sqrt(np.einsum("...i,...i->...", vector, vector))
+        angle = 2 * np.arctan2(sine, q[..., 0])
+        limit = 2.0
+    else:
+        angle = np.arctan2(sine, cosine)
+        limit = 1.0
     small = sine < 1e-9
-    # q0 >= 0, so a small sine means a small angle, where angle / sine -> 2.
-    scale = np.where(small, 2.0, angle / np.where(small, 1.0, sine))
+    scale = np.where(small, limit, angle / np.where(small, 1.0, sine))
     return scale[..., None] * vector
 
 

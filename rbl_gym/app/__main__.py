@@ -1,0 +1,8 @@
+"""``python -m rbl_gym.app`` is ``rbl-gym``."""
+
+import sys
+
+from rbl_gym.app.cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,187 @@
+"""A recording through a filter: the same estimators on real radios."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import estimators, metrics, motion, ranging, recordings, rotations
+from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.recordings import Recording
+
+# What the planar constraint leaves to height (m), roll and pitch (rad).
+_PLANAR_STD = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How a recording is filtered.
+
+    Parameters
+    ----------
+    filter
+        Name of the filter.
+    range_std_m
+        Standard deviation of a range; None: the recording's own where it has one, else
+        `DEFAULT_RANGE_STD_M`, which covers link biases that change with the pose.
+    walk_m, walk_deg
+        No twist is known: the pose is a random walk of this standard deviation after 1 s.
+    robust
+        Huber's loss (iterated EKF only).
+    planar
+        Hold height, roll and pitch by a tight prior.
+    height_offset_m
+        How far the tags' plane lies below the anchors' mean height (planar only).
+    yaw_offset_deg
+        Constant turn of the tag table against the truth's body frame: the yaw error is
+        estimate - (truth + offset).
+    """
+
+    filter: str = "iekf"
+    range_std_m: float | None = None
+    walk_m: float = 0.1
+    walk_deg: float = 10.0
+    robust: bool = True
+    planar: bool = False
+    height_offset_m: float = 0.0
+    yaw_offset_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.range_std_m is not None:
+            check_number("range_std_m", self.range_std_m, low=1e-6)
+        check_number("walk_m", self.walk_m, low=0.0)
+        check_number("walk_deg", self.walk_deg, low=0.0)
+        check_number("height_offset_m", self.height_offset_m)
+        check_number("yaw_offset_deg", self.yaw_offset_deg)
+
+
+DEFAULT_RANGE_STD_M = 0.12
+
+
+class Track(NamedTuple):
+    """Beliefs after every epoch: times (K,), rotation, translation, covariance (K, 6, 6)."""
+
+    times: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+
+
+def run(
+    recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
+) -> Track:
+    """Filter a recording causally, epoch by epoch; `advance` is called after each."""
+    filter = _filter(recording, settings)
+    state = filter.initial(*_prior(recording, settings))
+    reported = settings.range_std_m is None and recording.range_std is not None
+    beliefs = []
+    before = recording.times[0]
+    for k, now in enumerate(recording.times):
+        if reported:
+            law = ranging.LinkNoise(recording.range_std[k])  # pyright: ignore[reportOptionalSubscript]
+            filter = dataclasses.replace(filter, noise=law)  # pyright: ignore[reportArgumentType]
+        if now > before:
+            state = filter.predict(state, np.zeros(6), now - before)
+        state = filter.update(state, recording.ranges[k], recording.anchors, recording.links[k])
+        beliefs.append(filter.belief(state))
+        before = now
+        advance()
+    return Track(
+        recording.times,
+        np.array([belief.rotation for belief in beliefs]),
+        np.array([belief.translation for belief in beliefs]),
+        np.array([belief.covariance for belief in beliefs]),
+    )
+
+
+def _filter(recording: Recording, settings: Settings) -> estimators.Filter:
+    walk, turn = settings.walk_m, math.radians(settings.walk_deg)
+    if settings.planar:
+        process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
+    else:
+        process = motion.ProcessNoise(turn, walk)
+    options = {"robust": settings.robust} if settings.filter == "iekf" else {}
+    noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
+    return estimators.make(
+        settings.filter, tags=recording.tags, noise=noise, process=process, **options
+    )
+
+
+def _prior(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Anywhere among the anchors, turned anyhow; the plane, where there is one, is known."""
+    centre = recording.anchors.mean(axis=0)
+    extent = max(float(np.ptp(recording.anchors, axis=0).max()), 1.0)
+    std = np.array([math.pi] * 3 + [extent] * 3)
+    if settings.planar:
+        centre[2] -= settings.height_offset_m + recording.tags[:, 2].mean()
+        std[[0, 1, 5]] = _PLANAR_STD
+    return np.eye(3), centre, np.diag(std**2)
+
+
+class Errors(NamedTuple):
+    """Errors where truth exists: mask (K,), distance (m), yaw (rad), rotation angle (rad), NEES."""
+
+    known: np.ndarray
+    position: FloatArray
+    yaw: FloatArray
+    rotation: FloatArray
+    nees: FloatArray
+
+
+def errors(recording: Recording, track: Track, settings: Settings) -> Errors | None:
+    """Errors against the recording's truth, interpolated; None without truth.
+
+    Planar: position in x and y, NEES of (yaw, x, y); the truth's roll and pitch are not read.
+    """
+    if recording.truth is None:
+        return None
+    rotation, translation, known = recordings.truth_at(recording.truth, track.times)
+    offset = rotations.exp([0.0, 0.0, math.radians(settings.yaw_offset_deg)])
+    if settings.planar:
+        heading = np.zeros((len(known), 3))
+        heading[:, 2] = rotations.yaw(rotation)
+        rotation = rotations.exp(heading)
+    expected = offset @ rotation
+    error = metrics.pose_error(track.rotation, track.translation, expected, translation)
+    axes = [2, 3, 4] if settings.planar else list(range(6))
+    block = track.covariance[:, axes][:, :, axes]
+    turn = rotations.yaw(track.rotation) - rotations.yaw(expected)
+    return Errors(
+        known,
+        np.linalg.norm(error[:, 3 : 5 if settings.planar else 6], axis=-1),
+        (turn + np.pi) % (2 * np.pi) - np.pi,
+        np.linalg.norm(error[:, :3], axis=-1),
+        metrics.nees(error[:, axes], block),
+    )
+
+
+def figures(
+    recording: Recording, track: Track, found: Errors | None, settings: Settings
+) -> dict[str, Any]:
+    """The figures of a run as plain numbers; errors are null where there is no truth."""
+    result: dict[str, Any] = {
+        "settings": dataclasses.asdict(settings),
+        "epochs": len(track.times),
+        "duration_s": float(track.times[-1] - track.times[0]),
+        "links": int(recording.links.sum()),
+    }
+    if found is None or not found.known.any():
+        return result
+    known = found.known
+    result["epochs_with_truth"] = int(known.sum())
+    result["position_axes"] = "xy" if settings.planar else "xyz"
+    yaw = np.rad2deg(found.yaw[known])
+    rotation = np.rad2deg(found.rotation[known])
+    for name, values in (
+        ("position_{}_m", found.position[known]), ("yaw_{}_deg", yaw), ("rotation_{}_deg", rotation)
+    ):  # fmt: skip
+        result[name.format("rmse")] = float(np.sqrt(np.mean(values**2)))
+        result[name.format("median")] = float(np.median(np.abs(values)))
+        result[name.format("p95")] = float(np.quantile(np.abs(values), 0.95))
+    result["yaw_mean_deg"] = float(yaw.mean())
+    result["anees"] = float(found.nees[known].mean() / (3 if settings.planar else 6))
+    return result

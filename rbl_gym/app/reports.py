@@ -1,0 +1,66 @@
+"""Tables on the terminal, by rich."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+_CAMSAP_COLUMNS = (
+    ("rotation RMSE", "rotation_rmse", "{:.4f}"),
+    ("translation RMSE [m]", "translation_rmse_m", "{:.4f}"),
+    ("mean angle [deg]", "mean_angular_error_deg", "{:.3f}"),
+    ("rot / bound", "rotation_to_bound", "{:.3f}"),
+    ("pos / bound", "translation_to_bound", "{:.3f}"),
+    ("NEES (6)", "nees", "{:.2f}"),
+    ("reward", "reward", "{:.3f}"),
+    ("us / step", "microseconds_per_step", "{:.1f}"),
+)
+
+
+def print_camsap2013(result: dict[str, Any]) -> None:
+    """One table for each reading, and the claims with their figures."""
+    # Piped, a table keeps all of its columns.
+    console = Console(width=None if Console().is_terminal else 130, highlight=False)
+    for reading, data in result["readings"].items():
+        table = Table(title=f"camsap2013, turn noise {reading}/s, {result['trials']} trials")
+        table.add_column("filter")
+        for heading, _, _ in _CAMSAP_COLUMNS:
+            table.add_column(heading, justify="right")
+        for label, figures in data["filters"].items():
+            table.add_row(label, *(form.format(figures[key]) for _, key, form in _CAMSAP_COLUMNS))
+        console.print(table)
+        for claim in data["claims"]:
+            verdict = "holds" if claim["holds"] else "FAILS"
+            console.print(f"  {verdict}  {claim['statement']}  ({claim['figures']})")
+        console.print()
+    console.print(
+        "Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward = -log b.\n"
+        "KF and ET-KF are judged by their raw matrix, as in the paper."
+    )
+
+
+def print_replay(result: dict[str, Any]) -> None:
+    """The figures of a recording, one a line."""
+    console = Console(highlight=False)
+    console.print(
+        f"{result['epochs']} epochs, {result['links']} ranges in {result['duration_s']:.1f} s, "
+        f"filter {result['settings']['filter']}"
+    )
+    if "epochs_with_truth" not in result:
+        console.print("no truth, no errors")
+        return
+    table = Table()
+    for heading in ("error", "RMSE", "median", "p95"):
+        table.add_column(heading, justify="left" if heading == "error" else "right")
+    axes = result["position_axes"]
+    for name, unit, places in (("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2)):
+        label = f"position {axes} [m]" if name == "position" else f"{name} [{unit}]"
+        values = [result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")]
+        table.add_row(label, *(f"{value:.{places}f}" for value in values))
+    console.print(table)
+    console.print(
+        f"mean yaw error {result['yaw_mean_deg']:.2f} deg, NEES per degree of freedom "
+        f"{result['anees']:.1f} (1: honest; above: overconfident)"
+    )

@@ -1,0 +1,375 @@
+"""Rotations against the group axioms, power series, scipy and finite differences."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from rbl_gym import rotations
+
+PROPERTY = settings(deadline=None, derandomize=True, max_examples=40)
+SEEDS = st.integers(0, 2**32 - 1)
+SHAPES = [(), (5,), (2, 3), (0,)]
+ANGLES = [
+    0.0, 1e-12, 1e-9, 1e-6, 1e-3, 0.0099, 0.01, 0.0101, 0.5, 2.0, 3.0,
+    np.pi - 1e-3, np.pi - 1e-6, np.pi - 1e-9, np.pi - 1e-12, np.pi,
+]  # fmt: skip
+BELOW_PI = ANGLES[:-1]
+
+
+def turns(angle: float) -> np.ndarray:
+    """Rotation vectors (12, 3) of one angle: about the axes, their opposites, and at random."""
+    axes = np.random.default_rng(7).standard_normal((6, 3))
+    axes = np.concatenate([np.eye(3), -np.eye(3), axes])
+    return angle * axes / np.linalg.norm(axes, axis=-1, keepdims=True)
+
+
+def cross_matrix(w: np.ndarray) -> np.ndarray:
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+def series(w: np.ndarray, shift: int) -> np.ndarray:
+    """sum_k [w]x^k / (k + shift)!: the exponential (shift 0), the left Jacobian (shift 1)."""
+    total, power, factorial = np.zeros((3, 3)), np.eye(3), 1.0
+    for k in range(40):
+        total += power / factorial
+        power, factorial = power @ cross_matrix(w), factorial * (k + 1 + shift)
+    return total
+
+
+def finite_difference(function, n: int = 3, step: float = 1e-5) -> np.ndarray:
+    """Jacobian of a vector function at zero by central differences."""
+    columns = [(function(step * e) - function(-step * e)) / (2 * step) for e in np.eye(n)]
+    return np.stack(columns, axis=-1)
+
+
+# --- group axioms -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_is_closed_in_the_rotations(angle):
+    Q = rotations.exp(turns(angle))
+    np.testing.assert_allclose(Q @ np.swapaxes(Q, -1, -2), np.broadcast_to(np.eye(3), Q.shape),
+                               atol=1e-15 * 4)  # fmt: skip
+    np.testing.assert_allclose(np.linalg.det(Q), 1, rtol=1e-14)
+
+
+def test_identity_is_exact():
+    np.testing.assert_array_equal(rotations.exp(np.zeros(3)), np.eye(3))
+    np.testing.assert_array_equal(rotations.log(np.eye(3)), np.zeros(3))
+    np.testing.assert_array_equal(rotations.left_jacobian(np.zeros(3)), np.eye(3))
+    np.testing.assert_array_equal(rotations.left_jacobian_inverse(np.zeros(3)), np.eye(3))
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_opposite_vector_is_the_inverse(angle):
+    w = turns(angle)
+    product = rotations.exp(w) @ rotations.exp(-w)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=4e-15)
+    np.testing.assert_array_equal(rotations.exp(-w), np.swapaxes(rotations.exp(w), -1, -2))
+
+
+@PROPERTY
+@given(SEEDS)
+def test_composition_is_associative_and_stays_in_the_group(seed):
+    A, B, C = rotations.random(np.random.default_rng(seed), (3,))
+    turn = rotations.error(A @ (B @ C), (A @ B) @ C)
+    np.testing.assert_allclose(turn, 0, atol=2e-15)
+    rotations.check_rotation("product", A @ B @ C, tolerance=1e-14)
+
+
+@PROPERTY
+@given(SEEDS, st.floats(-4, 4), st.floats(-4, 4))
+def test_turns_about_one_axis_add(seed, a, b):
+    axis = np.random.default_rng(seed).standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    got = rotations.exp(a * axis) @ rotations.exp(b * axis)
+    np.testing.assert_allclose(got, rotations.exp((a + b) * axis), atol=1e-14)
+
+
+@PROPERTY
+@given(SEEDS)
+def test_turning_a_rotation_turns_its_vector(seed):
+    rng = np.random.default_rng(seed)
+    Q, w = rotations.random(rng), rng.standard_normal(3)
+    np.testing.assert_allclose(
+        rotations.exp(Q @ w), Q @ rotations.exp(w) @ Q.T, atol=1e-14
+    )  # fmt: skip
+
+
+# --- exponential, logarithm, quaternions ------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_equals_its_power_series(angle):
+    w = turns(angle)
+    want = np.stack([series(row, 0) for row in w])
+    np.testing.assert_allclose(rotations.exp(w), want, atol=5e-15)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_and_quaternion_equal_scipy(angle):
+    w = turns(angle)
+    scipy = Rotation.from_rotvec(w)
+    Q = rotations.exp(w)
+    np.testing.assert_allclose(Q, scipy.as_matrix(), atol=2e-15)
+    got, want = rotations.quaternion(Q), np.roll(scipy.as_quat(), 1, axis=-1)
+    want *= np.sign(np.sum(got * want, axis=-1, keepdims=True))  # q and -q are one rotation
+    np.testing.assert_allclose(got, want, atol=2e-15)
+    assert (got[..., 0] >= 0).all()
+
+
+@pytest.mark.parametrize("angle", BELOW_PI)
+def test_log_undoes_exp_to_relative_precision(angle):
+    w = turns(angle)
+    np.testing.assert_allclose(
+        rotations.log(rotations.exp(w)), w, rtol=1e-12, atol=4e-15 * angle
+    )  # fmt: skip
+
+
+def test_log_at_half_a_turn_is_one_of_the_two_vectors():
+    w = turns(np.pi)
+    got = rotations.log(rotations.exp(w))
+    np.testing.assert_allclose(np.linalg.norm(got, axis=-1), np.pi, rtol=1e-15)
+    sign = np.sign(np.sum(got * w, axis=-1, keepdims=True))
+    np.testing.assert_allclose(sign * got, w, atol=4e-15)
+
+
+@PROPERTY
+@given(SEEDS)
+def test_log_equals_scipy_and_exp_undoes_it(seed):
+    Q = rotations.random(np.random.default_rng(seed), (20,))
+    w = rotations.log(Q)
+    np.testing.assert_allclose(w, Rotation.from_matrix(Q).as_rotvec(), atol=1e-13)
+    np.testing.assert_allclose(rotations.exp(w), Q, atol=4e-15)
+
+
+@pytest.mark.parametrize("angle", [np.pi + 1e-3, 4.0, 6.0, 2 * np.pi, 20.0])
+def test_log_takes_the_short_way(angle):
+    got = rotations.log(rotations.exp(turns(angle)))
+    short = abs((angle + np.pi) % (2 * np.pi) - np.pi)
+    np.testing.assert_allclose(np.linalg.norm(got, axis=-1), short, atol=1e-14)
+
+
+@PROPERTY
+@given(SEEDS, st.floats(1e-3, 1e3))
+def test_from_quaternion_undoes_quaternion_at_any_length_and_sign(seed, length):
+    rng = np.random.default_rng(seed)
+    Q = Rotation.random(8, rng=rng).as_matrix()
+    q = rotations.quaternion(Q)
+    for scale in (length, -length):
+        np.testing.assert_allclose(rotations.from_quaternion(scale * q), Q, atol=4e-15)
+
+
+@pytest.mark.parametrize(
+    ("q", "message"),
+    [
+        (np.zeros((2, 4)), "quaternion must not be zero"),
+        (np.ones(3), "quaternion must have shape (..., 4), got (3,)"),
+        ([1, 0, np.nan, 0], "quaternion must be finite, got nan at index (2,)"),
+    ],
+)
+def test_bad_quaternion_is_refused(q, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        rotations.from_quaternion(q)
+
+
+@PROPERTY
+@given(st.floats(-7, 7), st.floats(-7, 7), st.floats(-7, 7))
+def test_euler_angles_equal_scipy(yaw, pitch, roll):
+    want = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    np.testing.assert_allclose(rotations.from_euler_zyx(yaw, pitch, roll), want, atol=1e-14)
+
+
+def test_euler_angles_broadcast_together():
+    yaw, pitch = np.array([[0.1], [0.2]]), np.array([0.3, 0.4, 0.5])
+    got = rotations.from_euler_zyx(yaw, pitch, 1)
+    assert got.shape == (2, 3, 3, 3)
+    np.testing.assert_array_equal(got[1, 2], rotations.from_euler_zyx(0.2, 0.5, 1))
+
+
+@PROPERTY
+@given(st.floats(-3.14, 3.14), st.floats(-1.5, 1.5), st.floats(-3, 3))
+def test_yaw_is_the_first_euler_angle(yaw, pitch, roll):
+    got = rotations.yaw(rotations.from_euler_zyx(yaw, pitch, roll))
+    np.testing.assert_allclose(got, yaw, atol=1e-13)
+
+
+# --- Jacobians --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_left_jacobian_equals_its_power_series(angle):
+    w = turns(angle)
+    want = np.stack([series(row, 1) for row in w])
+    np.testing.assert_allclose(rotations.left_jacobian(w), want, atol=5e-15)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_left_jacobian_equals_finite_differences(angle):
+    for w in turns(angle):
+        Q = rotations.exp(w)
+        want = finite_difference(lambda d, w=w, Q=Q: rotations.log(rotations.exp(w + d) @ Q.T))
+        np.testing.assert_allclose(rotations.left_jacobian(w), want, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [a for a in ANGLES if a < np.pi - 1e-4])
+def test_left_jacobian_inverse_equals_finite_differences(angle):
+    for w in turns(angle):
+        Q = rotations.exp(w)
+        want = finite_difference(lambda d, Q=Q: rotations.log(rotations.exp(d) @ Q))
+        np.testing.assert_allclose(rotations.left_jacobian_inverse(w), want, atol=1e-8)
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, 4.0, 6.0])
+def test_left_jacobian_times_its_inverse_is_the_identity(angle):
+    w = turns(angle)
+    product = rotations.left_jacobian(w) @ rotations.left_jacobian_inverse(w)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=3e-14)
+
+
+# --- nearest rotation -------------------------------------------------------------------------
+
+
+def closeness(M: np.ndarray) -> float:
+    """Largest tr(R^T M) over the rotations R: the top eigenvalue of Davenport's 4 x 4 matrix."""
+    z = np.array([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]])
+    K = np.empty((4, 4))
+    K[0, 0], K[0, 1:], K[1:, 0] = np.trace(M), z, z
+    K[1:, 1:] = M + M.T - np.trace(M) * np.eye(3)
+    return np.linalg.eigvalsh(K)[-1]
+
+
+def matrices() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(3)
+    M, Q = rng.standard_normal((3, 3)), rotations.random(rng)
+    if np.linalg.det(M) < 0:
+        M = -M
+    rank1 = np.outer(M[0], M[1])
+    return {
+        "general": M, "reflected": -M, "near a rotation": Q + 0.01 * M,
+        "a reflection": Q @ np.diag([1, 1, -1]), "minus a rotation": -Q,
+        "rank 2": M @ np.diag([1, 1, 0]), "rank 1": rank1, "zero": np.zeros((3, 3)),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", matrices())
+def test_nearest_is_a_rotation_that_no_other_beats(kind):
+    M = matrices()[kind]
+    R = rotations.nearest(M)
+    rotations.check_rotation(kind, R, tolerance=1e-14)
+    np.testing.assert_allclose(np.trace(R.T @ M), closeness(M), atol=1e-13)
+    drawn = Rotation.random(5000, rng=np.random.default_rng(0)).as_matrix()
+    assert np.linalg.norm(R - M) <= np.linalg.norm(drawn - M, axis=(-2, -1)).min() + 1e-12
+
+
+@PROPERTY
+@given(SEEDS, st.floats(1e-3, 1e3))
+def test_nearest_keeps_rotations_and_turns_and_scales_with_its_argument(seed, scale):
+    rng = np.random.default_rng(seed)
+    Q, M = rotations.random(rng), rng.standard_normal((3, 3)) + 2 * np.eye(3)
+    np.testing.assert_allclose(rotations.nearest(scale * Q), Q, atol=1e-14)
+    np.testing.assert_allclose(rotations.nearest(Q @ M), Q @ rotations.nearest(M), atol=1e-10)
+
+
+# --- errors and angles ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("angle", BELOW_PI)
+def test_error_is_global(angle):
+    Q = rotations.random(np.random.default_rng(0))
+    w = turns(angle)
+    np.testing.assert_allclose(rotations.error(rotations.exp(w) @ Q, Q), w, atol=3e-15)
+
+
+@PROPERTY
+@given(SEEDS)
+def test_error_turns_with_the_world_and_not_with_the_body(seed):
+    R, Q_hat, Q = rotations.random(np.random.default_rng(seed), (3,))
+    w = rotations.error(Q_hat, Q)
+    np.testing.assert_allclose(rotations.error(R @ Q_hat, R @ Q), R @ w, atol=1e-13)
+    np.testing.assert_allclose(rotations.error(Q_hat @ R, Q @ R), w, atol=1e-13)
+    np.testing.assert_allclose(rotations.error(Q, Q_hat), -w, atol=1e-13)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("length", [1e-3, 1.0, 1e3])
+def test_angle_between_keeps_small_and_large_angles(angle, length):
+    u = np.array([length, 0, 0])
+    v = np.array([np.cos(angle), np.sin(angle), 0]) * 2
+    np.testing.assert_allclose(rotations.angle_between(u, v), angle, rtol=1e-14)
+
+
+@PROPERTY
+@given(SEEDS)
+def test_hat_is_the_cross_product_and_vee_its_inverse(seed):
+    w, v = np.random.default_rng(seed).standard_normal((2, 4, 3))
+    W = rotations.hat(w)
+    np.testing.assert_allclose((W @ v[..., None])[..., 0], np.cross(w, v), atol=1e-15)
+    np.testing.assert_array_equal(rotations.vee(W), w)
+    symmetric = v[:, :, None] * v[:, None, :]
+    np.testing.assert_allclose(rotations.vee(W + symmetric), w, atol=1e-15)
+
+
+# --- batches, draws, checks -------------------------------------------------------------------
+
+VECTOR_FUNCTIONS = [rotations.exp, rotations.left_jacobian, rotations.left_jacobian_inverse,
+                    rotations.hat]  # fmt: skip
+MATRIX_FUNCTIONS = [rotations.log, rotations.quaternion, rotations.nearest, rotations.vee,
+                    rotations.yaw]  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("function", VECTOR_FUNCTIONS + MATRIX_FUNCTIONS)
+def test_a_batch_is_a_loop(function, shape):
+    rng = np.random.default_rng(11)
+    argument = rng.standard_normal((*shape, 3)) * np.exp(rng.uniform(-12, 0, (*shape, 1)))
+    if function in MATRIX_FUNCTIONS:
+        argument = Rotation.from_rotvec(argument.reshape(-1, 3)).as_matrix()
+        argument = argument.reshape(*shape, 3, 3)
+    got = function(argument)
+    assert got.shape[: len(shape)] == shape
+    for index in np.ndindex(*shape):
+        np.testing.assert_allclose(got[index], function(argument[index]), rtol=1e-14, atol=1e-16)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_draws_have_the_shape_asked_for(shape):
+    assert rotations.random(np.random.default_rng(0), shape).shape == (*shape, 3, 3)
+
+
+def test_draws_are_uniform():
+    Q = rotations.random(np.random.default_rng(5), (4000,))
+    angle = np.linalg.norm(rotations.log(Q), axis=-1)
+    # Density of the angle under the uniform law: (1 - cos x) / pi.
+    assert stats.kstest(angle, lambda x: (x - np.sin(x)) / np.pi).pvalue > 1e-3
+    # Every entry is uniform on [-1, 1] (Archimedes): mean 0, variance 1/3; 4.5 deviations.
+    np.testing.assert_allclose(Q.mean(axis=0), 0, atol=4.5 / (3 * 4000) ** 0.5)
+    for row, column in np.ndindex(3, 3):
+        assert stats.kstest(Q[:, row, column], stats.uniform(-1, 2).cdf).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_good_rotations_pass(shape):
+    Q = rotations.random(np.random.default_rng(0), shape)
+    np.testing.assert_array_equal(rotations.check_rotation("Q", Q), Q)
+
+
+@pytest.mark.parametrize(
+    ("Q", "message"),
+    [
+        (1.001 * np.eye(3), "start must be orthogonal, Q Q^T is off the identity by 0.002"),
+        (np.stack([np.eye(3), np.diag([1, 1, -1])]), "start must be a proper rotation"),
+        (np.eye(4), "start must have shape (..., 3, 3), got (4, 4)"),
+        (np.full((3, 3), np.nan), "start must be finite, got nan at index (0, 0)"),
+    ],
+)
+def test_bad_rotations_are_refused(Q, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        rotations.check_rotation("start", Q)
