@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,17 +20,16 @@ from rbl_gym.checks import (
     BoolArray,
     FloatArray,
     check_array,
-    check_links,
     check_number,
     check_one_of,
 )
 from rbl_gym.estimators.belief import PoseBelief, inverse
+from rbl_gym.estimators.engines import ENGINES
+from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
 from rbl_gym.estimators.least_squares import procrustes, unvec, vec
 from rbl_gym.estimators.squared_range import (
     Statistic,
-    compressed,
     geometric_rank,
-    information,
     statistic,
 )
 from rbl_gym.motion import ProcessNoise
@@ -101,7 +100,7 @@ class KalmanFamily:
 
     def __post_init__(self) -> None:
         check_one_of("constraint", self.constraint, list(_CONSTRAINTS))
-        check_one_of("engine", self.engine, list(_ENGINES))
+        check_one_of("engine", self.engine, list(ENGINES))
         check_number("sigma_q_scale", self.sigma_q_scale, low=0.0)
         check_number("threshold", self.threshold, low=0.0)
         if self.weights is not None:
@@ -147,7 +146,7 @@ class KalmanFamily:
         std = self.process.std()
         sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
         Q = dt * np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
-        mean, covariance = _ENGINES[self.engine].predict(
+        mean, covariance = ENGINES[self.engine].predict(
             state.mean, state.covariance, F, twist[..., 3:] * dt, np.diag(Q)
         )
         return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
@@ -176,7 +175,7 @@ class KalmanFamily:
             weights = np.asarray(self.weights, dtype=np.float64)
             weights = weights[..., None] if weights.ndim == 1 else weights
         stat = statistic(ranges, anchors, self.tags, weights, mask)
-        mean, covariance = _ENGINES[self.engine].update(state.mean, state.covariance, stat)
+        mean, covariance = ENGINES[self.engine].update(state.mean, state.covariance, stat)
         return _CONSTRAINTS[self.constraint](self, state, KalmanState(
             mean, covariance, np.zeros(mean.shape[:-1], bool)
         ), stat)  # fmt: skip
@@ -217,82 +216,6 @@ class KalmanFamily:
                 f"too vague to stand in; got {anchors.shape[-2]} anchors, {len(self.tags)} tags. "
                 "Use 'iekf', or a tighter prior covariance"
             )
-
-
-# --- engines: the same linear algebra, for many bodies and by filterpy for one ------------
-
-
-class _Batched:
-    """The information form ``(I + P G)^-1 P``: exact for vague priors, any leading axes."""
-
-    @staticmethod
-    def predict(
-        mean: FloatArray, P: FloatArray, F: FloatArray, shift: FloatArray, Q: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        mean = (F @ mean[..., None])[..., 0]
-        mean[..., 9:] += shift
-        return mean, symmetric(F @ P @ np.swapaxes(F, -1, -2)) + Q
-
-    @staticmethod
-    def update(mean: FloatArray, P: FloatArray, stat: Statistic) -> tuple[FloatArray, FloatArray]:
-        matrix, vector = information(stat)
-        P = symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
-        innovation = vector[..., None] - matrix @ mean[..., None]
-        return mean + (P @ innovation)[..., 0], P
-
-
-class _FilterPy:
-    """filterpy's KalmanFilter on the compressed measurement; one body."""
-
-    @classmethod
-    def predict(
-        cls, mean: FloatArray, P: FloatArray, F: FloatArray, shift: FloatArray, Q: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        kf = cls._filter(mean, P)
-        kf.F, kf.Q = F, Q
-        # Without B filterpy ignores u in silence.
-        kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
-        kf.predict(u=shift[:, None])
-        return cls._result(kf)
-
-    @classmethod
-    def update(
-        cls, mean: FloatArray, P: FloatArray, stat: Statistic
-    ) -> tuple[FloatArray, FloatArray]:
-        kf = cls._filter(mean, P)
-        z, H = compressed(stat)
-        kf.R = np.eye(12)
-        # A one-dimensional z would silently broadcast the state to a matrix.
-        kf.update(z[:, None], H=H)
-        return cls._result(kf)
-
-    @staticmethod
-    def _filter(mean: FloatArray, P: FloatArray) -> Any:
-        from filterpy.kalman import KalmanFilter  # slow to import, and not always needed
-
-        if mean.ndim != 1:
-            raise ValueError(
-                f"engine 'filterpy' tracks one body, got a state of shape {mean.shape}; "
-                "use engine='batched'"
-            )
-        kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
-        kf.x, kf.P = mean[:, None].copy(), P.copy()
-        return kf
-
-    @staticmethod
-    def _result(kf: Any) -> tuple[FloatArray, FloatArray]:
-        mean, P = np.asarray(kf.x), np.asarray(kf.P)
-        if mean.shape != (12, 1) or P.shape != (12, 12):
-            raise RuntimeError(f"filterpy returned shapes {mean.shape} and {P.shape}")
-        if not (np.isfinite(mean).all() and np.isfinite(P).all()):
-            raise ValueError("the filter's state is no longer finite")
-        return mean[:, 0].copy(), symmetric(P)
-
-
-_ENGINES: dict[str, type[_Batched] | type[_FilterPy]] = {
-    "batched": _Batched,
-    "filterpy": _FilterPy,
-}
 
 
 # --- constraints: what happens to the rotation after the linear update --------------------
@@ -403,56 +326,3 @@ def expand_covariance(covariance: FloatArray) -> FloatArray:
     expanded[..., index, index] = (2 / 3) * trace[..., None]
     expanded[..., 9:, 9:] = covariance[..., 3:, 3:]
     return expanded
-
-
-# --- checks shared by all filters ----------------------------------------------------------
-
-
-def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
-    """A symmetric positive definite covariance of one of the sizes, or a ValueError."""
-    covariance = check_array("covariance", covariance, ("n", "n"))
-    if covariance.shape[-1] not in sizes or covariance.shape[-2] != covariance.shape[-1]:
-        wanted = " or ".join(f"(..., {n}, {n})" for n in sizes)
-        raise ValueError(f"covariance must have shape {wanted}, got {covariance.shape}")
-    skew = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()
-    if skew > 1e-8 * np.abs(covariance).max():
-        raise ValueError(f"covariance must be symmetric, is off by {skew:.3g}")
-    smallest = np.linalg.eigvalsh(covariance).min()
-    if smallest <= 0:
-        raise ValueError(f"covariance must be positive definite, smallest eigenvalue {smallest:g}")
-    return covariance
-
-
-def check_epoch(
-    ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None, tags: FloatArray
-) -> tuple[FloatArray, FloatArray, BoolArray | None]:
-    """One epoch as (ranges, anchors, links): links None where all measured, else 0 behind False.
-
-    Raises
-    ------
-    ValueError
-        On shapes that do not fit, NaN or inf behind a True link, a range that is not positive.
-    """
-    anchors = check_array("anchors", anchors, ("M", 3))
-    shape = (anchors.shape[-2], tags.shape[-2])
-    mask = check_links(links, shape)
-    if mask is not None:
-        ranges = np.where(mask, np.asarray(ranges, dtype=np.float64), 0.0)
-        if mask.all():
-            mask = None
-    ranges = check_array("ranges", ranges, shape)
-    wrong = ranges <= 0 if mask is None else (ranges <= 0) & mask
-    if wrong.any():
-        index = tuple(int(i) for i in np.argwhere(wrong)[0])
-        raise ValueError(f"ranges must be positive where measured, got {ranges[index]} at {index}")
-    return ranges, anchors, mask
-
-
-def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
-    """The variances, 1 where no link uses them, or a ValueError if one is not positive."""
-    if links is not None:
-        used = links if variance.shape[-1] == links.shape[-1] else links.any(-1, keepdims=True)
-        variance = np.where(used, variance, 1.0)
-    if not (variance > 0).all():
-        raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
-    return variance

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import bounds, ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.belief import PoseBelief, inverse
-from rbl_gym.estimators.kalman import check_covariance, check_epoch, check_variance
+from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
 from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
 from rbl_gym.estimators.squared_range import statistic
 from rbl_gym.motion import ProcessNoise, propagate
@@ -174,7 +174,8 @@ class MapProblem:
         self, rotation: FloatArray, translation: FloatArray, data: Linearization
     ) -> Linearization:
         turn = rotations.error(rotation, self.prior.rotation)
-        error = np.concatenate([turn, translation - self.prior.translation], axis=-1)
+        shift = translation - self.prior.translation
+        error = np.concatenate(np.broadcast_arrays(turn, shift), axis=-1)
         D = np.zeros((*error.shape, 6))
         D[..., :3, :3] = rotations.left_jacobian_inverse(turn)
         D[..., 3:, 3:] = np.eye(3)

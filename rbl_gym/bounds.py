@@ -196,7 +196,7 @@ def symmetric(matrix: FloatArray) -> FloatArray:
     return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
-def score(covariance: ArrayLike, rotation: ArrayLike, tags: ArrayLike) -> FloatArray:
+def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> FloatArray:
     """Root mean square tag error b (...) in metres that a pose covariance (..., 6, 6) implies.
 
     ``b^2 = mean_n tr(J_n P J_n^T)``, ``J_n = [-[Q c_n]x, I]``: one number for position and

@@ -287,8 +287,9 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
     base = SCENES[check_one_of("scene", scene["name"], list(SCENES))]
     if "n_anchors" in changes and "anchors" not in changes:
         changes["anchors"] = None
-    if changes.get("anchors") is not None:
-        changes.setdefault("n_anchors", len(changes["anchors"]))
+    anchors = changes.get("anchors")
+    if anchors is not None:
+        changes.setdefault("n_anchors", len(anchors))
     return _replace(base, changes, "scene")
 
 

@@ -55,8 +55,9 @@ def finite_difference(function, n: int = 3, step: float = 1e-5) -> np.ndarray:
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exp_is_closed_in_the_rotations(angle):
     Q = rotations.exp(turns(angle))
-    np.testing.assert_allclose(Q @ np.swapaxes(Q, -1, -2), np.broadcast_to(np.eye(3), Q.shape),
-                               atol=1e-15 * 4)  # fmt: skip
+    np.testing.assert_allclose(
+        Q @ np.swapaxes(Q, -1, -2), np.broadcast_to(np.eye(3), Q.shape), atol=4e-15
+    )
     np.testing.assert_allclose(np.linalg.det(Q), 1, rtol=1e-14)
 
 
@@ -98,9 +99,7 @@ def test_turns_about_one_axis_add(seed, a, b):
 def test_turning_a_rotation_turns_its_vector(seed):
     rng = np.random.default_rng(seed)
     Q, w = rotations.random(rng), rng.standard_normal(3)
-    np.testing.assert_allclose(
-        rotations.exp(Q @ w), Q @ rotations.exp(w) @ Q.T, atol=1e-14
-    )  # fmt: skip
+    np.testing.assert_allclose(rotations.exp(Q @ w), Q @ rotations.exp(w) @ Q.T, atol=1e-14)
 
 
 # --- exponential, logarithm, quaternions ------------------------------------------------------
@@ -128,9 +127,7 @@ def test_exp_and_quaternion_equal_scipy(angle):
 @pytest.mark.parametrize("angle", BELOW_PI)
 def test_log_undoes_exp_to_relative_precision(angle):
     w = turns(angle)
-    np.testing.assert_allclose(
-        rotations.log(rotations.exp(w)), w, rtol=1e-12, atol=4e-15 * angle
-    )  # fmt: skip
+    np.testing.assert_allclose(rotations.log(rotations.exp(w)), w, rtol=1e-12, atol=4e-15 * angle)
 
 
 def test_log_at_half_a_turn_is_one_of_the_two_vectors():

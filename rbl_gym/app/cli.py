@@ -100,9 +100,9 @@ def _add_replay(commands: Any) -> None:
     replay.add_argument(
         "--walk-deg",
         type=float,
-        default=10.0,
+        default=7.0,
         metavar="X",
-        help="random walk of the rotation after 1 s, default 10",
+        help="random walk of the rotation after 1 s, default 7",
     )
     replay.add_argument("--no-robust", action="store_true", help="squares in place of Huber's loss")
     replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")

@@ -8,11 +8,13 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
 
 from rbl_gym.app.papers import Example
 from rbl_gym.app.replay import Errors, Track
 from rbl_gym.checks import FloatArray
 from rbl_gym.recordings import Recording, truth_at
+from rbl_gym.rotations import error as rotation_error
 
 COLOURS = {
     "KF": "#d1495b",
@@ -38,12 +40,13 @@ def save(figure: Figure, path: str) -> None:
 
 
 def camsap2013(result: dict[str, Any], example: Example) -> Figure:
-    """One trajectory with its beliefs, and the error curves of both readings with the bound."""
-    figure = _new(13, 7.2)
-    grid = figure.add_gridspec(2, 3, width_ratios=[1.15, 1, 1])
-    _trajectory(figure.add_subplot(grid[:, 0]), example)
-    for row, (reading, data) in enumerate(result["readings"].items()):
-        for column, (key, label) in enumerate(
+    """One trajectory with its beliefs and errors; the error curves of both readings, the bound."""
+    figure = _new(14, 7.2)
+    grid = figure.add_gridspec(2, 3, height_ratios=[1.25, 1])
+    _trajectory(figure.add_subplot(grid[0, 0]), example)
+    _errors(figure.add_subplot(grid[1, 0]), example)
+    for column, (reading, data) in enumerate(result["readings"].items()):
+        for row, (key, label) in enumerate(
             (("rotation_rmse", "rotation RMSE (Frobenius)"),
              ("translation_rmse_m", "translation RMSE [m]"))
         ):  # fmt: skip
@@ -55,33 +58,59 @@ def camsap2013(result: dict[str, Any], example: Example) -> Figure:
             axes.semilogy(steps, data["bound"][key], "k.", ms=5, label="posterior CRB")
             axes.set_ylabel(label)
             axes.set_xlabel("step")
-            axes.set_title(f"turn noise {reading}/s", fontsize=9)
+            axes.set_xticks([1, 5, 10, 15, 20])
+            axes.set_title(f"turn noise {reading}/s, {result['trials']} trials", fontsize=9)
+            axes.yaxis.set_major_formatter(ScalarFormatter())
+            axes.yaxis.set_minor_formatter(ScalarFormatter())
             axes.grid(alpha=0.25, which="both", lw=0.5)
-            if row == 0 and column == 0:
+            if row == 0:
                 axes.legend(frameon=False, fontsize=8, ncols=2)
+            else:
+                axes.text(0.98, 0.9, "the linear filters coincide", transform=axes.transAxes,
+                          ha="right", fontsize=8, color=COLOURS["UC-KF"])  # fmt: skip
     return figure
 
 
 def _trajectory(axes: Any, example: Example) -> None:
     """The track seen from above, the beliefs of a magnified error around it."""
-    truth = example.world.episode.translation[0]
-    axes.plot(truth[:, 0], truth[:, 1], color="0.6", lw=1, zorder=1)
-    axes.plot(truth[:, 0], truth[:, 1], "k.", ms=3, label="true position", zorder=2)
-    for name in ("KF", "iterated EKF"):
-        for k, belief in enumerate(example.beliefs[name]):
+    episode = example.world.episode
+    truth = episode.translation[0]
+    axes.plot(*truth[:, :2].T, color="0.6", lw=1, zorder=1)
+    axes.plot(*truth[:, :2].T, "k.", ms=4, label="true position", zorder=4)
+    for name, beliefs in example.beliefs.items():
+        for k, belief in enumerate(beliefs):
             error = belief.translation[0, :2] - truth[k, :2]
             ring = ellipse(belief.covariance[0, 3:5, 3:5]) + error
             places = truth[k, :2] + _MAGNIFY * ring
-            axes.plot(*places.T, color=COLOURS[name], lw=1.1, label=name if k == 0 else None)
-    arrows = example.world.episode.rotation[0][:, :2, 0]
-    axes.quiver(*truth[:, :2].T, *arrows.T, angles="xy", scale_units="xy", scale=0.09,
-                width=0.003, color="0.3", zorder=3)  # fmt: skip
-    axes.set_aspect("equal", adjustable="datalim")
+            axes.plot(*places.T, color=COLOURS[name], lw=1.2, label=name if k == 0 else None)
+    heading = episode.rotation[0][:, :2, 0]
+    axes.quiver(*truth[:, :2].T, *heading.T, angles="xy", scale_units="xy", scale=0.06,
+                width=0.004, color="0.3", zorder=3)  # fmt: skip
+    axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.set_title(f"one trial: 95 % beliefs and their errors, magnified {_MAGNIFY} times",
-                   fontsize=9)  # fmt: skip
+    axes.set_title(f"one trial: 95 % beliefs and their errors x {_MAGNIFY}", fontsize=9)
     axes.legend(frameon=False, fontsize=8, loc="upper left")
+
+
+def _errors(axes: Any, example: Example) -> None:
+    """The same trial's rotation error about one axis inside its 3-sigma band."""
+    steps = np.arange(1, len(example.world.measurements) + 1)
+    for name, beliefs in example.beliefs.items():
+        errors, bands = [], []
+        for k, belief in enumerate(beliefs):
+            error = rotation_error(belief.rotation[0], example.world.episode.rotation[0, k])
+            errors.append(np.rad2deg(error[2]))
+            bands.append(3 * np.rad2deg(np.sqrt(belief.covariance[0, 2, 2])))
+        band = np.array(bands)
+        axes.fill_between(steps, -band, band, color=COLOURS[name], alpha=0.15, lw=0)
+        axes.plot(steps, errors, color=COLOURS[name], lw=1.5, label=name)
+    axes.axhline(0, color="0.5", lw=0.6)
+    axes.set_xlabel("step")
+    axes.set_xticks([1, 5, 10, 15, 20])
+    axes.set_ylabel("rotation error about z [deg]")
+    axes.set_title("the same trial: error and claimed 3-sigma band", fontsize=9)
+    axes.legend(frameon=False, fontsize=8)
 
 
 def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
@@ -96,7 +125,7 @@ def replay(recording: Recording, track: Track, found: Errors | None) -> Figure:
     """The track from above with the anchors, and, where truth exists, the errors over time."""
     figure = _new(12, 5.2 if found is not None else 6)
     grid = figure.add_gridspec(
-        2, 2 if found is not None else 1, width_ratios=[1, 1.2][: 1 + (found is not None)]
+        2, 2 if found is not None else 1, width_ratios=[1, 1.2] if found is not None else [1]
     )
     axes = figure.add_subplot(grid[:, 0])
     axes.plot(*recording.anchors[:, :2].T, "k^", ms=7, label="anchors")
@@ -109,7 +138,7 @@ def replay(recording: Recording, track: Track, found: Errors | None) -> Figure:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     if found is None:
         return figure
     curves = (("position error [m]", found.position), ("yaw error [deg]", np.rad2deg(found.yaw)))

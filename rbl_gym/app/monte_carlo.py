@@ -121,7 +121,7 @@ def run(
         advance()
         start = time.process_time()
     columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Trace(*columns, seconds / columns[0].size)
+    return Trace._make([*columns, seconds / columns[0].size])
 
 
 def _own_variances(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -137,10 +137,13 @@ def camsap_claims(
         np.abs(translation[label] / translation["KF"] - 1).max() for label in ("KF-ortho", "UC-KF")
     )
     event = rotation["ET-KF"] / rotation["KF-ortho"]
-    ratio = np.maximum(
-        rotation["iterated EKF"] / bound["rotation_rmse"],
-        translation["iterated EKF"] / bound["translation_rmse_m"],
+    ratios = np.array(
+        [
+            rotation["iterated EKF"] / bound["rotation_rmse"],
+            translation["iterated EKF"] / bound["translation_rmse_m"],
+        ]
     )
+    average = ratios.mean(axis=1).max()
     nees = float(traces["iterated EKF"].nees.mean())
     return [
         _claim("UC-KF's rotation error below KF's at every step", below.max() < 1, below),
@@ -153,8 +156,8 @@ def camsap_claims(
               f"largest difference {100 * spread:.2g} %"),
         _claim("ET-KF(0.15) not below KF-ortho", event.min() >= 1, event),
         Claim("iterated EKF <= 1.08 of the bound at each step, <= 1.03 on average",
-              bool(ratio.max() <= 1.08 and ratio.mean() <= 1.03),
-              f"worst {ratio.max():.3f}, mean {ratio.mean():.3f}"),
+              bool(ratios.max() <= 1.08 and average <= 1.03),
+              f"worst step {ratios.max():.3f}, average {average:.3f}"),
         Claim("iterated EKF's NEES 6 +- 0.4", bool(abs(nees - 6) <= 0.4), f"{nees:.2f}"),
     ]  # fmt: skip
 
@@ -169,7 +172,7 @@ def example(seed: int) -> Example:
     scene = _scene(next(iter(READINGS.values())))
     world = monte_carlo.simulate_world(scene, 1, np.random.default_rng([seed, len(READINGS)]))
     steps = {}
-    for label in ("KF", "UC-KF", "iterated EKF"):
+    for label in ("KF", "iterated EKF"):
         name, options = FILTERS[label]
         steps[label] = [
             belief

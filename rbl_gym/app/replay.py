@@ -44,7 +44,7 @@ class Settings:
     filter: str = "iekf"
     range_std_m: float | None = None
     walk_m: float = 0.1
-    walk_deg: float = 10.0
+    walk_deg: float = 7.0
     robust: bool = True
     planar: bool = False
     height_offset_m: float = 0.0

@@ -16,7 +16,7 @@ from rbl_gym.checks import FloatArray, check_array, check_one_of
 REWARDS = ("bound", "none")
 
 
-class TrackingEnv(gym.Env[dict[str, np.ndarray], Any]):
+class TrackingEnv(gym.Env[Any, Any]):
     """A rigid body moves; anchors measure noisy ranges to its tags; where is it, and how turned?
 
     ## Description

@@ -1,0 +1,50 @@
+# make demo: everything from nothing to a table and a picture.  make test: the whole suite.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test lint format types wheel clean
+
+demo: .venv/demo.stamp
+	$(BIN)/rbl-gym demo --plot out/demo.png
+
+test: .venv/dev.stamp
+	$(BIN)/python -m pytest -n 2 -m "not long"
+
+lint: .venv/dev.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: .venv/dev.stamp
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# On an installed copy: no checker follows the mapping from folders to import names.
+types: .venv/dev.stamp
+	rm -rf build
+	$(BIN)/python -m pip install --quiet --no-deps --target build/types .
+	cp -r tests pyproject.toml build/types/
+	cd build/types && ../../$(BIN)/pyright --pythonpath ../../$(BIN)/python
+
+# Built and installed outside the checkout, where the folder mapping has to hold by itself.
+wheel: .venv/dev.stamp
+	rm -rf build dist .venv/smoke
+	$(BIN)/python -m build --wheel --outdir dist .
+	$(BIN)/python -m venv .venv/smoke
+	.venv/smoke/bin/python -m pip install --quiet "$$(ls dist/*.whl)[cli]"
+	cd /tmp && "$(CURDIR)/.venv/smoke/bin/python" -W error "$(CURDIR)/tests/smoke.py"
+
+clean:
+	rm -rf .venv build dist out *.egg-info .pytest_cache .ruff_cache
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || (echo "rbl-gym needs Python 3.11 or newer: make PYTHON=python3.12 ..." >&2; exit 1)
+	$(PYTHON) -m venv .venv
+
+.venv/demo.stamp: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[cli]'
+	touch $@
+
+.venv/dev.stamp: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@ .venv/demo.stamp

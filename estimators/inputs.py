@@ -1,0 +1,58 @@
+"""Checks of what comes into a filter: priors, and epochs of ranges with their links."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_links
+
+
+def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
+    """A symmetric positive definite covariance of one of the sizes, or a ValueError."""
+    covariance = check_array("covariance", covariance, ("n", "n"))
+    if covariance.shape[-1] not in sizes or covariance.shape[-2] != covariance.shape[-1]:
+        wanted = " or ".join(f"(..., {n}, {n})" for n in sizes)
+        raise ValueError(f"covariance must have shape {wanted}, got {covariance.shape}")
+    skew = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()
+    if skew > 1e-8 * np.abs(covariance).max():
+        raise ValueError(f"covariance must be symmetric, is off by {skew:.3g}")
+    smallest = np.linalg.eigvalsh(covariance).min()
+    if smallest <= 0:
+        raise ValueError(f"covariance must be positive definite, smallest eigenvalue {smallest:g}")
+    return covariance
+
+
+def check_epoch(
+    ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None, tags: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray | None]:
+    """One epoch as (ranges, anchors, links): links None where all measured, else 0 behind False.
+
+    Raises
+    ------
+    ValueError
+        On shapes that do not fit, NaN or inf behind a True link, a range that is not positive.
+    """
+    anchors = check_array("anchors", anchors, ("M", 3))
+    shape = (anchors.shape[-2], tags.shape[-2])
+    mask = check_links(links, shape)
+    if mask is not None:
+        ranges = np.where(mask, np.asarray(ranges, dtype=np.float64), 0.0)
+        if mask.all():
+            mask = None
+    ranges = check_array("ranges", ranges, shape)
+    wrong = ranges <= 0 if mask is None else (ranges <= 0) & mask
+    if wrong.any():
+        index = tuple(int(i) for i in np.argwhere(wrong)[0])
+        raise ValueError(f"ranges must be positive where measured, got {ranges[index]} at {index}")
+    return ranges, anchors, mask
+
+
+def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
+    """The variances, 1 where no link uses them, or a ValueError if one is not positive."""
+    if links is not None:
+        used = links if variance.shape[-1] == links.shape[-1] else links.any(-1, keepdims=True)
+        variance = np.where(used, variance, 1.0)
+    if not (variance > 0).all():
+        raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
+    return variance

@@ -1,0 +1,52 @@
+"""What several tests share: naive oracles and small worlds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbl_gym import ranging, rotations
+
+DATA = Path(__file__).parent / "data"
+ROOT = Path(__file__).parents[1]
+
+
+def load(name: str) -> Any:
+    """A reference file of tests/data."""
+    return json.loads((DATA / name).read_text(encoding="utf-8"))
+
+
+def random_world(rng: np.random.Generator, m: int, n: int, batch: tuple[int, ...] = ()):
+    """Anchors in a 20 m cube, tags within a metre, a pose, all of a batch."""
+    anchors = rng.uniform(-10, 10, (*batch, m, 3))
+    tags = rng.uniform(-0.5, 0.5, (n, 3))
+    return anchors, tags, rotations.random(rng, batch), rng.uniform(-3, 3, (*batch, 3))
+
+
+def textbook_model(ranges, anchors, tags, weights, links=None):
+    """Whitened H (K x 12) and z (K) of the squared ranges with |s|^2 projected out by U_M.
+
+    Straight from the papers: per tag the rows W^1/2 (-2 A^T), projected onto the complement
+    of W^1/2 1. One trial, plain loops.
+    """
+    rows, values = [], []
+    m, n = ranges.shape
+    weights = np.broadcast_to(weights, (m, n))
+    for tag in range(n):
+        w = weights[:, tag] * (1 if links is None else links[:, tag])
+        root = np.sqrt(w)
+        # U_M: complement of W^1/2 1; nothing to project where the tag has no link.
+        basis = np.linalg.svd(root[:, None])[0][:, 1:] if root.any() else np.eye(m)
+        d = ranges[:, tag] ** 2 - (anchors**2).sum(axis=1)
+        small = basis.T @ (root[:, None] * (-2 * anchors))
+        rows.append(np.kron(np.append(tags[tag], 1.0)[None], small))
+        values.append(basis.T @ (root * d))
+    return np.concatenate(rows), np.concatenate(values)
+
+
+def simulate(rng, anchors, tags, rotation, translation, noise):
+    """Ranges of one epoch."""
+    return ranging.simulate(anchors, tags, rotation, translation, noise, rng).ranges

@@ -1,0 +1,84 @@
+"""The registry of filters and its entry-point group."""
+
+from __future__ import annotations
+
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from rbl_gym import bodies, estimators, motion, ranging
+from rbl_gym.estimators import belief
+
+LAWS = {
+    "tags": bodies.pyramid(),
+    "noise": ranging.RangeNoise(0.1),
+    "process": motion.ProcessNoise(0.1, 0.1),
+}
+
+
+class Standstill:
+    """The least filter: it believes its prior. What a third party would write."""
+
+    def __init__(self, tags, noise, process, shift=0.0):
+        self.shift = shift
+
+    def initial(self, rotation, translation, covariance):
+        return belief.PoseBelief(rotation, translation, covariance, rotation)
+
+    def predict(self, state, twist, dt):
+        return state
+
+    def update(self, state, ranges, anchors, links=None):
+        return state._replace(translation=state.translation + self.shift)
+
+    def belief(self, state):
+        return state
+
+
+def test_our_filters_go_by_their_names():
+    assert set(estimators.names()) >= {"kf", "uc-kf", "et-kf", "kf-ortho", "iekf"}
+    for name in estimators.names():
+        filter = estimators.make(name, **LAWS)
+        state = filter.initial(np.eye(3), np.zeros(3), np.eye(6))
+        assert filter.belief(state).covariance.shape == (6, 6)
+
+
+def test_a_package_adds_its_filter_by_an_entry_point(monkeypatch):
+    entry = EntryPoint("standstill", "tests.test_belief:Standstill", "rbl_gym.filters")
+    monkeypatch.setattr(belief, "entry_points", lambda group: [entry])
+    assert "standstill" in estimators.names()
+    filter = estimators.make("standstill", **LAWS, shift=2.0)
+    state = filter.initial(np.eye(3), np.zeros(3), np.eye(6))
+    state = filter.update(
+        filter.predict(state, np.zeros(6), 1.0), np.ones((4, 5)), np.eye(4)[:, :3]
+    )
+    assert filter.belief(state).translation[0] == 2.0
+
+
+def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
+    monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
+    estimators.register("standstill", Standstill)
+    estimators.register("standstill", Standstill)
+    with pytest.raises(ValueError, match="filter 'standstill' is already registered"):
+        estimators.register("standstill", estimators.IteratedEkf)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "message"),
+    [
+        ("ekf", {}, "filter must be one of et-kf, iekf, kf, kf-ortho, uc-kf, got 'ekf'"),
+        ("kf", {"robust": True}, "filter 'kf' has no option 'robust'; it has"),
+        ("iekf", {"threshold": 1.0}, "it has iterations, robust"),
+        ("kf", {"noise": 0.1}, "noise must have variance and squared_range_variance, got 0.1"),
+        ("kf", {"process": None}, "process must have covariance and std"),
+        ("iekf", {"tags": np.zeros((5, 2))}, r"tags must have shape \(..., N, 3\), got \(5, 2\)"),
+        ("iekf", {"iterations": 0}, r"iterations must be a finite number in \[1, inf\], got 0"),
+        ("et-kf", {"threshold": -1}, "threshold must be a finite number"),
+        ("kf", {"engine": "numpy"}, "engine must be one of 'batched', 'filterpy', got 'numpy'"),
+        ("kf", {"weights": [1.0, -1.0]}, "weights must not be negative, got -1.0"),
+    ],
+)
+def test_wrong_names_and_options_are_named(name, changes, message):
+    with pytest.raises(ValueError, match=message):
+        estimators.make(name, **{**LAWS, **changes})

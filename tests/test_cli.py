@@ -1,0 +1,183 @@
+"""The command line, run in this process: demo and replay, their files, their errors."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rbl_gym import bodies, motion, ranging, rotations
+from rbl_gym.app import papers
+from rbl_gym.app.cli import main
+from tests.helpers import ROOT
+
+LIAS = ROOT.parent / "shared" / "data" / "lias_planar"
+
+
+def test_demo_writes_a_table_a_picture_and_the_same_figures_for_the_same_seed(tmp_path, capsys):
+    picture, figures = tmp_path / "new" / "demo.png", tmp_path / "demo.json"
+    arguments = ["demo", "--trials", "4", "--seed", "3", "--plot", str(picture)]
+    assert main([*arguments, "--json", str(figures)]) == 0
+    table = capsys.readouterr().out
+    for label in papers.FILTERS:
+        assert label in table
+    assert picture.stat().st_size > 20_000
+    first = json.loads(figures.read_text())
+    assert main([*arguments, "--json"]) == 0
+    second = json.loads(capsys.readouterr().out)
+    for result in (first, second):
+        for reading in result["readings"].values():
+            for filter in reading["filters"].values():
+                assert filter.pop("microseconds_per_step") > 0
+    assert first == second
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    return papers.camsap2013(1000, 0)
+
+
+@pytest.mark.parametrize("reading", list(papers.READINGS))
+def test_the_tracking_papers_claims_hold_in_1000_trials(experiment, reading):
+    claims = experiment["readings"][reading]["claims"]
+    assert len(claims) == 8
+    assert [claim for claim in claims if not claim["holds"]] == []
+
+
+@pytest.mark.parametrize("reading", list(papers.READINGS))
+def test_only_the_iterated_ekf_reaches_the_bound(experiment, reading):
+    ratios = {
+        label: (filter["rotation_to_bound"], filter["translation_to_bound"])
+        for label, filter in experiment["readings"][reading]["filters"].items()
+    }
+    assert max(ratios.pop("iterated EKF")) < 1.03
+    assert all(translation > 1.25 for _, translation in ratios.values())
+    assert ratios["UC-KF"][0] < 1.1 < ratios["KF-ortho"][0] < ratios["ET-KF"][0]
+
+
+def write(path: Path, header: list[str], rows) -> str:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(rows)
+    return str(path)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A body turning and flying through a room for 20 s, 3-D, with its truth."""
+    rng = np.random.default_rng(1)
+    tags = bodies.octahedron(0.8)
+    anchors = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3], [4, 0, 3], [4, 8, 0.0]])
+    start = motion.constant_twist(np.eye(3), [2, 2, 1], [0, 0.05, 0.3, 0.2, 0.2, 0.02], 100)
+    path = motion.simulate(start, 0.2, motion.ProcessNoise())
+    ranges = ranging.simulate(
+        anchors, tags, path.rotation, path.translation, ranging.RangeNoise(0.03), rng
+    ).ranges
+    times = 0.2 * np.arange(101)
+    q = rotations.quaternion(path.rotation)
+    names = [f"a{a}t{t}" for a in range(6) for t in range(6)]
+    rows = [[t, *r.ravel()] for t, r in zip(times, ranges, strict=True)]
+    rows[7][5] = ""
+    return {
+        "ranges": write(tmp_path / "ranges.csv", ["t", *names], rows),
+        "anchors": write(tmp_path / "anchors.csv", ["anchor", "x", "y", "z"],
+                         [[i, *a] for i, a in enumerate(anchors)]),
+        "tags": write(tmp_path / "tags.csv", ["tag", "x", "y", "z"],
+                      [[i, *c] for i, c in enumerate(tags)]),
+        "truth": write(tmp_path / "truth.csv", ["t", "x", "y", "z", "qw", "qx", "qy", "qz"],
+                       np.column_stack([times, path.translation, q])),
+    }  # fmt: skip
+
+
+def arguments(files):
+    return ["replay", *(part for name, path in files.items() for part in (f"--{name}", path))]
+
+
+@pytest.mark.parametrize("name", ["iekf", "uc-kf", "kf-ortho"])
+def test_replay_tracks_a_recording_from_nothing(files, name, tmp_path, capsys):
+    picture = tmp_path / "track.png"
+    options = ["--filter", name, "--range-std-m", "0.03", "--walk-m", "0.5", "--walk-deg", "25"]
+    assert main([*arguments(files), *options, "--plot", str(picture), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["epochs"] == 101
+    assert result["links"] == 101 * 36 - 1
+    limit = 1.0 if name == "iekf" else 2.0
+    assert result["position_rmse_m"] < 0.05 * limit
+    assert result["rotation_rmse_deg"] < 4 * limit
+    assert result["yaw_rmse_deg"] < 4 * limit
+    assert result["position_median_m"] < result["position_p95_m"]
+    assert picture.stat().st_size > 10_000
+
+
+def test_replay_yaw_offset_counts_against_the_truth(files, capsys):
+    options = ["--range-std-m", "0.03", "--walk-m", "0.5", "--walk-deg", "25"]
+    means = []
+    for offset in ("0", "10"):
+        assert main([*arguments(files), *options, "--yaw-offset-deg", offset, "--json"]) == 0
+        means.append(json.loads(capsys.readouterr().out)["yaw_mean_deg"])
+    assert math.isclose(means[0] - means[1], 10.0, abs_tol=1e-6)
+
+
+def test_replay_without_truth_prints_no_errors(files, capsys):
+    del files["truth"]
+    assert main(arguments(files)) == 0
+    assert "no truth, no errors" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not LIAS.is_dir(), reason="the LIAS recording is not on this machine")
+def test_replay_of_a_real_planar_recording(tmp_path):
+    """The defaults reach 0.033 m and 3.8 degrees over the whole run, causally."""
+    files = {"ranges": LIAS / "dynamic_fast_ranges.csv", "anchors": LIAS / "anchors_8_14.csv",
+             "tags": LIAS / "tags_8_14.csv", "truth": LIAS / "dynamic_fast_truth.csv",
+             "calibration": LIAS / "calibration_8_14.csv"}  # fmt: skip
+    options = ["--planar", "--height-offset-m", "0.08", "--yaw-offset-deg", "7"]
+    figures = tmp_path / "lias.json"
+    assert main([*map(str, arguments(files)), *options, "--json", str(figures)]) == 0
+    result = json.loads(figures.read_text())
+    assert result["epochs"] == result["epochs_with_truth"] == 13481
+    assert result["position_rmse_m"] <= 0.033
+    assert result["yaw_rmse_deg"] <= 3.8
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--ranges", "nowhere.csv"], "nowhere.csv"),
+        (["--filter", "magic"], "filter must be one of"),
+        (["--walk-m", "-1"], "walk_m must be a finite number"),
+        (["--range-std-m", "0"], "range_std_m must be a finite number"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_with_status_2(files, change, message, capsys):
+    assert main([*arguments(files), *change]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert error.startswith("rbl-gym replay: ")
+    assert message in error
+
+
+def test_a_planar_recording_refuses_the_linear_filters_with_their_rank(files, tmp_path, capsys):
+    rows = [
+        [i, x, y, 0] for i, (x, y) in enumerate([(0, 0), (8, 0), (8, 8), (0, 8), (4, 0), (4, 8)])
+    ]
+    files["anchors"] = write(tmp_path / "flat.csv", ["anchor", "x", "y", "z"], rows)
+    assert main([*arguments(files), "--filter", "kf"]) == 2
+    assert "rank 8 of the filter's 12 states" in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_named(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "rich.progress", None)
+    assert main(["demo", "--trials", "2", "--plot", str(tmp_path / "x.png")]) == 2
+    assert "pip install 'rbl-gym[cli]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("bad", [["--trials", "0"], ["--trials", "x"], ["--seed", "-1"]])
+def test_numbers_out_of_range_are_usage_errors(bad, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["demo", *bad])
+    assert "must be" in capsys.readouterr().err

@@ -1,0 +1,413 @@
+"""EstimatePose against the filter driven by hand, its consistency, its specs and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics, TimeLimit
+from scipy.spatial.transform import Rotation
+
+from rbl_gym import estimators, simulation
+from rbl_gym.scenes import SCENES
+from rbl_gym.wrappers import EstimatePose
+
+ID = "rbl_gym:RBL/Tracking-v0"
+NAMES = list(SCENES)
+KALMAN = ["kf", "uc-kf", "et-kf", "kf-ortho"]
+# The KF family needs anchors and tags that are not coplanar; the buoys float on one plane.
+SPATIAL = ["uwb_room", "drone_yard", "satellite", "camsap2013"]
+LOSSY = {"drop_probability": 0.3}
+BELIEF = ("belief_rotation", "belief_translation", "belief_covariance")
+
+
+def short(name: str, steps: int = 12, **fields: Any) -> dict[str, Any]:
+    return {"name": name, "steps": steps, **fields}
+
+
+def raw(scene: Any, **options: Any) -> gym.Env:
+    return gym.make(ID, scene=scene, **options)
+
+
+def wrapped(scene: Any, filter: str = "iekf", **arguments: Any) -> EstimatePose:
+    return EstimatePose(raw(scene), filter, **arguments)
+
+
+def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> list[Any]:
+    """A whole episode (or `steps` of it) under random actions of that seed."""
+    env.action_space.seed(seed)
+    results: list[Any] = [(*env.reset(seed=seed),)]
+    while len(results) != (steps or 10**6) + 1:
+        results.append(env.step(env.action_space.sample()))
+        if results[-1][3]:
+            break
+    return results
+
+
+def assert_same(got: Any, want: Any) -> None:
+    """Equal to the last bit, through dicts and sequences."""
+    assert type(got) is type(want)
+    if isinstance(got, dict):
+        assert got.keys() == want.keys()
+        for key in got:
+            assert_same(got[key], want[key])
+    elif isinstance(got, list | tuple):
+        assert len(got) == len(want)
+        for a, b in zip(got, want, strict=True):
+            assert_same(a, b)
+    else:
+        np.testing.assert_array_equal(got, want)
+
+
+def tag_spread_by_hand(P: np.ndarray, rotation: np.ndarray, tags: np.ndarray) -> float:
+    """Root mean square tag error that a pose covariance implies."""
+    total = 0.0
+    for tag in tags:
+        J = np.hstack([np.cross(rotation @ tag, np.eye(3)), np.eye(3)])
+        total += np.trace(J @ P @ J.T)
+    return (total / len(tags)) ** 0.5
+
+
+# --- the filter by hand -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("links", [{}, LOSSY], ids=["all links", "lost links"])
+@pytest.mark.parametrize(
+    ("name", "filter", "options"),
+    [
+        *((name, "iekf", {}) for name in NAMES),
+        ("uwb_room", "iekf", {"robust": True, "iterations": 2}),
+        ("uwb_room", "uc-kf", {"coupled": True}),
+        ("satellite", "et-kf", {"threshold": 0.01}),
+        ("drone_yard", "kf", {"engine": "filterpy", "sigma_q_scale": 0.8}),
+    ],
+)
+def test_wrapped_rollout_equals_driving_the_filter_by_hand(name, filter, options, links):
+    scene = short(name, 8, links=links)
+    env = raw(scene, reward="none")
+    world: Any = env.unwrapped
+    hand = estimators.make(
+        filter, tags=world.scene.tags, noise=world.scene.noise, process=world.scene.process,
+        **options,
+    )  # fmt: skip
+    runs = {
+        reward: rollout(wrapped(scene, filter, options=options, reward=reward), 1)
+        for reward in ("belief", "error")
+    }
+    tags = np.array(world.scene.tags)
+    state = None
+    for k, result in enumerate(rollout(env, 1)):
+        seen, info = result[0], result[-1]
+        if state is None:
+            prior = info["prior_rotation"], info["prior_translation"], info["prior_covariance"]
+            state = hand.initial(*prior)
+        else:
+            state = hand.predict(state, seen["twist"], world.scene.dt)
+        state = hand.update(state, seen["ranges"], seen["anchors"], seen["links"])
+        belief = hand.belief(state)
+        b = tag_spread_by_hand(belief.covariance, belief.rotation, tags)
+        estimated = tags @ belief.rotation.T + belief.translation
+        true = tags @ info["rotation"].T + info["translation"]
+        error = np.mean(np.sum((estimated - true) ** 2, axis=1)) ** 0.5
+        w = Rotation.from_matrix(belief.rotation @ info["rotation"].T).as_rotvec()
+        e = np.concatenate([w, belief.translation - info["translation"]])
+        for reward, steps in runs.items():
+            got, told = steps[k][0], steps[k][-1]
+            for key, want in zip(BELIEF, belief[:3], strict=True):
+                np.testing.assert_array_equal(got[key], want)
+            for key, want in seen.items():
+                np.testing.assert_array_equal(got[key], want)
+            assert told["score_m"] == pytest.approx(b, rel=1e-9)
+            assert told["tag_error_m"] == pytest.approx(error, rel=1e-7, abs=1e-12)
+            assert told["rotation_error_rad"] == pytest.approx(np.linalg.norm(w), abs=1e-7)
+            assert told["position_error_m"] == pytest.approx(np.linalg.norm(e[3:]), rel=1e-9)
+            nees = e @ np.linalg.inv(belief.covariance) @ e
+            assert told["nees"] == pytest.approx(nees, rel=1e-4)
+            if k > 0:
+                want = -np.log(b) if reward == "belief" else -error
+                assert steps[k][1] == pytest.approx(want, rel=1e-7, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_the_environment_says_passes_through(name):
+    for got, want in zip(
+        rollout(wrapped(short(name)), 2), rollout(raw(short(name), reward="none"), 2), strict=True
+    ):
+        assert want[-1].items() <= got[-1].items() or all(
+            np.array_equal(got[-1][key], value) for key, value in want[-1].items()
+        )
+        assert got[2:-1] == want[2:-1]
+
+
+def test_environments_own_reward_is_switched_off(monkeypatch):
+    def refuse(*_: Any) -> None:
+        raise AssertionError("the bound was computed")
+
+    monkeypatch.setattr(simulation, "posterior_information", refuse)
+    with pytest.raises(AssertionError, match="the bound"):
+        raw(short("uwb_room"), reward="bound").reset(seed=0)
+    assert len(rollout(wrapped(short("uwb_room")))) == 13
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_iekf_is_consistent(name):
+    """The mean NEES is 6 within 4 standard deviations of the mean over independent episodes.
+
+    Errors within an episode are correlated in time, episodes are not: the standard deviation
+    comes from the spread of the episodes' means, over the root of their number.
+    """
+    env = wrapped(short(name, min(SCENES[name].steps, 30)))
+    means = np.array(
+        [np.mean([result[-1]["nees"] for result in rollout(env, seed)]) for seed in range(16)]
+    )
+    deviation = means.std(ddof=1) / len(means) ** 0.5
+    assert abs(means.mean() - 6) < 4 * deviation
+    assert deviation < 0.75  # or the test would say nothing
+
+
+@pytest.mark.parametrize("reward", ["belief", "error"])
+@pytest.mark.parametrize("name", SPATIAL)
+@pytest.mark.parametrize("filter", KALMAN)
+def test_kalman_family_tracks(filter, name, reward):
+    """Real errors at the end of an episode below half the initial ones, the prior's."""
+    env = wrapped(name, filter, reward=reward)
+    scene = SCENES[name]
+    results = rollout(env, 3)
+    assert len(results) == scene.steps + 1
+    start = tag_spread_by_hand(scene.prior_covariance, np.eye(3), np.array(scene.tags))
+    last = [result[-1]["tag_error_m"] for result in results[-5:]]
+    assert np.mean(last) < start / 2
+    for result in results[1:]:
+        assert type(result[1]) is float
+        assert np.isfinite(result[1])
+        turn = result[0]["belief_rotation"]
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+        assert np.linalg.det(turn) > 0
+
+
+def test_filters_belief_scores_no_better_than_the_bound_on_average():
+    """The iterated EKF reaches the posterior Cramer-Rao bound: log b apart by 3 % at most."""
+    gaps = []
+    for seed in range(4):
+        beliefs = rollout(wrapped(short("drone_yard", 40)), seed)
+        bound = rollout(raw(short("drone_yard", 40)), seed)
+        gaps += [
+            np.log(a[-1]["score_m"] / b[-1]["score_m"]) for a, b in zip(beliefs, bound, strict=True)
+        ]
+    assert abs(np.mean(gaps)) < 0.03
+
+
+# --- specs, pickles, memory -------------------------------------------------------------------
+
+ARGUMENTS = [
+    {"filter": "uc-kf"},
+    {"filter": "iekf", "options": {"robust": True}, "reward": "error"},
+    {"filter": "et-kf", "options": {"threshold": 0.2}, "observation": "flat"},
+]
+
+
+@pytest.mark.parametrize("arguments", ARGUMENTS, ids=str)
+def test_spec_makes_the_same_environment_also_through_json(arguments):
+    env = EstimatePose(raw(short("satellite", links=LOSSY)), **arguments)
+    assert env.spec is not None
+    text = env.spec.to_json()
+    assert json.loads(text)["additional_wrappers"][-1]["name"] == "EstimatePose"
+    want = rollout(env, 4)
+    for spec in (env.spec, EnvSpec.from_json(text)):
+        twin = gym.make(spec)
+        assert twin.spec == env.spec
+        assert twin.spec is not None
+        assert twin.spec.to_json() == text
+        assert_same(rollout(twin, 4), want)
+
+
+def test_spec_keeps_the_options_as_they_were():
+    options = {"robust": True}
+    env = wrapped("uwb_room", options=options)
+    options["robust"] = False
+    assert env.spec is not None
+    kwargs = env.spec.additional_wrappers[-1].kwargs
+    assert kwargs is not None
+    assert kwargs["options"] == {"robust": True}
+
+
+@pytest.mark.parametrize("filter", ["iekf", "uc-kf"])
+def test_pickled_wrapper_continues_as_the_original(filter):
+    env = wrapped(short("satellite", links=LOSSY), filter)
+    rollout(env, 5, steps=4)
+    twin = pickle.loads(pickle.dumps(env))
+    actions = [env.action_space.sample() for _ in range(5)]
+    assert_same([env.step(a) for a in actions], [twin.step(a) for a in actions])
+    assert_same(env.reset(), twin.reset())
+
+
+@pytest.mark.parametrize("filter", ["iekf", *KALMAN])
+@pytest.mark.parametrize("observation", ["dict", "flat"])
+def test_what_the_user_writes_into_observations_changes_nothing(filter, observation):
+    clean, spoilt = (wrapped(short("satellite"), filter, observation=observation) for _ in range(2))
+    assert_same(spoilt.reset(seed=6), clean.reset(seed=6))
+    for k in range(6):
+        action = np.full(15, 0.1 * k, np.float32)
+        got, want = spoilt.step(action), clean.step(action)
+        assert_same(got, want)
+        arrays = [got[0]] if observation == "flat" else list(got[0].values())
+        for array in (*arrays, *got[4].values()):
+            if isinstance(array, np.ndarray):
+                array.fill(0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_same_seed_and_actions_give_the_same_rollout(name):
+    scene = short(name, links=LOSSY)
+    assert_same(rollout(wrapped(scene), 7), rollout(wrapped(scene), 7))
+
+
+# --- observations -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("filter", ["iekf", "kf"])
+@pytest.mark.parametrize("name", SPATIAL)
+def test_dict_observation_is_in_its_space(name, filter):
+    env = wrapped(short(name, links=LOSSY), filter)
+    space = env.observation_space
+    assert isinstance(space, spaces.Dict)
+    for result in rollout(env, 8):
+        assert space.contains(result[0])
+        assert [result[0][key].dtype for key in BELIEF] == [np.float64] * 3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_flat_observation_is_float32_and_in_its_space(name):
+    env = wrapped(name, observation="flat")
+    size = 21 + 4 * SCENES[name].n_anchors
+    assert env.observation_space == spaces.Box(-10.0, 10.0, (size,), np.float32)
+    for result in rollout(env, 9):
+        assert result[0].dtype == np.float32
+        assert env.observation_space.contains(result[0])
+
+
+@pytest.mark.parametrize("name", ["uwb_room", "drone_yard", "auv_buoys", "satellite"])
+def test_flat_observation_is_of_order_one(name):
+    """What a policy reads is neither cut nor vanishing: at most 1 % of the numbers at the cut."""
+    flat = np.stack([result[0] for result in rollout(wrapped(name, observation="flat"), 10)])
+    assert (np.abs(flat) == 10.0).mean() < 0.01
+    assert 0.1 < np.sqrt(np.mean(flat**2)) < 5
+
+
+def test_meaning_of_the_flat_observation_checked_by_hand():
+    scene = SCENES["auv_buoys"]
+    _, full = rollout(wrapped("auv_buoys"), 11, steps=1)
+    _, flat = rollout(wrapped("auv_buoys", observation="flat"), 11, steps=1)
+    seen, got = full[0], flat[0]
+    rotation, place = seen["belief_rotation"], seen["belief_translation"]
+    # Volume +-150, +-150, -80 to -20; anchors +-200 at z = 0: the box around both has the
+    # half diagonal of 400 x 400 x 80.
+    extent = np.linalg.norm([400, 400, 80]) / 2
+    want = list((place - [0, 0, -50]) / [150, 150, 30])
+    want += list(seen["twist"][:3] / (np.pi / 10))  # dt = 1 s
+    want += list(seen["twist"][3:] / 1.5)
+    want += [np.log(seen["belief_covariance"][i, i] ** 0.5) for i in range(6)]
+    want += [*rotation[:, 0], *rotation[:, 1]]
+    for m in range(scene.n_anchors):
+        want += list((seen["anchors"][m] - place) / extent)
+    for m in range(scene.n_anchors):
+        want.append(np.log(np.linalg.norm(seen["anchors"][m] - place) / extent))
+    assert max(map(abs, want)) < 10
+    np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
+
+
+# --- what it refuses --------------------------------------------------------------------------
+
+
+def test_environment_of_another_kind_is_named():
+    with pytest.raises(ValueError, match="env must have a rbl_gym Scene.*CartPole"):
+        EstimatePose(gym.make("CartPole-v1"))
+
+
+def test_environment_that_hides_its_measurements_is_named():
+    with pytest.raises(ValueError, match=r"env must observe ranges, links, anchors.*Box\("):
+        EstimatePose(FlattenObservation(raw("uwb_room")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"filter": "ekf"}, "filter must be one of .*uc-kf.*, got 'ekf'"),
+        ({"filter": ""}, "filter must be one of"),
+        ({"filter": None}, "filter must be one of .*, got None"),
+        ({"options": {"iteration": 3}}, "'iekf' has no option 'iteration'; it has iterations"),
+        ({"filter": "kf", "options": {"robust": True}}, "'kf' has no option 'robust'"),
+        ({"options": {"iterations": 0}}, "iterations"),
+        ({"options": {"iterations": "many"}}, "iterations.*many"),
+        ({"filter": "kf", "options": {"engine": "steam"}}, "engine must be one of .*'steam'"),
+        ({"filter": "et-kf", "options": {"threshold": -1}}, "threshold"),
+        ({"reward": "bound"}, "reward must be one of 'belief', 'error', got 'bound'"),
+        ({"reward": None}, "reward must be one of 'belief', 'error', got None"),
+        ({"observation": "image"}, "observation must be one of 'dict', 'flat', got 'image'"),
+    ],
+    ids=str,
+)
+def test_wrong_argument_is_named(arguments, named):
+    with pytest.raises(ValueError, match=named):
+        EstimatePose(raw("uwb_room"), **arguments)
+
+
+def test_coplanar_anchors_are_refused_by_the_linear_filters_where_the_prior_is_vague():
+    env = wrapped({"name": "auv_buoys", "initial_rotation_rad": 2.0}, "kf")
+    with pytest.raises(ValueError, match="rank"):
+        env.reset(seed=0)
+
+
+# --- with other wrappers ----------------------------------------------------------------------
+
+
+def test_time_limit_around_it():
+    env = TimeLimit(wrapped("uwb_room", observation="flat"), max_episode_steps=5)
+    assert len(rollout(env)) == 6
+
+
+def test_time_limit_inside_it():
+    env = EstimatePose(raw("uwb_room", max_episode_steps=5))
+    assert len(rollout(env)) == 6
+
+
+def test_episode_statistics_sum_its_reward():
+    env = RecordEpisodeStatistics(wrapped(short("drone_yard"), reward="error"))
+    results = rollout(env, 12)
+    told = results[-1][-1]["episode"]
+    assert told["l"] == 12
+    assert told["r"] == pytest.approx(-sum(r[-1]["tag_error_m"] for r in results[1:]), rel=1e-5)
+
+
+@pytest.mark.parametrize("observation", ["dict", "flat"])
+def test_sync_vector_of_wrapped_environments_equals_them_one_by_one(observation):
+    def wrap(env: gym.Env) -> gym.Env:
+        return EstimatePose(env, "iekf", observation=observation)
+
+    scene = short("satellite", 5)
+    vector = gym.make_vec(ID, num_envs=3, vectorization_mode="sync", wrappers=[wrap], scene=scene)
+    singles = [wrapped(scene, observation=observation) for _ in range(3)]
+    vector.action_space.seed(0)
+    seen, _ = vector.reset(seed=13)
+    alone = [env.reset(seed=13 + i)[0] for i, env in enumerate(singles)]
+    for k in range(5):
+        actions = vector.action_space.sample()
+        seen, rewards, _, truncated, info = vector.step(actions)
+        for i, env in enumerate(singles):
+            alone[i], reward, _, _, told = env.step(actions[i])
+            assert rewards[i] == reward
+            assert info["nees"][i] == told["nees"]
+        assert truncated.tolist() == [k == 4] * 3
+        if observation == "flat":
+            np.testing.assert_array_equal(seen, np.stack(alone))
+        else:
+            for key in BELIEF:
+                np.testing.assert_array_equal(seen[key], [one[key] for one in alone])
+    assert vector.observation_space.contains(seen)
+    assert np.isfinite(vector.step(actions)[1]).all()  # the reset after the end

@@ -1,0 +1,252 @@
+"""The iterated EKF: reference track, derivatives, global start, robustness, bound."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym import bodies, bounds, estimators, metrics, motion, ranging, rotations
+from rbl_gym.estimators.belief import inverse
+from rbl_gym.estimators.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.manifold import MapProblem, PoseState
+from tests.helpers import load, random_world, simulate
+
+NOISE = ranging.RangeNoise(0.05, 0.001)
+PROCESS = motion.ProcessNoise(0.02, 0.1)
+
+
+def make(tags, **options):
+    return estimators.make("iekf", tags=tags, noise=NOISE, process=PROCESS, **options)
+
+
+def test_track_of_the_reference_implementation_from_its_first_step():
+    track = load("track.json")
+    filter = estimators.make(
+        "iekf",
+        tags=np.array(track["C"]).T,
+        noise=ranging.SquaredRangeNoise(track["sigma"]),
+        process=motion.ProcessNoise(track["sigma_q_rad"], track["sigma_t"]),
+    )
+    first, *others = track["steps"]
+    given = first["IEKF6raw"]
+    state = filter.initial(given["Q"], given["t"], given["P"])
+    for step in others:
+        state = filter.predict(state, track["twist"], 1.0)
+        state = filter.update(state, np.sqrt(step["d"]), np.array(track["A"]).T)
+        expected = step["IEKF6raw"]
+        np.testing.assert_allclose(state.rotation, expected["Q"], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(state.translation, expected["t"], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(
+            state.covariance, expected["P"], rtol=0, atol=1e-6 * np.abs(expected["P"]).max()
+        )
+
+
+def test_the_papers_vague_prior_finds_the_reference_pose_by_itself():
+    track = load("track.json")
+    filter = estimators.make(
+        "iekf",
+        tags=np.array(track["C"]).T,
+        noise=ranging.SquaredRangeNoise(track["sigma"]),
+        process=motion.ProcessNoise(track["sigma_q_rad"], track["sigma_t"]),
+    )
+    state = filter.initial(np.eye(3), np.zeros(3), np.diag([50.0] * 3 + [100.0] * 3))
+    state = filter.predict(state, track["twist"], 1.0)
+    first = track["steps"][0]
+    state = filter.update(state, np.sqrt(first["d"]), np.array(track["A"]).T)
+    # The reference treats the vague prior in its own way: equal to a thousandth of its sigma.
+    np.testing.assert_allclose(state.rotation, first["IEKF6raw"]["Q"], atol=1e-5)
+    np.testing.assert_allclose(state.translation, first["IEKF6raw"]["t"], atol=1e-5)
+
+
+@pytest.mark.parametrize("huber", [None, 1.5])
+def test_gradient_and_hessian_by_finite_differences(huber):
+    rng = np.random.default_rng(1)
+    anchors, tags, rotation, translation = random_world(rng, 5, 4)
+    ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
+    ranges[1, 2] += 3.0
+    P = np.diag([0.3, 0.2, 0.4, 1.0, 2.0, 3.0])
+    off = rotations.exp(0.3 * rng.standard_normal(3)) @ rotation
+    problem = MapProblem(
+        PoseState(off, translation + 0.2, P),
+        inverse(P),
+        ranges,
+        1 / NOISE.variance(ranges) * (rng.random((5, 4)) > 0.2),
+        anchors,
+        tags,
+        huber,
+    )
+    at = problem.linearize(rotation, translation)
+    step = 1e-5
+
+    def moved(error):
+        return problem.linearize(rotations.exp(error[:3]) @ rotation, translation + error[3:])
+
+    for axis in range(6):
+        d = step * np.eye(6)[axis]
+        numeric = (moved(d).cost - moved(-d).cost) / (2 * step)
+        np.testing.assert_allclose(at.gradient[axis], numeric, rtol=1e-6, atol=1e-4)
+    if huber is None:
+        # Without residuals the Gauss-Newton Hessian is the exact one.
+        exact = problem.__class__(
+            PoseState(rotation, translation, P), inverse(P),
+            ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags)),
+            problem.weights, anchors, tags,
+        )  # fmt: skip
+        hessian = exact.linearize(rotation, translation).hessian
+        for axis in range(6):
+            d = step * np.eye(6)[axis]
+            plus = exact.linearize(rotations.exp(d[:3]) @ rotation, translation + d[3:])
+            minus = exact.linearize(rotations.exp(-d[:3]) @ rotation, translation - d[3:])
+            numeric = (plus.gradient - minus.gradient) / (2 * step)
+            np.testing.assert_allclose(hessian[axis], numeric, atol=1e-4 * np.abs(hessian).max())
+
+
+def test_a_batch_is_a_loop_over_trials():
+    rng = np.random.default_rng(2)
+    tags = bodies.octahedron()
+    anchors, _, rotation, translation = random_world(rng, 5, 6, (6,))
+    ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
+    links = rng.random((6, 5, 6)) > 0.2
+    # Two trials with a vague prior among four with a good one.
+    covariance = np.where(np.arange(6)[:, None, None] < 2, 10.0, 0.01) * np.eye(6)
+    filter = make(tags, robust=True)
+    state = filter.initial(rotation, translation, covariance)
+    whole = filter.belief(filter.update(state, ranges, anchors, links))
+    for k in range(6):
+        state = filter.initial(rotation[k], translation[k], covariance[k])
+        single = filter.belief(filter.update(state, ranges[k], anchors[k], links[k]))
+        for a, b in zip(whole, single, strict=True):
+            np.testing.assert_allclose(a[k], b, atol=1e-8)
+
+
+def test_vague_priors_reach_the_global_optimum_of_brute_force():
+    """100 poses against a multi-start from 100 random rotations: not one is missed."""
+    rng = np.random.default_rng(3)
+    tags = bodies.pyramid(1.0)
+    anchors, _, rotation, translation = random_world(rng, 6, 5, (100,))
+    ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
+    P = np.diag([50.0] * 3 + [100.0] * 3)
+    filter = make(tags)
+    state = filter.update(filter.initial(np.eye(3), np.zeros((100, 3)), P), ranges, anchors)
+    problem = MapProblem(
+        PoseState(np.eye(3), np.zeros(3), P), inverse(P), ranges[:, None],
+        (1 / NOISE.variance(ranges))[:, None], anchors[:, None], tags,
+    )  # fmt: skip
+    starts = rotations.random(rng, (100,))
+    brute = minimize_pose(problem.linearize, starts, translation[:, None], 30).at.cost.min(axis=1)
+    found = problem.linearize(state.rotation[:, None], state.translation[:, None]).cost[:, 0]
+    assert (found <= brute + 1e-6).all()
+    error = metrics.pose_error(state.rotation, state.translation, rotation, translation)
+    mean = metrics.nees(error, state.covariance).mean()
+    # chi-square with 6 degrees: standard deviation of the mean of 100 is 0.35.
+    assert abs(mean - 6) < 4 * 0.35
+
+
+def test_reaches_the_posterior_bound_and_is_consistent():
+    """One update of a drawn prior, 2000 trials: RMSE within 3 sigma of the bound, NEES 6."""
+    rng = np.random.default_rng(4)
+    trials = 2000
+    tags = bodies.octahedron(0.8)
+    anchors, _, rotation, translation = random_world(rng, 6, 6)
+    std = np.array([0.15] * 3 + [0.5] * 3)
+    offset = std * rng.standard_normal((trials, 6))
+    ranges = simulate(rng, anchors, tags, np.broadcast_to(rotation, (trials, 3, 3)), translation,
+                      NOISE)  # fmt: skip
+    filter = make(tags)
+    prior = filter.initial(
+        rotations.exp(offset[:, :3]) @ rotation, translation + offset[:, 3:], np.diag(std**2)
+    )
+    belief = filter.belief(filter.update(prior, ranges, anchors))
+    error = metrics.pose_error(belief.rotation, belief.translation, rotation, translation)
+    bound = bounds.pose_crb(anchors, tags, rotation, translation, NOISE, np.diag(std**-2.0))
+    for block in (slice(0, 3), slice(3, 6)):
+        ratio = np.sqrt((error[:, block] ** 2).sum(1).mean() / np.trace(bound[block, block]))
+        assert abs(ratio - 1) < 3 / np.sqrt(2 * trials)
+    nees = metrics.nees(error, belief.covariance).mean()
+    assert abs(nees - 6) < 4 * np.sqrt(12 / trials)
+
+
+def test_planar_body_finds_its_heading_from_a_vague_prior():
+    """Height, roll and pitch held by the prior; anchors and tags in one plane."""
+    rng = np.random.default_rng(5)
+    tags = bodies.plate(0.6, 0.3)[[0, 1, 2]]
+    anchors = np.array([[0, 0, 0], [7, 0, 0], [7, 6, 0], [0, 6, 0]], float)
+    heading = rng.uniform(-np.pi, np.pi, 100)
+    rotation = rotations.from_euler_zyx(heading, np.zeros(100), np.zeros(100))
+    translation = np.column_stack([rng.uniform(1, 5, (100, 2)), np.zeros(100)])
+    noise = ranging.RangeNoise(0.02)
+    ranges = simulate(rng, anchors, tags, rotation, translation, noise)
+    filter = estimators.make("iekf", tags=tags, noise=noise, process=PROCESS)
+    P = np.diag([1e-6, 1e-6, np.pi**2, 49.0, 49.0, 1e-6])
+    state = filter.update(filter.initial(np.eye(3), [3.5, 3.0, 0.0], P), ranges, anchors)
+    error = metrics.pose_error(state.rotation, state.translation, rotation, translation)
+    assert np.abs(error[:, 2]).max() < np.deg2rad(25)
+    assert np.abs(error[:, 3:5]).max() < 0.15
+
+
+def test_huber_shrugs_off_reflected_paths():
+    """10 % of ranges 5 m too long: the plain filter is metres off, the robust one is not."""
+    rng = np.random.default_rng(6)
+    tags = bodies.octahedron(0.8)
+    anchors, _, rotation, translation = random_world(rng, 8, 6, (300,))
+    ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
+    ranges = ranges + 5.0 * (rng.random(ranges.shape) < 0.1)
+    median = {}
+    for robust in (False, True):
+        filter = make(tags, robust=robust)
+        state = filter.initial(rotation, translation, np.diag([0.03] * 3 + [0.25] * 3))
+        state = filter.update(state, ranges, anchors)
+        median[robust] = np.median(np.linalg.norm(state.translation - translation, axis=-1))
+    assert median[True] < 0.05 < 0.5 < median[False]
+
+
+def test_one_iteration_is_overconfident_where_four_are_not():
+    rng = np.random.default_rng(7)
+    trials = 2000
+    tags = bodies.pyramid(1.0)
+    anchors, _, rotation, translation = random_world(rng, 5, 5, (trials,))
+    std = np.array([0.35] * 3 + [0.5] * 3)
+    offset = std * rng.standard_normal((trials, 6))
+    ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
+    nees = {}
+    for iterations in (1, 4):
+        filter = make(tags, iterations=iterations)
+        state = filter.initial(
+            rotations.exp(offset[:, :3]) @ rotation, translation + offset[:, 3:], np.diag(std**2)
+        )
+        state = filter.update(state, ranges, anchors)
+        error = metrics.pose_error(state.rotation, state.translation, rotation, translation)
+        nees[iterations] = metrics.nees(error, state.covariance).mean()
+    assert nees[1] > 10
+    assert abs(nees[4] - 6) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("anchors", "tags", "message"),
+    [
+        ([[0, 0, 0], [5, 0, 0]], bodies.pyramid(), "anchors must be at least 3 and not collinear"),
+        ([[0, 0, 0], [5, 0, 0], [9, 0, 0]], bodies.pyramid(), "got 3 of rank 1"),
+        ([[0, 0, 0], [5, 0, 0], [0, 5, 0]], bodies.plate()[:2], "tags must be at least 3"),
+    ],
+)
+def test_a_vague_prior_and_a_geometry_without_a_pose_raise(anchors, tags, message):
+    anchors = np.array(anchors, float)
+    ranges = ranging.distances(anchors, tags + [1.0, 2.0, 3.0])
+    filter = make(tags)
+    vague = filter.initial(np.eye(3), [1, 2, 3], np.diag([50.0] * 3 + [100.0] * 3))
+    with pytest.raises(ValueError, match=message):
+        filter.update(vague, ranges, anchors)
+    tight = filter.initial(np.eye(3), [1, 2, 3], np.diag([0.01] * 3 + [0.1] * 3))
+    assert np.isfinite(filter.update(tight, ranges, anchors).translation).all()
+
+
+def test_prediction_turns_the_covariance_with_the_body():
+    filter = make(bodies.pyramid())
+    P = np.diag([0.1, 0.2, 0.3, 1.0, 2.0, 3.0])
+    twist = np.array([0.0, 0.0, np.pi / 2, 1.0, 0.0, 0.0])
+    state = filter.predict(filter.initial(np.eye(3), np.zeros(3), P), twist, 1.0)
+    Jl = rotations.left_jacobian(twist[:3])
+    np.testing.assert_allclose(
+        state.covariance[:3, :3], np.diag([0.2, 0.1, 0.3]) + 0.02**2 * Jl @ Jl.T, atol=1e-12
+    )
+    np.testing.assert_allclose(state.translation, [1, 0, 0])

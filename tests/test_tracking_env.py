@@ -1,0 +1,524 @@
+"""RBL/Tracking-v0: Gymnasium's contract, the score by hand, and what it refuses."""
+
+from __future__ import annotations
+
+import copy
+import json
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec, registry
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+
+import rbl_gym
+from rbl_gym import bounds
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.scenes import SCENES
+
+ROOT = Path(__file__).resolve().parent.parent
+ID = "rbl_gym:RBL/Tracking-v0"
+NAMES = list(SCENES)
+MOVABLE = [name for name, scene in SCENES.items() if scene.anchor_speed_m_s > 0]
+FIXED = [name for name in NAMES if name not in MOVABLE]
+LOSSY = {"drop_probability": 0.3, "nlos_probability": 0.2}
+OVERRIDDEN = {
+    "name": "satellite",
+    "steps": 6,
+    "links": LOSSY,
+    "noise": {"kind": "range", "floor_m": 0.2, "reference_tag": 0},
+    "anchors": [[100.0, 0, 0], [0, 100, 0], [0, 0, 100], [-60, -60, -60]],
+}
+Step = tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]
+
+
+def short(name: str, steps: int = 12, **fields: Any) -> dict[str, Any]:
+    return {"name": name, "steps": steps, **fields}
+
+
+def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> Iterator[Step]:
+    """A whole episode under random actions of that seed; the reset comes first."""
+    env.action_space.seed(seed)
+    observation, info = env.reset(seed=seed)
+    yield observation, 0.0, False, False, info
+    for k in range(steps or 10**6):
+        result = env.step(env.action_space.sample())
+        yield result
+        if result[3] and steps is None:
+            break
+        assert k < 10**5
+
+
+def assert_same(got: Any, want: Any) -> None:
+    """Equal to the last bit, through dicts and sequences."""
+    assert type(got) is type(want)
+    if isinstance(got, dict):
+        assert got.keys() == want.keys()
+        for key in got:
+            assert_same(got[key], want[key])
+    elif isinstance(got, list | tuple):
+        assert len(got) == len(want)
+        for a, b in zip(got, want, strict=True):
+            assert_same(a, b)
+    else:
+        np.testing.assert_array_equal(got, want)
+
+
+def run_python(code: str) -> str:
+    """Standard output of a fresh interpreter at the root of the checkout."""
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=ROOT,
+        env=variables,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# --- Gymnasium --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reward", ["bound", "none"])
+@pytest.mark.parametrize("name", NAMES)
+def test_gymnasiums_checker_has_no_complaint(name, reward):
+    check_env(gym.make(ID, scene=name, reward=reward).unwrapped)
+
+
+def test_make_alone_finds_the_environment_in_a_fresh_process():
+    code = f"""
+import sys, gymnasium
+env = gymnasium.make({ID!r})
+env.reset(seed=0)
+print(type(env.unwrapped).__module__)
+"""
+    assert run_python(code) == "rbl_gym.envs.tracking\n"
+
+
+def test_make_alone_finds_the_environment_in_a_spawned_worker():
+    worker = multiprocessing.get_context("spawn").Process(target=gym.make, args=(ID,))
+    worker.start()
+    worker.join(60)
+    assert worker.exitcode == 0
+
+
+def test_registration_is_idempotent():
+    before = registry["RBL/Tracking-v0"]
+    rbl_gym._register_environments()
+    assert registry["RBL/Tracking-v0"] is before
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_same_seed_and_actions_give_the_same_rollout(name):
+    scene = short(name, links=LOSSY)
+    first, second = TrackingEnv(scene), TrackingEnv(scene)
+    assert_same(list(rollout(first, 3)), list(rollout(second, 3)))
+    assert_same(list(rollout(first, 3)), list(rollout(first, 3)))
+    other = list(rollout(second, 4))
+    assert (other[0][0]["ranges"] != next(rollout(first, 3))[0]["ranges"]).any()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reset_without_a_seed_continues_the_stream(name):
+    first, second = TrackingEnv(short(name)), TrackingEnv(short(name))
+    observations = [env.reset(seed=1)[0] for env in (first, second)]
+    again = [env.reset()[0] for env in (first, second)]
+    assert_same(again[0], again[1])
+    assert (again[0]["ranges"] != observations[0]["ranges"]).all()
+
+
+@pytest.mark.parametrize("name", ["uwb_room", "satellite"])
+def test_pickled_environment_continues_as_the_original(name):
+    env = TrackingEnv(short(name, links=LOSSY))
+    list(rollout(env, 5, steps=4))
+    twin = pickle.loads(pickle.dumps(env))
+    actions = [env.action_space.sample() for _ in range(8)]
+    assert_same([env.step(action) for action in actions], [twin.step(action) for action in actions])
+    assert_same(env.reset(), twin.reset())  # the generator came along
+
+
+@pytest.mark.parametrize("scene", [*NAMES, OVERRIDDEN], ids=[*NAMES, "overridden"])
+def test_spec_survives_json_and_makes_the_same_environment(scene):
+    env = gym.make(ID, scene=scene, reward="none")
+    assert env.spec is not None
+    spec = EnvSpec.from_json(env.spec.to_json())
+    assert spec.kwargs == {"scene": scene, "reward": "none"}
+    assert json.loads(env.spec.to_json())["kwargs"] == spec.kwargs
+    for source in (spec, env.spec):
+        twin = gym.make(source)
+        assert twin.spec == env.spec
+        assert_same(list(rollout(twin, 6, steps=3)), list(rollout(env, 6, steps=3)))
+
+
+def test_environment_leaves_the_scene_dict_alone():
+    scene = copy.deepcopy(OVERRIDDEN)
+    env = TrackingEnv(scene)
+    list(rollout(env))
+    assert scene == OVERRIDDEN
+
+
+def test_overrides_reach_the_scene():
+    scene = TrackingEnv(OVERRIDDEN).scene
+    assert (scene.steps, scene.n_anchors, scene.dt) == (6, 4, SCENES["satellite"].dt)
+    assert scene.noise.variance(np.ones((1, 2))).item() == pytest.approx(0.04)
+    assert scene.links.drop_probability == 0.3
+
+
+@pytest.mark.parametrize("tag", [0, 1, 5])
+def test_any_tag_may_be_the_reference_of_the_noise(tag):
+    noise = {"floor_m": 0.1, "proportional": 0.01, "reference_tag": tag}
+    env = TrackingEnv(short("uwb_room", noise=noise))
+    for observation, *_ in rollout(env):
+        assert env.observation_space.contains(observation)
+
+
+def test_max_episode_steps_of_make_truncates():
+    env = gym.make(ID, scene="drone_yard", max_episode_steps=7)
+    assert [step[3] for step in rollout(env)] == [False] * 7 + [True]
+
+
+def test_sync_vector_environment_equals_its_environments():
+    vector = gym.make_vec(ID, num_envs=3, vectorization_mode="sync", scene=short("auv_buoys", 4))
+    singles = [gym.make(ID, scene=short("auv_buoys", 4)) for _ in range(3)]
+    observations, _ = vector.reset(seed=7)
+    alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
+    assert vector.observation_space.contains(observations)
+    vector.action_space.seed(0)
+    for k in range(4):
+        actions = vector.action_space.sample()
+        observations, rewards, _, truncated, _ = vector.step(actions)
+        for i, env in enumerate(singles):
+            alone[i], reward, _, _, _ = env.step(actions[i])
+            assert rewards[i] == reward
+        assert truncated.tolist() == [k == 3] * 3
+        for key in observations:
+            np.testing.assert_array_equal(observations[key], [one[key] for one in alone])
+    vector.step(actions)  # the step after the end resets
+    assert not vector.step(actions)[3].any()
+
+
+# --- spaces, memory, types, the end -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("trajectory", [None, "random-twist"])
+@pytest.mark.parametrize("name", NAMES)
+def test_every_observation_is_in_the_space(name, trajectory):
+    fields = {} if trajectory is None else {"trajectory": trajectory}
+    env = TrackingEnv(short(name, SCENES[name].steps, links=LOSSY, **fields))
+    for observation, *_ in rollout(env, 8):
+        for key, space in env.observation_space.items():
+            assert space.contains(observation[key]), key
+        assert env.observation_space.contains(observation)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_observation_space_is_finite_and_its_numbers_are_float64(name):
+    for key, space in TrackingEnv(name).observation_space.items():
+        if isinstance(space, spaces.Box):
+            assert space.dtype == np.float64
+            assert np.isfinite(space.low).all(), key
+            assert np.isfinite(space.high).all(), key
+
+
+@pytest.mark.parametrize("name", MOVABLE)
+def test_anchors_driven_to_the_edge_of_their_region_stay_in_the_space(name):
+    env = TrackingEnv({"name": name, "anchor_speed_m_s": 1000.0})
+    rng = np.random.default_rng(9)
+    env.reset(seed=9)
+    for _ in range(env.scene.steps):
+        action = rng.choice([-1.0, 0.0, 1.0], 3 * env.scene.n_anchors)
+        assert env.observation_space.contains(env.step(action)[0])
+
+
+def test_fast_spin_is_refused_or_stays_in_the_space():
+    try:
+        env = TrackingEnv({"name": "auv_buoys", "spin_rad_s": 3.0})
+    except ValueError:
+        return
+    for seed in range(20):
+        env.reset(seed=seed)
+        assert env.observation_space.contains(env.step(np.zeros(12))[0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_the_user_writes_into_observations_changes_nothing(name):
+    scene = short(name, links=LOSSY)
+    clean, spoilt = TrackingEnv(scene), TrackingEnv(scene)
+    for want, got in zip(rollout(clean, 10), rollout(spoilt, 10), strict=True):
+        assert_same(got, want)
+        for array in (*got[0].values(), *got[4].values()):
+            if isinstance(array, np.ndarray):
+                array.fill(1)
+    assert_same(list(rollout(spoilt, 10)), list(rollout(clean, 10)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_observations_and_infos_share_no_memory(name):
+    kept = [
+        array
+        for observation, *_, info in rollout(TrackingEnv(short(name, 3)))
+        for array in (*observation.values(), *info.values())
+        if isinstance(array, np.ndarray)
+    ]
+    for i, array in enumerate(kept):
+        assert not any(np.shares_memory(array, other) for other in kept[:i])
+
+
+@pytest.mark.parametrize("reward", ["bound", "none"])
+@pytest.mark.parametrize("name", NAMES)
+def test_reward_is_a_float_and_the_flags_are_bools(name, reward):
+    for _, value, terminated, truncated, _ in rollout(TrackingEnv(short(name, 3), reward)):
+        assert type(value) is float
+        assert type(terminated) is bool
+        assert type(truncated) is bool
+        assert not terminated
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_episode_truncates_after_the_scenes_steps_and_then_needs_a_reset(name):
+    env = TrackingEnv(name)
+    truncated = [step[3] for step in rollout(env)]
+    assert truncated == [False] * SCENES[name].steps + [True]
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step(env.action_space.sample())
+    env.reset()
+    env.step(env.action_space.sample())
+
+
+def test_step_before_reset_is_refused():
+    env = TrackingEnv()
+    with pytest.raises(ResetNeeded, match="reset"):
+        env.step(0)
+
+
+def test_info_tells_the_truth_the_epoch_and_at_reset_the_prior():
+    steps = list(rollout(TrackingEnv(short("uwb_room", 3))))
+    assert [info["epoch"] for *_, info in steps] == [0, 1, 2, 3]
+    common = {"rotation", "translation", "nlos", "epoch", "score_m"}
+    prior = {"prior_rotation", "prior_translation", "prior_covariance"}
+    assert steps[0][4].keys() == common | prior
+    assert all(info.keys() == common for *_, info in steps[1:])
+    for *_, info in steps:
+        np.testing.assert_allclose(info["rotation"] @ info["rotation"].T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_ranges_are_those_of_the_true_pose_to_the_anchors_seen(name):
+    """Within 6 standard deviations of the distance, the anchors being where they are now."""
+    env = TrackingEnv(short(name))
+    tags = np.array(env.scene.tags)
+    for observation, *_, info in rollout(env, 11):
+        for m, n in np.ndindex(observation["ranges"].shape):
+            tag = info["rotation"] @ tags[n] + info["translation"]
+            distances = np.linalg.norm(
+                tags @ info["rotation"].T + info["translation"] - observation["anchors"][m], axis=1
+            )
+            variance = np.broadcast_to(env.scene.noise.variance(distances[None]), (1, len(tags)))
+            error = observation["ranges"][m, n] - np.linalg.norm(tag - observation["anchors"][m])
+            assert abs(error) < 6 * variance[0, n] ** 0.5
+
+
+# --- reward -----------------------------------------------------------------------------------
+
+
+def score_by_hand(P: np.ndarray, rotation: np.ndarray, tags: np.ndarray) -> float:
+    total = 0.0
+    for tag in tags:
+        J = np.zeros((3, 6))
+        J[:, :3] = np.cross(rotation @ tag, np.eye(3))  # row i: arm x e_i, that is -[arm]x
+        J[:, 3:] = np.eye(3)
+        total += np.trace(J @ P @ J.T)
+    return (total / len(tags)) ** 0.5
+
+
+@pytest.mark.parametrize("links", [{}, LOSSY], ids=["all links", "lost links"])
+@pytest.mark.parametrize("name", NAMES)
+def test_reward_is_minus_log_of_the_posterior_bound_along_the_truth(name, links):
+    env = TrackingEnv(short(name, links=links))
+    scene, tags = env.scene, np.array(env.scene.tags)
+    J = None
+    for k, (seen, reward, *_, info) in enumerate(rollout(env, 12)):
+        pose = info["rotation"], info["translation"]
+        if J is None:
+            J = np.linalg.inv(info["prior_covariance"]) + bounds.range_information(
+                seen["anchors"], tags, *pose, scene.noise, seen["links"]
+            )
+        else:
+            J = bounds.posterior_crb_step(
+                J, seen["anchors"], tags, *pose, scene.noise,
+                seen["twist"], scene.dt, scene.process, seen["links"],
+            )  # fmt: skip
+        b = score_by_hand(np.linalg.inv(J), info["rotation"], tags)
+        assert info["score_m"] == pytest.approx(b, rel=1e-9)
+        if k > 0:
+            assert reward == pytest.approx(-np.log(b), abs=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reward_none_is_zero_and_computes_no_score(name):
+    steps = list(rollout(TrackingEnv(short(name), reward="none"), 13))
+    assert [reward for _, reward, *_ in steps] == [0.0] * 13
+    assert not any("score_m" in info for *_, info in steps)
+
+
+def test_reward_has_no_influence_on_the_world():
+    both = [rollout(TrackingEnv(short("satellite"), reward=r), 14) for r in ("bound", "none")]
+    for a, b in zip(*both, strict=True):
+        assert_same(a[0], b[0])
+
+
+# --- actions ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_fixed_anchors_have_one_action_and_stay(name):
+    env = TrackingEnv(short(name))
+    assert env.action_space == spaces.Discrete(1)
+    first, *rest = (observation["anchors"] for observation, *_ in rollout(env, 15))
+    for anchors in rest:
+        np.testing.assert_array_equal(anchors, first)
+
+
+@pytest.mark.parametrize("name", MOVABLE)
+def test_movable_anchors_take_velocities(name):
+    env = TrackingEnv(name)
+    size = 3 * env.scene.n_anchors
+    assert env.action_space == spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+
+@pytest.mark.parametrize("name", MOVABLE)
+def test_zero_action_keeps_the_anchors(name):
+    env = TrackingEnv(short(name))
+    first = env.reset(seed=16)[0]["anchors"]
+    for _ in range(12):
+        seen = env.step(np.zeros(env.action_space.shape or (), np.float32))[0]["anchors"]
+        np.testing.assert_allclose(seen, first, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", MOVABLE)
+def test_a_full_action_moves_an_anchor_by_the_speed_limit_before_the_ranges_are_taken(name):
+    env = TrackingEnv(short(name))
+    first = env.reset(seed=17)[0]["anchors"]
+    action = np.zeros((env.scene.n_anchors, 3), np.float32)
+    action[0, 1] = action[1, 0] = 1.0
+    seen = env.step(action.ravel())[0]["anchors"]
+    step = env.scene.anchor_speed_m_s * env.scene.dt
+    np.testing.assert_allclose(seen - first, step * action, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "action",
+    [
+        np.zeros(11),
+        np.zeros((4, 3)),
+        np.zeros((1, 12)),
+        np.zeros((2, 12)),
+        0.0,
+        [np.nan] * 12,
+        [0.0] * 11 + [np.inf],
+        None,
+        "north",
+    ],
+    ids=["11", "4x3", "1x12", "2x12", "scalar", "nan", "inf", "None", "str"],
+)
+@pytest.mark.parametrize("reward", ["bound", "none"])
+def test_bad_action_is_named_and_changes_nothing(action, reward):
+    env, twin = (TrackingEnv(short("auv_buoys"), reward) for _ in range(2))
+    env.reset(seed=18)
+    twin.reset(seed=18)
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+    assert_same(env.step(np.ones(12)), twin.step(np.ones(12)))
+
+
+@pytest.mark.parametrize("action", [1, -1, np.zeros(18), None], ids=str)
+def test_action_that_fixed_anchors_do_not_have_is_named(action):
+    env = TrackingEnv("uwb_room")
+    env.reset(seed=19)
+    with pytest.raises(ValueError, match="action"):
+        env.step(action)
+
+
+# --- arguments --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scene", "named"),
+    [
+        ("nowhere", "scene must be one of .*'uwb_room'.*'nowhere'"),
+        (None, "scene"),
+        (5, "scene"),
+        ({}, "name"),
+        ({"steps": 5}, "name"),
+        ({"name": "nowhere"}, "nowhere"),
+        ({"name": "uwb_room", "stepz": 5}, "stepz.*steps"),
+        ({"name": "uwb_room", "steps": 0}, "steps"),
+        ({"name": "uwb_room", "steps": 5.0}, "steps"),
+        ({"name": "uwb_room", "dt": float("nan")}, "dt"),
+        ({"name": "uwb_room", "anchors": 5}, "anchors"),
+        ({"name": "uwb_room", "anchors": [[0, 0]]}, "anchors"),
+        ({"name": "uwb_room", "anchors": [[0, 0, float("inf")]]}, "anchors.*inf"),
+        ({"name": "uwb_room", "n_anchors": "six"}, "n_anchors"),
+        ({"name": "uwb_room", "links": None}, "links"),
+        ({"name": "uwb_room", "links": {"drop_probability": 2}}, "drop_probability"),
+        ({"name": "uwb_room", "links": {"drops": 0.1}}, "drops"),
+        ({"name": "uwb_room", "noise": {"kind": "loud"}}, "noise.kind.*loud"),
+        ({"name": "uwb_room", "noise": {"kind": "box", "low": [0] * 3, "high": [1] * 3}}, "noise"),
+        ({"name": "uwb_room", "process": {"rotation_rad": -1}}, "rotation_rad"),
+        ({"name": "uwb_room", "trajectory": "teleport"}, "trajectory.*teleport"),
+    ],
+    ids=str,
+)
+def test_bad_scene_is_named(scene, named):
+    with pytest.raises(ValueError, match=named):
+        TrackingEnv(scene)
+
+
+@pytest.mark.parametrize("reward", ["score", "", None, 1])
+def test_bad_reward_is_named(reward):
+    with pytest.raises(ValueError, match=f"reward must be one of 'bound', 'none', got {reward!r}"):
+        TrackingEnv(reward=reward)
+
+
+def test_bad_render_mode_is_named():
+    with pytest.raises(ValueError, match="render_mode must be None, got 'human'"):
+        TrackingEnv(render_mode="human")
+
+
+# --- links ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_lost_links_show_as_range_0_and_as_often_as_said(name):
+    env = TrackingEnv({"name": name, "steps": 40, "links": {"drop_probability": 0.25}})
+    seen = [observation for observation, *_ in rollout(env, 20)]
+    ranges = np.stack([observation["ranges"] for observation in seen])
+    links = np.stack([observation["links"] for observation in seen])
+    np.testing.assert_array_equal(ranges == 0, links == 0)
+    assert links.dtype == np.int8
+    assert np.mean(links == 0) == pytest.approx(0.25, abs=4 * (0.1875 / links.size) ** 0.5)
+
+
+def test_info_marks_reflected_paths():
+    env = TrackingEnv(short("uwb_room", links={"nlos_probability": 0.3, "nlos_bias_m": 50.0}))
+    for observation, *_, info in rollout(env, 21):
+        np.testing.assert_array_equal(info["nlos"], observation["ranges"] > 40)
+
+
+def test_no_link_at_all_is_a_world_too():
+    env = TrackingEnv(short("auv_buoys", links={"drop_probability": 1.0}))
+    scores = [info["score_m"] for *_, info in rollout(env, 22)]
+    assert (np.diff(scores) > 0).all()
