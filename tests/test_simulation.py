@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from rbl_gym import bounds, scenes, simulation
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
+from rbl_gym.regions import Box
 from rbl_gym.scenes import SCENES, Scene
 from rbl_gym.simulation import Episode
 
@@ -92,6 +93,8 @@ def test_same_seed_gives_the_same_bytes_and_another_seed_others(name):
     scene = change(name, links=BAD_LINKS)
     first, second, other = draw(scene, 5), draw(scene, 5), draw(scene, 6)
     for a, b in zip(first, second, strict=True):
+        assert a is not None
+        assert b is not None
         assert a.tobytes() == b.tobytes()
     assert first.normals.tobytes() != other.normals.tobytes()
     assert first.rotation.tobytes() != other.rotation.tobytes() or name == "icassp2013"
@@ -452,7 +455,7 @@ def test_zero_action_keeps_the_anchors(name):
 def test_anchors_move_as_commanded_and_no_faster_than_the_limit(name):
     scene = SCENES[name]
     rng = np.random.default_rng(17)
-    box = scenes.Box((-1e4,) * 3, (1e4,) * 3)
+    box = Box((-1e4, -1e4, -1e4), (1e4, 1e4, 1e4))
     free = dataclasses.replace(scene, anchor_region=box)
     anchors = draw(scene).anchors
     step = scene.anchor_speed_m_s * scene.dt

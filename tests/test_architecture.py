@@ -1,0 +1,232 @@
+"""The house: who may import whom, what an import costs, what stands where."""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
+PLAIN_MODELS = {
+    "rotations", "ranging", "bearing", "sensing_network", "bounds", "motion", "checks",
+}  # fmt: skip
+# numpy.random's names that are no global state.
+GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
+
+
+def import_name(file: Path) -> str:
+    """The name a file of the three folders is imported under."""
+    first, *rest = file.relative_to(ROOT).with_suffix("").parts
+    return ".".join([FOLDERS[first], *(part for part in rest if part != "__init__")])
+
+
+FILES = sorted(file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py"))
+MODULES = {import_name(file): file for file in FILES}
+TREES = {name: ast.parse(file.read_text(encoding="utf-8")) for name, file in MODULES.items()}
+
+
+def imports(name: str) -> set[str]:
+    """All modules a module imports, also inside functions; `from a import b` as a and a.b."""
+    found = set()
+    for node in ast.walk(TREES[name]):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module is not None
+            found.add(node.module)
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def within(imported: str, package: str) -> bool:
+    return imported == package or imported.startswith(f"{package}.")
+
+
+def modules_of(package: str) -> list[str]:
+    return [name for name in MODULES if within(name, package)]
+
+
+def run_python(code: str) -> list[str]:
+    """Lines of standard output of a fresh interpreter at the root of the checkout.
+
+    An installed copy or an editable install must not help it.
+    """
+    keep = "import sys; sys.meta_path[:] = [f for f in sys.meta_path if '__editable__' not in "
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", f"{keep}str(f)]\n{code}"],
+        cwd=ROOT,
+        env=variables,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def pyproject() -> dict:
+    return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+# --- packages ---------------------------------------------------------------------------------
+
+
+def test_packages_of_pyproject_are_those_of_the_tree():
+    tree = [import_name(file) for file in FILES if file.name == "__init__.py"]
+    assert sorted(pyproject()["tool"]["setuptools"]["packages"]) == sorted(tree)
+
+
+def test_every_module_stands_in_a_package():
+    for file in FILES:
+        assert (file.parent / "__init__.py").is_file(), file
+
+
+def test_package_directories_of_pyproject_are_the_three_folders():
+    mapping = pyproject()["tool"]["setuptools"]["package-dir"]
+    assert mapping == {name: folder for folder, name in FOLDERS.items()}
+
+
+def test_versions_of_pyproject_and_package_agree():
+    import rbl_gym
+
+    assert pyproject()["project"]["version"] == rbl_gym.__version__
+
+
+# --- who imports whom -------------------------------------------------------------------------
+
+WORLD = [
+    name
+    for name in MODULES
+    if not any(within(name, f"rbl_gym.{above}") for above in ("estimators", "wrappers", "app"))
+]
+
+
+@pytest.mark.parametrize("name", WORLD)
+def test_the_world_imports_neither_estimators_nor_wrappers_nor_the_app(name):
+    for above in ("estimators", "wrappers", "app"):
+        assert not [m for m in imports(name) if within(m, f"rbl_gym.{above}")]
+
+
+@pytest.mark.parametrize("name", modules_of("rbl_gym.estimators"))
+def test_estimators_import_only_the_plain_models(name):
+    ours = {m for m in imports(name) if within(m, "rbl_gym")} - {"rbl_gym"}
+    assert {m.split(".")[1] for m in ours} <= PLAIN_MODELS | {"estimators"}
+
+
+@pytest.mark.parametrize("name", modules_of("rbl_gym.wrappers"))
+def test_wrappers_do_not_import_the_app(name):
+    assert not [m for m in imports(name) if within(m, "rbl_gym.app")]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_are_absolute_and_by_the_one_name(name):
+    for node in ast.walk(TREES[name]):
+        assert not (isinstance(node, ast.ImportFrom) and node.level), f"line {node.lineno}"
+    bare = [m for m in imports(name) for folder in ("estimators", "wrappers") if within(m, folder)]
+    assert not bare
+
+
+def test_every_module_imports_alone_and_none_under_a_second_name():
+    lines = run_python(f"""
+import importlib, sys
+for name in {sorted(name for name in MODULES if not name.endswith("__main__"))}:
+    importlib.import_module(name)
+second = [m for m in sys.modules if m.split(".")[0] in ("estimators", "wrappers")]
+print(second)
+""")
+    assert lines == ["[]"]
+
+
+# --- what an import costs ---------------------------------------------------------------------
+
+
+def test_import_is_light():
+    heavy = ["matplotlib", "filterpy", "scipy.stats", "rich", "pandas", "torch"]
+    lines = run_python(f"""
+import sys, rbl_gym
+print([m for m in {heavy} if m in sys.modules])
+""")
+    assert lines == ["[]"]
+
+
+def test_environment_runs_without_the_estimators():
+    lines = run_python("""
+import sys, gymnasium
+env = gymnasium.make("rbl_gym:RBL/Tracking-v0")
+env.reset(seed=0)
+env.step(0)
+heavy = ("rbl_gym.estimators", "rbl_gym.wrappers", "rbl_gym.app", "filterpy", "matplotlib")
+print([m for m in heavy if m in sys.modules])
+""")
+    assert lines == ["[]"]
+
+
+def test_checkout_imports_from_its_root_without_installation():
+    lines = run_python("""
+import rbl_gym, rbl_gym.estimators, rbl_gym.wrappers, rbl_gym.app
+for module in (rbl_gym, rbl_gym.estimators, rbl_gym.wrappers, rbl_gym.app):
+    print(module.__file__)
+""")
+    folders = ["rbl_gym", "estimators", "wrappers", "rbl_gym/app"]
+    assert lines == [str(ROOT / folder / "__init__.py") for folder in folders]
+
+
+# --- what stands where ------------------------------------------------------------------------
+
+
+def random_names(tree: ast.Module) -> Iterator[str]:
+    """Everything used of numpy.random, however it was imported."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute):
+            inner = node.value
+            if inner.attr == "random" and getattr(inner.value, "id", "") in ("np", "numpy"):
+                yield node.attr
+        elif isinstance(node, ast.ImportFrom) and node.module == "numpy.random":
+            yield from (alias.name for alias in node.names)
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_no_global_randomness(name):
+    assert set(random_names(TREES[name])) <= GENERATORS
+    assert "random" not in imports(name)
+    for node in ast.walk(TREES[name]):
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "default_rng":
+            assert node.args, f"line {node.lineno}: a generator without a seed"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_no_module_is_longer_than_450_lines(name):
+    assert len(MODULES[name].read_text(encoding="utf-8").splitlines()) <= 450
+
+
+def undocumented(node: ast.Module | ast.ClassDef, path: str = "") -> Iterator[str]:
+    for child in node.body:
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            if child.name.startswith("_"):
+                continue
+            if not ast.get_docstring(child):
+                yield f"{path}{child.name}"
+            if isinstance(child, ast.ClassDef):
+                yield from undocumented(child, f"{child.name}.")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_everything_public_has_a_docstring(name):
+    assert list(undocumented(TREES[name])) == []
+    empty = not TREES[name].body
+    assert empty or ast.get_docstring(TREES[name])
+
+
+@pytest.mark.parametrize("command", ["make demo", "make test"])
+def test_readme_names_the_commands(command):
+    target = command.split()[1]
+    assert command in (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"\n{target}:" in (ROOT / "Makefile").read_text(encoding="utf-8")
