@@ -21,12 +21,14 @@ class Batched:
     def predict(
         mean: FloatArray, P: FloatArray, F: FloatArray, shift: FloatArray, Q: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance after ``x <- F x + [0; shift]``, ``P <- F P F^T + Q``."""
         mean = (F @ mean[..., None])[..., 0]
         mean[..., 9:] += shift
         return mean, symmetric(F @ P @ np.swapaxes(F, -1, -2)) + Q
 
     @staticmethod
     def update(mean: FloatArray, P: FloatArray, stat: Statistic) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance after an epoch."""
         matrix, vector = information(stat)
         P = symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
         innovation = vector[..., None] - matrix @ mean[..., None]
@@ -40,6 +42,7 @@ class FilterPy:
     def predict(
         cls, mean: FloatArray, P: FloatArray, F: FloatArray, shift: FloatArray, Q: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
+        """As `Batched.predict`."""
         kf = cls._filter(mean, P)
         kf.F, kf.Q = F, Q
         # Without B filterpy ignores u in silence.
@@ -51,6 +54,7 @@ class FilterPy:
     def update(
         cls, mean: FloatArray, P: FloatArray, stat: Statistic
     ) -> tuple[FloatArray, FloatArray]:
+        """As `Batched.update`, by filterpy's own gain and Joseph form."""
         kf = cls._filter(mean, P)
         z, H = compressed(stat)
         kf.R = np.eye(12)

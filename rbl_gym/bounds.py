@@ -70,7 +70,10 @@ def range_information(
     rotation = check_array("rotation", rotation, (3, 3))
     translation = check_array("translation", translation, (3,))
     mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
-    return information_at(anchors, tags, rotation, translation, noise, mask)
+    information = information_at(anchors, tags, rotation, translation, noise, mask)
+    if not np.isfinite(information).all():
+        raise ValueError("an anchor stands on a tag, where this noise law has no variance")
+    return information
 
 
 def information_at(
@@ -84,7 +87,9 @@ def information_at(
     """`range_information` on arrays that are known to be good (the environment's inner loop)."""
     positions = ranging.tag_positions(rotation, translation, tags)
     distance, unit = directions(anchors, positions)
-    weight = 1 / np.broadcast_to(noise.variance(distance), distance.shape)
+    # Where an anchor stands on a tag the range has no gradient: that link tells nothing.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(distance > 0, 1 / noise.variance(distance), 0.0)
     if links is not None:
         weight = weight * links
     per_tag = np.einsum("...mni,...mnj->...nij", weight[..., None] * unit, unit)
@@ -162,6 +167,8 @@ def posterior_crb_step(
     """
     J = check_array("J", J, (6, 6))
     twist = check_array("twist", twist, (6,))
+    if (check_array("dt", dt, ()) < 0).any():
+        raise ValueError(f"dt must not be negative, got {dt}")
     predicted = predict_information(J, twist, dt, process)
     return predicted + range_information(anchors, tags, rotation, translation, noise, links)
 
@@ -205,4 +212,6 @@ def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> Float
     J = tag_jacobian(np.asarray(rotation, dtype=np.float64), np.asarray(tags, dtype=np.float64))
     mean_square = np.einsum("...nia,...nib->...ab", J, J) / J.shape[-3]
     trace = np.einsum("...ab,...ab->...", mean_square, covariance)
-    return np.sqrt(np.maximum(trace, 0.0))
+    if not (trace >= 0).all():
+        raise ValueError(f"covariance must be positive and finite, got a trace of {trace.min()}")
+    return np.sqrt(trace)

@@ -59,7 +59,7 @@ def as_float(name: str, value: Any) -> FloatArray:
 
 def check_finite(name: str, array: FloatArray) -> FloatArray:
     """`array` unchanged, or a ValueError with the first entry that is NaN or inf."""
-    if not math.isfinite(array.sum()) and not np.isfinite(array).all():
+    if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name} must be finite, got {array[index]} at index {index}")
     return array
@@ -68,8 +68,10 @@ def check_finite(name: str, array: FloatArray) -> FloatArray:
 def check_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
     """`value` as a finite float in ``[low, high]``, or a ValueError that names it."""
     try:
+        if isinstance(value, (str, bytes)):
+            raise TypeError(type(value))
         number = float(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be a number, got {value!r:.80}") from error
     if not math.isfinite(number) or not low <= number <= high:
         bounds = f" in [{low:g}, {high:g}]" if low > -math.inf or high < math.inf else ""

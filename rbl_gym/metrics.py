@@ -63,5 +63,7 @@ def expected_mean_angular_error(covariance: FloatArray, rotation: FloatArray) ->
         across = [axis for axis in range(3) if axis != column]
         block = body[..., across, :][..., across]
         l2, l1 = np.moveaxis(np.linalg.eigvalsh(block), -1, 0)
-        lengths.append(np.sqrt(2 * l1 / np.pi) * special.ellipe(1 - l2 / l1))
+        l1, l2 = np.maximum(l1, 0.0), np.maximum(l2, 0.0)  # rounding, where one axis is still
+        ratio = l2 / np.where(l1 > 0, l1, 1.0)
+        lengths.append(np.sqrt(2 * l1 / np.pi) * special.ellipe(1 - ratio))
     return np.mean(lengths, axis=0)

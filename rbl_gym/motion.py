@@ -113,8 +113,12 @@ def simulate(
     twists = trajectory.twists
     if normals is not None:
         twists = twists + normals * (process.std() / np.sqrt(dt))
+    batch = np.broadcast_shapes(
+        trajectory.rotation.shape[:-2], trajectory.translation.shape[:-1], twists.shape[:-2]
+    )
+    twists = np.broadcast_to(twists, (*batch, *twists.shape[-2:]))
     steps = rotations.exp(twists[..., :3] * dt)
-    rotation = np.empty((*steps.shape[:-3], steps.shape[-3] + 1, 3, 3))
+    rotation = np.empty((*batch, steps.shape[-3] + 1, 3, 3))
     rotation[..., 0, :, :] = trajectory.rotation
     for k in range(steps.shape[-3]):
         np.matmul(steps[..., k, :, :], rotation[..., k, :, :], out=rotation[..., k + 1, :, :])
@@ -160,6 +164,8 @@ def random_twist(
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     steps, hold = _check_steps(steps), _check_steps(hold, "hold")
+    speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
+    turn_rate_rad_s = check_number("turn_rate_rad_s", turn_rate_rad_s, low=0.0)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     directions = rng.standard_normal((*batch, -(-steps // hold), 2, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -207,15 +213,17 @@ def waypoints(
     start = np.take_along_axis(points, leg[..., None], axis=-2)
     stop = np.take_along_axis(points, leg[..., None] + 1, axis=-2)
     velocity = np.diff(start + fraction * (stop - start), axis=-2) / dt
-    spin = np.broadcast_to(spin[..., None, :], velocity.shape)
-    return Trajectory(rotation, points[..., 0, :], np.concatenate([spin, velocity], axis=-1))
+    twists = np.concatenate(np.broadcast_arrays(spin[..., None, :], velocity), axis=-1)
+    return Trajectory(rotation, points[..., 0, :], twists)
 
 
 def lawn_mower_points(low: ArrayLike, high: ArrayLike, spacing_m: float) -> FloatArray:
     """Way-points (K, 3) of parallel lanes along x, `spacing_m` apart, at the mid height."""
     low, high = check_array("low", low, (3,)), check_array("high", high, (3,))
     spacing_m = check_number("spacing_m", spacing_m, low=1e-9)
-    lanes = max(int(np.floor((high[1] - low[1]) / spacing_m)) + 1, 1)
+    if (low > high).any():
+        raise ValueError(f"low must not lie above high, got low {low}, high {high}")
+    lanes = int(np.floor((high[1] - low[1]) / spacing_m + 1e-9)) + 1
     y = np.repeat(low[1] + spacing_m * np.arange(lanes), 2)
     x = np.where(np.arange(2 * lanes) % 4 % 3 == 0, low[0], high[0])
     return np.stack([x, y, np.full(2 * lanes, 0.5 * (low[2] + high[2]))], axis=-1)
@@ -234,10 +242,11 @@ def orbit(
     radius_m = check_number("radius_m", radius_m, low=1e-9)
     dt = check_number("dt", dt, low=1e-12)
     rate = check_number("speed_m_s", speed_m_s, low=0.0) / radius_m
-    angle = np.asarray(phase, float)[..., None] + rate * dt * np.arange(_check_steps(steps) + 1)
+    steps = _check_steps(steps)
+    angle = check_array("phase", phase, ())[..., None] + rate * dt * np.arange(steps + 1)
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
     places = centre[..., None, :] + radius_m * circle
-    twists = np.zeros((*angle.shape[:-1], steps, 6))
+    twists = np.zeros((*places.shape[:-2], steps, 6))
     twists[..., 2] = rate
     twists[..., 3:] = np.diff(places, axis=-2) / dt
     heading = np.zeros((*angle.shape[:-1], 3))
@@ -262,6 +271,11 @@ def recorded(
     translation = check_array("translation", translation, ("L", 3))
     if times.ndim != 1 or len(times) < 2 or (np.diff(times) <= 0).any():
         raise ValueError("times must be (L,) with L >= 2 and strictly increasing")
+    for name, value, shape in (
+        ("rotation", rotation, (len(times), 3, 3)), ("translation", translation, (len(times), 3))
+    ):  # fmt: skip
+        if value.shape != shape:
+            raise ValueError(f"{name} must have shape {shape} as times, got {value.shape}")
     dt = check_number("dt", dt, low=1e-12)
     at = np.arange(times[0], times[-1] + 1e-9 * dt, dt)
     if len(at) < 2:
@@ -285,6 +299,6 @@ def interpolate(
 
 
 def _check_steps(steps: int, name: str = "steps") -> int:
-    if steps != int(steps) or steps < 1:
+    if not isinstance(steps, (int, float, np.number)) or steps < 1 or steps % 1 != 0:
         raise ValueError(f"{name} must be a positive int, got {steps!r}")
     return int(steps)

@@ -9,6 +9,7 @@ recognise the papers' case.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -64,8 +65,9 @@ class RangeNoise:
         check_number("proportional", self.proportional, low=0.0)
         if self.floor_m == 0 and self.proportional == 0:
             raise ValueError("floor_m and proportional must not both be zero: noise-free ranges")
-        if self.reference_tag is not None and self.reference_tag != int(self.reference_tag):
-            raise ValueError(f"reference_tag must be None or an int, got {self.reference_tag!r}")
+        tag = self.reference_tag
+        if tag is not None and (isinstance(tag, bool) or not isinstance(tag, Integral)):
+            raise ValueError(f"reference_tag must be None or an int, got {tag!r}")
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
         """Variance of the ranges [m^2]; see `NoiseLaw`."""
@@ -170,7 +172,8 @@ def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None
     reference = ranges[..., tag : tag + 1 or None]
     if links is None or links.all():
         return reference
-    links = np.broadcast_to(links, ranges.shape)
+    ranges, links = np.broadcast_arrays(ranges, links)
+    reference = ranges[..., tag : tag + 1 or None]
     count = links.sum(axis=-1, keepdims=True)
     mean = np.where(links, ranges, 0.0).sum(axis=-1, keepdims=True) / np.maximum(count, 1)
     stand_in = np.where(count > 0, mean, 1.0)

@@ -34,6 +34,8 @@ class Region(Protocol):
 def _check_corners(region: Box | Walls, *, flat: bool) -> None:
     for name in ("low", "high"):
         value = check_array(name, getattr(region, name), (3,))
+        if value.ndim != 1:
+            raise ValueError(f"{name} must have no leading axes, got shape {value.shape}")
         object.__setattr__(region, name, tuple(value.tolist()))
     if any(h < lo or (h == lo and not flat) for lo, h in zip(region.low, region.high, strict=True)):
         raise ValueError(f"low must lie below high, got low {region.low}, high {region.high}")
@@ -96,8 +98,13 @@ class Walls:
     def project(self, points: FloatArray) -> FloatArray:
         """The nearest point of a wall or the ceiling."""
         inside = np.clip(points, *self.bounds())
-        gaps = np.stack([np.abs(inside[..., a] - v) for a, v in self._faces()], axis=-1)
-        face = np.argmin(gaps, axis=-1)
+        outside = (points - inside) ** 2
+        squares = outside.sum(axis=-1)
+        # Squared distance to each surface; below the floor the nearest gap alone misleads.
+        distances = [
+            squares - outside[..., a] + (points[..., a] - v) ** 2 for a, v in self._faces()
+        ]
+        face = np.argmin(np.stack(distances, axis=-1), axis=-1)
         for index, (axis, value) in enumerate(self._faces()):
             inside[..., axis] = np.where(face == index, value, inside[..., axis])
         return inside
@@ -115,8 +122,8 @@ class Shell:
     outer_m: float
 
     def __post_init__(self) -> None:
-        check_number("inner_m", self.inner_m, low=0.0)
-        check_number("outer_m", self.outer_m, low=self.inner_m)
+        inner_m = check_number("inner_m", self.inner_m, low=0.0)
+        check_number("outer_m", self.outer_m, low=inner_m)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """The cube around the outer sphere."""

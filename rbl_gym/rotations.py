@@ -214,7 +214,7 @@ def random(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> FloatArray:
 def check_rotation(name: str, Q: ArrayLike, *, tolerance: float = 1e-6) -> FloatArray:
     """`Q` as float64 (..., 3, 3) proper rotations, or a ValueError that says what is wrong."""
     Q = check_array(name, Q, (3, 3))
-    defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max()
+    defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max(initial=0.0)
     if defect > tolerance:
         raise ValueError(f"{name} must be orthogonal, Q Q^T is off the identity by {defect:.3g}")
     if (np.linalg.det(Q) < 0).any():

@@ -19,6 +19,12 @@ from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box, Region, Shell, Walls
 
+_REGIONS = {"box": Box, "walls": Walls, "shell": Shell}
+_NOISES = {"range": RangeNoise, "squared-range": SquaredRangeNoise}
+_FIELD_KINDS: dict[str, tuple[type, ...]] = {
+    "volume": (Box,), "anchor_region": tuple(_REGIONS.values()), "noise": tuple(_NOISES.values()),
+    "process": (ProcessNoise,), "links": (LinkModel,),
+}  # fmt: skip
 TRAJECTORIES = ("waypoints", "constant", "random-twist", "orbit", "lawn-mower")
 Points = tuple[tuple[float, float, float], ...]
 
@@ -82,6 +88,9 @@ class Scene:
     prior: str = "drawn"
 
     def __post_init__(self) -> None:
+        for name, kinds in _FIELD_KINDS.items():
+            if not isinstance(getattr(self, name), kinds):
+                raise ValueError(f"{name} must be {_names(kinds)}, got {getattr(self, name)!r:.80}")
         check_number("dt", self.dt, low=1e-9)
         for name in ("initial_rotation_rad", "initial_translation_m"):
             check_number(name, getattr(self, name), low=1e-9)
@@ -97,13 +106,15 @@ class Scene:
             "tags": ("N", 3), "anchors": ("M", 3), "twist": (6,), "start_translation": (3,),
         }  # fmt: skip
         for name, shape in shapes.items():
-            if getattr(self, name) is not None:
+            if name == "tags" or getattr(self, name) is not None:
                 value = check_array(name, getattr(self, name), shape)
                 if value.ndim != len(shape):
                     raise ValueError(f"{name} must have no leading axes, got shape {value.shape}")
                 object.__setattr__(self, name, _tuples(value))
         if self.start_rotation is not None:
             value = rotations.check_rotation("start_rotation", self.start_rotation)
+            if value.ndim != 2:
+                raise ValueError(f"start_rotation must have no leading axes, got {value.shape}")
             object.__setattr__(self, "start_rotation", _tuples(value))
         if self.anchors is not None and len(self.anchors) != self.n_anchors:
             raise ValueError(
@@ -123,14 +134,19 @@ class Scene:
     def range_limit_m(self) -> float:
         """A range that no measurement of this scene exceeds (measurements are clipped to it)."""
         duration = self.steps * self.dt
-        corners = np.array([*self.volume.bounds(), *self.anchor_region.bounds()])
+        places = (*(self.anchors or ()), *filter(None, [self.start_translation]))
+        corners = np.array([*self.volume.bounds(), *self.anchor_region.bounds(), *places])
         extent = float(np.linalg.norm(np.ptp(corners, axis=0)))
         speed = max(self.speed_m_s, float(np.linalg.norm(self.twist[3:])))
         body = float(np.linalg.norm(self.tags, axis=-1).max())
         spread = 10 * float(self.process.std()[3:].max()) * math.sqrt(duration)
-        reach = np.array([[extent + speed * (duration + self.dt) + spread + body]])
+        reach = np.full((1, len(self.tags)), extent + speed * (duration + self.dt) + spread + body)
         noise = 10 * float(np.sqrt(self.noise.variance(reach).max()))
         return float(reach[0, 0]) + noise + self.links.nlos_bias_m
+
+
+def _names(kinds: tuple[type, ...]) -> str:
+    return " or ".join(kind.__name__ for kind in kinds)
 
 
 def _tuples(value: FloatArray) -> Any:
@@ -289,7 +305,7 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         changes["anchors"] = None
     anchors = changes.get("anchors")
     if anchors is not None:
-        changes.setdefault("n_anchors", len(anchors))
+        changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))
     return _replace(base, changes, "scene")
 
 
@@ -313,11 +329,13 @@ def _replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
 
 
 def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
-    kinds = {**_REGIONS, **_NOISES}
+    kinds = next((k for k in (_REGIONS, _NOISES) if isinstance(old, tuple(k.values()))), {})
     if "kind" not in value:
         if not dataclasses.is_dataclass(old):
             raise ValueError(f"{path} is not a nested field, got a dict {dict(value)!r:.80}")
         return _replace(old, value, path)
+    if not kinds:
+        raise ValueError(f"{path} comes in one kind only, got kind {value['kind']!r}")
     kind = kinds[check_one_of(f"{path}.kind", value["kind"], list(kinds))]
     try:
         return kind(**{key: item for key, item in value.items() if key != "kind"})

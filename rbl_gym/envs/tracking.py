@@ -117,8 +117,10 @@ class TrackingEnv(gym.Env[Any, Any]):
         if self._episode is None or self._epoch >= self.scene.steps:
             raise gym.error.ResetNeeded("the episode is over or never began: call reset()")
         if self.scene.anchor_speed_m_s > 0:
-            velocities = check_array("action", action, (3 * self.scene.n_anchors,))
+            velocities = check_action(action, 3 * self.scene.n_anchors)
             self._anchors = simulation.move_anchors(self.scene, self._anchors, velocities)
+        elif not self.action_space.contains(action):
+            raise ValueError(f"action must be 0 where the anchors are fixed, got {action!r:.80}")
         self._epoch += 1
         observation, info, reward = self._observe(self._episode)
         return observation, reward, False, self._epoch >= self.scene.steps, info
@@ -151,6 +153,14 @@ class TrackingEnv(gym.Env[Any, Any]):
         return observation, info, reward
 
 
+def check_action(action: ArrayLike, size: int) -> FloatArray:
+    """An action as a finite vector of its size, or a ValueError."""
+    array = check_array("action", action, (size,))
+    if array.ndim != 1:
+        raise ValueError(f"action must have shape ({size},), got {array.shape}")
+    return array
+
+
 def observation_space(scene: scenes.Scene) -> spaces.Dict:
     """Finite bounds of a scene's observations."""
     links = (scene.n_anchors, len(scene.tags))
@@ -161,8 +171,8 @@ def observation_space(scene: scenes.Scene) -> spaces.Dict:
     # check_env wants room between the bounds; a water surface has none.
     low, high = np.where(high > low, low, low - 1), np.where(high > low, high, high + 1)
     twist = np.abs(scene.twist)
-    # No sampled rotation turns by more than pi a step.
-    twist[:3] = np.maximum(twist[:3], np.pi / scene.dt)
+    # Ten standard deviations of the drawn turn rate; an orbit of 1 m is the tightest.
+    twist[:3] = np.maximum(twist[:3], max(10 * scene.spin_rad_s, np.pi / scene.dt, scene.speed_m_s))
     twist[3:] = np.maximum(twist[3:], scene.speed_m_s) + 1e-9
     return spaces.Dict(
         {
