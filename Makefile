@@ -31,7 +31,7 @@ wheel: .venv/dev.stamp
 	$(BIN)/python -m build --wheel --outdir dist .
 	$(BIN)/python -m venv .venv/smoke
 	.venv/smoke/bin/python -m pip install --quiet "$$(ls dist/*.whl)[cli]"
-	cd /tmp && "$(CURDIR)/.venv/smoke/bin/python" -W error "$(CURDIR)/tests/smoke.py"
+	cd "$${TMPDIR:-/tmp}" && "$(CURDIR)/.venv/smoke/bin/python" -W error "$(CURDIR)/tests/smoke.py"
 
 clean:
 	rm -rf .venv build dist out *.egg-info .pytest_cache .ruff_cache
