@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym import bounds, ranging, rotations
+from rbl_gym import bounds, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.belief import PoseBelief, inverse
 from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
 from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
+from rbl_gym.estimators.range_cost import RangeCost, huber, pick
 from rbl_gym.estimators.squared_range import statistic
 from rbl_gym.motion import ProcessNoise, propagate
 from rbl_gym.ranging import NoiseLaw
@@ -116,15 +117,16 @@ class IteratedEkf:
         weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
         if mask is not None:
             weights = weights * mask
-        problem = MapProblem(state, inverse(state.covariance), ranges, weights, anchors, self.tags,
-                             HUBER if self.robust else None)  # fmt: skip
+        loss = huber(HUBER) if self.robust else None
+        data = RangeCost(ranges, weights, anchors, self.tags, loss)
+        problem = MapProblem(state, inverse(state.covariance), data)
         start = state.rotation, state.translation
         variance = np.linalg.eigvalsh(state.covariance[..., :3, :3])[..., -1]
         vague = variance > VAGUE_ROTATION_RAD**2
         if vague.any():
             _check_determined(anchors, self.tags)
             start = global_start(problem, vague)
-        solution = minimize_pose(problem.linearize, *start, iterations=self.iterations)
+        solution = minimize_pose(problem, *start, iterations=self.iterations)
         return PoseState(solution.rotation, solution.translation, inverse(solution.at.hessian))
 
     def belief(self, state: PoseState) -> PoseBelief:
@@ -137,42 +139,17 @@ class IteratedEkf:
 class MapProblem:
     """Maximum a posteriori pose of one epoch; arrays with leading batch axes.
 
-    Cost: half the squared whitened range residuals (or Huber's loss of them) plus half the
-    prior's Mahalanobis distance, residual ``(log(Q Q_pred^T), t - t_pred)``.
+    Cost: that of the ranges plus half the prior's Mahalanobis distance, residual
+    ``(log(Q Q_pred^T), t - t_pred)``.
     """
 
     prior: PoseState
     prior_information: FloatArray
-    ranges: FloatArray
-    weights: FloatArray
-    anchors: FloatArray
-    tags: FloatArray
-    huber: float | None = None
+    data: RangeCost
 
-    def linearize(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
+    def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
-        positions = ranging.tag_positions(rotation, translation, self.tags)
-        distance, unit = bounds.directions(self.anchors, positions)
-        residual = distance - self.ranges
-        weights = self.weights
-        if self.huber is None:
-            cost = 0.5 * np.einsum("...mn,...mn->...", weights, residual**2)
-        else:
-            whitened = np.abs(residual) * np.sqrt(weights)
-            factor = self.huber / np.maximum(whitened, self.huber)
-            weights = weights * factor
-            # Huber: x^2 / 2 inside, k x - k^2 / 2 outside; factor = min(1, k / x).
-            cost = (factor * whitened**2 - 0.5 * (factor * whitened) ** 2).sum(axis=(-2, -1))
-        weighted = weights[..., None] * unit
-        J = bounds.tag_jacobian(rotation, self.tags)
-        hessian = bounds.lift(J, np.einsum("...mni,...mnj->...nij", weighted, unit))
-        per_tag = np.einsum("...mni,...mn->...ni", weighted, residual)
-        gradient = np.einsum("...nia,...ni->...a", J, per_tag)
-        return self._add_prior(rotation, translation, Linearization(cost, gradient, hessian))
-
-    def _add_prior(
-        self, rotation: FloatArray, translation: FloatArray, data: Linearization
-    ) -> Linearization:
+        data = self.data(rotation, translation)
         turn = rotations.error(rotation, self.prior.rotation)
         shift = translation - self.prior.translation
         error = np.concatenate(np.broadcast_arrays(turn, shift), axis=-1)
@@ -189,24 +166,12 @@ class MapProblem:
 
     def take(self, where: BoolArray) -> MapProblem:
         """The trials of a mask (...) on one flat axis, with a further axis of 1 for starts."""
-
-        def pick(array: FloatArray, trailing: int) -> FloatArray:
-            shape = (*where.shape, *array.shape[array.ndim - trailing :])
-            return np.broadcast_to(array, shape)[where][:, None]
-
-        return MapProblem(
-            PoseState(
-                pick(self.prior.rotation, 2),
-                pick(self.prior.translation, 1),
-                pick(self.prior.covariance, 2),
-            ),
-            pick(self.prior_information, 2),
-            pick(self.ranges, 2),
-            pick(self.weights, 2),
-            pick(self.anchors, 2),
-            self.tags,
-            self.huber,
+        prior = PoseState(
+            pick(self.prior.rotation, where, 2),
+            pick(self.prior.translation, where, 1),
+            pick(self.prior.covariance, where, 2),
         )
+        return MapProblem(prior, pick(self.prior_information, where, 2), self.data.take(where))
 
 
 def _octahedral_rotation_vectors() -> FloatArray:
@@ -231,12 +196,13 @@ def global_start(problem: MapProblem, vague: BoolArray) -> tuple[FloatArray, Flo
     the translation that the squared ranges and the prior imply (a linear problem), then a few
     Gauss-Newton steps on the full cost.
     """
-    batch = np.broadcast_shapes(vague.shape, problem.ranges.shape[:-2], problem.anchors.shape[:-2])
+    data = problem.data
+    batch = np.broadcast_shapes(vague.shape, data.ranges.shape[:-2], data.anchors.shape[:-2])
     vague = np.broadcast_to(vague, batch)
     part = problem.take(vague)
     rotation = _spread(part.prior)
     translation = _translation_given(rotation, part)
-    solution = minimize_pose(part.linearize, rotation, translation, iterations=12, tolerance=1e-6)
+    solution = minimize_pose(part, rotation, translation, iterations=12, tolerance=1e-6)
     best = np.argmin(solution.at.cost, axis=-1)
     row = np.arange(len(best))
     start_rotation = np.broadcast_to(problem.prior.rotation, (*batch, 3, 3)).copy()
@@ -256,11 +222,12 @@ def _spread(prior: PoseState) -> FloatArray:
 
 def _translation_given(rotation: FloatArray, problem: MapProblem) -> FloatArray:
     """Translation of the linear squared-range model with its prior, the rotation given."""
+    data = problem.data
     # To first order var(r^2) = 4 r^2 var(r).
-    scale = 4 * np.where(problem.weights > 0, problem.ranges, 1.0) ** 2
-    stat = statistic(problem.ranges, problem.anchors, problem.tags, problem.weights / scale)
+    scale = 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
+    stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale)
     information = inverse(problem.prior.covariance[..., 3:, 3:])
-    turned = problem.tags @ np.swapaxes(rotation, -1, -2)
+    turned = data.tags @ np.swapaxes(rotation, -1, -2)
     per_tag = stat.b - (stat.G @ turned[..., None])[..., 0]
     right = (information @ problem.prior.translation[..., None])[..., 0] + per_tag.sum(axis=-2)
     return np.linalg.solve(information + stat.G.sum(axis=-3), right[..., None])[..., 0]

@@ -120,9 +120,29 @@ class Scene:
             raise ValueError(
                 f"anchors must hold n_anchors = {self.n_anchors} places, got {len(self.anchors)}"
             )
+        self._check_trajectory()
+        if self.anchors is not None and self.anchor_speed_m_s > 0:
+            moved = np.abs(self.anchor_region.project(np.array(self.anchors)) - self.anchors)
+            if moved.max() > 1e-6:
+                raise ValueError(
+                    f"anchors that move must start in their region, got one {moved.max():g} m off"
+                )
         reference = getattr(self.noise, "reference_tag", None)
         if reference is not None and not 0 <= reference < len(self.tags):
             raise ValueError(f"reference_tag must be below {len(self.tags)} tags, got {reference}")
+
+    def _check_trajectory(self) -> None:
+        """An orbit and a lawn-mower bring their own start, and need a volume to be in."""
+        if self.trajectory not in ("orbit", "lawn-mower"):
+            return
+        stated = "start_translation" if self.start_translation is not None else None
+        if self.trajectory == "orbit" and self.start_rotation is not None:
+            stated = "start_rotation"
+        if stated is not None:
+            raise ValueError(f"{stated} must be None for trajectory {self.trajectory!r}")
+        low, high = self.volume.bounds()
+        if not (high > low)[:2].all():
+            raise ValueError(f"volume must have an extent in x and y for {self.trajectory!r}")
 
     @property
     def prior_covariance(self) -> FloatArray:

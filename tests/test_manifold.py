@@ -9,6 +9,7 @@ from rbl_gym import bodies, bounds, estimators, metrics, motion, ranging, rotati
 from rbl_gym.estimators.belief import inverse
 from rbl_gym.estimators.levenberg_marquardt import minimize_pose
 from rbl_gym.estimators.manifold import MapProblem, PoseState
+from rbl_gym.estimators.range_cost import RangeCost, huber
 from tests.helpers import load, random_world, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
@@ -58,45 +59,45 @@ def test_the_papers_vague_prior_finds_the_reference_pose_by_itself():
     np.testing.assert_allclose(state.translation, first["IEKF6raw"]["t"], atol=1e-5)
 
 
-@pytest.mark.parametrize("huber", [None, 1.5])
-def test_gradient_and_hessian_by_finite_differences(huber):
+@pytest.mark.parametrize(("threshold", "tag_variance"), [(None, 0.0), (1.5, 0.0), (None, 0.01)])
+def test_gradient_and_hessian_by_finite_differences(threshold, tag_variance):
     rng = np.random.default_rng(1)
     anchors, tags, rotation, translation = random_world(rng, 5, 4)
     ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
     ranges[1, 2] += 3.0
     P = np.diag([0.3, 0.2, 0.4, 1.0, 2.0, 3.0])
     off = rotations.exp(0.3 * rng.standard_normal(3)) @ rotation
+    weights = 1 / NOISE.variance(ranges) * (rng.random((5, 4)) > 0.2)
+    loss = None if threshold is None else huber(threshold)
+    prior = PoseState(off, translation + 0.2, P)
+    positions = ranging.tag_positions(off, translation, tags)
+    unit = bounds.directions(anchors, positions)[1] if tag_variance else None
     problem = MapProblem(
-        PoseState(off, translation + 0.2, P),
-        inverse(P),
-        ranges,
-        1 / NOISE.variance(ranges) * (rng.random((5, 4)) > 0.2),
-        anchors,
-        tags,
-        huber,
+        prior, inverse(P), RangeCost(ranges, weights, anchors, tags, loss, tag_variance, unit)
     )
-    at = problem.linearize(rotation, translation)
+    at = problem(rotation, translation)
     step = 1e-5
 
     def moved(error):
-        return problem.linearize(rotations.exp(error[:3]) @ rotation, translation + error[3:])
+        return problem(rotations.exp(error[:3]) @ rotation, translation + error[3:])
 
     for axis in range(6):
         d = step * np.eye(6)[axis]
         numeric = (moved(d).cost - moved(-d).cost) / (2 * step)
         np.testing.assert_allclose(at.gradient[axis], numeric, rtol=1e-6, atol=1e-4)
-    if huber is None:
+    if threshold is None:
         # Without residuals the Gauss-Newton Hessian is the exact one.
-        exact = problem.__class__(
-            PoseState(rotation, translation, P), inverse(P),
-            ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags)),
-            problem.weights, anchors, tags,
-        )  # fmt: skip
-        hessian = exact.linearize(rotation, translation).hessian
+        true = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
+        exact = MapProblem(
+            PoseState(rotation, translation, P),
+            inverse(P),
+            RangeCost(true, weights, anchors, tags, None, tag_variance, unit),
+        )
+        hessian = exact(rotation, translation).hessian
         for axis in range(6):
             d = step * np.eye(6)[axis]
-            plus = exact.linearize(rotations.exp(d[:3]) @ rotation, translation + d[3:])
-            minus = exact.linearize(rotations.exp(-d[:3]) @ rotation, translation - d[3:])
+            plus = exact(rotations.exp(d[:3]) @ rotation, translation + d[3:])
+            minus = exact(rotations.exp(-d[:3]) @ rotation, translation - d[3:])
             numeric = (plus.gradient - minus.gradient) / (2 * step)
             np.testing.assert_allclose(hessian[axis], numeric, atol=1e-4 * np.abs(hessian).max())
 
@@ -128,13 +129,11 @@ def test_vague_priors_reach_the_global_optimum_of_brute_force():
     P = np.diag([50.0] * 3 + [100.0] * 3)
     filter = make(tags)
     state = filter.update(filter.initial(np.eye(3), np.zeros((100, 3)), P), ranges, anchors)
-    problem = MapProblem(
-        PoseState(np.eye(3), np.zeros(3), P), inverse(P), ranges[:, None],
-        (1 / NOISE.variance(ranges))[:, None], anchors[:, None], tags,
-    )  # fmt: skip
+    data = RangeCost(ranges[:, None], (1 / NOISE.variance(ranges))[:, None], anchors[:, None], tags)
+    problem = MapProblem(PoseState(np.eye(3), np.zeros(3), P), inverse(P), data)
     starts = rotations.random(rng, (100,))
-    brute = minimize_pose(problem.linearize, starts, translation[:, None], 30).at.cost.min(axis=1)
-    found = problem.linearize(state.rotation[:, None], state.translation[:, None]).cost[:, 0]
+    brute = minimize_pose(problem, starts, translation[:, None], 30).at.cost.min(axis=1)
+    found = problem(state.rotation[:, None], state.translation[:, None]).cost[:, 0]
     assert (found <= brute + 1e-6).all()
     error = metrics.pose_error(state.rotation, state.translation, rotation, translation)
     mean = metrics.nees(error, state.covariance).mean()

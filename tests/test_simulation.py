@@ -191,10 +191,12 @@ def test_body_stays_in_its_volume(name, trajectory):
     """Exactly without process noise; with it, within 6 standard deviations of its walk."""
     low, high = SCENES[name].volume.bounds()
     fields = {"trajectory": trajectory, "speed_m_s": max(SCENES[name].speed_m_s, 0.3)}
-    exact = draw(without_process(name, **fields, start_translation=None), 4, (20,)).translation
+    exact = draw(
+        without_process(name, **fields, start_translation=None, start_rotation=None), 4, (20,)
+    ).translation
     assert (exact >= low - 1e-9).all()
     assert (exact <= high + 1e-9).all()
-    scene = change(name, **fields, start_translation=None)
+    scene = change(name, **fields, start_translation=None, start_rotation=None)
     margin = 6 * scene.process.std()[3] * (scene.steps * scene.dt) ** 0.5 + 1e-9
     walked = draw(scene, 4, (20,)).translation
     assert (walked >= low - margin).all()
@@ -208,6 +210,25 @@ def test_random_twist_stays_within_reach_of_its_start(name):
     travelled = np.linalg.norm(translation - translation[:, :1], axis=-1)
     assert (travelled <= 2.0 * scene.dt * np.arange(scene.steps + 1) + 1e-9).all()
     assert travelled.max() > 2.0 * scene.dt * 10 - 1e-9  # ten steps straight on, at least
+
+
+@pytest.mark.parametrize("trajectory", scenes.TRAJECTORIES)
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("start_translation", (5.0, 4.0, 1.0)),
+        ("start_rotation", scenes.get("camsap2013").start_rotation),
+    ],
+)
+def test_a_stated_start_is_kept_or_refused(trajectory, field, value):
+    """On every trajectory; it is never passed over in silence."""
+    overrides = {"name": "uwb_room", "trajectory": trajectory, field: value}
+    try:
+        episode = draw(scenes.get(overrides))
+    except ValueError:
+        return
+    start = {"start_translation": episode.translation, "start_rotation": episode.rotation}[field]
+    np.testing.assert_allclose(start[0], value, atol=1e-12)
 
 
 @pytest.mark.parametrize("steps", [100, 2000])
@@ -451,6 +472,16 @@ def test_zero_action_keeps_the_anchors(name):
     np.testing.assert_allclose(moved, anchors, rtol=0, atol=1e-12)
 
 
+def test_zero_action_keeps_anchors_that_stand_outside_their_region_or_the_scene_is_refused():
+    anchors = [[250, 0, 0], [0, 250, 0], [-250, 0, 0], [0, -250, 5]]
+    try:
+        scene = scenes.get({"name": "auv_buoys", "anchors": anchors})
+    except ValueError:
+        return
+    moved = simulation.move_anchors(scene, draw(scene).anchors, np.zeros(12))
+    np.testing.assert_allclose(moved, anchors)
+
+
 @pytest.mark.parametrize("name", MOVABLE)
 def test_anchors_move_as_commanded_and_no_faster_than_the_limit(name):
     scene = SCENES[name]
@@ -520,7 +551,9 @@ def information_by_hand(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_posterior_information_equals_a_naive_recursion_and_that_of_bounds(name):
-    scene = change(name, steps=6, links=LinkModel(drop_probability=0.3))
+    std = SCENES[name].process.std() * [1, 4, 0.2, 1, 2, 0.5]  # every axis its own
+    process = ProcessNoise(tuple(std[:3]), tuple(std[3:]))
+    scene = change(name, steps=6, links=LinkModel(drop_probability=0.3), process=process)
     episode = draw(scene, 19)
     rng = np.random.default_rng(19)
     anchors = episode.anchors
