@@ -1,11 +1,17 @@
-"""Weighted orthogonal Procrustes: the rotation that fits a 9-vector in a given 9 x 9 weight."""
+"""The static paper's estimators on squared ranges: LS, LS-projected, CLS, weighted Procrustes.
+
+All read the statistic of an epoch (`squared_range`) and broadcast over leading axes. Where the
+links of a trial do not determine a solution, its entries are NaN; the caller must look.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rbl_gym import rotations
+from rbl_gym.bounds import information_rank
 from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.squared_range import Statistic, information
 
 # The generators of SO(3): E[i] = [e_i]x.
 _E = rotations.hat(np.eye(3))
@@ -77,3 +83,82 @@ def procrustes(
         if (length[..., 0] < 1e-13).all():
             break
     return Q, cost
+
+
+def linear_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
+    """LS: the unconstrained 3 x 3 matrix and translation, eq. (14) of the static paper."""
+    matrix, vector = information(stat)
+    x = _solve(matrix, vector)
+    return unvec(x[..., :9]), x[..., 9:]
+
+
+def translation_fit(stat: Statistic, rotation: FloatArray) -> FloatArray:
+    """The translation of least squares for a given rotation."""
+    per_tag = stat.b - (stat.G @ (stat.tags @ np.swapaxes(rotation, -1, -2))[..., None])[..., 0]
+    return _solve(_total(stat), per_tag.sum(axis=-2))
+
+
+def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
+    """CLS = CTLS, Algorithm 1: every tag located by itself, then an orthogonal Procrustes fit.
+
+    Tags whose links do not determine their place are left out; three that are not collinear
+    have to remain.
+    """
+    places = _solve(stat.G, stat.b)
+    known = np.broadcast_to(np.isfinite(places).all(axis=-1), places.shape[:-1])
+    share = known / np.maximum(known.sum(axis=-1, keepdims=True), 1)
+    places = np.where(known[..., None], places, 0.0)
+    centre = (share[..., None] * places).sum(axis=-2)
+    middle = (share[..., None] * stat.tags).sum(axis=-2)
+    weighted = share[..., None] * (stat.tags - middle[..., None, :])
+    cross = np.swapaxes(places - centre[..., None, :], -1, -2) @ weighted
+    rotation = rotations.nearest(cross)
+    translation = centre - (rotation @ middle[..., None])[..., 0]
+    few = known.sum(axis=-1) < 3
+    return np.where(few[..., None, None], np.nan, rotation), np.where(
+        few[..., None], np.nan, translation
+    )
+
+
+def procrustes_fit(stat: Statistic, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weighted orthogonal Procrustes (optimally constrained LS): the best of all starts.
+
+    Parameters
+    ----------
+    starts
+        Rotations (..., S, 3, 3), S local searches for every trial.
+
+    Returns
+    -------
+    Rotation (..., 3, 3) and the translation (..., 3) that belongs to it.
+    """
+    matrix, vector = information(stat)
+    lower = np.linalg.solve(_loaded(matrix[..., 9:, 9:]), matrix[..., 9:, :9])
+    weight = matrix[..., :9, :9] - np.swapaxes(matrix[..., 9:, :9], -1, -2) @ lower
+    pull = vector[..., :9] - (np.swapaxes(lower, -1, -2) @ vector[..., 9:, None])[..., 0]
+    # Coplanar tags leave the weight singular: the loading acts where it carries nothing.
+    target = np.linalg.solve(_loaded(weight), pull[..., None])[..., 0]
+    Q, cost = procrustes(weight[..., None, :, :], target[..., None, :], starts)
+    best = np.argmin(cost, axis=-1)
+    rotation = np.take_along_axis(Q, best[..., None, None, None], axis=-3)[..., 0, :, :]
+    return rotation, translation_fit(stat, rotation)
+
+
+def _total(stat: Statistic) -> FloatArray:
+    n_tags = stat.b.shape[-2]
+    return stat.G[..., 0, :, :] * n_tags if stat.is_common else stat.G.sum(axis=-3)
+
+
+def _loaded(matrix: FloatArray) -> FloatArray:
+    """A symmetric matrix with 1e-13 of its trace on the diagonal: always invertible."""
+    size = matrix.shape[-1]
+    trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
+    return matrix + (1e-13 * trace + 1e-300) * np.eye(size)
+
+
+def _solve(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Solution of symmetric positive systems, NaN where one is singular."""
+    singular = information_rank(matrix) < matrix.shape[-1]
+    safe = np.where(singular[..., None, None], np.eye(matrix.shape[-1]), matrix)
+    solved = np.linalg.solve(safe, vector[..., None])[..., 0]
+    return np.where(singular[..., None], np.nan, solved)

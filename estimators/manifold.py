@@ -19,6 +19,7 @@ from rbl_gym.estimators.belief import PoseBelief, inverse
 from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
 from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
 from rbl_gym.estimators.range_cost import RangeCost, huber, pick
+from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import statistic
 from rbl_gym.motion import ProcessNoise, propagate
 from rbl_gym.ranging import NoiseLaw
@@ -174,19 +175,7 @@ class MapProblem:
         return MapProblem(prior, pick(self.prior_information, where, 2), self.data.take(where))
 
 
-def _octahedral_rotation_vectors() -> FloatArray:
-    """The 24 rotations of the cube as rotation vectors (24, 3): a coarse net over SO(3)."""
-    quarter = [rotations.exp(0.5 * np.pi * axis) for axis in np.eye(3)]
-    group = [np.eye(3)]
-    for element in group:
-        for turn in quarter:
-            candidate = np.round(turn @ element)
-            if not any(np.array_equal(candidate, known) for known in group):
-                group.append(candidate)
-    return rotations.log(np.array(group))
-
-
-_NET = _octahedral_rotation_vectors()
+_NET = rotations.log(ROTATION_NET)
 
 
 def global_start(problem: MapProblem, vague: BoolArray) -> tuple[FloatArray, FloatArray]:

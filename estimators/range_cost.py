@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbl_gym import bounds, ranging
+from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.levenberg_marquardt import Linearization
 
@@ -70,8 +70,7 @@ class RangeCost:
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
-        positions = ranging.tag_positions(rotation, translation, self.tags)
-        distance, unit = bounds.directions(self.anchors, positions)
+        distance, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
         residual = distance - self.ranges
         weights = self.weights
         squared = weights * residual**2
@@ -81,9 +80,8 @@ class RangeCost:
             costs, factor = self.loss(squared)
             cost = costs.sum(axis=(-2, -1))
             weights = weights * factor
-        weighted = weights[..., None] * unit
-        information = np.einsum("...mni,...mnj->...nij", weighted, unit)
-        pull = np.einsum("...mni,...mn->...ni", weighted, residual)
+        pull = weights * residual
+        hessian = (J * _row(weights)) @ np.swapaxes(J, -1, -2)
         if self.tag_unit is not None:
             # The covariance of a tag's ranges is diag(1/w) + s^2 U U^T; its inverse by Woodbury.
             base = weights[..., None] * self.tag_unit
@@ -91,13 +89,13 @@ class RangeCost:
             inner = self.tag_variance * np.linalg.inv(np.eye(3) + self.tag_variance * gram)
             projected = np.einsum("...mni,...mn->...ni", base, residual)
             eased = (inner @ projected[..., None])[..., 0]
-            cross = np.einsum("...mni,...mnj->...nij", base, unit)
             cost = cost - 0.5 * np.einsum("...ni,...ni->...", projected, eased)
-            pull = pull - np.einsum("...nij,...ni->...nj", cross, eased)
-            information = information - np.swapaxes(cross, -1, -2) @ inner @ cross
-        J = bounds.tag_jacobian(rotation, self.tags)
-        gradient = np.einsum("...nia,...ni->...a", J, pull)
-        return Linearization(cost, gradient, bounds.lift(J, information))
+            pull = pull - np.einsum("...mni,...ni->...mn", base, eased)
+            per_link = J.reshape((*J.shape[:-1], *weights.shape[-2:]))
+            cross = np.einsum("...amn,...mni->...nia", per_link, base)
+            hessian = hessian - bounds.lift(cross, inner)
+        gradient = (J @ np.swapaxes(_row(pull), -1, -2))[..., 0]
+        return Linearization(cost, gradient, hessian)
 
     def take(self, where: BoolArray) -> RangeCost:
         """The trials of a mask (...) on one flat axis, with a further axis of 1 for starts."""
@@ -109,6 +107,11 @@ class RangeCost:
             tags=pick(self.tags, where, 2),
             tag_unit=None if self.tag_unit is None else pick(self.tag_unit, where, 3),
         )
+
+
+def _row(per_link: FloatArray) -> FloatArray:
+    """(..., M, N) as one row (..., 1, M N)."""
+    return per_link.reshape((*per_link.shape[:-2], 1, -1))
 
 
 def pick(array: FloatArray, where: BoolArray, trailing: int) -> FloatArray:

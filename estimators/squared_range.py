@@ -68,12 +68,16 @@ def statistic(
     total = weights.sum(axis=-2, keepdims=True)
     share = weights / np.where(total > 0, total, 1.0)
     # Deviations from the weighted means carry the projection Pi without forming it.
-    spread = anchors[..., :, None, :] - (np.swapaxes(share, -1, -2) @ anchors)[..., None, :, :]
-    weighted = weights[..., None] * spread
-    G = 4 * np.einsum("...mni,...mnj->...nij", weighted, spread)
+    per_tag = np.swapaxes(share, -1, -2)
+    spread = anchors[..., None, :, :] - (per_tag @ anchors)[..., :, None, :]
+    weighted = np.swapaxes(weights, -1, -2)[..., None] * spread
+    G = 4 * np.swapaxes(weighted, -1, -2) @ spread
     d = ranges**2 - np.einsum("...mi,...mi->...m", anchors, anchors)[..., None]
     d = d - (share * d).sum(axis=-2, keepdims=True)
-    b = -2 * np.einsum("...mni,...mn->...ni", np.broadcast_to(weighted, (*d.shape, 3)), d)
+    if weights.shape[-1] == 1:
+        b = -2 * np.swapaxes(d, -1, -2) @ weighted[..., 0, :, :]
+    else:
+        b = -2 * (np.swapaxes(d, -1, -2)[..., None, :] @ weighted)[..., 0, :]
     return Statistic(G, b, tags)
 
 

@@ -35,7 +35,32 @@ def directions(anchors: FloatArray, positions: FloatArray) -> tuple[FloatArray, 
 
 def lift(J: FloatArray, per_tag: FloatArray) -> FloatArray:
     """Pose information ``sum_n J_n^T U_n J_n`` from that of each tag's position (..., N, 3, 3)."""
-    return np.einsum("...nia,...nib->...ab", J, per_tag @ J, optimize=False)
+    stacked = (*J.shape[:-3], 3 * J.shape[-3], 6)
+    weighted = per_tag @ J
+    rows = weighted.reshape((*weighted.shape[:-3], *stacked[-2:]))
+    return np.swapaxes(J.reshape(stacked), -1, -2) @ rows
+
+
+def range_jacobian(
+    anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Distances (..., M, N) and their derivative by the pose error, transposed: (..., 6, M N).
+
+    The derivative of a distance by (w, v) is ``(Q c x u, u)``, u the unit vector from anchor to
+    tag (zero where both coincide). Components come first, so that every step runs along memory.
+    """
+    turned = tags @ np.swapaxes(rotation, -1, -2)
+    positions = turned + translation[..., None, :]
+    c = [turned[..., None, :, i] for i in range(3)]
+    d = [positions[..., None, :, i] - anchors[..., :, None, i] for i in range(3)]
+    distance = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    inverse = 1 / np.where(distance > 0, distance, 1.0)
+    J = np.empty((*distance.shape[:-2], 6, *distance.shape[-2:]))
+    for i in range(3):
+        np.multiply(d[i], inverse, out=J[..., 3 + i, :, :])
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        J[..., i, :, :] = c[j] * J[..., 3 + k, :, :] - c[k] * J[..., 3 + j, :, :]
+    return distance, J.reshape((*distance.shape[:-2], 6, -1))
 
 
 def range_information(
@@ -85,15 +110,14 @@ def information_at(
     links: BoolArray | None = None,
 ) -> FloatArray:
     """`range_information` on arrays that are known to be good (the environment's inner loop)."""
-    positions = ranging.tag_positions(rotation, translation, tags)
-    distance, unit = directions(anchors, positions)
+    distance, J = range_jacobian(anchors, tags, rotation, translation)
     # Where an anchor stands on a tag the range has no gradient: that link tells nothing.
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = np.where(distance > 0, 1 / noise.variance(distance), 0.0)
     if links is not None:
         weight = weight * links
-    per_tag = np.einsum("...mni,...mnj->...nij", weight[..., None] * unit, unit)
-    return lift(tag_jacobian(rotation, tags), per_tag)
+    flat = weight.reshape((*weight.shape[:-2], 1, -1))
+    return (J * flat) @ np.swapaxes(J, -1, -2)
 
 
 def pose_crb(
@@ -133,7 +157,14 @@ def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.nd
     scale = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 0.0))
     scale = np.where(scale > 0, scale, 1.0)
     scaled = information / (scale[..., :, None] * scale[..., None, :])
-    return (np.linalg.eigvalsh(scaled) > tolerance).sum(axis=-1)
+    n = information.shape[-1]
+    # With a unit diagonal no eigenvalue exceeds n: a determinant bounds the smallest one, and
+    # spares most matrices the eigenvalues.
+    rank = np.full(scaled.shape[:-2], n)
+    open_ = np.asarray(np.linalg.det(scaled) <= 2 * tolerance * n ** (n - 1))
+    if open_.any():
+        rank[open_] = (np.linalg.eigvalsh(scaled[open_]) > tolerance).sum(axis=-1)
+    return rank
 
 
 def posterior_crb_step(

@@ -69,6 +69,15 @@ class RangeNoise:
         if tag is not None and (isinstance(tag, bool) or not isinstance(tag, Integral)):
             raise ValueError(f"reference_tag must be None or an int, got {tag!r}")
 
+    @classmethod
+    def from_reference_range_db(cls, db: float, reference_tag: int | None = 0) -> RangeNoise:
+        """The static paper's law: a reference range of `db` decibels, 100 dB = 1 mm at 100 m.
+
+        The standard deviation is ``10^(-db / 20)`` of the range, by default that of the first
+        tag for all tags of an anchor (its eq. (2)); ``reference_tag=None``: of each link.
+        """
+        return cls(0.0, 10 ** (-check_number("db", db) / 20), reference_tag)
+
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
         """Variance of the ranges [m^2]; see `NoiseLaw`."""
         r = self._scale(ranges, links)

@@ -148,6 +148,7 @@ def _replay(options: argparse.Namespace) -> int:
     recording = recordings.read_recording(
         options.ranges, options.anchors, options.tags, options.truth, options.calibration
     )
+    replay.make_filter(recording, settings)  # a wrong name is said before the work begins
     with progress("replay", len(recording.times)) as advance:
         track = replay.run(recording, settings, advance)
     found = replay.errors(recording, track, settings)

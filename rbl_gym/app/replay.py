@@ -75,7 +75,7 @@ def run(
     recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
 ) -> Track:
     """Filter a recording causally, epoch by epoch; `advance` is called after each."""
-    filter = _filter(recording, settings)
+    filter = make_filter(recording, settings)
     state = filter.initial(*_prior(recording, settings))
     reported = settings.range_std_m is None and recording.range_std is not None
     beliefs = []
@@ -98,7 +98,8 @@ def run(
     )
 
 
-def _filter(recording: Recording, settings: Settings) -> estimators.Filter:
+def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
+    """The named filter with the recording's tags, a random walk and the range noise."""
     walk, turn = settings.walk_m, math.radians(settings.walk_deg)
     if settings.planar:
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))

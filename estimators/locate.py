@@ -1,0 +1,380 @@
+"""Static localization: one epoch of ranges in, a pose with its covariance out.
+
+`locate` is the door; every method behind it is a function of a flat `Epoch` (one batch axis).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import bounds, rotations
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.estimators import least_squares
+from rbl_gym.estimators.inputs import check_epoch, check_variance
+from rbl_gym.estimators.kalman import state_jacobian
+from rbl_gym.estimators.levenberg_marquardt import Solution, minimize_pose
+from rbl_gym.estimators.maximum_likelihood import (
+    Alternatives,
+    maximum_likelihood,
+    no_alternatives,
+    robust,
+)
+from rbl_gym.estimators.range_cost import RangeCost
+from rbl_gym.estimators.rotation_net import ROTATION_NET
+from rbl_gym.estimators.squared_range import Statistic, information, statistic
+from rbl_gym.ranging import NoiseLaw
+
+ENTRY_POINT_GROUP = "rbl_gym.locators"
+
+
+class PoseEstimate(NamedTuple):
+    """A pose from one epoch of ranges, with leading batch axes.
+
+    Attributes
+    ----------
+    rotation, translation
+        (..., 3, 3), always a proper rotation, and (..., 3) in metres. NaN where the links of
+        a trial do not determine what the method needs.
+    covariance
+        (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``, as
+        the method's own theory has it. Enormous along directions that nothing determines.
+    cost
+        (...), half the sum of squared whitened range residuals at the pose (of `robust`: of
+        the ranges it kept).
+    converged
+        (...), whether the method ended in a solution of its own problem.
+    rank
+        (...), how many of the 6 directions of the pose the ranges determine. Below 6 the pose
+        is one of many.
+    alternatives
+        Other poses that explain the ranges about as well (within 3 sigma of the cost), such as
+        mirror poses; looked for by ``ml`` and ``robust`` where the geometry is poor.
+    matrix
+        (..., 3, 3), the raw matrix of ``ls``; of all others the rotation.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    cost: FloatArray
+    converged: BoolArray
+    rank: np.ndarray
+    alternatives: Alternatives
+    matrix: FloatArray
+
+
+class Epoch(NamedTuple):
+    """Checked arrays of B trials: ranges (B, M, N), anchors (B, M, 3), tags (B, N, 3).
+
+    `weights` (B, M, N) are inverse variances of the ranges, 0 where a link is missing;
+    `stat` is the statistic of the squared ranges; `tag_std_m` that of the tags' places.
+    """
+
+    ranges: FloatArray
+    anchors: FloatArray
+    tags: FloatArray
+    weights: FloatArray
+    stat: Statistic
+    tag_std_m: float
+
+
+class Fit(NamedTuple):
+    """What a method returns: pose (B, ...), covariance, convergence, cost and rivals if its own."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    converged: BoolArray
+    cost: FloatArray | None = None
+    alternatives: Alternatives | None = None
+    matrix: FloatArray | None = None
+
+
+def locate(
+    ranges: ArrayLike,
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    noise: NoiseLaw,
+    method: str = "ml",
+    links: ArrayLike | None = None,
+    tag_std_m: float = 0.0,
+) -> PoseEstimate:
+    """The pose of a body from one epoch of ranges; a thousand problems are one call.
+
+    Parameters
+    ----------
+    ranges
+        (..., M, N), metres.
+    anchors, tags
+        (..., M, 3) in the world frame and (..., N, 3) in the body frame, metres.
+    noise
+        Law of the ranges; variances are taken at the measured ranges.
+    method
+        ``"ls"``: least squares on the squared ranges without the constraint (static paper,
+        (14)). ``"ls-projected"``: its matrix projected onto SO(3), then the translation.
+        ``"cls"``: tag by tag, then an orthogonal Procrustes fit (CTLS, Algorithm 1).
+        ``"procrustes"``: weighted orthogonal Procrustes, the optimally constrained least
+        squares. ``"ml"``: maximum likelihood of the raw ranges, searched for globally where
+        the geometry is poor. ``"two-step"``: ``cls`` and two Gauss-Newton steps on the raw
+        ranges. ``"robust"``: for ranges of which some are wrong. Or a name that a package
+        offers by the entry-point group ``rbl_gym.locators``.
+    links
+        Mask (..., M, N), True = measured.
+    tag_std_m
+        Standard deviation of the tags' places on the body, per axis; marginalised by ``ml``.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, NaN, ranges that are not positive, an unknown method; and where the
+        anchors or tags cannot give what a squared-range method needs (four anchors not
+        coplanar; tags not collinear, for ``ls`` not coplanar).
+    """
+    fit = _method(method)
+    tags = check_array("tags", tags, ("N", 3))
+    ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
+    epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
+    found = fit(epoch)
+    if method in _NEEDS and not np.isfinite(found.translation).all():
+        _check_geometry(method, anchors, tags)
+    rotation = found.rotation
+    safe = np.where(np.isfinite(rotation), rotation, np.eye(3))
+    data = RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags)
+    at = data(safe, np.where(np.isfinite(found.translation), found.translation, 0.0))
+    rank = np.where(
+        np.isfinite(found.translation).all(axis=-1), bounds.information_rank(at.hessian), 0
+    )
+    result = (
+        rotation,
+        found.translation,
+        found.covariance,
+        at.cost if found.cost is None else found.cost,
+        found.converged,
+        rank,
+        found.alternatives or no_alternatives(len(rank)),
+        rotation if found.matrix is None else found.matrix,
+    )
+    return PoseEstimate(*(_unflat(field, batch) for field in result))
+
+
+def _unflat(field: FloatArray | Alternatives, batch: tuple[int, ...]):
+    if isinstance(field, Alternatives):
+        return Alternatives(*(_unflat(part, batch) for part in field))
+    return field.reshape((*batch, *field.shape[1:]))
+
+
+def _epoch(
+    ranges: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    noise: NoiseLaw,
+    mask: BoolArray | None,
+    tag_std_m: float,
+) -> tuple[Epoch, tuple[int, ...]]:
+    """One flat batch of all leading axes, and the shape it had."""
+    variance = check_variance(noise.variance(ranges, mask), mask)
+    squared = check_variance(noise.squared_range_variance(ranges, mask), mask)
+    masks = () if mask is None else (mask.shape[:-2],)
+    batch = np.broadcast_shapes(
+        ranges.shape[:-2], anchors.shape[:-2], tags.shape[:-2], variance.shape[:-2], *masks
+    )
+
+    def flat(array: FloatArray) -> FloatArray:
+        shape = array.shape[-2:]
+        return np.broadcast_to(array, (*batch, *shape)).reshape(-1, *shape)
+
+    weights = np.broadcast_to(1 / variance, (*batch, *ranges.shape[-2:]))
+    flat_mask = None
+    if mask is not None:
+        weights = np.where(mask, weights, 0.0)
+        flat_mask = flat(mask)
+    stat = statistic(flat(ranges), flat(anchors), flat(tags), flat(1 / squared), flat_mask)
+    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0)
+    return Epoch(flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m), batch
+
+
+# Rank of the anchors and of the tags that the squared-range methods stand on.
+_NEEDS = {"ls": (3, 3), "ls-projected": (3, 3), "cls": (3, 2), "procrustes": (3, 2)}
+
+
+def _check_geometry(method: str, anchors: FloatArray, tags: FloatArray) -> None:
+    needs = zip(("anchors", "tags"), (anchors, tags), _NEEDS[method], strict=True)
+    for name, points, needed in needs:
+        spread = points - points.mean(axis=-2, keepdims=True)
+        values = np.linalg.svd(spread, compute_uv=False)
+        rank = (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1).min()
+        if rank < needed:
+            raise ValueError(
+                f"method {method!r} needs {name} that span {needed} dimensions, got "
+                f"{points.shape[-2]} of rank {rank}; 'ml' takes any geometry and says what it "
+                "determines"
+            )
+
+
+# --- methods -------------------------------------------------------------------------------
+
+
+def _ls(epoch: Epoch) -> Fit:
+    matrix, translation = least_squares.linear_fit(epoch.stat)
+    rotation = _nearest(matrix)
+    pinv = np.swapaxes(state_jacobian(rotation), -1, -2) * np.array([0.5] * 3 + [1.0] * 3)[:, None]
+    covariance = _propagated(pinv, epoch.stat)
+    return _linear(rotation, translation, covariance, matrix)
+
+
+def _ls_projected(epoch: Epoch) -> Fit:
+    matrix, _ = least_squares.linear_fit(epoch.stat)
+    rotation = _nearest(matrix)
+    translation = least_squares.translation_fit(epoch.stat, rotation)
+    # w = Jq^+ dq, v = dt + K (dq - Jq w), K = I_tt^-1 I_tq of the linear information.
+    J = state_jacobian(rotation)[:, :9, :3]
+    info, _ = information(epoch.stat)
+    K = np.linalg.solve(_loaded(info[:, 9:, 9:]), info[:, 9:, :9])
+    T = np.zeros((len(rotation), 6, 12))
+    T[:, :3, :9] = 0.5 * np.swapaxes(J, -1, -2)
+    T[:, 3:, :9] = K - K @ J @ T[:, :3, :9]
+    T[:, 3:, 9:] = np.eye(3)
+    return _linear(rotation, translation, _propagated(T, epoch.stat))
+
+
+def _cls(epoch: Epoch) -> Fit:
+    rotation, translation = least_squares.points_fit(epoch.stat)
+    # Unweighted fit of points: (J^T J)^-1 (sum J_n^T S_n J_n) (J^T J)^-1, S_n = G_n^-1.
+    regular = bounds.information_rank(epoch.stat.G) == 3
+    safe = np.where(regular[..., None, None], epoch.stat.G, np.eye(3))
+    known = np.broadcast_to(regular, epoch.tags.shape[:-1])[..., None, None]
+    J = (
+        bounds.tag_jacobian(np.where(np.isfinite(rotation), rotation, np.eye(3)), epoch.tags)
+        * known
+    )
+    spread = covariance_of(np.einsum("bnia,bnic->bac", J, J))
+    middle = bounds.lift(J, np.broadcast_to(np.linalg.inv(safe), (*J.shape[:2], 3, 3)))
+    return _linear(rotation, translation, spread @ middle @ spread)
+
+
+def _procrustes(epoch: Epoch) -> Fit:
+    first, _ = least_squares.points_fit(epoch.stat)
+    first = np.where(np.isfinite(first), first, np.eye(3))[:, None]
+    net = np.broadcast_to(ROTATION_NET, (len(first), 24, 3, 3))
+    starts = np.concatenate([first, net], axis=1)
+    rotation, translation = least_squares.procrustes_fit(epoch.stat, starts)
+    G = np.broadcast_to(epoch.stat.G, (*epoch.tags.shape[:2], 3, 3))
+    covariance = covariance_of(bounds.lift(bounds.tag_jacobian(rotation, epoch.tags), G))
+    return _linear(rotation, translation, covariance)
+
+
+def _ml(epoch: Epoch) -> Fit:
+    start = least_squares.points_fit(epoch.stat)
+    return _from_solution(*maximum_likelihood(_range_cost(epoch), *start, epoch.tag_std_m))
+
+
+def _two_step(epoch: Epoch) -> Fit:
+    rotation, translation = least_squares.points_fit(epoch.stat)
+    usable = np.isfinite(translation).all(axis=-1)
+    solution = minimize_pose(
+        _range_cost(epoch),
+        np.where(usable[:, None, None], rotation, np.eye(3)),
+        np.where(usable[:, None], translation, 0.0),
+        iterations=2,
+    )
+    blank = np.where(usable, 1.0, np.nan)
+    return _from_solution(
+        solution._replace(
+            rotation=solution.rotation * blank[:, None, None],
+            translation=solution.translation * blank[:, None],
+            converged=usable,
+        ),
+        no_alternatives(len(usable)),
+    )
+
+
+def _robust(epoch: Epoch) -> Fit:
+    start = least_squares.points_fit(epoch.stat)
+    return _from_solution(*robust(_range_cost(epoch), *start))
+
+
+def _range_cost(epoch: Epoch) -> RangeCost:
+    return RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags)
+
+
+def _from_solution(solution: Solution, alternatives: Alternatives) -> Fit:
+    return Fit(
+        solution.rotation,
+        solution.translation,
+        covariance_of(solution.at.hessian),
+        solution.converged,
+        solution.at.cost,
+        alternatives,
+    )
+
+
+def _linear(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    matrix: FloatArray | None = None,
+) -> Fit:
+    found = np.isfinite(translation).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    return Fit(rotation, translation, covariance, found, matrix=matrix)
+
+
+def _nearest(matrix: FloatArray) -> FloatArray:
+    known = np.isfinite(matrix).all(axis=(-2, -1))[:, None, None]
+    return np.where(known, rotations.nearest(np.where(known, matrix, np.eye(3))), np.nan)
+
+
+def _loaded(matrix: FloatArray) -> FloatArray:
+    trace = np.trace(matrix, axis1=-2, axis2=-1)[:, None, None]
+    return matrix + (1e-13 * trace + 1e-300) * np.eye(matrix.shape[-1])
+
+
+def _propagated(T: FloatArray, stat: Statistic) -> FloatArray:
+    """``T I^-1 T^T`` with the information of the 12 linear states."""
+    info, _ = information(stat)
+    return bounds.symmetric(T @ np.linalg.solve(_loaded(info), np.swapaxes(T, -1, -2)))
+
+
+def covariance_of(hessian: FloatArray) -> FloatArray:
+    """Inverse of information (..., 6, 6); what nothing determines gets 1e12 of the rest."""
+    scale = np.sqrt(np.maximum(np.diagonal(hessian, axis1=-2, axis2=-1), 0.0))
+    largest = scale.max(axis=-1, keepdims=True)
+    scale = np.where(scale > 1e-9 * largest, scale, np.where(largest > 0, largest, 1.0))
+    outer = scale[..., :, None] * scale[..., None, :]
+    scaled = hessian / outer
+    singular = bounds.information_rank(scaled, 1e-12) < hessian.shape[-1]
+    inverse = np.linalg.inv(np.where(singular[..., None, None], np.eye(6), scaled))
+    if singular.any():
+        values, vectors = np.linalg.eigh(scaled[singular])
+        transposed = np.swapaxes(vectors, -1, -2)
+        inverse[singular] = (vectors / np.maximum(values, 1e-12)[..., None, :]) @ transposed
+    return bounds.symmetric(inverse / outer)
+
+
+METHODS: dict[str, Callable[[Epoch], Fit]] = {
+    "ls": _ls,
+    "ls-projected": _ls_projected,
+    "cls": _cls,
+    "procrustes": _procrustes,
+    "two-step": _two_step,
+    "ml": _ml,
+    "robust": _robust,
+}
+
+
+def methods() -> list[str]:
+    """Names of all methods: ours, and those of installed packages (``rbl_gym.locators``)."""
+    return sorted({*METHODS, *(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))})
+
+
+def _method(name: str) -> Callable[[Epoch], Fit]:
+    if name in METHODS:
+        return METHODS[name]
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        if entry.name == name:
+            return entry.load()
+    raise ValueError(f"method must be one of {', '.join(map(repr, methods()))}, got {name!r}")
