@@ -75,6 +75,8 @@ def register(name: str, factory: Callable[..., Filter]) -> None:
     ValueError
         If another factory already has the name.
     """
+    if not name or not isinstance(name, str) or not callable(factory):
+        raise ValueError(f"name and factory must be a string and a callable, got {name!r}")
     if _FACTORIES.setdefault(name, factory) is not factory:
         raise ValueError(f"filter {name!r} is already registered")
 
@@ -112,7 +114,10 @@ def make(
     if factory is None:
         found = [entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name == name]
         if not found:
-            raise ValueError(f"filter must be one of {', '.join(names())}, got {name!r}")
+            raise ValueError(
+                f"filter must be one of {', '.join(names())}, or a name given by "
+                f"rbl_gym.estimators.register; got {name!r:.80}"
+            )
         factory = found[0].load()
     tags = check_array("tags", tags, ("N", 3))
     for label, value, methods in (

@@ -63,7 +63,11 @@ class IteratedEkf:
     robust: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int):
+            raise ValueError(f"iterations must be an int, got {self.iterations!r}")
         check_number("iterations", self.iterations, low=1)
+        if not isinstance(self.robust, bool):
+            raise ValueError(f"robust must be True or False, got {self.robust!r}")
 
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
@@ -105,7 +109,9 @@ class IteratedEkf:
         """State after one epoch of ranges (..., M, N).
 
         Where the prior rotation is vaguer than `VAGUE_ROTATION_RAD`, the update starts from
-        many poses and keeps the best.
+        many poses and keeps the best. Among coplanar anchors the mirror pose may explain the
+        ranges as well: then only a prior that knows the side tells them apart (`locate` lists
+        both).
 
         Raises
         ------

@@ -92,8 +92,10 @@ def range_information(
     """
     anchors = check_array("anchors", anchors, ("M", 3))
     tags = check_array("tags", tags, ("N", 3))
-    rotation = check_array("rotation", rotation, (3, 3))
+    rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
+    if not callable(getattr(noise, "variance", None)):
+        raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
     mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
     information = information_at(anchors, tags, rotation, translation, noise, mask)
     if not np.isfinite(information).all():

@@ -53,8 +53,12 @@ class Scene:
     dt, steps
         Seconds between epochs, steps of an episode.
     trajectory, speed_m_s, spin_rad_s, twist
-        One of `TRAJECTORIES`; the speed; the standard deviation of the turn rate that is
-        drawn once an episode; the twist (6) of a ``"constant"`` trajectory.
+        ``"waypoints"``: straight lines between points uniform in the volume.
+        ``"constant"``: the same `twist` (6) at every step. ``"random-twist"``: a new direction
+        and turn axis every 10 steps, at `speed_m_s` and `spin_rad_s`. ``"orbit"``: a level
+        circle about the volume's centre, its radius 0.35 of the shorter side, nose first.
+        ``"lawn-mower"``: lanes along x, a fifth of the volume apart. On way-points and lanes
+        the body turns at a rate drawn once an episode with standard deviation `spin_rad_s`.
     start_rotation, start_translation
         Pose at the start; None: drawn (uniform on SO(3), uniform in the volume).
     initial_rotation_rad, initial_translation_m
@@ -306,7 +310,8 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         change. Nested fields take mappings of their own: ``{"name": "uwb_room", "steps": 50,
         "links": {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``. A region or noise of
         another kind is named by ``"kind"`` (``"box"``, ``"walls"``, ``"shell"``; ``"range"``,
-        ``"squared-range"``).
+        ``"squared-range"``). Another number of anchors than the scene has, without their places,
+        draws them anew in the region at every reset.
 
     Raises
     ------
@@ -321,8 +326,8 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         raise ValueError(f"scene must be a name or a dict with the key 'name', got {scene!r:.120}")
     changes = {key: value for key, value in scene.items() if key != "name"}
     base = SCENES[check_one_of("scene", scene["name"], list(SCENES))]
-    if "n_anchors" in changes and "anchors" not in changes:
-        changes["anchors"] = None
+    if changes.get("n_anchors", base.n_anchors) != base.n_anchors:
+        changes.setdefault("anchors", None)
     anchors = changes.get("anchors")
     if anchors is not None:
         changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))

@@ -67,7 +67,11 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "changes", "message"),
     [
-        ("ekf", {}, "filter must be one of et-kf, iekf, kf, kf-ortho, uc-kf, got 'ekf'"),
+        (
+            "ekf",
+            {},
+            "filter must be one of et-kf, iekf, kf, kf-ortho, uc-kf, or a name .*got 'ekf'",
+        ),
         ("kf", {"robust": True}, "filter 'kf' has no option 'robust'; it has"),
         ("iekf", {"threshold": 1.0}, "it has iterations, robust"),
         ("kf", {"noise": 0.1}, "noise must have variance and squared_range_variance, got 0.1"),

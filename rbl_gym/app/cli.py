@@ -34,7 +34,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="rbl-gym", description="Localization of rigid bodies by radio."
     )
     parser.add_argument("--version", action="version", version=f"rbl-gym {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     _add_demo(commands)
     _add_replay(commands)
     return parser

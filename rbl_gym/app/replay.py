@@ -55,7 +55,8 @@ class Settings:
             check_number("range_std_m", self.range_std_m, low=1e-6)
         check_number("walk_m", self.walk_m, low=0.0)
         check_number("walk_deg", self.walk_deg, low=0.0)
-        check_number("height_offset_m", self.height_offset_m)
+        if check_number("height_offset_m", self.height_offset_m) != 0 and not self.planar:
+            raise ValueError("height_offset_m means nothing without planar")
         check_number("yaw_offset_deg", self.yaw_offset_deg)
 
 
@@ -141,6 +142,13 @@ def errors(recording: Recording, track: Track, settings: Settings) -> Errors | N
     if recording.truth is None:
         return None
     rotation, translation, known = recordings.truth_at(recording.truth, track.times)
+    if not known.any():
+        spans = [
+            f"{times[0]:g} to {times[-1]:g} s" for times in (track.times, recording.truth.times)
+        ]
+        raise ValueError(
+            f"truth shares no time with the ranges: ranges {spans[0]}, truth {spans[1]}"
+        )
     offset = rotations.exp([0.0, 0.0, math.radians(settings.yaw_offset_deg)])
     if settings.planar:
         heading = np.zeros((len(known), 3))
@@ -163,14 +171,14 @@ def errors(recording: Recording, track: Track, settings: Settings) -> Errors | N
 def figures(
     recording: Recording, track: Track, found: Errors | None, settings: Settings
 ) -> dict[str, Any]:
-    """The figures of a run as plain numbers; errors are null where there is no truth."""
+    """The figures of a run as plain numbers; those of errors are absent without truth."""
     result: dict[str, Any] = {
         "settings": dataclasses.asdict(settings),
         "epochs": len(track.times),
         "duration_s": float(track.times[-1] - track.times[0]),
         "links": int(recording.links.sum()),
     }
-    if found is None or not found.known.any():
+    if found is None:
         return result
     known = found.known
     result["epochs_with_truth"] = int(known.sum())
