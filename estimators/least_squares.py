@@ -121,12 +121,13 @@ def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
 
 
 def procrustes_fit(stat: Statistic, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weighted orthogonal Procrustes (optimally constrained LS): the best of all starts.
+    """Weighted orthogonal Procrustes (optimally constrained LS), searched for globally.
 
     Parameters
     ----------
     starts
-        Rotations (..., S, 3, 3), S local searches for every trial.
+        Rotations (..., S, 3, 3); Newton's method runs from the first of every trial and from
+        the two of least cost among the others.
 
     Returns
     -------
@@ -138,7 +139,15 @@ def procrustes_fit(stat: Statistic, starts: FloatArray) -> tuple[FloatArray, Flo
     pull = vector[..., :9] - (np.swapaxes(lower, -1, -2) @ vector[..., 9:, None])[..., 0]
     # Coplanar tags leave the weight singular: the loading acts where it carries nothing.
     target = np.linalg.solve(_loaded(weight), pull[..., None])[..., 0]
-    Q, cost = procrustes(weight[..., None, :, :], target[..., None, :], starts)
+    weight, target = weight[..., None, :, :], target[..., None, :]
+    residual = vec(starts) - target
+    cost = np.einsum(
+        "...i,...i->...", residual @ np.swapaxes(weight[..., 0, :, :], -1, -2), residual
+    )
+    order = np.argsort(cost[..., 1:], axis=-1)[..., :2] + 1
+    chosen = np.concatenate([np.zeros_like(order[..., :1]), order], axis=-1)
+    starts = np.take_along_axis(starts, chosen[..., None, None], axis=-3)
+    Q, cost = procrustes(weight, target, starts)
     best = np.argmin(cost, axis=-1)
     rotation = np.take_along_axis(Q, best[..., None, None, None], axis=-3)[..., 0, :, :]
     return rotation, translation_fit(stat, rotation)

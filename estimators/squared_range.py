@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbl_gym.bounds import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
 
 
@@ -67,10 +68,7 @@ def statistic(
         ranges = np.where(links, ranges, 0.0)
     total = weights.sum(axis=-2, keepdims=True)
     share = weights / np.where(total > 0, total, 1.0)
-    # Deviations from the weighted means carry the projection Pi without forming it.
-    per_tag = np.swapaxes(share, -1, -2)
-    spread = anchors[..., None, :, :] - (per_tag @ anchors)[..., :, None, :]
-    weighted = np.swapaxes(weights, -1, -2)[..., None] * spread
+    spread, weighted = weighted_spread(anchors, weights)
     G = 4 * np.swapaxes(weighted, -1, -2) @ spread
     d = ranges**2 - np.einsum("...mi,...mi->...m", anchors, anchors)[..., None]
     d = d - (share * d).sum(axis=-2, keepdims=True)

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import ranging, rotations
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_links
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_links,
+    check_number,
+    check_one_of,
+)
 from rbl_gym.motion import ProcessNoise
 
 
@@ -70,6 +77,9 @@ def range_information(
     translation: ArrayLike,
     noise: ranging.NoiseLaw,
     links: ArrayLike | None = None,
+    *,
+    model: str = "raw",
+    tag_std_m: float = 0.0,
 ) -> FloatArray:
     """Fisher information (..., 6, 6) of one epoch of ranges about the pose.
 
@@ -84,12 +94,21 @@ def range_information(
         Law of the ranges.
     links
         Mask (..., M, N), True = measured.
+    model
+        ``"raw"``: of the ranges. ``"squared"``: of what is left of the squared ranges once
+        ``|s|^2`` is projected out, that is of all the papers' linear estimators and filters;
+        with the prior of the 12 states brought to the pose, the unitarily constrained bound
+        of the tracking paper's model.
+    tag_std_m
+        Standard deviation of the tags' places on the body, per axis: a nuisance, marginalised.
 
     Raises
     ------
     ValueError
         On a wrong shape or a value that is not finite.
     """
+    check_one_of("model", model, ("raw", "squared"))
+    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0)
     anchors = check_array("anchors", anchors, ("M", 3))
     tags = check_array("tags", tags, ("N", 3))
     rotation = rotations.check_rotation("rotation", rotation)
@@ -97,7 +116,14 @@ def range_information(
     if not callable(getattr(noise, "variance", None)):
         raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
     mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
-    information = information_at(anchors, tags, rotation, translation, noise, mask)
+    if model == "raw" and tag_std_m == 0:
+        information = information_at(anchors, tags, rotation, translation, noise, mask)
+    else:
+        positions = ranging.tag_positions(rotation, translation, tags)
+        of_tag = _raw_tag_information if model == "raw" else _squared_tag_information
+        per_tag = of_tag(anchors, positions, noise, mask)
+        damping = np.eye(3) + tag_std_m**2 * per_tag
+        information = lift(tag_jacobian(rotation, tags), np.linalg.solve(damping, per_tag))
     if not np.isfinite(information).all():
         raise ValueError("an anchor stands on a tag, where this noise law has no variance")
     return information
@@ -122,6 +148,40 @@ def information_at(
     return (J * flat) @ np.swapaxes(J, -1, -2)
 
 
+def _raw_tag_information(
+    anchors: FloatArray, positions: FloatArray, noise: ranging.NoiseLaw, links: BoolArray | None
+) -> FloatArray:
+    """Information (..., N, 3, 3) of the ranges about the place of each tag."""
+    distance, unit = directions(anchors, positions)
+    weight = 1 / np.broadcast_to(noise.variance(distance), distance.shape)
+    weight = weight if links is None else weight * links
+    return np.einsum("...mni,...mnj->...nij", weight[..., None] * unit, unit)
+
+
+def _squared_tag_information(
+    anchors: FloatArray, positions: FloatArray, noise: ranging.NoiseLaw, links: BoolArray | None
+) -> FloatArray:
+    """Information ``4 A Pi_n A^T`` (..., N, 3, 3) about each tag, |s|^2 projected out."""
+    distance = ranging.distances(anchors, positions)
+    weight = 1 / np.broadcast_to(noise.squared_range_variance(distance), distance.shape)
+    weight = weight if links is None else weight * links
+    spread, weighted = weighted_spread(anchors, weight)
+    return 4 * np.swapaxes(weighted, -1, -2) @ spread
+
+
+def weighted_spread(anchors: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Anchors less their weighted mean (..., N, M, 3), and the same times the weights (..., M, N).
+
+    Their product ``A Pi A^T`` is the projection of the common unknown ``|s|^2`` out of the
+    squared ranges, without forming Pi.
+    """
+    per_tag = np.swapaxes(weights, -1, -2)
+    total = per_tag.sum(axis=-1, keepdims=True)
+    mean = (per_tag / np.where(total > 0, total, 1.0)) @ anchors
+    spread = anchors[..., None, :, :] - mean[..., :, None, :]
+    return spread, per_tag[..., None] * spread
+
+
 def pose_crb(
     anchors: ArrayLike,
     tags: ArrayLike,
@@ -130,6 +190,9 @@ def pose_crb(
     noise: ranging.NoiseLaw,
     prior_information: ArrayLike | None = None,
     links: ArrayLike | None = None,
+    *,
+    model: str = "raw",
+    tag_std_m: float = 0.0,
 ) -> FloatArray:
     """Cramer-Rao bound (..., 6, 6) of the pose from one epoch of ranges.
 
@@ -141,7 +204,9 @@ def pose_crb(
     ValueError
         As `range_information`, and where the information is singular, with its rank.
     """
-    information = range_information(anchors, tags, rotation, translation, noise, links)
+    information = range_information(
+        anchors, tags, rotation, translation, noise, links, model=model, tag_std_m=tag_std_m
+    )
     if prior_information is not None:
         information = information + check_array("prior_information", prior_information, (6, 6))
     rank = information_rank(information)

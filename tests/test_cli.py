@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import bodies, motion, ranging, rotations
-from rbl_gym.app import papers
+from rbl_gym.app import camsap2013
 from rbl_gym.app.cli import main
 from tests.helpers import ROOT
 
@@ -24,7 +24,7 @@ def test_demo_writes_a_table_a_picture_and_the_same_figures_for_the_same_seed(tm
     arguments = ["demo", "--trials", "4", "--seed", "3", "--plot", str(picture)]
     assert main([*arguments, "--json", str(figures)]) == 0
     table = capsys.readouterr().out
-    for label in papers.FILTERS:
+    for label in camsap2013.FILTERS:
         assert label in table
     assert picture.stat().st_size > 20_000
     first = json.loads(figures.read_text())
@@ -39,17 +39,17 @@ def test_demo_writes_a_table_a_picture_and_the_same_figures_for_the_same_seed(tm
 
 @pytest.fixture(scope="module")
 def experiment():
-    return papers.camsap2013(1000, 0)
+    return camsap2013.run(1000, 0)
 
 
-@pytest.mark.parametrize("reading", list(papers.READINGS))
+@pytest.mark.parametrize("reading", list(camsap2013.READINGS))
 def test_the_tracking_papers_claims_hold_in_1000_trials(experiment, reading):
     claims = experiment["readings"][reading]["claims"]
     assert len(claims) == 8
     assert [claim for claim in claims if not claim["holds"]] == []
 
 
-@pytest.mark.parametrize("reading", list(papers.READINGS))
+@pytest.mark.parametrize("reading", list(camsap2013.READINGS))
 def test_only_the_iterated_ekf_reaches_the_bound(experiment, reading):
     ratios = {
         label: (filter["rotation_to_bound"], filter["translation_to_bound"])

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
-from rbl_gym.app.papers import Example
+from rbl_gym.app.camsap2013 import Example
 from rbl_gym.app.replay import Errors, Track
 from rbl_gym.checks import FloatArray
 from rbl_gym.recordings import Recording, truth_at
@@ -22,6 +22,15 @@ COLOURS = {
     "ET-KF": "#8d6cab",
     "UC-KF": "#2e86ab",
     "iterated EKF": "#1b7f5c",
+}
+STATIC_COLOURS = {
+    "LS": "#d1495b",
+    "LS-projected": "#e8a33d",
+    "CLS": "#8d6cab",
+    "procrustes": "#2e86ab",
+    "two-step": "#6c757d",
+    "ML": "#1b7f5c",
+    "ML, marginalised": "#7fb800",
 }
 # A belief is centimetres wide on a track of hundreds of metres.
 _MAGNIFY = 200
@@ -111,6 +120,39 @@ def _errors(axes: Any, example: Example) -> None:
     axes.set_ylabel("rotation error about z [deg]")
     axes.set_title("the same trial: error and claimed 3-sigma band", fontsize=9)
     axes.legend(frameon=False, fontsize=8)
+
+
+def static(result: dict[str, Any]) -> Figure:
+    """Angle and translation error over the reference range, a column for every setting."""
+    settings = result["settings"]
+    figure = _new(3.4 * len(settings) + 1.2, 6.6)
+    axes = figure.subplots(2, len(settings), squeeze=False, sharex=True)
+    rows = (
+        ("mean_angular_error_deg", "mean angular error [deg]"),
+        ("translation_rmse_m", "translation RMSE [m]"),
+    )
+    for column, (label, data) in enumerate(settings.items()):
+        for row, (key, title) in enumerate(rows):
+            ax = axes[row, column]
+            for name, method in data["methods"].items():
+                ax.semilogy(data["reference_range_db"], method[key], label=name, lw=1.3,
+                            color=STATIC_COLOURS[name],
+                            ls="--" if name in ("two-step", "LS-projected") else "-")  # fmt: skip
+            ax.semilogy(data["reference_range_db"], data["bound"][key], "k.", label="CRB")
+            ax.semilogy(data["reference_range_db"], data["bound_squared"][key], "k+",
+                        label="CRB, squared ranges")  # fmt: skip
+            ax.grid(alpha=0.25, lw=0.5)
+            ax.set_title(f"anchors in {label}" if row == 0 else "", fontsize=9)
+            ax.set_xlabel("reference range [dB]" if row == 1 else "")
+            ax.set_ylabel(title if column == 0 else "")
+    handles = {
+        text: handle
+        for ax in axes.flat
+        for handle, text in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5,
+                  frameon=False, fontsize=8)  # fmt: skip
+    return figure
 
 
 def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:

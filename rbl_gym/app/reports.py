@@ -19,10 +19,14 @@ _CAMSAP_COLUMNS = (
 )
 
 
+def _console() -> Console:
+    # Piped, a table keeps all of its columns.
+    return Console(width=None if Console().is_terminal else 130, highlight=False)
+
+
 def print_camsap2013(result: dict[str, Any]) -> None:
     """One table for each reading, and the claims with their figures."""
-    # Piped, a table keeps all of its columns.
-    console = Console(width=None if Console().is_terminal else 130, highlight=False)
+    console = _console()
     for reading, data in result["readings"].items():
         table = Table(title=f"camsap2013, turn noise {reading}/s, {result['trials']} trials")
         table.add_column("filter")
@@ -34,6 +38,10 @@ def print_camsap2013(result: dict[str, Any]) -> None:
         for claim in data["claims"]:
             verdict = "holds" if claim["holds"] else "FAILS"
             console.print(f"  {verdict}  {claim['statement']}  ({claim['figures']})")
+        if "trade" in data:
+            console.print("  ET-KF: " + ", ".join(
+                f"threshold {row['threshold']:g}: {100 * row['trigger_rate']:.0f} % projected, "
+                f"RMSE {row['rotation_rmse']:.4f}" for row in data["trade"]))  # fmt: skip
         console.print()
     deviation = 100 / (6 * result["trials"]) ** 0.5
     console.print(
@@ -41,6 +49,26 @@ def print_camsap2013(result: dict[str, Any]) -> None:
         "KF and ET-KF are judged by their raw matrix, as in the paper. One standard deviation of\n"
         f"an RMSE is about {deviation:.1f} %: with few trials a claim can fail by chance."
     )
+
+
+def print_static(result: dict[str, Any]) -> None:
+    """Mean ratios to the bound over the reference ranges, one table for each setting."""
+    console = _console()
+    for label, data in result["settings"].items():
+        low, high = data["reference_range_db"][0], data["reference_range_db"][-1]
+        table = Table(title=f"{result['experiment']}, anchors in {label}, {low} to {high} dB, "
+                      f"{result['trials']} trials")  # fmt: skip
+        table.add_column("method")
+        for heading in ("angle / bound", "rotation / bound", "translation / bound"):
+            table.add_column(heading, justify="right")
+        table.add_column(f"angle at {high} dB (deg)", justify="right")
+        table.add_column(f"NEES at {high} dB (6)", justify="right")
+        for name, method in data["methods"].items():
+            ratios = [f"{ratio:.3f}" for ratio in method["ratio"].values()]
+            angle = f"{method['mean_angular_error_deg'][-1]:.5f}"
+            table.add_row(name, *ratios, angle, f"{method['nees'][-1]:.2f}")
+        table.add_row("bound", "1", "1", "1", f"{data['bound']['mean_angular_error_deg'][-1]:.5f}")
+        console.print(table)
 
 
 def print_replay(result: dict[str, Any]) -> None:
