@@ -8,7 +8,7 @@ from functools import partial
 
 from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
 from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
-from rbl_gym.estimators.locate import PoseEstimate, locate, methods
+from rbl_gym.estimators.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
 
 for _name, _constraint in {

@@ -116,7 +116,7 @@ def make(
         if not found:
             raise ValueError(
                 f"filter must be one of {', '.join(names())}, or a name given by "
-                f"rbl_gym.estimators.register; got {name!r:.80}"
+                f"rbl_gym.estimators.register, got {name!r:.80}"
             )
         factory = found[0].load()
     tags = check_array("tags", tags, ("N", 3))

@@ -33,7 +33,7 @@ def minimize_pose(
     rotation: FloatArray,
     translation: FloatArray,
     iterations: int,
-    tolerance: float = 1e-10,
+    tolerance: float = 1e-6,
 ) -> Solution:
     """Minimise a sum of squares over poses, ``Q <- exp(w) Q``, ``t <- t + v``.
 
@@ -49,7 +49,8 @@ def minimize_pose(
     iterations
         At the most; stops when every trial has converged.
     tolerance
-        On the largest entry of the step, in radians and in units of the translation.
+        On the length of the step in standard deviations, the Hessian taken as information.
+        The step is still taken, and near the minimum leaves its square behind.
     """
     at = linearize(rotation, translation)
     batch = at.cost.shape
@@ -65,8 +66,11 @@ def minimize_pose(
         step = -np.linalg.solve(damped, at.gradient[..., None])[..., 0]
         candidate = rotations.exp(step[..., :3]) @ rotation, translation + step[..., 3:]
         new = linearize(*candidate)
-        better = new.cost <= at.cost * (1 + 1e-12)
-        small = np.abs(step).max(axis=-1) < tolerance
+        # Damping shortens the step by about 1 + damping: a short step alone proves nothing.
+        decrease = -np.einsum("...i,...i->...", at.gradient, step) * (1 + damping)
+        small = decrease < tolerance**2
+        # A step of 1e-4 standard deviations changes the cost by less than rounding may.
+        better = (new.cost <= at.cost * (1 + 1e-12)) | (decrease < 1e-8)
         if better.all():
             (rotation, translation), at = candidate, new
         else:

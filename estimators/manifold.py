@@ -197,7 +197,7 @@ def global_start(problem: MapProblem, vague: BoolArray) -> tuple[FloatArray, Flo
     part = problem.take(vague)
     rotation = _spread(part.prior)
     translation = _translation_given(rotation, part)
-    solution = minimize_pose(part, rotation, translation, iterations=12, tolerance=1e-6)
+    solution = minimize_pose(part, rotation, translation, iterations=12, tolerance=1e-3)
     best = np.argmin(solution.at.cost, axis=-1)
     row = np.arange(len(best))
     start_rotation = np.broadcast_to(problem.prior.rotation, (*batch, 3, 3)).copy()

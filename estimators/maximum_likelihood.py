@@ -67,17 +67,18 @@ def maximum_likelihood(
         Standard deviation of the tags' places on the body, marginalised.
     """
     rotation, translation, usable = _usable(cost, rotation, translation)
-    solution = minimize_pose(cost, rotation, translation, iterations=12, tolerance=1e-9)
+    solution = minimize_pose(cost, rotation, translation, iterations=12)
+    judged = _with_tag_noise(cost, solution, tag_std_m)
     alternatives = no_alternatives(len(usable))
-    doubtful = ~usable | ~solution.converged | in_doubt(cost, solution.at)
+    doubtful = ~usable | ~judged.converged | in_doubt(cost, judged.at)
+    if not doubtful.any():
+        return judged, alternatives
     for part in _chunks(doubtful):
         found, others = search(cost.take(part), solution, part)
         solution = merge(solution, found, part)
         for mine, theirs in zip(alternatives, others, strict=True):
             mine[part] = theirs
-    if tag_std_m > 0:
-        solution = _with_tag_noise(cost, solution, tag_std_m)
-    return solution, alternatives
+    return _with_tag_noise(cost, solution, tag_std_m), alternatives
 
 
 def _usable(
@@ -105,13 +106,13 @@ def _chunks(where: BoolArray) -> list[BoolArray]:
 
 def _with_tag_noise(cost: RangeCost, solution: Solution, tag_std_m: float) -> Solution:
     """The solution with uncertain tag places marginalised about it (twice, as they move it)."""
+    if tag_std_m == 0:
+        return solution
     for _ in range(2):
         positions = ranging.tag_positions(solution.rotation, solution.translation, cost.tags)
         unit = bounds.directions(cost.anchors, positions)[1]
         eased = dataclasses.replace(cost, tag_variance=tag_std_m**2, tag_unit=unit)
-        solution = minimize_pose(
-            eased, solution.rotation, solution.translation, iterations=8, tolerance=1e-9
-        )
+        solution = minimize_pose(eased, solution.rotation, solution.translation, iterations=8)
     return solution
 
 
@@ -138,7 +139,10 @@ def rotation_std(hessian: FloatArray) -> FloatArray:
 def search(part: RangeCost, first: Solution, where: BoolArray) -> tuple[Solution, Alternatives]:
     """Best of many local solves, and its rivals; arguments as `local_minima`."""
     fine = local_minima(part, first, where)
-    return cheapest(fine), _rivals(part, fine)
+    best = cheapest(fine)
+    # Where many poses are nearly as good the way along the valley is long.
+    polished = minimize_pose(part, best.rotation[:, None], best.translation[:, None], 100)
+    return cheapest(polished), _rivals(part, fine)
 
 
 def local_minima(part: RangeCost, first: Solution, where: BoolArray) -> Solution:
@@ -165,14 +169,13 @@ def local_minima(part: RangeCost, first: Solution, where: BoolArray) -> Solution
     rotation = np.broadcast_to(net, (len(places), 24, 3, 3, 3)).reshape(len(places), -1, 3, 3)
     rotation = np.concatenate([first.rotation[where][:, None], rotation], axis=1)
     translation = np.concatenate([first.translation[where][:, None], translation], axis=1)
-    coarse = minimize_pose(part, rotation, translation, iterations=10, tolerance=1e-4)
+    coarse = minimize_pose(part, rotation, translation, iterations=10, tolerance=1e-2)
     keep = np.argsort(coarse.at.cost, axis=-1)[:, :8]
     return minimize_pose(
         part,
         np.take_along_axis(coarse.rotation, keep[..., None, None], axis=1),
         np.take_along_axis(coarse.translation, keep[..., None], axis=1),
         iterations=25,
-        tolerance=1e-9,
     )
 
 
@@ -277,7 +280,7 @@ def robust(
     """
     rotation, translation, _ = _usable(cost, rotation, translation)
     easy = dataclasses.replace(cost, loss=huber(_HUBER))
-    solution = minimize_pose(easy, rotation, translation, iterations=20, tolerance=1e-6)
+    solution = minimize_pose(easy, rotation, translation, iterations=20, tolerance=1e-2)
     solution = _narrow(cost, solution.rotation, solution.translation, widest=1.0)
     links = np.maximum((cost.weights > 0).sum(axis=(-2, -1)), 1)
     doubtful = _inliers(cost, solution).sum(axis=(-2, -1)) < _TRUSTED_INLIERS * links
@@ -314,7 +317,7 @@ def _narrow(
     scale = np.maximum(np.quantile(residuals, widest, axis=(-2, -1)), 3.0)
     while True:
         narrowed = dataclasses.replace(cost, loss=geman_mcclure(scale[..., None, None]))
-        solution = minimize_pose(narrowed, rotation, translation, iterations=4, tolerance=1e-7)
+        solution = minimize_pose(narrowed, rotation, translation, iterations=4, tolerance=1e-3)
         if (scale <= 3.0).all():
             return solution
         rotation, translation = solution.rotation, solution.translation

@@ -37,6 +37,24 @@ def test_demo_writes_a_table_a_picture_and_the_same_figures_for_the_same_seed(tm
     assert first == second
 
 
+@pytest.mark.parametrize("name", ["camsap2013", "icassp2013", "slides2013"])
+def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(name, tmp_path, capsys):
+    picture, table = tmp_path / "x.png", tmp_path / "x.csv"
+    arguments = ["reproduce", name, "--trials", "3", "--plot", str(picture), "--csv", str(table)]
+    assert main([*arguments, "--json", str(tmp_path / "x.json")]) == 0
+    assert "bound" in capsys.readouterr().out
+    assert picture.stat().st_size > 20_000
+    result = json.loads((tmp_path / "x.json").read_text())
+    rows = list(csv.reader(table.open()))
+    assert rows[0][-1] == "value"
+    for row in rows[1:]:
+        node = result
+        for key in filter(None, row[:-1]):
+            node = node[int(key)] if isinstance(node, list) else node[key]
+        assert str(node) == row[-1]
+    assert len(rows) > 100
+
+
 @pytest.fixture(scope="module")
 def experiment():
     return camsap2013.run(1000, 0)

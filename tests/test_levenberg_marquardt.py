@@ -45,7 +45,8 @@ def test_never_raises_the_cost_and_damps_where_it_would():
 
     start = rotations.random(rng, (10,)), np.zeros((10, 3))
     costs = [minimize_pose(exaggerated, *start, iterations=k).at.cost for k in range(25)]
-    assert (np.diff(costs, axis=0) <= 1e-12).all()
+    # Below 1e-4 standard deviations steps are taken unseen: 1e-8 of cost.
+    assert (np.diff(costs, axis=0) <= 1e-7).all()
     assert (costs[-1] < 0.2 * costs[0]).all()
 
 

@@ -30,6 +30,8 @@ from rbl_gym.estimators.squared_range import Statistic, information, statistic
 from rbl_gym.ranging import NoiseLaw
 
 ENTRY_POINT_GROUP = "rbl_gym.locators"
+# Trials of a block: their arrays stay in the processor's cache.
+_BLOCK = 256
 
 
 class PoseEstimate(NamedTuple):
@@ -139,33 +141,42 @@ def locate(
     tags = check_array("tags", tags, ("N", 3))
     ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
     epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
-    found = fit(epoch)
-    if method in _NEEDS and not np.isfinite(found.translation).all():
+    blocks = [
+        _solve(fit, _rows(epoch, slice(start, start + _BLOCK)))
+        for start in range(0, len(epoch.ranges), _BLOCK)
+    ]
+    if method in _NEEDS and not all(np.isfinite(block[1]).all() for block in blocks):
         _check_geometry(method, anchors, tags)
-    rotation = found.rotation
-    safe = np.where(np.isfinite(rotation), rotation, np.eye(3))
-    data = RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags)
-    at = data(safe, np.where(np.isfinite(found.translation), found.translation, 0.0))
-    rank = np.where(
-        np.isfinite(found.translation).all(axis=-1), bounds.information_rank(at.hessian), 0
+    fields = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+    fields = [field.reshape((*batch, *field.shape[1:])) for field in fields]
+    return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9])
+
+
+def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:
+    """The fields of a `PoseEstimate` (alternatives as three) for one block of trials."""
+    found = fit(epoch)
+    rotation, translation = found.rotation, found.translation
+    known = np.isfinite(translation).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    at = _range_cost(epoch)(
+        np.where(known[:, None, None], rotation, np.eye(3)),
+        np.where(known[:, None], translation, 0.0),
     )
-    result = (
+    return (
         rotation,
-        found.translation,
+        translation,
         found.covariance,
         at.cost if found.cost is None else found.cost,
         found.converged,
-        rank,
-        found.alternatives or no_alternatives(len(rank)),
+        np.where(known, bounds.information_rank(at.hessian), 0),
+        *(found.alternatives or no_alternatives(len(known))),
         rotation if found.matrix is None else found.matrix,
     )
-    return PoseEstimate(*(_unflat(field, batch) for field in result))
 
 
-def _unflat(field: FloatArray | Alternatives, batch: tuple[int, ...]):
-    if isinstance(field, Alternatives):
-        return Alternatives(*(_unflat(part, batch) for part in field))
-    return field.reshape((*batch, *field.shape[1:]))
+def _rows(epoch: Epoch, rows: slice) -> Epoch:
+    """Some of the trials."""
+    stat = Statistic(*(field[rows] for field in epoch.stat))
+    return Epoch(*(field[rows] for field in epoch[:4]), stat, epoch.tag_std_m)
 
 
 def _epoch(
@@ -252,7 +263,8 @@ def _cls(epoch: Epoch) -> Fit:
         bounds.tag_jacobian(np.where(np.isfinite(rotation), rotation, np.eye(3)), epoch.tags)
         * known
     )
-    spread = covariance_of(np.einsum("bnia,bnic->bac", J, J))
+    stacked = J.reshape(len(J), -1, 6)
+    spread = np.linalg.inv(_loaded(np.swapaxes(stacked, 1, 2) @ stacked))
     middle = bounds.lift(J, np.broadcast_to(np.linalg.inv(safe), (*J.shape[:2], 3, 3)))
     return _linear(rotation, translation, spread @ middle @ spread)
 
