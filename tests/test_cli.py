@@ -45,7 +45,7 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(name, tmp
     assert "bound" in capsys.readouterr().out
     assert picture.stat().st_size > 20_000
     result = json.loads((tmp_path / "x.json").read_text())
-    rows = list(csv.reader(table.open()))
+    rows = list(csv.reader(table.read_text().splitlines()))
     assert rows[0][-1] == "value"
     for row in rows[1:]:
         node = result

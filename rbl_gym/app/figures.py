@@ -53,7 +53,11 @@ def camsap2013(result: dict[str, Any], example: Example) -> Figure:
     figure = _new(14, 7.2)
     grid = figure.add_gridspec(2, 3, height_ratios=[1.25, 1])
     _trajectory(figure.add_subplot(grid[0, 0]), example)
-    _errors(figure.add_subplot(grid[1, 0]), example)
+    lower = figure.add_subplot(grid[1, 0])
+    if all("trade" in data for data in result["readings"].values()):
+        _trade(lower, result)
+    else:
+        _errors(lower, example)
     for column, (reading, data) in enumerate(result["readings"].items()):
         for row, (key, label) in enumerate(
             (("rotation_rmse", "rotation RMSE (Frobenius)"),
@@ -100,6 +104,23 @@ def _trajectory(axes: Any, example: Example) -> None:
     axes.set_ylabel("y [m]")
     axes.set_title(f"one trial: 95 % beliefs and their errors x {_MAGNIFY}", fontsize=9)
     axes.legend(frameon=False, fontsize=8, loc="upper left")
+
+
+def _trade(axes: Any, result: dict[str, Any]) -> None:
+    """ET-KF's error against how often it projects, a point for every threshold."""
+    for (reading, data), marker in zip(result["readings"].items(), "os", strict=False):
+        rates = [100 * row["trigger_rate"] for row in data["trade"]]
+        errors = [row["rotation_rmse"] for row in data["trade"]]
+        axes.plot(rates, errors, marker=marker, ms=4, lw=1.2, color=COLOURS["ET-KF"],
+                  label=f"turn noise {reading}/s")  # fmt: skip
+        for row, rate, error in zip(data["trade"], rates, errors, strict=True):
+            if 1 < rate < 97:
+                axes.annotate(f"{row['threshold']:g}", (rate, error), xytext=(3, 4),
+                              textcoords="offset points", fontsize=7)  # fmt: skip
+    axes.set_xlabel("updates that project [%]")
+    axes.set_ylabel("rotation RMSE (Frobenius)")
+    axes.set_title("ET-KF's trade, labelled by threshold", fontsize=9)
+    axes.legend(frameon=False, fontsize=8)
 
 
 def _errors(axes: Any, example: Example) -> None:
