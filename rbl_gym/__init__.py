@@ -17,10 +17,15 @@ if (_root / "pyproject.toml").is_file() and (_root / "estimators").is_dir():
 def _register_environments() -> None:
     from gymnasium.envs.registration import register, registry
 
-    entry_points = {"RBL/Tracking-v0": "rbl_gym.envs.tracking:TrackingEnv"}
-    for env_id, entry_point in entry_points.items():
+    entry_points = {
+        "RBL/Tracking-v0": (
+            "rbl_gym.envs.tracking:TrackingEnv",
+            "rbl_gym.envs.tracking_vector:TrackingVectorEnv",
+        ),
+    }
+    for env_id, (scalar, vector) in entry_points.items():
         if env_id not in registry:
-            register(id=env_id, entry_point=entry_point)
+            register(id=env_id, entry_point=scalar, vector_entry_point=vector)
 
 
 _register_environments()

@@ -168,10 +168,18 @@ def random_twist(
     turn_rate_rad_s = check_number("turn_rate_rad_s", turn_rate_rad_s, low=0.0)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     directions = rng.standard_normal((*batch, -(-steps // hold), 2, 3))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    rates = np.array([turn_rate_rad_s, speed_m_s])[:, None]
-    twists = (directions * rates).reshape(*batch, -1, 6)
-    return Trajectory(rotation, translation, np.repeat(twists, hold, axis=-2)[..., :steps, :])
+    twists = held_twists(directions, turn_rate_rad_s, speed_m_s, steps, hold)
+    return Trajectory(rotation, translation, twists)
+
+
+def held_twists(
+    directions: FloatArray, turn_rate_rad_s: float, speed_m_s: float, steps: int, hold: int
+) -> FloatArray:
+    """Twists (..., T, 6) along turn axes and directions (..., K, 2, 3), `hold` steps for each."""
+    units = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    twists = units * np.array([turn_rate_rad_s, speed_m_s])[:, None]
+    twists = twists.reshape((*directions.shape[:-2], 6))
+    return np.repeat(twists, hold, axis=-2)[..., :steps, :]
 
 
 def waypoints(

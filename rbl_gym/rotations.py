@@ -38,7 +38,7 @@ def vee(W: ArrayLike) -> FloatArray:
     )
 
 
-def _coefficients(squared: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def coefficients(squared: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 as functions of x^2, both branches finite."""
     small = squared < _SMALL_SQUARED_ANGLE
     safe = np.where(small, 1.0, squared)
@@ -60,6 +60,15 @@ def _coefficients(squared: FloatArray) -> tuple[FloatArray, FloatArray, FloatArr
     return a, b, c
 
 
+def inverse_coefficient(squared: FloatArray) -> FloatArray:
+    """(1 - x / (2 tan(x / 2))) / x^2 as a function of x^2: of ``w w^T`` in the inverse Jacobian."""
+    small = squared < _SMALL_SQUARED_ANGLE
+    safe = np.where(small, 1.0, squared)
+    x = np.sqrt(safe)
+    series = 1 / 12 + squared * (1 / 720 + squared / 30240)
+    return np.where(small, series, (1 - x / (2 * np.tan(x / 2))) / safe)
+
+
 def _series(w: FloatArray, a: FloatArray, b: FloatArray, diagonal: ArrayLike) -> FloatArray:
     """``diagonal * I + a [w]x + b w w^T``, the common form of exp and its Jacobians."""
     M = b[..., None, None] * (w[..., :, None] * w[..., None, :]) + hat(a[..., None] * w)
@@ -72,7 +81,7 @@ def exp(w: ArrayLike) -> FloatArray:
     """Rotation matrix (..., 3, 3) of the rotation vector ``w`` (..., 3) in radians (Rodrigues)."""
     w = np.asarray(w, dtype=np.float64)
     squared = np.einsum("...i,...i->...", w, w)
-    a, b, _ = _coefficients(squared)
+    a, b, _ = coefficients(squared)
     return _series(w, a, b, 1.0 - b * squared)
 
 
@@ -80,7 +89,7 @@ def left_jacobian(w: ArrayLike) -> FloatArray:
     """Left Jacobian (..., 3, 3): ``exp(w + d) = exp(Jl(w) d) exp(w)`` to first order in d."""
     w = np.asarray(w, dtype=np.float64)
     squared = np.einsum("...i,...i->...", w, w)
-    _, b, c = _coefficients(squared)
+    _, b, c = coefficients(squared)
     return _series(w, b, c, 1.0 - c * squared)
 
 
@@ -91,13 +100,7 @@ def left_jacobian_inverse(w: ArrayLike) -> FloatArray:
     """
     w = np.asarray(w, dtype=np.float64)
     squared = np.einsum("...i,...i->...", w, w)
-    small = squared < _SMALL_SQUARED_ANGLE
-    x = np.sqrt(np.where(small, 1.0, squared))
-    c = np.where(
-        small,
-        1 / 12 + squared * (1 / 720 + squared / 30240),
-        (1 - x / (2 * np.tan(x / 2))) / np.where(small, 1.0, squared),
-    )
+    c = inverse_coefficient(squared)
     return _series(w, np.full_like(squared, -0.5), c, 1.0 - c * squared)
 
 

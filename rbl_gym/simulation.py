@@ -15,34 +15,68 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.scenes import Scene
 
 
+class Draws(NamedTuple):
+    """All random numbers of an episode: standard normals (..., n) and uniforms (..., m)."""
+
+    normals: FloatArray
+    uniforms: FloatArray
+
+
 class Episode(NamedTuple):
     """All of an episode that does not depend on actions, with leading batch axes.
 
     Attributes
     ----------
-    rotation, translation
-        True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3).
+    rotation, translation, positions
+        True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3), and the places of
+        the tags (..., T + 1, N, 3).
     twists
         Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
         unless the prior is older than it.
+    normals, uniforms
+        Random numbers of the ranges (..., T + 1, M, N), of the links (..., T + 1, 2, M, N) or
+        None where the scene's links need none.
     prior_rotation, prior_translation, prior_covariance
         Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
     anchors
         At epoch 0, (..., M, 3).
-    normals, uniforms
-        Random numbers of the ranges (..., T + 1, M, N), of the links (..., T + 1, 2, M, N) or
-        None where the scene's links need none.
     """
 
     rotation: FloatArray
     translation: FloatArray
+    positions: FloatArray
     twists: FloatArray
+    normals: FloatArray
+    uniforms: FloatArray | None
     prior_rotation: FloatArray
     prior_translation: FloatArray
     prior_covariance: FloatArray
     anchors: FloatArray
+
+
+class Epoch(NamedTuple):
+    """An episode at one epoch: the first six fields of `Episode` without their time axis."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    positions: FloatArray
+    twist: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
+
+
+# Standard normals of an episode besides those of steps and ranges: rotation, spin, prior.
+_START_NORMALS = 4 + 3 + 6
+# Steps for which a random twist is held.
+_HOLD = 10
+
+
+def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Draws:
+    """The random numbers of an episode: one call for normals, one for uniforms."""
+    return Draws(
+        rng.standard_normal((*batch, sum(_normal_sizes(scene)))),
+        rng.random((*batch, sum(_uniform_sizes(scene)))),
+    )
 
 
 def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:
@@ -50,17 +84,52 @@ def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] 
 
     Anchors that the scene leaves open are drawn anew for every episode of the batch.
     """
-    older = scene.prior == "start"
-    steps = scene.steps + older
-    trajectory = _trajectory(scene, rng, batch, steps)
-    path = motion.simulate(
-        trajectory, scene.dt, scene.process, rng.standard_normal((*batch, steps, 6))
-    )
+    return build_episode(scene, draw(scene, rng, batch))
+
+
+def _steps(scene: Scene) -> int:
+    """Steps of motion: one more than the episode's where the prior is older than epoch 0."""
+    return scene.steps + (scene.prior == "start")
+
+
+def _links(scene: Scene) -> int:
+    return scene.n_anchors * len(scene.tags)
+
+
+def _normal_sizes(scene: Scene) -> tuple[int, int, int, int]:
+    """Normals of the start, the process, the ranges, the random twists."""
+    held = -(-_steps(scene) // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
+    return _START_NORMALS, 6 * _steps(scene), (scene.steps + 1) * _links(scene), held
+
+
+def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
+    """Uniforms of the way-points, the orbit's phase, the anchors, the links."""
+    anchors = 3 * scene.n_anchors if scene.anchors is None else 0
+    links = 2 * (scene.steps + 1) * _links(scene) if scene.links.is_random else 0
+    return 3 * _n_points(scene), int(scene.trajectory == "orbit"), anchors, links
+
+
+def _n_points(scene: Scene) -> int:
+    if scene.trajectory != "waypoints":
+        return 1
+    extent = max(float(np.linalg.norm(np.ptp(scene.volume.bounds(), axis=0))), 1e-9)
+    # Legs average above a quarter of the extent: four times as many as that calls for, and 8.
+    return 8 + int(np.ceil(16 * scene.speed_m_s * scene.dt * _steps(scene) / extent))
+
+
+def build_episode(scene: Scene, draws: Draws) -> Episode:
+    """The episodes that these random numbers make; batched over their leading axes."""
+    batch = draws.normals.shape[:-1]
+    start, process, noise, held = _split(draws.normals, _normal_sizes(scene))
+    places, phase, spots, chances = _split(draws.uniforms, _uniform_sizes(scene))
+    trajectory = _trajectory(scene, start[..., :7], places, phase, held)
+    steps = _steps(scene)
+    path = motion.simulate(trajectory, scene.dt, scene.process, process.reshape((*batch, steps, 6)))
     twists = np.broadcast_to(trajectory.twists, (*batch, steps, 6))
-    offset = rng.standard_normal((*batch, 6))
+    offset = start[..., 7:]
     covariance = np.broadcast_to(scene.prior_covariance, (*batch, 6, 6))
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
-    if older:
+    if scene.prior == "start":
         prior = motion.propagate(rotation, translation, twists[..., 0, :], scene.dt)
         covariance = bounds.predict_covariance(
             covariance, twists[..., 0, :], scene.dt, scene.process
@@ -73,59 +142,73 @@ def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] 
         )
         twists = np.concatenate([np.zeros((*batch, 1, 6)), twists], axis=-2)
     if scene.anchors is None:
-        anchors = scene.anchor_region.draw(rng.random((*batch, scene.n_anchors, 3)))
+        anchors = scene.anchor_region.draw(spots.reshape((*batch, scene.n_anchors, 3)))
     else:
         anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
     shape = (scene.n_anchors, len(scene.tags))
-    normals = rng.standard_normal((*batch, scene.steps + 1, *shape))
-    uniforms = rng.random((*batch, scene.steps + 1, 2, *shape)) if scene.links.is_random else None
-    return Episode(*path, twists, *prior, covariance, anchors, normals, uniforms)
+    return Episode(
+        *path,
+        ranging.tag_positions(*path, scene.tags),
+        twists,
+        noise.reshape((*batch, scene.steps + 1, *shape)),
+        chances.reshape((*batch, scene.steps + 1, 2, *shape)) if scene.links.is_random else None,
+        *prior,
+        covariance,
+        anchors,
+    )
+
+
+def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
+    return np.split(block, np.cumsum(sizes)[:-1], axis=-1)
 
 
 def _trajectory(
-    scene: Scene, rng: np.random.Generator, batch: tuple[int, ...], steps: int
+    scene: Scene, start: FloatArray, places: FloatArray, phase: FloatArray, held: FloatArray
 ) -> motion.Trajectory:
-    """The scene's nominal motion; waypoints and the start are uniform in its volume."""
-    rotation = rotations.random(rng, batch)
+    """The scene's nominal motion; way-points and the start are uniform in its volume."""
+    batch, steps = start.shape[:-1], _steps(scene)
+    rotation = rotations.from_quaternion(start[..., :4])
     if scene.start_rotation is not None:
         rotation = np.broadcast_to(scene.start_rotation, (*batch, 3, 3))
     low, high = scene.volume.bounds()
-    length = scene.speed_m_s * scene.dt * steps
-    # Legs average above a quarter of the extent: four times as many as that calls for, and 8.
-    extent = max(float(np.linalg.norm(high - low)), 1e-9)
-    n_points = 8 + int(np.ceil(16 * length / extent)) if scene.trajectory == "waypoints" else 1
-    points = low + rng.random((*batch, n_points, 3)) * (high - low)
-    start = points[..., 0, :]
+    points = low + places.reshape((*batch, -1, 3)) * (high - low)
+    first = points[..., 0, :]
     if scene.start_translation is not None:
-        start = np.broadcast_to(scene.start_translation, (*batch, 3))
-        points[..., 0, :] = start
-    spin = scene.spin_rad_s * rng.standard_normal((*batch, 3))
+        first = np.broadcast_to(scene.start_translation, (*batch, 3))
+        points[..., 0, :] = first
     if scene.trajectory == "constant":
-        return motion.constant_twist(rotation, start, scene.twist, steps)
+        return motion.constant_twist(rotation, first, scene.twist, steps)
     if scene.trajectory == "random-twist":
-        return motion.random_twist(rotation, start, scene.speed_m_s, scene.spin_rad_s, steps, rng)
+        rates = (scene.spin_rad_s, scene.speed_m_s)
+        twists = motion.held_twists(held.reshape((*batch, -1, 2, 3)), *rates, steps, _HOLD)
+        return motion.Trajectory(rotation, first, twists)
     if scene.trajectory == "orbit":
         radius = 0.35 * float((high - low)[:2].min())
-        phase = 2 * np.pi * rng.random(batch)
-        return motion.orbit(0.5 * (low + high), radius, scene.speed_m_s, scene.dt, steps, phase)
+        turn = 2 * np.pi * phase[..., 0]
+        return motion.orbit(0.5 * (low + high), radius, scene.speed_m_s, scene.dt, steps, turn)
     if scene.trajectory == "lawn-mower":
-        spacing = max(0.2 * float((high - low)[1]), 1e-9)
-        points = np.broadcast_to(lanes := motion.lawn_mower_points(low, high, spacing),
-                                 (*batch, *lanes.shape))  # fmt: skip
+        lanes = motion.lawn_mower_points(low, high, max(0.2 * float((high - low)[1]), 1e-9))
+        points = np.broadcast_to(lanes, (*batch, *lanes.shape))
+    spin = scene.spin_rad_s * start[..., 4:7]
     return motion.waypoints(rotation, points, scene.speed_m_s, scene.dt, steps, spin)
 
 
-def measure(scene: Scene, episode: Episode, epoch: int, anchors: FloatArray) -> ranging.Measurement:
-    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3)."""
-    positions = ranging.tag_positions(
-        episode.rotation[..., epoch, :, :], episode.translation[..., epoch, :], scene.tags
-    )
-    measured = ranging.measure(
-        ranging.distances(anchors, positions),
-        scene.noise,
+def epoch_of(episode: Episode, epoch: int) -> Epoch:
+    """Views of an episode at one epoch, the same for the whole batch."""
+    return Epoch(
+        episode.rotation[..., epoch, :, :],
+        episode.translation[..., epoch, :],
+        episode.positions[..., epoch, :, :],
+        episode.twists[..., epoch, :],
         episode.normals[..., epoch, :, :],
-        scene.links,
         None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
+    )
+
+
+def measure(scene: Scene, at: Epoch, anchors: FloatArray) -> ranging.Measurement:
+    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3)."""
+    measured = ranging.measure(
+        ranging.distances(anchors, at.positions), scene.noise, at.normals, scene.links, at.uniforms
     )
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     links = measured.links & (measured.ranges > 0)
@@ -146,11 +229,11 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
 
 def posterior_information(
     scene: Scene,
-    episode: Episode,
-    epoch: int,
+    at: Epoch,
     anchors: FloatArray,
     links: BoolArray,
     previous: FloatArray | None,
+    prior_covariance: FloatArray | None = None,
 ) -> FloatArray:
     """Posterior Cramer-Rao information (..., 6, 6) at the true pose of an epoch.
 
@@ -158,16 +241,9 @@ def posterior_information(
     gave nothing tell nothing.
     """
     if previous is None:
-        predicted = np.linalg.inv(episode.prior_covariance)
+        predicted = np.linalg.inv(prior_covariance)
     else:
-        predicted = bounds.predict_information(
-            previous, episode.twists[..., epoch, :], scene.dt, scene.process
-        )
+        predicted = bounds.predict_information(previous, at.twist, scene.dt, scene.process)
     return predicted + bounds.information_at(
-        anchors,
-        np.asarray(scene.tags),
-        episode.rotation[..., epoch, :, :],
-        episode.translation[..., epoch, :],
-        scene.noise,
-        links,
+        anchors, np.asarray(scene.tags), at.rotation, at.translation, scene.noise, links
     )

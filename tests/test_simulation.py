@@ -109,6 +109,7 @@ def test_every_array_of_a_batch_has_the_stated_shape(name, batch):
     shapes = {
         "rotation": (8, 3, 3),
         "translation": (8, 3),
+        "positions": (8, links[1], 3),
         "twists": (8, 6),
         "prior_rotation": (3, 3),
         "prior_translation": (3,),
@@ -318,7 +319,7 @@ def test_measure_equals_a_loop_over_the_links(name):
     assert episode.uniforms is not None
     for k in (0, 3, 5):
         clean = ranges_by_hand(scene, episode, k, episode.anchors)
-        got = simulation.measure(scene, episode, k, episode.anchors)
+        got = simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors)
         for m, n in np.ndindex(clean.shape):
             dropped = episode.uniforms[k, 0, m, n] < 0.3
             reflected = episode.uniforms[k, 1, m, n] < 0.2
@@ -332,10 +333,10 @@ def test_measure_equals_a_loop_over_the_links(name):
 def test_measure_of_a_batch_equals_its_episodes_one_by_one(name):
     scene = change(name, steps=4, links=BAD_LINKS)
     batch = draw(scene, 10, (3,))
-    together = simulation.measure(scene, batch, 2, batch.anchors)
+    together = simulation.measure(scene, simulation.epoch_of(batch, 2), batch.anchors)
     for b in range(3):
         single = Episode(*(None if array is None else array[b] for array in batch))  # type: ignore[arg-type]
-        alone = simulation.measure(scene, single, 2, single.anchors)
+        alone = simulation.measure(scene, simulation.epoch_of(single, 2), single.anchors)
         for got, want in zip(together, alone, strict=True):
             np.testing.assert_allclose(got[b], want, rtol=1e-13)
 
@@ -344,7 +345,7 @@ def test_measure_of_a_batch_equals_its_episodes_one_by_one(name):
 def test_measurements_of_an_epoch_depend_on_no_other_epoch(name):
     scene = change(name, steps=6, links=BAD_LINKS)
     episode = draw(scene, 11)
-    want = simulation.measure(scene, episode, 3, episode.anchors)
+    want = simulation.measure(scene, simulation.epoch_of(episode, 3), episode.anchors)
 
     def spoil(array: np.ndarray) -> np.ndarray:
         others = np.arange(7) != 3
@@ -352,7 +353,7 @@ def test_measurements_of_an_epoch_depend_on_no_other_epoch(name):
 
     per_epoch = ("rotation", "translation", "twists", "normals", "uniforms")
     spoilt = episode._replace(**{key: spoil(getattr(episode, key)) for key in per_epoch})
-    got = simulation.measure(scene, spoilt, 3, episode.anchors)
+    got = simulation.measure(scene, simulation.epoch_of(spoilt, 3), episode.anchors)
     for a, b in zip(got, want, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -396,7 +397,7 @@ def test_limit_of_a_changed_scene_does_not_cut_its_ranges(override):
         return
     episode = draw(scene, 0)
     want = ranges_by_hand(scene, episode, 0, episode.anchors)
-    got = simulation.measure(scene, episode, 0, episode.anchors).ranges
+    got = simulation.measure(scene, simulation.epoch_of(episode, 0), episode.anchors).ranges
     np.testing.assert_allclose(got, want)
 
 
@@ -405,7 +406,7 @@ def test_an_impossible_range_is_cut_to_the_limit(name):
     scene = change(name, steps=2)
     episode = draw(scene, 12)
     wild = episode._replace(normals=np.full_like(episode.normals, 1e12))
-    ranges = simulation.measure(scene, wild, 1, episode.anchors).ranges
+    ranges = simulation.measure(scene, simulation.epoch_of(wild, 1), episode.anchors).ranges
     np.testing.assert_array_equal(ranges, np.full_like(ranges, scene.range_limit_m))
 
 
@@ -413,7 +414,7 @@ def test_a_range_of_zero_is_no_link():
     scene = change("uwb_room", steps=2)
     episode = draw(scene, 13)
     none = episode._replace(normals=np.full_like(episode.normals, -1e6))
-    measured = simulation.measure(scene, none, 1, episode.anchors)
+    measured = simulation.measure(scene, simulation.epoch_of(none, 1), episode.anchors)
     assert not measured.links.any()
     assert not measured.ranges.any()
 
@@ -426,7 +427,10 @@ def test_links_drop_as_often_as_said(probability):
     scene = change("uwb_room", links=LinkModel(drop_probability=probability))
     episode = draw(scene, 14)
     lost = np.concatenate(
-        [~simulation.measure(scene, episode, k, episode.anchors).links for k in range(101)]
+        [
+            ~simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors).links
+            for k in range(101)
+        ]
     )
     deviation = (probability * (1 - probability) / lost.size) ** 0.5
     assert abs(lost.mean() - probability) <= 4 * deviation
@@ -439,8 +443,8 @@ def test_links_end_at_the_reach():
     seen = []
     for k in range(0, 101, 5):
         distances = distances_by_hand(scene, episode, k, episode.anchors)
-        free = simulation.measure(clean, episode, k, episode.anchors)
-        got = simulation.measure(scene, episode, k, episode.anchors)
+        free = simulation.measure(clean, simulation.epoch_of(episode, k), episode.anchors)
+        got = simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors)
         np.testing.assert_array_equal(got.links, distances <= 70.0)
         np.testing.assert_array_equal(got.ranges, np.where(distances <= 70.0, free.ranges, 0.0))
         seen.append(got.links)
@@ -454,8 +458,11 @@ def test_reflected_paths_are_longer_by_the_bias_and_as_frequent_as_said():
     np.testing.assert_array_equal(episode.normals, free.normals)
     flags = []
     for k in range(101):
-        got = simulation.measure(scene, episode, k, episode.anchors)
-        want = simulation.measure(clean, free, k, free.anchors).ranges + 3.0 * got.nlos
+        got = simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors)
+        want = (
+            simulation.measure(clean, simulation.epoch_of(free, k), free.anchors).ranges
+            + 3.0 * got.nlos
+        )
         np.testing.assert_allclose(got.ranges, want, rtol=1e-14)
         flags.append(got.nlos)
     assert np.mean(flags) == pytest.approx(0.2, abs=4 * (0.16 / np.size(flags)) ** 0.5)
@@ -560,13 +567,15 @@ def test_posterior_information_equals_a_naive_recursion_and_that_of_bounds(name)
     P, J, stepped = episode.prior_covariance, None, None
     for k in range(scene.steps + 1):
         anchors = anchors + rng.normal(0, 0.1, anchors.shape)
-        links = simulation.measure(scene, episode, k, anchors).links
+        links = simulation.measure(scene, simulation.epoch_of(episode, k), anchors).links
         twist = episode.twists[k]
         if k > 0:
             P = predicted_covariance(scene, P, twist)
         P = np.linalg.inv(np.linalg.inv(P) + information_by_hand(scene, episode, k, anchors, links))
         pose = episode.rotation[k], episode.translation[k]
-        J = simulation.posterior_information(scene, episode, k, anchors, links, J)
+        J = simulation.posterior_information(
+            scene, simulation.epoch_of(episode, k), anchors, links, J, episode.prior_covariance
+        )
         if stepped is None:
             stepped = np.linalg.inv(episode.prior_covariance) + bounds.range_information(
                 anchors, scene.tags, *pose, scene.noise, links
@@ -587,7 +596,14 @@ def test_links_that_gave_nothing_tell_nothing(name):
     scene = change(name, steps=2)
     episode = draw(scene, 20)
     none = np.zeros((scene.n_anchors, len(scene.tags)), bool)
-    J = simulation.posterior_information(scene, episode, 0, episode.anchors, none, None)
+    J = simulation.posterior_information(
+        scene,
+        simulation.epoch_of(episode, 0),
+        episode.anchors,
+        none,
+        None,
+        episode.prior_covariance,
+    )
     np.testing.assert_allclose(J @ episode.prior_covariance, np.eye(6), rtol=0, atol=1e-12)
 
 
@@ -595,11 +611,22 @@ def test_information_of_a_batch_equals_its_episodes_one_by_one():
     scene = change("auv_buoys", steps=2)
     batch = draw(scene, 21, (3,))
     links = np.ones((3, scene.n_anchors, len(scene.tags)), bool)
-    first = simulation.posterior_information(scene, batch, 0, batch.anchors, links, None)
-    second = simulation.posterior_information(scene, batch, 1, batch.anchors, links, first)
+    first = simulation.posterior_information(
+        scene, simulation.epoch_of(batch, 0), batch.anchors, links, None, batch.prior_covariance
+    )
+    second = simulation.posterior_information(
+        scene, simulation.epoch_of(batch, 1), batch.anchors, links, first, batch.prior_covariance
+    )
     for b in range(3):
         alone = Episode(*(None if array is None else array[b] for array in batch))  # type: ignore[arg-type]
         J = None
         for k in (0, 1):
-            J = simulation.posterior_information(scene, alone, k, alone.anchors, links[b], J)
+            J = simulation.posterior_information(
+                scene,
+                simulation.epoch_of(alone, k),
+                alone.anchors,
+                links[b],
+                J,
+                alone.prior_covariance,
+            )
         np.testing.assert_allclose(second[b], J, rtol=1e-10)

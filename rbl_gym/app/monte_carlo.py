@@ -64,9 +64,10 @@ def simulate_world(scene: scenes.Scene, trials: int, rng: np.random.Generator) -
     covariances = []
     information = None
     for epoch in range(scene.steps + 1):
-        measured = simulation.measure(scene, episode, epoch, episode.anchors)
+        at = simulation.epoch_of(episode, epoch)
+        measured = simulation.measure(scene, at, episode.anchors)
         information = simulation.posterior_information(
-            scene, episode, epoch, episode.anchors, measured.links, information
+            scene, at, episode.anchors, measured.links, information, episode.prior_covariance
         )
         measurements.append(measured)
         covariances.append(np.linalg.inv(information))

@@ -129,26 +129,32 @@ class TrackingEnv(gym.Env[Any, Any]):
         self, episode: simulation.Episode
     ) -> tuple[dict[str, np.ndarray], dict[str, Any], float]:
         k = self._epoch
-        measured = simulation.measure(self.scene, episode, k, self._anchors)
+        at = simulation.epoch_of(episode, k)
+        measured = simulation.measure(self.scene, at, self._anchors)
         info: dict[str, Any] = {
-            "rotation": episode.rotation[k].copy(),
-            "translation": episode.translation[k].copy(),
+            "rotation": at.rotation.copy(),
+            "translation": at.translation.copy(),
             "nlos": measured.nlos,
             "epoch": k,
         }
         reward = 0.0
         if self.reward_mode == "bound":
             self._information = simulation.posterior_information(
-                self.scene, episode, k, self._anchors, measured.links, self._information
+                self.scene,
+                at,
+                self._anchors,
+                measured.links,
+                self._information,
+                episode.prior_covariance,
             )
             covariance = np.linalg.inv(self._information)
-            info["score_m"] = float(bounds.score(covariance, episode.rotation[k], self._tags))
+            info["score_m"] = float(bounds.score(covariance, at.rotation, self._tags))
             reward = -float(np.log(info["score_m"]))
         observation = {
             "ranges": measured.ranges,
             "links": measured.links.astype(np.int8),
             "anchors": self._anchors.copy(),
-            "twist": episode.twists[k].copy(),
+            "twist": at.twist.copy(),
         }
         return observation, info, reward
 

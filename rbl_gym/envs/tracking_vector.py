@@ -1,0 +1,292 @@
+"""RBL/Tracking-v0, many bodies at once: the native vector environment on the scalar one's core."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
+
+from rbl_gym import bounds, scenes, simulation
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
+from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
+
+# Fields of an episode that have a time axis; here it comes first, so that a step reads and
+# writes contiguous memory.
+_TIMED = simulation.Epoch._fields
+
+
+class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
+    """`num_envs` independent `TrackingEnv` worlds in arrays with a leading axis.
+
+    Made by ``gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=1024, scene=...)``. Observations,
+    rewards and infos are those of the scalar environment, stacked; its docstring describes
+    them. `info` keys have Gymnasium's boolean masks ``_key`` beside them.
+
+    Seeding: ``reset(seed=s)`` seeds environment i with ``s + i``, a list gives each its own.
+    Every environment has a generator of its own and draws an episode from it at reset exactly as
+    the scalar environment does, so that environment i equals ``TrackingEnv`` seeded with its
+    seed, episode after episode, in every autoreset mode.
+
+    Parameters
+    ----------
+    num_envs
+        How many.
+    scene, reward, render_mode
+        As `TrackingEnv`.
+    max_episode_steps
+        Truncate after so many steps, if fewer than the scene's.
+    autoreset_mode
+        ``"NextStep"`` (default): the step after an episode's end resets, ignores its action and
+        rewards 0. ``"SameStep"``: the ending step already returns the next episode's first
+        observation, and `info` holds ``final_obs`` and ``final_info``. ``"Disabled"``: call
+        ``reset(options={"reset_mask": mask})``.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scene: str | Mapping[str, Any] = "uwb_room",
+        reward: str = "bound",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs must be a positive int, got {num_envs!r}")
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}")
+        modes = [mode.value for mode in AutoresetMode]
+        if not isinstance(autoreset_mode, AutoresetMode):
+            autoreset_mode = AutoresetMode(check_one_of("autoreset_mode", autoreset_mode, modes))
+        self.num_envs = num_envs
+        self.scene = scenes.get(scene)
+        self.reward_mode = check_one_of("reward", reward, REWARDS)
+        self.render_mode = render_mode
+        self.steps_limit = min(self.scene.steps, max_episode_steps or self.scene.steps)
+        self.metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}
+        self._mode = autoreset_mode
+        self.single_observation_space = observation_space(self.scene)
+        self.single_action_space = action_space(self.scene)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._tags = np.asarray(self.scene.tags)
+        self._generators: list[np.random.Generator] = []
+        self._timed: dict[str, FloatArray] | None = None
+        self._done = np.zeros(num_envs, dtype=np.bool_)
+        self._epochs = np.zeros(num_envs, dtype=np.int64)
+
+    # --- reset ------------------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
+        mask = self._reset_mask(options)
+        seeds = self._seeds(seed)
+        if self._timed is None and not mask.all():
+            raise gym.error.ResetNeeded("reset all environments before some of them")
+        if not self._generators:
+            self._generators = [seeding.np_random(one)[0] for one in seeds]
+        else:
+            for i in np.flatnonzero(mask):
+                if seeds[i] is not None:
+                    self._generators[i] = seeding.np_random(seeds[i])[0]
+        prior = self._restart(mask)
+        observation, info, _ = self._observe(fresh=mask, moved=np.zeros_like(mask))
+        return observation, {**info, **prior}
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> BoolArray:
+        if options is None or "reset_mask" not in options:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        mask = np.asarray(options["reset_mask"])
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise ValueError(
+                f"reset_mask must be ({self.num_envs},) booleans, at least one True, "
+                f"got shape {mask.shape} of {mask.dtype}"
+            )
+        return mask
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed must hold {self.num_envs} seeds, got {len(seed)}")
+        return list(seed)
+
+    def _restart(self, mask: BoolArray) -> dict[str, Any]:
+        """New episodes where the mask says; returns their priors as info."""
+        chosen = np.flatnonzero(mask)
+        draws = [simulation.draw(self.scene, self._generators[i]) for i in chosen]
+        episode = simulation.build_episode(
+            self.scene, simulation.Draws(*(np.stack(part) for part in zip(*draws, strict=True)))
+        )
+        timed = {
+            name: np.moveaxis(value, 1, 0)
+            for name, value in zip(_TIMED, episode[: len(_TIMED)], strict=True)
+            if value is not None
+        }
+        if self._timed is None or mask.all():
+            self._timed = {name: np.ascontiguousarray(value) for name, value in timed.items()}
+            self._anchors = episode.anchors.copy()
+            self._prior_covariance = episode.prior_covariance.copy()
+        else:
+            for name, value in timed.items():
+                self._timed[name][:, chosen] = value
+            self._anchors[chosen] = episode.anchors
+            self._prior_covariance[chosen] = episode.prior_covariance
+        self._epochs[chosen] = 0
+        self._done[chosen] = False
+        info: dict[str, Any] = {}
+        for name in ("prior_rotation", "prior_translation", "prior_covariance"):
+            value = getattr(episode, name)
+            full = np.zeros((self.num_envs, *value.shape[1:]))
+            full[chosen] = value
+            info[name], info[f"_{name}"] = full, mask.copy()
+        return info
+
+    # --- step -------------------------------------------------------------------------------
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[dict[str, np.ndarray], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Step every world; see the autoreset mode for those whose episode is over."""
+        if self._timed is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        ended = self._done.copy()
+        if ended.any() and self._mode is AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded("episodes are over: reset them by options['reset_mask']")
+        moving = ~ended
+        self._move(actions, moving)
+        prior: dict[str, Any] = {}
+        if ended.any():
+            prior = self._restart(ended)
+        self._epochs[moving] += 1
+        observation, info, reward = self._observe(fresh=ended, moved=moving)
+        reward[ended] = 0.0
+        truncated = moving & (self._epochs >= self.steps_limit)
+        terminated = np.zeros(self.num_envs, dtype=np.bool_)
+        if self._mode is AutoresetMode.SAME_STEP and truncated.any():
+            observation, info = self._same_step(truncated, observation, info)
+        else:
+            self._done = truncated.copy()
+        return observation, reward, terminated, truncated, {**info, **prior}
+
+    def _move(self, actions: ArrayLike, moving: BoolArray) -> None:
+        if self.scene.anchor_speed_m_s > 0:
+            size = 3 * self.scene.n_anchors
+            velocities = check_array("actions", actions, (self.num_envs, size))
+            if velocities.ndim != 2:
+                shape = (self.num_envs, size)
+                raise ValueError(f"actions must have shape {shape}, got {velocities.shape}")
+            moved = simulation.move_anchors(self.scene, self._anchors, velocities)
+            # Those that reset in this step get their anchors from the new episode.
+            self._anchors = moved if moving.all() else np.where(
+                moving[:, None, None], moved, self._anchors
+            )  # fmt: skip
+        elif not self.action_space.contains(np.asarray(actions)):
+            raise ValueError(f"actions must be {self.num_envs} zeros where the anchors are fixed")
+
+    def _same_step(
+        self, truncated: BoolArray, observation: dict[str, np.ndarray], info: dict[str, Any]
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """The next episodes' first observations in place of the last, which go into `info`."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(truncated):
+            final[i] = {key: value[i].copy() for key, value in observation.items()}
+        last = {
+            key: np.where(
+                truncated.reshape(-1, *[1] * (value.ndim - 1)), value, np.zeros_like(value)
+            )
+            for key, value in info.items()
+            if not key.startswith("_")
+        }
+        masks = {f"_{key}": truncated.copy() for key in last}
+        prior = self._restart(truncated)
+        # Measurements are functions of the epoch: those of the other worlds come out the same.
+        fresh, fresh_info, _ = self._observe(fresh=truncated, moved=np.zeros_like(truncated))
+        fresh_info.update(prior)
+        fresh_info["final_obs"], fresh_info["_final_obs"] = final, truncated.copy()
+        fresh_info["final_info"] = {**last, **masks}
+        fresh_info["_final_info"] = truncated.copy()
+        return fresh, fresh_info
+
+    # --- what is seen -----------------------------------------------------------------------
+
+    def _at(self) -> simulation.Epoch:
+        """The worlds at their epochs: one slice where all clocks agree."""
+        assert self._timed is not None
+        first = self._epochs[0]
+        if (self._epochs == first).all():
+            slices = {name: value[first] for name, value in self._timed.items()}
+        else:
+            index = np.arange(self.num_envs)
+            slices = {name: value[self._epochs, index] for name, value in self._timed.items()}
+        return simulation.Epoch(*(slices.get(name) for name in _TIMED))  # pyright: ignore[reportArgumentType]
+
+    def _observe(
+        self, *, fresh: BoolArray, moved: BoolArray
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any], FloatArray]:
+        """Observations, infos and rewards of all worlds at their epochs.
+
+        `fresh` worlds are at the start of an episode, `moved` ones have just stepped: their bound
+        is carried on. The others are only looked at again.
+        """
+        at = self._at()
+        measured = simulation.measure(self.scene, at, self._anchors)
+        info: dict[str, Any] = {
+            "rotation": at.rotation.copy(),
+            "translation": at.translation.copy(),
+            "nlos": measured.nlos,
+            "epoch": self._epochs.copy(),
+        }
+        reward = np.zeros(self.num_envs)
+        if self.reward_mode == "bound":
+            self._carry_bound(at, measured.links, fresh, moved)
+            covariance = np.linalg.inv(self._information)
+            info["score_m"] = bounds.score(covariance, at.rotation, self._tags)
+            reward = -np.log(info["score_m"])
+        for key in list(info):
+            info[f"_{key}"] = np.ones(self.num_envs, dtype=np.bool_)
+        observation = {
+            "ranges": measured.ranges,
+            "links": measured.links.astype(np.int8),
+            "anchors": self._anchors.copy(),
+            "twist": at.twist.copy(),
+        }
+        return observation, info, reward
+
+    def _carry_bound(
+        self, at: simulation.Epoch, links: BoolArray, fresh: BoolArray, moved: BoolArray
+    ) -> None:
+        """The posterior Cramer-Rao information of the worlds that started or stepped."""
+        if moved.all():
+            self._information = simulation.posterior_information(
+                self.scene, at, self._anchors, links, self._information
+            )
+            return
+        if fresh.all():
+            self._information = np.empty((self.num_envs, 6, 6))
+        for rows, started in ((fresh, True), (moved, False)):
+            if rows.any():
+                part = simulation.Epoch(*(None if f is None else f[rows] for f in at))  # pyright: ignore[reportArgumentType]
+                self._information[rows] = simulation.posterior_information(
+                    self.scene,
+                    part,
+                    self._anchors[rows],
+                    links[rows],
+                    None if started else self._information[rows],
+                    self._prior_covariance[rows],
+                )
