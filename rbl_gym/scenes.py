@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -154,7 +155,7 @@ class Scene:
         std = [self.initial_rotation_rad] * 3 + [self.initial_translation_m] * 3
         return np.diag(np.square(std))
 
-    @property
+    @functools.cached_property
     def range_limit_m(self) -> float:
         """A range that no measurement of this scene exceeds (measurements are clipped to it)."""
         duration = self.steps * self.dt

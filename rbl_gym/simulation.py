@@ -6,6 +6,7 @@ is arithmetic on arrays with leading batch axes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -77,6 +78,16 @@ def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) ->
         rng.standard_normal((*batch, sum(_normal_sizes(scene)))),
         rng.random((*batch, sum(_uniform_sizes(scene)))),
     )
+
+
+def draw_each(scene: Scene, generators: Sequence[np.random.Generator]) -> Draws:
+    """`draw` once by each generator, (B, n) and (B, m): what a vector environment resets with."""
+    normals = np.empty((len(generators), sum(_normal_sizes(scene))))
+    uniforms = np.empty((len(generators), sum(_uniform_sizes(scene))))
+    for generator, normal_row, uniform_row in zip(generators, normals, uniforms, strict=True):
+        generator.standard_normal(out=normal_row)
+        generator.random(out=uniform_row)
+    return Draws(normals, uniforms)
 
 
 def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:

@@ -11,8 +11,8 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
 from rbl_gym import bounds, estimators, metrics, scenes
-from rbl_gym.checks import check_one_of
-from rbl_gym.estimators import PoseBelief
+from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.estimators import Filter, PoseBelief
 
 REWARDS = ("belief", "error")
 OBSERVATIONS = ("dict", "flat")
@@ -25,7 +25,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Wraps an environment whose observation has `ranges`, `links`, `anchors` and `twist` and
     whose unwrapped form has a `scene` (`RBL/Tracking-v0`). The environment's own reward is
-    switched off. No vector version yet: wrap the sub-environments.
+    switched off. For vector environments: `VectorEstimatePose`.
 
     Parameters
     ----------
@@ -72,24 +72,13 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             self, filter=filter, options=options, reward=reward, observation=observation
         )
         gym.Wrapper.__init__(self, env)
-        scene = getattr(env.unwrapped, "scene", None)
-        if not isinstance(scene, scenes.Scene):
-            raise ValueError(f"env must have a rbl_gym Scene as its scene, got {env.unwrapped!r}")
-        self._scene = scene
+        self._scene = scene_of(env)
         self._reward = check_one_of("reward", reward, REWARDS)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
-        self._tags = np.asarray(scene.tags)
-        self._filter = estimators.make(
-            filter,
-            tags=self._tags,
-            noise=scene.noise,
-            process=scene.process,
-            **(options or {}),
-        )
+        self._tags = np.asarray(self._scene.tags)
+        self._filter = make_filter(self._scene, filter, options)
         self._state: Any = None
-        if hasattr(env.unwrapped, "reward_mode"):
-            env.unwrapped.reward_mode = "none"  # pyright: ignore[reportAttributeAccessIssue]
-        self.observation_space = self._make_space()
+        self.observation_space = observation_space(self._kind, env.observation_space, self._scene)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -121,46 +110,83 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _judge(self, belief: PoseBelief, info: dict[str, Any]) -> None:
         """Errors against the true pose, into `info`."""
-        truth = info["rotation"], info["translation"]
-        error = metrics.pose_error(belief.rotation, belief.translation, *truth)
-        info["rotation_error_rad"] = float(np.linalg.norm(error[:3]))
-        info["position_error_m"] = float(np.linalg.norm(error[3:]))
-        info["tag_error_m"] = float(
-            metrics.tag_error(belief.rotation, belief.translation, *truth, self._tags)
-        )
-        info["nees"] = float(metrics.nees(error, belief.covariance))
-        info["score_m"] = float(bounds.score(belief.covariance, belief.rotation, self._tags))
+        figures = judge(belief, info["rotation"], info["translation"], self._tags)
+        info.update({name: float(value) for name, value in figures.items()})
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
-        if self._kind == "flat":
-            return flat_observation(observation, belief, self._scene)
-        return {
-            **observation,
-            "belief_rotation": belief.rotation,
-            "belief_translation": belief.translation,
-            "belief_covariance": belief.covariance,
-        }
+        return present(self._kind, observation, belief, self._scene)
 
-    def _make_space(self) -> spaces.Space[Any]:
-        inner = self.env.observation_space
-        if not isinstance(inner, spaces.Dict) or not {"ranges", "links", "anchors", "twist"} <= set(
-            inner.keys()
-        ):
-            raise ValueError(
-                f"env must observe ranges, links, anchors and twist, its space is {inner}"
-            )
-        if self._kind == "flat":
-            size = 21 + 4 * self._scene.n_anchors
-            return spaces.Box(-_FLAT_LIMIT, _FLAT_LIMIT, (size,), np.float32)
-        # Beliefs have no bound of their own; these are finite and never met.
-        return spaces.Dict(
-            {
-                **inner.spaces,
-                "belief_rotation": spaces.Box(-1.001, 1.001, (3, 3), np.float64),
-                "belief_translation": spaces.Box(-1e9, 1e9, (3,), np.float64),
-                "belief_covariance": spaces.Box(-1e18, 1e18, (6, 6), np.float64),
-            }
-        )
+
+def scene_of(env: Any) -> scenes.Scene:
+    """The scene of an environment, its own reward switched off; or a ValueError."""
+    unwrapped = env.unwrapped
+    scene = getattr(unwrapped, "scene", None)
+    if not isinstance(scene, scenes.Scene):
+        raise ValueError(f"env must have a rbl_gym Scene as its scene, got {unwrapped!r}")
+    if hasattr(unwrapped, "reward_mode"):
+        unwrapped.reward_mode = "none"
+    return scene
+
+
+def make_filter(scene: scenes.Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
+    """A named filter that knows the scene's tags and laws."""
+    return estimators.make(
+        name,
+        tags=np.asarray(scene.tags),
+        noise=scene.noise,
+        process=scene.process,
+        **(options or {}),
+    )
+
+
+def judge(
+    belief: PoseBelief, rotation: FloatArray, translation: FloatArray, tags: FloatArray
+) -> dict[str, FloatArray]:
+    """Errors of beliefs against true poses, their NEES and score, arrays (...)."""
+    truth = rotation, translation
+    error = metrics.pose_error(belief.rotation, belief.translation, *truth)
+    return {
+        "rotation_error_rad": np.linalg.norm(error[..., :3], axis=-1),
+        "position_error_m": np.linalg.norm(error[..., 3:], axis=-1),
+        "tag_error_m": metrics.tag_error(belief.rotation, belief.translation, *truth, tags),
+        "nees": metrics.nees(error, belief.covariance),
+        "score_m": bounds.score(belief.covariance, belief.rotation, tags),
+    }
+
+
+def present(
+    kind: str, observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: scenes.Scene
+) -> Any:
+    """The observation with the belief: a dict, or flat for a policy."""
+    if kind == "flat":
+        return flat_observation(observation, belief, scene)
+    return {
+        **observation,
+        "belief_rotation": belief.rotation,
+        "belief_translation": belief.translation,
+        "belief_covariance": belief.covariance,
+    }
+
+
+def observation_space(
+    kind: str, inner: spaces.Space[Any], scene: scenes.Scene
+) -> spaces.Space[Any]:
+    """The space of `present`, from that of one raw environment."""
+    needed = {"ranges", "links", "anchors", "twist"}
+    if not isinstance(inner, spaces.Dict) or not needed <= set(inner.keys()):
+        raise ValueError(f"env must observe ranges, links, anchors and twist, its space is {inner}")
+    if kind == "flat":
+        size = 21 + 4 * scene.n_anchors
+        return spaces.Box(-_FLAT_LIMIT, _FLAT_LIMIT, (size,), np.float32)
+    # Beliefs have no bound of their own; these are finite and never met.
+    return spaces.Dict(
+        {
+            **inner.spaces,
+            "belief_rotation": spaces.Box(-1.001, 1.001, (3, 3), np.float64),
+            "belief_translation": spaces.Box(-1e9, 1e9, (3,), np.float64),
+            "belief_covariance": spaces.Box(-1e18, 1e18, (6, 6), np.float64),
+        }
+    )
 
 
 def flat_observation(

@@ -129,10 +129,8 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
     def _restart(self, mask: BoolArray) -> dict[str, Any]:
         """New episodes where the mask says; returns their priors as info."""
         chosen = np.flatnonzero(mask)
-        draws = [simulation.draw(self.scene, self._generators[i]) for i in chosen]
-        episode = simulation.build_episode(
-            self.scene, simulation.Draws(*(np.stack(part) for part in zip(*draws, strict=True)))
-        )
+        draws = simulation.draw_each(self.scene, [self._generators[i] for i in chosen])
+        episode = simulation.build_episode(self.scene, draws)
         timed = {
             name: np.moveaxis(value, 1, 0)
             for name, value in zip(_TIMED, episode[: len(_TIMED)], strict=True)
@@ -245,7 +243,8 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         is carried on. The others are only looked at again.
         """
         at = self._at()
-        measured = simulation.measure(self.scene, at, self._anchors)
+        fast = at._replace(positions=_worlds_last(at.positions), normals=_worlds_last(at.normals))
+        measured = simulation.measure(self.scene, fast, _worlds_last(self._anchors))
         info: dict[str, Any] = {
             "rotation": at.rotation.copy(),
             "translation": at.translation.copy(),
@@ -261,8 +260,8 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         for key in list(info):
             info[f"_{key}"] = np.ones(self.num_envs, dtype=np.bool_)
         observation = {
-            "ranges": measured.ranges,
-            "links": measured.links.astype(np.int8),
+            "ranges": np.ascontiguousarray(measured.ranges),
+            "links": measured.links.astype(np.int8, order="C"),
             "anchors": self._anchors.copy(),
             "twist": at.twist.copy(),
         }
@@ -290,3 +289,8 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
                     None if started else self._information[rows],
                     self._prior_covariance[rows],
                 )
+
+
+def _worlds_last(array: FloatArray) -> FloatArray:
+    """A copy (B, ...) whose memory runs along the worlds: small inner axes make slow loops."""
+    return np.moveaxis(np.ascontiguousarray(np.moveaxis(array, 0, -1)), -1, 0)

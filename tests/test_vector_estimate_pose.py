@@ -1,0 +1,100 @@
+"""VectorEstimatePose against scalar wrapped environments, step by step, in every mode."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
+from tests.test_tracking_vector_env import ID, actions_of, assert_equal, short
+
+LOSSY = {"drop_probability": 0.2}
+
+
+def pair(scene, mode, filter="iekf", n=3, **arguments):
+    native = TrackingVectorEnv(n, scene, autoreset_mode=mode)
+    peer = SyncVectorEnv(
+        [lambda: EstimatePose(TrackingEnv(scene), filter, **arguments)] * n, autoreset_mode=mode
+    )
+    return VectorEstimatePose(native, filter, **arguments), peer
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize(
+    ("name", "filter", "arguments"),
+    [
+        ("auv_buoys", "iekf", {}),
+        ("drone_yard", "uc-kf", {"reward": "error"}),
+        ("uwb_room", "kf-ortho", {"observation": "flat"}),
+        ("camsap2013", "et-kf", {}),
+        ("satellite", "iekf", {"options": {"robust": True}, "observation": "flat"}),
+    ],
+)
+def test_equals_scalar_wrapped_environments(mode, name, filter, arguments):
+    native, peer = pair(short(name, 4, links=LOSSY), mode, filter, **arguments)
+    rng = np.random.default_rng(1)
+    assert_close(native.reset(seed=3), peer.reset(seed=3))
+    for _ in range(10):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got, want, strict=True):
+            assert_close(a, b)
+        assert native.observation_space.contains(got[0])
+
+
+def assert_close(got, want):
+    """As `assert_equal`, at the precision that a filter's rounding leaves."""
+    if isinstance(want, dict):
+        assert got.keys() == want.keys()
+        for key in want:
+            assert_close(got[key], want[key])
+    elif isinstance(want, tuple):
+        for a, b in zip(got, want, strict=True):
+            assert_close(a, b)
+    elif isinstance(want, np.ndarray) and want.dtype == object:
+        for a, b in zip(got, want, strict=True):
+            assert (a is None) == (b is None)
+            if b is not None:
+                assert_close(a, b)
+    elif np.asarray(want).dtype.kind == "f":
+        np.testing.assert_allclose(got, want, rtol=2e-5, atol=2e-6)
+    else:
+        assert_equal(got, want)
+
+
+def test_disabled_restarts_only_what_the_mask_says():
+    native, peer = pair(short("drone_yard", 5), AutoresetMode.DISABLED)
+    assert_close(native.reset(seed=2), peer.reset(seed=2))
+    zeros = np.zeros(3, int)
+    native.step(zeros), peer.step(zeros)
+    mask = np.array([False, True, False])
+    got = native.reset(options={"reset_mask": mask})[0]
+    assert_close(got, peer.reset(options={"reset_mask": mask})[0])
+    for _ in range(3):
+        a, b = native.step(zeros), peer.step(zeros)
+        assert_close(a[:4], b[:4])
+
+
+def test_wraps_what_make_vec_gives_and_its_own_reward_is_off(monkeypatch):
+    envs = gym.make_vec(ID, num_envs=4, scene="uwb_room")
+    wrapped = VectorEstimatePose(envs, "iekf")
+    from rbl_gym import simulation
+
+    def refuse(*_):
+        raise AssertionError("the bound was computed")
+
+    monkeypatch.setattr(simulation, "posterior_information", refuse)
+    wrapped.reset(seed=1)
+    _, reward, _, _, info = wrapped.step(np.zeros(4, int))
+    np.testing.assert_allclose(reward, -np.log(info["score_m"]))
+
+
+def test_wrong_environments_and_names_are_named():
+    with pytest.raises(ValueError, match="env must have a rbl_gym Scene"):
+        VectorEstimatePose(gym.make_vec("CartPole-v1", num_envs=2))
+    with pytest.raises(ValueError, match="reward must be one of 'belief', 'error', got 'gold'"):
+        VectorEstimatePose(TrackingVectorEnv(2), reward="gold")

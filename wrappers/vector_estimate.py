@@ -1,0 +1,186 @@
+"""VectorEstimatePose: one call of a batched filter for all worlds of a vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.wrappers.estimate import (
+    OBSERVATIONS,
+    REWARDS,
+    judge,
+    make_filter,
+    observation_space,
+    present,
+    scene_of,
+)
+
+_MEASURED = ("ranges", "links", "anchors", "twist")
+
+
+class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
+    """`EstimatePose` for a vector environment: beliefs, rewards and infos of all worlds at once.
+
+    Parameters, observations, rewards and infos are those of `EstimatePose`, stacked. Wraps the
+    native vector environment (`TrackingVectorEnv`) in every autoreset mode; worlds that reset get
+    a new state from their prior, the others keep theirs.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from rbl_gym.wrappers import VectorEstimatePose
+    >>> envs = gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=64, scene="drone_yard")
+    >>> envs = VectorEstimatePose(envs, "iekf")
+    >>> observation, info = envs.reset(seed=1)
+    >>> observation["belief_covariance"].shape
+    (64, 6, 6)
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        filter: str = "iekf",
+        options: Mapping[str, Any] | None = None,
+        reward: str = "belief",
+        observation: str = "dict",
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, filter=filter, options=options, reward=reward, observation=observation
+        )
+        VectorWrapper.__init__(self, env)
+        self._scene = scene_of(env)
+        self._reward = check_one_of("reward", reward, REWARDS)
+        self._kind = check_one_of("observation", observation, OBSERVATIONS)
+        self._tags = np.asarray(self._scene.tags)
+        self._filter = make_filter(self._scene, filter, options)
+        self._state: Any = None
+        self._belief: PoseBelief | None = None
+        single = observation_space(self._kind, env.single_observation_space, self._scene)
+        self.single_observation_space = single
+        self.observation_space = batch_space(single, env.num_envs)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start the filters of the worlds that reset from their priors."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._start(observation, info, info["_prior_rotation"])
+        self._judge(info)
+        return self._present(observation), info
+
+    def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Step the worlds; predict and update those that go on, start those that begin."""
+        observation, _, terminated, truncated, info = self.env.step(actions)
+        fresh = info.get("_prior_rotation", np.zeros(self.num_envs, dtype=np.bool_))
+        same_step = self.env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+        last = truncated if same_step else np.zeros_like(fresh)
+        moved = ~fresh | last
+        if moved.any():
+            self._advance(observation, info, moved, last)
+        reward = np.zeros(self.num_envs)
+        figures = self._figures(info, last)
+        if self._reward == "belief":
+            reward[moved] = -np.log(figures["score_m"][moved])
+        else:
+            reward[moved] = -figures["tag_error_m"][moved]
+        if last.any():
+            self._finish(info, figures, last)
+        if fresh.any():
+            self._start(observation, info, fresh)
+        self._judge(info)
+        return self._present(observation), reward, terminated, truncated, info
+
+    def _advance(
+        self,
+        observation: dict[str, np.ndarray],
+        info: dict[str, Any],
+        moved: BoolArray,
+        last: BoolArray,
+    ) -> None:
+        """Predict and update the worlds that stepped, the ended ones with their final ranges."""
+        measured = {key: observation[key] for key in _MEASURED}
+        if last.any():
+            final = info["final_obs"][last]
+            for key in _MEASURED:
+                measured[key] = measured[key].copy()
+                measured[key][last] = np.stack([one[key] for one in final])
+        everywhere = bool(moved.all())
+        state = self._state if everywhere else _rows(self._state, moved)
+        if not everywhere:
+            measured = {key: value[moved] for key, value in measured.items()}
+        state = self._filter.predict(state, measured["twist"], self._scene.dt)
+        state = self._filter.update(state, *(measured[k] for k in ("ranges", "anchors", "links")))
+        self._put(state, moved)
+
+    def _start(
+        self, observation: dict[str, np.ndarray], info: dict[str, Any], fresh: BoolArray
+    ) -> None:
+        """States of new episodes, from the priors in `info`, updated with their first ranges."""
+        prior = [info[f"prior_{name}"][fresh] for name in ("rotation", "translation", "covariance")]
+        state = self._filter.initial(*prior)
+        epoch = [observation[key][fresh] for key in ("ranges", "anchors", "links")]
+        self._put(self._filter.update(state, *epoch), fresh)
+
+    def _put(self, state: Any, where: BoolArray) -> None:
+        """Take over the states of some worlds, and their beliefs."""
+        belief = self._filter.belief(state)
+        if where.all():
+            self._state, self._belief = state, belief
+        else:
+            self._state = _merged(self._state, state, where)
+            self._belief = _merged(self._belief, belief, where)
+
+    def _figures(self, info: dict[str, Any], last: BoolArray) -> dict[str, FloatArray]:
+        """Errors of the beliefs, of ended worlds against their final poses."""
+        rotation, translation = info["rotation"], info["translation"]
+        if last.any():
+            final = info["final_info"]
+            rotation = np.where(last[:, None, None], final["rotation"], rotation)
+            translation = np.where(last[:, None], final["translation"], translation)
+        assert self._belief is not None
+        return judge(self._belief, rotation, translation, self._tags)
+
+    def _finish(
+        self, info: dict[str, Any], figures: dict[str, FloatArray], last: BoolArray
+    ) -> None:
+        """The last beliefs of ended episodes into `final_obs` and `final_info`."""
+        assert self._belief is not None
+        for i in np.flatnonzero(last):
+            belief = PoseBelief(*(field[i].copy() for field in self._belief))
+            info["final_obs"][i] = present(self._kind, info["final_obs"][i], belief, self._scene)
+        for name, value in figures.items():
+            info["final_info"][name] = np.where(last, value, 0.0)
+            info["final_info"][f"_{name}"] = last.copy()
+
+    def _judge(self, info: dict[str, Any]) -> None:
+        none = np.zeros(self.num_envs, dtype=np.bool_)
+        for name, value in self._figures(info, none).items():
+            info[name], info[f"_{name}"] = value, np.ones(self.num_envs, dtype=np.bool_)
+
+    def _present(self, observation: dict[str, np.ndarray]) -> Any:
+        assert self._belief is not None
+        belief = PoseBelief(*(field.copy() for field in self._belief))
+        return present(self._kind, observation, belief, self._scene)
+
+
+def _rows(state: Any, where: BoolArray) -> Any:
+    """A state of the worlds of a mask."""
+    return type(state)(*(None if field is None else field[where] for field in state))
+
+
+def _merged(state: Any, part: Any, where: BoolArray) -> Any:
+    """`state` with the worlds of the mask taken from `part`."""
+    fields = []
+    for old, new in zip(state, part, strict=True):
+        field = None if old is None else np.array(old)
+        if field is not None:
+            field[where] = new
+        fields.append(field)
+    return type(state)(*fields)
