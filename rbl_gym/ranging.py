@@ -233,8 +233,15 @@ class Measurement(NamedTuple):
 
 def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
     """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
-    turned = np.asarray(tags) @ np.swapaxes(np.asarray(rotation), -1, -2)
-    return turned + np.asarray(translation)[..., None, :]
+    rotation, tags = np.asarray(rotation), np.asarray(tags)
+    if tags.ndim == 2:
+        # Tags that all trials share: one matrix product in place of one for each trial.
+        turned = (rotation.reshape(-1, 3) @ tags.T).reshape((*rotation.shape[:-1], len(tags)))
+        turned = np.swapaxes(turned, -1, -2)
+    else:
+        turned = tags @ np.swapaxes(rotation, -1, -2)
+    # One memory order whatever the way here: a sum over it gives the same last bits.
+    return np.add(turned, np.asarray(translation)[..., None, :], order="C")
 
 
 def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:

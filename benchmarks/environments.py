@@ -1,0 +1,162 @@
+"""Environment speed as ratios, side by side in one run.
+
+Process time of one thread, medians over interleaved repeats:
+
+- the native vector environment against the time of generating its normals alone;
+- the vector environment against the scalar one, per environment step;
+- the scalar environment beside Gymnasium's CartPole;
+- vector environment + iterated EKF + belief observation + reward, in steps per CPU second;
+- ``import rbl_gym`` against ``import gymnasium``.
+
+    python benchmarks/environments.py [--json F] [--repeats 5] [--num-envs 1024]
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rbl_gym import scenes
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.wrappers import VectorEstimatePose
+
+SCENES = ("camsap2013", "auv_buoys", "uwb_room")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", metavar="F")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--num-envs", type=int, default=1024)
+    options = parser.parse_args()
+    jobs: dict[str, Callable[[], float]] = {"CartPole-v1 scalar": scalar_job(cart_pole())}
+    for scene in SCENES:
+        jobs[f"{scene} normals alone"] = normals_job(scene, options.num_envs)
+        for reward in ("none", "bound"):
+            jobs[f"{scene} vector {reward}"] = vector_job(scene, reward, options.num_envs)
+            jobs[f"{scene} scalar {reward}"] = scalar_job(TrackingEnv(scene, reward))
+        jobs[f"{scene} vector iekf"] = belief_job(scene, options.num_envs)
+    times: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(options.repeats):
+        for name, job in jobs.items():
+            times[name].append(job())
+    micro = {name: 1e6 * float(np.median(values)) for name, values in times.items()}
+    result: dict[str, Any] = {"microseconds_per_env_step": micro, "ratios": {}}
+    for scene in SCENES:
+        result["ratios"][scene] = {
+            "vector to normals": micro[f"{scene} vector none"] / micro[f"{scene} normals alone"],
+            "scalar to vector": micro[f"{scene} scalar none"] / micro[f"{scene} vector none"],
+            "scalar to CartPole": micro[f"{scene} scalar none"] / micro["CartPole-v1 scalar"],
+            "env + iekf steps per CPU second": 1e6 / micro[f"{scene} vector iekf"],
+        }
+    result["import_seconds"] = import_times(options.repeats)
+    for name, value in micro.items():
+        print(f"{name:<28} {value:9.2f} us per environment step")
+    for scene, ratios in result["ratios"].items():
+        print(scene, ", ".join(f"{name} {value:,.4g}" for name, value in ratios.items()))
+    print("import", result["import_seconds"])
+    if options.json:
+        Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
+
+
+def cart_pole() -> gym.Env[Any, Any]:
+    return gym.make("CartPole-v1").unwrapped
+
+
+def timed(work: Callable[[], None], steps: int) -> float:
+    """Process time of `work` per step."""
+    begin = time.process_time()
+    work()
+    return (time.process_time() - begin) / steps
+
+
+def normals_job(scene: str, num_envs: int) -> Callable[[], float]:
+    """The normals of a whole episode of every world, by one generator for each."""
+    world = scenes.get(scene)
+    size = 13 + 6 * world.steps + (world.steps + 1) * world.n_anchors * len(world.tags)
+    rng = np.random.default_rng(0)
+    block = np.empty((num_envs, size))
+
+    def work() -> None:
+        for row in block:
+            rng.standard_normal(out=row)
+
+    return lambda: timed(work, num_envs * (world.steps + 1))
+
+
+def vector_job(scene: str, reward: str, num_envs: int) -> Callable[[], float]:
+    """Whole episodes with their resets."""
+    envs = TrackingVectorEnv(num_envs, scene, reward)
+    return whole_episode(envs, envs.scene.steps + 1, num_envs)
+
+
+def belief_job(scene: str, num_envs: int) -> Callable[[], float]:
+    """The same with the iterated EKF (2 iterations), beliefs and rewards."""
+    envs = TrackingVectorEnv(num_envs, scene)
+    wrapped = VectorEstimatePose(envs, "iekf", options={"iterations": 2})
+    return whole_episode(wrapped, envs.scene.steps + 1, num_envs)
+
+
+def whole_episode(envs: Any, steps: int, num_envs: int) -> Callable[[], float]:
+    envs.reset(seed=0)
+    actions = np.zeros(envs.action_space.shape, envs.action_space.dtype)
+
+    def work() -> None:
+        for _ in range(steps):
+            envs.step(actions)
+
+    return lambda: timed(work, steps * num_envs)
+
+
+def scalar_job(env: gym.Env[Any, Any], steps: int = 400) -> Callable[[], float]:
+    """Steps alone, resets left out."""
+    action: Any = np.zeros(env.action_space.shape) if env.action_space.shape else 0
+
+    def job() -> float:
+        total, done = 0.0, 0
+        while done < steps:
+            env.reset(seed=done)
+            begin = time.process_time()
+            for _ in range(min(20, steps - done)):
+                _, _, terminated, truncated, _ = env.step(action)
+                done += 1
+                if terminated or truncated:
+                    break
+            total += time.process_time() - begin
+        return total / done
+
+    return job
+
+
+def import_times(repeats: int) -> dict[str, float]:
+    """Median wall seconds of a fresh interpreter that imports a module, less an empty one."""
+
+    def once(statement: str) -> float:
+        begin = time.perf_counter()
+        subprocess.run([sys.executable, "-c", statement], check=True)
+        return time.perf_counter() - begin
+
+    empty = np.median([once("pass") for _ in range(repeats)])
+    return {
+        module: float(np.median([once(f"import {module}") for _ in range(repeats)]) - empty)
+        for module in ("gymnasium", "rbl_gym")
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""The batched Kalman filters against filterpy: time per trial and step, side by side, same results.
+
+One step is predict and update, from ranges to state, weights included; filterpy has a
+KalmanFilter per trial and is given the whitened measurement matrix ready-made, (M - 1) N rows.
+Process time, one thread, medians over interleaved repeats; the results are checked equal first.
+
+    python benchmarks/filters.py [--json F] [--repeats 7] [--trials 1024] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from rbl_gym import bodies, estimators, motion, ranging, rotations
+from rbl_gym.estimators.engines import transition
+
+SIZES = {(4, 5): 20, (10, 6): 10, (50, 20): 1}  # peer trials for each (M, N)
+NOISE = ranging.SquaredRangeNoise(0.05)
+PROCESS = motion.ProcessNoise(0.02, 0.1)
+DT = 0.1
+STEPS = 3
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", metavar="F")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--trials", type=int, default=1024)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    results = {
+        f"{m}x{n}": measure(m, n, options.trials, options.repeats, options.seed) for m, n in SIZES
+    }
+    print(f"{'M x N':<7} {'path':<20} {'us/trial':>9} {'filterpy us':>12} {'ratio':>9}")
+    for size, rows in results.items():
+        for path, row in rows.items():
+            print(f"{size:<7} {path:<20} {row['microseconds']:9.3f} "
+                  f"{row['peer_microseconds']:12.1f} {row['ratio']:9.1f}")  # fmt: skip
+    if options.json:
+        Path(options.json).write_text(json.dumps(results, indent=1) + "\n")
+
+
+def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, dict[str, float]]:
+    """Medians per path at one number of anchors and tags."""
+    rng = np.random.default_rng([seed, m, n])
+    worlds = {
+        "four filters": World(rng, "kf", m, n, trials),
+        "four, turned axes": World(rng, "kf", m, n, trials, turned=True),
+        "kf-ortho": World(rng, "kf-ortho", m, n, trials),
+        "et-kf": World(rng, "et-kf", m, n, trials),
+        "uc-kf": World(rng, "uc-kf", m, n, trials),
+        "shared covariance": World(rng, "kf", m, n, trials, fixed=True),
+        "general 12 x 12": World(rng, "kf", m, n, trials, centred=False),
+    }
+    for path, world in worlds.items():
+        world.check(n_trials=SIZES[m, n], path=path)
+    peer = worlds["four filters"].peer(range(SIZES[m, n]))
+    times: dict[str, list[float]] = {path: [] for path in (*worlds, "peer")}
+    for _ in range(repeats):
+        times["peer"].append(clock(peer) / SIZES[m, n])
+        for path, world in worlds.items():
+            times[path].append(clock(world.run) / trials)
+    return {
+        path: {
+            "microseconds": 1e6 * float(np.median(times[path])),
+            "peer_microseconds": 1e6 * float(np.median(times["peer"])),
+            "ratio": float(np.median(np.divide(times["peer"], times[path]))),
+        }
+        for path in worlds
+    }
+
+
+def clock(run: Callable[[], Any]) -> float:
+    """Process time of one step of a run, seconds."""
+    begin = time.process_time()
+    run()
+    return (time.process_time() - begin) / STEPS
+
+
+class World:
+    """Trials of one filter, and the same trials for filterpy."""
+
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        name: str,
+        m: int,
+        n: int,
+        trials: int,
+        *,
+        centred: bool = True,
+        turned: bool = False,
+        fixed: bool = False,
+    ) -> None:
+        tags = rng.uniform(-0.5, 0.5, (n, 3))
+        tags -= tags.mean(axis=0)
+        if not turned:
+            tags = tags @ np.linalg.eigh(tags.T @ tags)[1]
+            tags -= tags.mean(axis=0)
+        if not centred:
+            tags = tags + [0.3, 0.0, 0.1]
+        self.tags, self.name, self.trials = tags, name, trials
+        # On a shell around the body: no anchor stands on a tag.
+        places = rng.standard_normal((m, 3) if fixed else (trials, m, 3))
+        self.anchors = 15 * places / np.linalg.norm(places, axis=-1, keepdims=True)
+        rotation, translation = rotations.random(rng, (trials,)), rng.uniform(-3, 3, (trials, 3))
+        twists = 0.5 * rng.standard_normal((trials, 6))
+        self.twist = twists[0] if fixed else twists
+        self.ranges = []
+        start = rotations.exp(0.1 * rng.standard_normal((trials, 3))) @ rotation, translation
+        for _ in range(STEPS):
+            rotation, translation = motion.propagate(rotation, translation, self.twist, DT)
+            measured = ranging.simulate(self.anchors, tags, rotation, translation, NOISE, rng)
+            self.ranges.append(measured.ranges)
+        self.weights = 1 / NOISE.squared_range_variance(self.ranges[0][0])[:, 0] if fixed else None
+        self.filter = estimators.make(
+            name, tags=tags, noise=NOISE, process=PROCESS, weights=self.weights
+        )
+        self.prior = self.filter.initial(*start, np.diag([0.02] * 3 + [1.0] * 3))
+
+    def run(self) -> Any:
+        """All steps of all trials."""
+        state = self.prior
+        for ranges in self.ranges:
+            state = self.filter.update(
+                self.filter.predict(state, self.twist, DT), ranges, self.anchors
+            )
+        return state
+
+    def peer(self, which: range) -> Callable[[], list[KalmanFilter]]:
+        """filterpy's filters of some trials, their models ready-made; a call runs all steps."""
+        inputs = [[self._model(k, ranges[k]) for ranges in self.ranges] for k in which]
+        twists = [self.twist if self.twist.ndim == 1 else self.twist[k] for k in which]
+        std = PROCESS.std()
+        noise = DT * np.diag([std[0] ** 2] * 9 + [std[3] ** 2] * 3)
+
+        def run() -> list[KalmanFilter]:
+            filters = []
+            for k, models, twist in zip(which, inputs, twists, strict=True):
+                kf = KalmanFilter(dim_x=12, dim_z=len(models[0][1]), dim_u=3)
+                kf.x, kf.P = self.prior.mean[k][:, None].copy(), self.prior.covariance[k].copy()
+                kf.F, kf.Q = transition(rotations.exp(twist[:3] * DT)), noise
+                kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
+                kf.R = np.eye(len(models[0][1]))
+                for H, z in models:
+                    kf.predict(u=twist[3:, None] * DT)
+                    kf.update(z[:, None], H=H)
+                filters.append(kf)
+            return filters
+
+        return run
+
+    def check(self, n_trials: int, path: str) -> None:
+        """Mean (of KF) and covariance equal filterpy's, or the run stops."""
+        state = self.run()
+        for k, kf in enumerate(self.peer(range(n_trials))()):
+            scale = np.abs(kf.P).max()
+            if np.abs(state.covariance[k] - kf.P).max() > 1e-8 * scale:
+                raise AssertionError(f"{path}: covariance differs from filterpy's")
+            if self.name == "kf" and np.abs(state.mean[k] - kf.x[:, 0]).max() > 1e-8:
+                raise AssertionError(f"{path}: mean differs from filterpy's")
+
+    def _model(self, k: int, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened H and z of one epoch, ``|s|^2`` projected out by U_M, as in the papers."""
+        anchors = self.anchors if self.anchors.ndim == 2 else self.anchors[k]
+        if self.weights is None:
+            root = np.sqrt(1 / NOISE.squared_range_variance(ranges)[:, 0])
+        else:
+            root = np.sqrt(self.weights)
+        basis = np.linalg.svd(root[:, None])[0][:, 1:]
+        d = ranges**2 - (anchors**2).sum(axis=1)[:, None]
+        rows = basis.T @ (root[:, None] * (-2 * anchors))
+        extended = np.concatenate([self.tags, np.ones((len(self.tags), 1))], axis=1)
+        return np.kron(extended, rows), (basis.T @ (root[:, None] * d)).T.ravel()
+
+
+if __name__ == "__main__":
+    main()
