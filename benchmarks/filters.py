@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from rbl_gym import bodies, estimators, motion, ranging, rotations
+from rbl_gym import estimators, motion, ranging, rotations
 from rbl_gym.estimators.engines import transition
 
 SIZES = {(4, 5): 20, (10, 6): 10, (50, 20): 1}  # peer trials for each (M, N)
 NOISE = ranging.SquaredRangeNoise(0.05)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
 DT = 0.1
-STEPS = 3
+STEPS = 5
 
 
 def main() -> None:

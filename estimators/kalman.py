@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,14 +25,19 @@ from rbl_gym.checks import (
     check_one_of,
 )
 from rbl_gym.estimators.belief import PoseBelief, inverse
-from rbl_gym.estimators.engines import ENGINES
-from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
-from rbl_gym.estimators.least_squares import procrustes, unvec, vec
-from rbl_gym.estimators.squared_range import (
-    Statistic,
-    geometric_rank,
-    statistic,
+from rbl_gym.estimators.engines import ENGINES, FEW_TRIALS, Epoch, Prediction
+from rbl_gym.estimators.four_filters import (
+    Frame,
+    join_mean,
+    principal_frame,
+    split,
+    split_mean,
 )
+from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
+from rbl_gym.estimators.least_squares import unvec, vec
+from rbl_gym.estimators.shared_covariance import shared, spread_out
+from rbl_gym.estimators.squared_range import geometric_rank
+from rbl_gym.estimators.unitary import column_fit, coupled_fit, decoupled_fit
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
 
@@ -130,24 +136,23 @@ class KalmanFamily:
         )
         mean = np.empty((*batch, 12))
         mean[..., :9], mean[..., 9:] = vec(rotation), translation
-        return KalmanState(
-            mean, np.broadcast_to(covariance, (*batch, 12, 12)).copy(), np.zeros(batch, bool)
-        )
+        # A covariance of all trials stays one in memory: see `shared_covariance`.
+        covariance = spread_out(covariance.copy(), batch)
+        return KalmanState(mean, covariance, np.zeros(batch, bool))
 
     def predict(self, state: KalmanState, twist: ArrayLike, dt: float) -> KalmanState:
         """State after `dt` seconds of the twist (..., 6): eqs (10)-(15), Omega carrying dt."""
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         step = rotations.exp(twist[..., :3] * dt)
-        F = np.zeros((*step.shape[:-2], 12, 12))
-        for k in range(3):
-            F[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = step
-        F[..., 9:, 9:] = np.eye(3)
         std = self.process.std()
         sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
-        Q = dt * np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
+        noise = dt * np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
         mean, covariance = ENGINES[self.engine].predict(
-            state.mean, state.covariance, F, twist[..., 3:] * dt, np.diag(Q)
+            state.mean,
+            state.covariance,
+            Prediction(step, twist[..., 3:] * dt, noise),
+            self._frame,
         )
         return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
 
@@ -174,11 +179,12 @@ class KalmanFamily:
         else:
             weights = np.asarray(self.weights, dtype=np.float64)
             weights = weights[..., None] if weights.ndim == 1 else weights
-        stat = statistic(ranges, anchors, self.tags, weights, mask)
-        mean, covariance = ENGINES[self.engine].update(state.mean, state.covariance, stat)
-        return _CONSTRAINTS[self.constraint](self, state, KalmanState(
-            mean, covariance, np.zeros(mean.shape[:-1], bool)
-        ), stat)  # fmt: skip
+        epoch = Epoch(ranges, anchors, self.tags, weights, mask)
+        mean, covariance = ENGINES[self.engine].update(
+            state.mean, state.covariance, epoch, self._frame
+        )
+        posterior = KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
+        return _CONSTRAINTS[self.constraint](self, state, posterior, epoch)
 
     def belief(self, state: KalmanState) -> PoseBelief:
         """Pose, its covariance, and the raw matrix.
@@ -200,12 +206,21 @@ class KalmanFamily:
         translation = state.mean[..., 9:].copy()
         return PoseBelief(rotation, translation, covariance, rotation if on_group else matrix)
 
+    @cached_property
+    def _frame(self) -> Frame | None:
+        return principal_frame(np.asarray(self.tags, dtype=np.float64))
+
     def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
-        variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
-        extent = np.ptp(anchors, axis=-2).max(axis=-1)
-        vague = (variance[..., :9].max(axis=-1) > _VAGUE_ENTRY_VARIANCE) | (
-            variance[..., 9:].max(axis=-1) > extent**2
-        )
+        common = shared(state.covariance)
+        covariance = state.covariance if common is None else common
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        vague_rotation = variance[..., :9].max(axis=-1) > _VAGUE_ENTRY_VARIANCE
+        largest = variance[..., 9:].max(axis=-1)
+        # Two anchors bound the extent from below, and mostly settle it.
+        apart = np.abs(anchors[..., 0, :] - anchors[..., -1, :]).max(axis=-1)
+        if not (vague_rotation | (largest > apart**2)).any():
+            return
+        vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
         if not vague.any():
             return
         rank = geometric_rank(anchors, self.tags)
@@ -222,7 +237,7 @@ class KalmanFamily:
 
 
 def _no_constraint(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     return posterior
 
@@ -236,13 +251,13 @@ def _project(posterior: KalmanState, where: BoolArray) -> KalmanState:
 
 
 def _always(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     return _project(posterior, np.ones(posterior.mean.shape[:-1], bool))
 
 
 def _above_threshold(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     matrix = unvec(posterior.mean[..., :9])
     defect = np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)
@@ -250,52 +265,27 @@ def _above_threshold(
 
 
 def _newton(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
 
     The covariance stays that of the linear update, (22) as printed: an overestimate.
     """
+    frame, few = family._frame, posterior.mean.size < 12 * FEW_TRIALS
+    blocks = None if frame is None or few else split(frame, posterior.covariance)
+    if frame is not None and blocks is not None:
+        # Nothing across the four filters: (23) and (26)-(27) are the same problem.
+        x = split_mean(frame, posterior.mean)
+        x[:, :3] = column_fit(x[:, :3], blocks[:, :3])
+        mean = join_mean(frame, x, posterior.mean.shape[:-1])
+        return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
+    stat = epoch.statistic()
     if stat.is_common and not family.coupled:
-        rotation, translation = _decoupled(prior, stat)
+        rotation, translation = decoupled_fit(prior.mean, prior.covariance, stat)
     else:
-        rotation, translation = _coupled(posterior)
+        rotation, translation = coupled_fit(posterior.mean, posterior.covariance)
     mean = np.concatenate([vec(rotation), translation], axis=-1)
     return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
-
-
-def _decoupled(prior: KalmanState, stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """Rotation from the centred tags and its prior block (26), then the translation (27)."""
-    P_q = inverse(prior.covariance[..., :9, :9])
-    P_t = inverse(prior.covariance[..., 9:, 9:])
-    tags = stat.tags - stat.tags.mean(axis=-2, keepdims=True)
-    G = stat.G[..., 0, :, :]
-    gram = np.swapaxes(tags, -1, -2) @ tags
-    kron = np.einsum("...kl,...ij->...kilj", gram, G)
-    weight = P_q + kron.reshape(*kron.shape[:-4], 9, 9)
-    pull = (P_q @ prior.mean[..., :9, None])[..., 0] + vec(np.swapaxes(stat.b, -1, -2) @ tags)
-    rotation = _fit_rotation(weight, np.linalg.solve(weight, pull[..., None])[..., 0])
-    n_tags = stat.b.shape[-2]
-    turned = (rotation @ stat.tags.sum(axis=-2)[..., None])[..., 0]
-    right = (
-        (P_t @ prior.mean[..., 9:, None])[..., 0]
-        + stat.b.sum(axis=-2)
-        - (G @ turned[..., None])[..., 0]
-    )
-    return rotation, np.linalg.solve(P_t + n_tags * G, right[..., None])[..., 0]
-
-
-def _coupled(posterior: KalmanState) -> tuple[FloatArray, FloatArray]:
-    """The pose nearest to the linear posterior in its own covariance, (23)."""
-    q, t = posterior.mean[..., :9], posterior.mean[..., 9:]
-    weight = inverse(posterior.covariance[..., :9, :9])
-    rotation = _fit_rotation(weight, q)
-    moved = weight @ (vec(rotation) - q)[..., None]
-    return rotation, t + (posterior.covariance[..., 9:, :9] @ moved)[..., 0]
-
-
-def _fit_rotation(weight: FloatArray, q: FloatArray) -> FloatArray:
-    return procrustes(weight, q, rotations.nearest(unvec(q)))[0]
 
 
 _CONSTRAINTS: dict[str, Callable[..., KalmanState]] = {

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym import rotations
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.components import exp, first, last, product, solve
 
 
 class Linearization(NamedTuple):
@@ -58,17 +58,15 @@ def minimize_pose(
     translation = np.broadcast_to(translation, (*batch, 3))
     damping = np.zeros(batch)
     converged = np.zeros(batch, bool)
-    index = np.arange(6)
     for _ in range(iterations):
-        damped = at.hessian.copy()
-        diagonal = damped[..., index, index]
-        damped[..., index, index] += (damping[..., None] + 1e-14) * diagonal + 1e-300
-        step = -np.linalg.solve(damped, at.gradient[..., None])[..., 0]
-        candidate = rotations.exp(step[..., :3]) @ rotation, translation + step[..., 3:]
+        gradient = first(at.gradient, 1)
+        step = -solve(first(at.hessian, 2), gradient, damping)
+        turned = product(exp(step[:3]), first(rotation, 2))
+        candidate = last(turned, 2), translation + last(step[3:], 1)
         new = linearize(*candidate)
         # Damping shortens the step by about 1 + damping: a short step alone proves nothing.
-        decrease = -np.einsum("...i,...i->...", at.gradient, step) * (1 + damping)
-        small = decrease < tolerance**2
+        decrease = -np.einsum("i...,i...->...", gradient, step) * (1 + damping)
+        converged = decrease < tolerance**2
         # A step of 1e-4 standard deviations changes the cost by less than rounding may.
         better = (new.cost <= at.cost * (1 + 1e-12)) | (decrease < 1e-8)
         if better.all():
@@ -84,7 +82,6 @@ def minimize_pose(
         damping = np.where(
             better, np.where(damping > 1e-5, 0.1 * damping, 0.0), np.maximum(10 * damping, 1e-3)
         )
-        converged = small
         if converged.all():
             break
     return Solution(rotation, translation, at, converged)

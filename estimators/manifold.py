@@ -7,6 +7,8 @@ filters of the tracking paper, which project ``|s|^2`` out, cannot.
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,10 +17,19 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
-from rbl_gym.estimators.belief import PoseBelief, inverse
+from rbl_gym.estimators.belief import PoseBelief
+from rbl_gym.estimators.components import (
+    first,
+    inverse,
+    last,
+    left_jacobian_inverse,
+    log,
+    product,
+    trials_last,
+)
 from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
 from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
-from rbl_gym.estimators.range_cost import RangeCost, huber, pick
+from rbl_gym.estimators.range_cost import RangeCost, TagMaps, huber, pick, tag_maps
 from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import statistic
 from rbl_gym.motion import ProcessNoise, propagate
@@ -28,6 +39,11 @@ from rbl_gym.ranging import NoiseLaw
 VAGUE_ROTATION_RAD = 0.5
 # Whitened innovation at which Huber's loss turns from squares to absolute values.
 HUBER = 1.5
+# At most so many trials, and so many links, are updated at once: the temporaries of a block
+# then stay in the cache.
+_BLOCK, _BLOCK_LINKS = 1024, 32_000
+# Trailing axes of rotation, translation, covariance, ranges, weights, anchors.
+_TRAILING = (2, 1, 2, 2, 2, 2)
 
 
 class PoseState(NamedTuple):
@@ -68,6 +84,10 @@ class IteratedEkf:
         check_number("iterations", self.iterations, low=1)
         if not isinstance(self.robust, bool):
             raise ValueError(f"robust must be True or False, got {self.robust!r}")
+
+    @functools.cached_property
+    def _tag_maps(self) -> TagMaps:
+        return tag_maps(self.tags)
 
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
@@ -124,17 +144,39 @@ class IteratedEkf:
         weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
         if mask is not None:
             weights = weights * mask
+        epoch = (*state, ranges, weights, anchors)
+        batch = np.broadcast_shapes(
+            *(a.shape[: a.ndim - n] for a, n in zip(epoch, _TRAILING, strict=True))
+        )
+        size = min(_BLOCK, 1 + _BLOCK_LINKS // math.prod(ranges.shape[-2:]))
+        if math.prod(batch) <= size:
+            return self._update(PoseState(*epoch[:3]), *epoch[3:])
+        flat = [_flatten(a, n, batch) for a, n in zip(epoch, _TRAILING, strict=True)]
+        parts = []
+        for start in range(0, math.prod(batch), size):
+            block = [a if len(a) == 1 else a[start : start + size] for a in flat]
+            parts.append(self._update(PoseState(*block[:3]), *block[3:]))
+        joined = (np.concatenate(fields) for fields in zip(*parts, strict=True))
+        return PoseState(*(a.reshape((*batch, *a.shape[1:])) for a in joined))
+
+    def _update(
+        self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
+    ) -> PoseState:
+        """The update of one block of trials, links as weights (..., M, N)."""
         loss = huber(HUBER) if self.robust else None
-        data = RangeCost(ranges, weights, anchors, self.tags, loss)
-        problem = MapProblem(state, inverse(state.covariance), data)
-        start = state.rotation, state.translation
-        variance = np.linalg.eigvalsh(state.covariance[..., :3, :3])[..., -1]
-        vague = variance > VAGUE_ROTATION_RAD**2
+        data = RangeCost(ranges, weights, anchors, self.tags, loss, maps=self._tag_maps)
+        prior = PoseState(*(trials_last(a, n) for a, n in zip(state, _TRAILING[:3], strict=True)))
+        information = last(inverse(first(prior.covariance, 2)), 2)
+        problem = MapProblem(prior, information, data)
+        start = prior.rotation, prior.translation
+        vague = _is_vague(state.covariance)
         if vague.any():
             _check_determined(anchors, self.tags)
             start = global_start(problem, vague)
-        solution = minimize_pose(problem, *start, iterations=self.iterations)
-        return PoseState(solution.rotation, solution.translation, inverse(solution.at.hessian))
+        found = minimize_pose(problem, *start, iterations=self.iterations)
+        covariance = last(inverse(first(found.at.hessian, 2)), 2)
+        fields = found.rotation, found.translation, covariance
+        return PoseState(*(np.array(field, order="C") for field in fields))
 
     def belief(self, state: PoseState) -> PoseBelief:
         """The state as a belief (copies)."""
@@ -157,19 +199,29 @@ class MapProblem:
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
         data = self.data(rotation, translation)
-        turn = rotations.error(rotation, self.prior.rotation)
-        shift = translation - self.prior.translation
-        error = np.concatenate(np.broadcast_arrays(turn, shift), axis=-1)
-        D = np.zeros((*error.shape, 6))
-        D[..., :3, :3] = rotations.left_jacobian_inverse(turn)
-        D[..., 3:, 3:] = np.eye(3)
-        pulled = np.swapaxes(D, -1, -2) @ self.prior_information
-        pull = (self.prior_information @ error[..., None])[..., 0]
-        return Linearization(
-            data.cost + 0.5 * np.einsum("...i,...i->...", error, pull),
-            data.gradient + (pulled @ error[..., None])[..., 0],
-            data.hessian + pulled @ D,
-        )
+        if rotation is self.prior.rotation and translation is self.prior.translation:
+            # Of the prior itself there is no error, and its Jacobian is the identity.
+            return data._replace(hessian=data.hessian + self.prior_information)
+        ndim = data.cost.ndim
+        information = first(self.prior_information, 2, ndim)
+        turned_back = first(self.prior.rotation, 2, ndim)
+        turn = log(product(first(rotation, 2, ndim), turned_back.swapaxes(0, 1)))
+        shift = first(translation, 1, ndim) - first(self.prior.translation, 1, ndim)
+        error = np.empty((6, *data.cost.shape))
+        error[:3], error[3:] = turn, shift
+        pull = product(information, error[:, None])[:, 0]
+        cost = data.cost + 0.5 * np.einsum("i...,i...->...", error, pull)
+        # D^T P^-1 D with D = blkdiag(Jl^-1, I), and D^T P^-1 e, added where the data's stand.
+        D = left_jacobian_inverse(turn)
+        gradient, hessian = first(data.gradient, 1), first(data.hessian, 2)
+        gradient[:3] += product(D.swapaxes(0, 1), pull[:3, None])[:, 0]
+        gradient[3:] += pull[3:]
+        pulled = product(D.swapaxes(0, 1), information[:3])
+        hessian[:3, :3] += product(pulled[:, :3], D)
+        hessian[:3, 3:] += pulled[:, 3:]
+        hessian[3:, :3] += pulled[:, 3:].swapaxes(0, 1)
+        hessian[3:, 3:] += information[3:, 3:]
+        return data._replace(cost=cost)
 
     def take(self, where: BoolArray) -> MapProblem:
         """The trials of a mask (...) on one flat axis, with a further axis of 1 for starts."""
@@ -179,6 +231,24 @@ class MapProblem:
             pick(self.prior.covariance, where, 2),
         )
         return MapProblem(prior, pick(self.prior_information, where, 2), self.data.take(where))
+
+
+def _is_vague(covariance: FloatArray) -> BoolArray:
+    """Where (...) the rotation's largest variance is above that of `VAGUE_ROTATION_RAD`."""
+    limit = VAGUE_ROTATION_RAD**2
+    # The trace bounds the largest eigenvalue: most priors need no more.
+    vague = np.asarray(np.einsum("...ii->...", covariance[..., :3, :3]) > limit)
+    if vague.any():
+        vague[vague] = np.linalg.eigvalsh(covariance[vague, :3, :3])[..., -1] > limit
+    return vague
+
+
+def _flatten(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
+    """An array (..., n) with one batch axis (B, n), of length 1 where it has none."""
+    shape = array.shape[array.ndim - trailing :]
+    if array.ndim == trailing:
+        return array[None]
+    return np.broadcast_to(array, (*batch, *shape)).reshape((-1, *shape))
 
 
 _NET = rotations.log(ROTATION_NET)
@@ -221,7 +291,7 @@ def _translation_given(rotation: FloatArray, problem: MapProblem) -> FloatArray:
     # To first order var(r^2) = 4 r^2 var(r).
     scale = 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
     stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale)
-    information = inverse(problem.prior.covariance[..., 3:, 3:])
+    information = np.linalg.inv(problem.prior.covariance[..., 3:, 3:])
     turned = data.tags @ np.swapaxes(rotation, -1, -2)
     per_tag = stat.b - (stat.G @ turned[..., None])[..., 0]
     right = (information @ problem.prior.translation[..., None])[..., 0] + per_tag.sum(axis=-2)

@@ -19,6 +19,9 @@ import numpy as np
 from rbl_gym.bounds import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
 
+# Ranges that are squared at a time: a quarter of a megabyte stays in the cache.
+_CHUNK = 1 << 15
+
 
 class Statistic(NamedTuple):
     """Sufficient statistic of one epoch of squared ranges.
@@ -79,6 +82,50 @@ def statistic(
     return Statistic(G, b, tags)
 
 
+def moments(
+    ranges: FloatArray, anchors: FloatArray, tags: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """G and ``B = sum_n b_n c_n^T`` of common weights, without the b of each tag.
+
+    Parameters
+    ----------
+    ranges, anchors, weights
+        (B, M, N), (B or 1, M, 3) and (B or 1, M, 1).
+    tags
+        Extended tags (N, 4), in any frame.
+
+    Returns
+    -------
+    G (B or 1, 3, 3) and B (B, 3, 4).
+    """
+    n_trials, n_anchors, n_tags = ranges.shape
+    # Anchors along memory: A (3 x M) of the papers, less its weighted mean.
+    A = np.ascontiguousarray(anchors.swapaxes(-1, -2))
+    w = weights.swapaxes(-1, -2)
+    total = w.sum(axis=-1, keepdims=True)
+    share = w / np.where(total > 0, total, 1.0)
+    spread = A - A @ share.swapaxes(-1, -2)
+    weighted = w * spread
+    sums = squares_times(ranges.reshape(-1, n_tags), tags).reshape(n_trials, n_anchors, 4)
+    squared = (A * A).sum(axis=-2)
+    for k, of_tags in enumerate(tags.sum(axis=0)):
+        if of_tags != 0:
+            sums[..., k] -= of_tags * squared
+    return 4 * weighted @ spread.swapaxes(-1, -2), -2 * weighted @ sums
+
+
+def squares_times(ranges: FloatArray, matrix: FloatArray) -> FloatArray:
+    """``(r * r) @ matrix`` for ranges (K, n) and a matrix (n, p), a few rows at a time."""
+    product = np.empty((len(ranges), matrix.shape[1]))
+    size = max(1, _CHUNK // ranges.shape[1])
+    squares = np.empty((min(size, len(ranges)), ranges.shape[1]))
+    for begin in range(0, len(ranges), size):
+        part = ranges[begin : begin + size]
+        here = np.multiply(part, part, out=squares[: len(part)])
+        np.matmul(here, matrix, out=product[begin : begin + size])
+    return product
+
+
 def extended(tags: FloatArray) -> FloatArray:
     """Tags with a fourth coordinate 1, ``c_e`` (..., N, 4)."""
     return np.concatenate([tags, np.ones((*tags.shape[:-1], 1))], axis=-1)
@@ -100,6 +147,17 @@ def information(stat: Statistic) -> tuple[FloatArray, FloatArray]:
         matrix = np.einsum("...nkl,...nij->...kilj", gram, stat.G)
     vector = np.einsum("...nk,...ni->...ki", ce, stat.b)
     return matrix.reshape(*matrix.shape[:-4], 12, 12), vector.reshape(*vector.shape[:-2], 12)
+
+
+def information_of_moments(
+    G: FloatArray, B: FloatArray, tags: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`information` from the `moments` of extended tags (N, 4)."""
+    gram = tags.T @ tags
+    # One product with a matrix of the tags, which is a fraction of the time of an einsum.
+    kron = np.einsum("kl,ia,jb->abkilj", gram, np.eye(3), np.eye(3)).reshape(9, 144)
+    matrix = (G.reshape(-1, 9) @ kron).reshape(-1, 12, 12)
+    return matrix, B.swapaxes(-1, -2).reshape(-1, 12)
 
 
 def compressed(stat: Statistic) -> tuple[FloatArray, FloatArray]:

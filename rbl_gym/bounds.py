@@ -20,6 +20,13 @@ from rbl_gym.checks import (
 )
 from rbl_gym.motion import ProcessNoise
 
+_EYE = np.eye(6)
+# J_n as a linear function of (c_n, 1), c_n turned: J_n[i, a] = sum_k (c_n, 1)[k] _BY_POSE[k, i, a].
+_BY_POSE = np.zeros((4, 3, 6))
+_BY_POSE[:3, :, :3] = -rotations.hat(np.eye(3))
+_BY_POSE[3, :, 3:] = np.eye(3)
+_BY_MOMENTS = np.einsum("kia,lib->klab", _BY_POSE, _BY_POSE).reshape(16, 36)
+
 
 def tag_jacobian(rotation: FloatArray, tags: FloatArray) -> FloatArray:
     """Derivative (..., N, 3, 6) of the tag positions by the pose error: ``[-[Q c_n]x, I]``."""
@@ -56,6 +63,8 @@ def range_jacobian(
     The derivative of a distance by (w, v) is ``(Q c x u, u)``, u the unit vector from anchor to
     tag (zero where both coincide). Components come first, so that every step runs along memory.
     """
+    if anchors.ndim == tags.ndim == rotation.ndim == 2 and translation.ndim == 1:
+        return _one_range_jacobian(anchors, tags, rotation, translation)
     turned = tags @ np.swapaxes(rotation, -1, -2)
     positions = turned + translation[..., None, :]
     c = [turned[..., None, :, i] for i in range(3)]
@@ -68,6 +77,19 @@ def range_jacobian(
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
         J[..., i, :, :] = c[j] * J[..., 3 + k, :, :] - c[k] * J[..., 3 + j, :, :]
     return distance, J.reshape((*distance.shape[:-2], 6, -1))
+
+
+def _one_range_jacobian(
+    anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`range_jacobian` of one pose, in few calls: its rows are linear in ``(c, 1) kron u``."""
+    turned = tags @ rotation.T
+    extended = np.ones((len(tags), 4, 1))
+    extended[:, :3, 0] = turned
+    difference = turned + (translation - anchors)[:, None]
+    distance = np.sqrt(np.einsum("mni,mni->mn", difference, difference))
+    products = extended * (difference / np.maximum(distance, 1e-300)[..., None])[:, :, None]
+    return distance, (products.reshape(-1, 12) @ _BY_POSE.reshape(12, 6)).T
 
 
 def range_information(
@@ -277,7 +299,7 @@ def predict_information(
     """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J."""
     turned = _turn(J, twist, dt)
     Q = process.covariance(twist, dt)
-    return symmetric(np.linalg.solve(np.eye(6) + turned @ Q, turned))
+    return symmetric(np.linalg.solve(_EYE + turned @ Q, turned))
 
 
 def predict_covariance(
@@ -288,12 +310,19 @@ def predict_covariance(
 
 
 def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
-    """``F matrix F^T``: the error is global, so the step turns its rotation part only."""
+    """``F matrix F^T`` of a symmetric matrix: the error is global, so its rotation part turns."""
     step = rotations.exp(twist[..., :3] * np.asarray(dt, float)[..., None])
-    F = np.zeros((*step.shape[:-2], 6, 6))
-    F[..., :3, :3] = step
-    F[..., 3:, 3:] = np.eye(3)
-    return F @ matrix @ np.swapaxes(F, -1, -2)
+    if matrix.ndim == step.ndim == 2:
+        F = _EYE.copy()
+        F[:3, :3] = step
+        return F @ matrix @ F.T
+    top = step @ matrix[..., :3, :]
+    turned = np.empty((*top.shape[:-2], 6, 6))
+    turned[..., :3, :3] = top[..., :3] @ np.swapaxes(step, -1, -2)
+    turned[..., :3, 3:] = top[..., 3:]
+    turned[..., 3:, :3] = np.swapaxes(top[..., 3:], -1, -2)
+    turned[..., 3:, 3:] = matrix[..., 3:, 3:]
+    return turned
 
 
 def symmetric(matrix: FloatArray) -> FloatArray:
@@ -307,9 +336,14 @@ def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> Float
     ``b^2 = mean_n tr(J_n P J_n^T)``, ``J_n = [-[Q c_n]x, I]``: one number for position and
     orientation together.
     """
-    J = tag_jacobian(np.asarray(rotation, dtype=np.float64), np.asarray(tags, dtype=np.float64))
-    mean_square = np.einsum("...nia,...nib->...ab", J, J) / J.shape[-3]
-    trace = np.einsum("...ab,...ab->...", mean_square, covariance)
+    turned = np.asarray(tags, dtype=np.float64) @ np.swapaxes(np.asarray(rotation), -1, -2)
+    extended = np.ones((*turned.shape[:-1], 4))
+    extended[..., :3] = turned
+    # The sum of J_n^T J_n is linear in the tags' second moments.
+    moments = np.swapaxes(extended, -1, -2) @ extended
+    square = moments.reshape((*moments.shape[:-2], 16)) @ _BY_MOMENTS
+    square = square.reshape((*square.shape[:-1], 6, 6)) / turned.shape[-2]
+    trace = np.einsum("...ab,...ab->...", square, covariance)
     if not (trace >= 0).all():
         raise ValueError(f"covariance must be positive and finite, got a trace of {trace.min()}")
     return np.sqrt(trace)

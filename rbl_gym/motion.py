@@ -7,6 +7,7 @@ Kinematics (tracking paper, (10)-(15), Omega carrying the time step tau):
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,16 +60,20 @@ class ProcessNoise:
         the noise is on the angular velocity, the error on the rotation it makes.
         """
         dt = np.asarray(dt, dtype=np.float64)[..., None]
-        variance = self.std() ** 2
         jacobian = rotations.left_jacobian(twist[..., :3] * dt)
-        batch = np.broadcast_shapes(twist.shape[:-1], dt.shape[:-1])
-        covariance = np.zeros((*batch, 6, 6))
-        covariance[..., :3, :3] = dt[..., None] * (
-            (jacobian * variance[:3]) @ np.swapaxes(jacobian, -1, -2)
+        variance = dt * self._variance
+        covariance = np.zeros((*jacobian.shape[:-2], 6, 6))
+        covariance[..., :3, :3] = (jacobian * variance[..., None, :3]) @ np.swapaxes(
+            jacobian, -1, -2
         )
-        index = np.arange(3, 6)
-        covariance[..., index, index] = dt * variance[3:]
+        # Every seventh entry of the 36 is on the diagonal.
+        covariance.reshape((*covariance.shape[:-2], 36))[..., 21::7] = variance[..., 3:]
         return covariance
+
+    @functools.cached_property
+    def _variance(self) -> FloatArray:
+        """The six variances after 1 s."""
+        return self.std() ** 2
 
 
 class Trajectory(NamedTuple):

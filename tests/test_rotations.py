@@ -275,6 +275,45 @@ def test_nearest_keeps_rotations_and_turns_and_scales_with_its_argument(seed, sc
     np.testing.assert_allclose(rotations.nearest(Q @ M), Q @ rotations.nearest(M), atol=1e-10)
 
 
+def nearest_by_svd(M: np.ndarray) -> np.ndarray:
+    """The textbook's way, one matrix."""
+    U, _, Vt = np.linalg.svd(M)
+    return U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9, 0.01, 0.1, 0.3, 0.5])
+@pytest.mark.parametrize("scale", [1e-150, 1.0, 1e150])
+def test_nearest_of_a_batch_equals_the_svd(noise, scale):
+    rng = np.random.default_rng(8)
+    M = rotations.random(rng, (500,)) + noise * rng.standard_normal((500, 3, 3))
+    want = np.stack([nearest_by_svd(m) for m in M])
+    # Where two singular values nearly cancel the answer itself is ill-conditioned: sigma_2 +
+    # sigma_3 (less it, of a reflection) divides every rounding error.
+    values = np.linalg.svd(M, compute_uv=False)
+    gap = values[:, 1] + np.sign(np.linalg.det(M)) * values[:, 2]
+    assert (np.abs(rotations.nearest(scale * M) - want).max(axis=(1, 2)) * gap < 1e-12).all()
+
+
+@pytest.mark.parametrize("kind", matrices())
+def test_nearest_of_a_hard_matrix_in_a_batch_is_that_of_the_matrix_alone(kind):
+    rng = np.random.default_rng(9)
+    M = rotations.random(rng, (10, 10)) + 0.1 * rng.standard_normal((10, 10, 3, 3))
+    M[3, 4] = matrices()[kind]
+    got = rotations.nearest(M)
+    assert got.shape == M.shape
+    rotations.check_rotation(kind, got, tolerance=1e-14)
+    np.testing.assert_allclose(got[3, 4], rotations.nearest(M[3, 4]), atol=1e-13)
+    np.testing.assert_allclose(got[0, 0], rotations.nearest(M[0, 0]), atol=1e-14)
+
+
+def test_log_of_a_batch_of_small_and_wide_turns_is_a_loop():
+    w = np.concatenate([turns(angle) for angle in ANGLES])
+    Q = rotations.exp(w)
+    np.testing.assert_allclose(
+        rotations.log(Q), [rotations.log(q) for q in Q], rtol=1e-13, atol=1e-15
+    )
+
+
 # --- errors and angles ------------------------------------------------------------------------
 
 

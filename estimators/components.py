@@ -1,0 +1,146 @@
+"""Small matrices by components: matrix axes first, trials last, so that calls run along memory.
+
+In public every array has its trials first. A view with its axes moved costs nothing, so the
+estimators keep that shape and lay only the memory out the other way; here both orders meet.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym import rotations
+from rbl_gym.checks import FloatArray
+
+_IDENTITY = np.eye(3)
+# [w]x as a tensor: hat(w)[i, j] = _HAT[i, j, k] w[k].
+_HAT = np.moveaxis(rotations.hat(np.eye(3)), 0, -1)
+
+
+def first(array: FloatArray, trailing: int, batch: int = 0) -> FloatArray:
+    """View (n, ..., batch) of (batch, n, ...): the `trailing` axes first, the batch axes last.
+
+    Fewer batch axes than `batch` are filled up with axes of 1, so that views broadcast.
+    """
+    lead = array.ndim - trailing
+    if lead == 0 and batch == 0:
+        return array
+    view = array.transpose((*range(lead, array.ndim), *range(lead)))
+    if batch <= lead:
+        return view
+    return view.reshape((*view.shape[:trailing], *(1,) * (batch - lead), *view.shape[trailing:]))
+
+
+def last(array: FloatArray, leading: int) -> FloatArray:
+    """View (batch, n, ...) of (n, ..., batch): inverse of `first`."""
+    if leading == array.ndim:
+        return array
+    return array.transpose((*range(leading, array.ndim), *range(leading)))
+
+
+def trials_last(array: FloatArray, trailing: int) -> FloatArray:
+    """The array (batch, n, ...) with its memory laid out as (n, ..., batch)."""
+    return last(np.ascontiguousarray(first(array, trailing)), trailing)
+
+
+def product(A: FloatArray, B: FloatArray) -> FloatArray:
+    """``A B`` (i, k, ...) of matrices (i, j, ...) and (j, k, ...)."""
+    return A @ B if A.ndim == B.ndim == 2 else np.einsum("ij...,jk...->ik...", A, B)
+
+
+def exp(w: FloatArray) -> FloatArray:
+    """Rotation matrices (3, 3, ...) of rotation vectors (3, ...); `rotations.exp`."""
+    if w.ndim == 1:
+        return rotations.exp(w)
+    squared = np.einsum("i...,i...->...", w, w)
+    a, b, _ = rotations.coefficients(squared)
+    return _series(w, a, b, 1.0 - b * squared)
+
+
+def log(Q: FloatArray) -> FloatArray:
+    """Rotation vectors (3, ...) of rotation matrices (3, 3, ...); `rotations.log`."""
+    return np.ascontiguousarray(first(rotations.log(last(Q, 2)), 1))
+
+
+def left_jacobian_inverse(w: FloatArray) -> FloatArray:
+    """``Jl(w)^-1`` (3, 3, ...) of rotation vectors (3, ...); `rotations.left_jacobian_inverse`."""
+    if w.ndim == 1:
+        return rotations.left_jacobian_inverse(w)
+    squared = np.einsum("i...,i...->...", w, w)
+    c = rotations.inverse_coefficient(squared)
+    return _series(w, np.full_like(squared, -0.5), c, 1.0 - c * squared)
+
+
+def _series(w: FloatArray, a: FloatArray, b: FloatArray, diagonal: FloatArray) -> FloatArray:
+    """``diagonal * I + a [w]x + b w w^T`` (3, 3, ...)."""
+    M = (b * w)[:, None] * w
+    turn = a * w
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        M[i, i] += diagonal
+        M[k, j] += turn[i]
+        M[j, k] -= turn[i]
+    return M
+
+
+def cross(c: FloatArray, X: FloatArray) -> FloatArray:
+    """``[c]x X`` for vectors (3, ...) and matrices (3, k, ...)."""
+    c1, c2 = c[[1, 2, 0]][:, None], c[[2, 0, 1]][:, None]
+    return c1 * X[[2, 0, 1]] - c2 * X[[1, 2, 0]]
+
+
+def solve(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:
+    """Solution (n, ...) of ``(A + damping diag(A)) x = b``, A (n, n, ...) positive semidefinite.
+
+    Elimination without exchange of rows, which such a matrix does not need. A pivot that
+    rounding leaves below 1e-14 of its diagonal entry is raised to it.
+    """
+    n = len(A)
+    diagonal = _diagonal(A)
+    if A.ndim == 2:
+        return np.linalg.solve(A + np.diag((damping + 1e-14) * diagonal + 1e-300), b)
+    U = np.concatenate([A, b[:, None]], axis=1)
+    if damping.any():
+        U[range(n), range(n)] += damping * diagonal
+    floor = 1e-14 * diagonal + 1e-300
+    pivots = []
+    for k in range(n):
+        pivots.append(np.maximum(U[k, k], floor[k]))
+        U[k + 1 :, k + 1 :] -= (U[k + 1 :, k] / pivots[k])[:, None] * U[k, k + 1 :]
+    x = U[:, n]
+    for k in reversed(range(n)):
+        x[k] /= pivots[k]
+        x[:k] -= U[:k, k] * x[k]
+    return x
+
+
+def inverse(A: FloatArray) -> FloatArray:
+    """Inverse (n, n, ...) of symmetric positive definite matrices by Gauss-Jordan sweeps.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a matrix is not positive definite.
+    """
+    if A.ndim == 2:
+        inverted = np.linalg.inv(A)
+        return 0.5 * (inverted + inverted.T)
+    A = A.copy()
+    pivots = []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k in range(len(A)):
+            column = A[k].copy()
+            pivots.append(column[k])
+            row = column / column[k]
+            A -= column[:, None] * row
+            # Swept matrices stay symmetric; a sweep leaves minus the inverse of what it swept.
+            A[k] = A[:, k] = row
+            np.divide(-1, column[k], out=A[k, k])
+    smallest = np.min(pivots, initial=np.inf)
+    if not smallest > 0:
+        raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
+    return np.negative(A, out=A)
+
+
+def _diagonal(A: FloatArray) -> FloatArray:
+    """The diagonal (n, ...) of (n, n, ...) as a view where the memory allows it."""
+    n = len(A)
+    return A.reshape((n * n, *A.shape[2:]))[:: n + 1]

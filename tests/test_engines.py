@@ -1,0 +1,279 @@
+"""Every path of the batched engine against the plain 12 x 12 form, and which path is taken."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from rbl_gym import bodies, estimators, motion, ranging, rotations
+from rbl_gym.estimators import engines, four_filters, kalman, unitary
+from rbl_gym.estimators.four_filters import inverse, join, principal_frame, split
+from rbl_gym.estimators.least_squares import procrustes, vec
+from rbl_gym.estimators.shared_covariance import shared
+from tests.helpers import simulate
+
+FAMILY = ["kf", "uc-kf", "et-kf", "kf-ortho"]
+NOISE = ranging.SquaredRangeNoise(0.05)
+PROCESS = motion.ProcessNoise(0.02, 0.1)
+PRIOR = np.diag([0.02] * 3 + [1.0] * 3)
+
+
+def turned_tags(rng):
+    """Centred, and their principal axes are not those of the body frame."""
+    tags = rng.uniform(-0.5, 0.5, (6, 3))
+    return tags - tags.mean(axis=0)
+
+
+TAGS = {
+    "aligned": bodies.pyramid(1.0),
+    "turned": turned_tags(np.random.default_rng(0)),
+    "uncentred": bodies.pyramid(1.0) + [0.3, -0.1, 0.2],
+    "plate": bodies.plate(),
+}
+
+
+def shell(rng, shape):
+    places = rng.standard_normal((*shape, 3))
+    return 15 * places / np.linalg.norm(places, axis=-1, keepdims=True)
+
+
+@pytest.fixture(autouse=True)
+def _few_trials_are_many(monkeypatch):
+    """Small batches take the fast paths too."""
+    monkeypatch.setattr(engines, "FEW_TRIALS", 8)
+    monkeypatch.setattr(kalman, "FEW_TRIALS", 8)
+
+
+def plain(monkeypatch):
+    """Switch to the plain form: no state is split, no covariance taken for shared."""
+    monkeypatch.setattr(engines, "FEW_TRIALS", 10**9)
+    monkeypatch.setattr(kalman, "FEW_TRIALS", 10**9)
+
+
+def track(name, tags, batch, *, steps=20, prior=PRIOR, process=PROCESS, noise=NOISE, fixed=False,
+          common_twist=False, lost=(), seed=3, edit=lambda state: state):  # fmt: skip
+    """States of a run."""
+    rng = np.random.default_rng(seed)
+    anchors = shell(rng, (7,) if fixed else (*batch, 7))
+    rotation, translation = rotations.random(rng, batch), rng.uniform(-3, 3, (*batch, 3))
+    weights = rng.uniform(0.5, 2.0, 7) if fixed else None
+    filter = estimators.make(name, tags=tags, noise=noise, process=process, weights=weights)
+    start = rotations.exp(0.1 * rng.standard_normal((*batch, 3))) @ rotation
+    state = edit(filter.initial(start, translation, prior))
+    states = []
+    for step in range(steps):
+        twist = 0.4 * rng.standard_normal((6,) if common_twist else (*batch, 6))
+        rotation, translation = motion.propagate(rotation, translation, twist, 0.1)
+        ranges = simulate(rng, anchors, tags, rotation, translation, noise)
+        links = rng.random(ranges.shape) > 0.2 if step in lost else None
+        state = filter.update(filter.predict(state, twist, 0.1), ranges, anchors, links)
+        states.append(state)
+    return states
+
+
+def assert_equal(got, want):
+    for state, other in zip(got, want, strict=True):
+        np.testing.assert_allclose(state.mean, other.mean, rtol=1e-9, atol=1e-9)
+        scale = np.abs(other.covariance).max()
+        np.testing.assert_allclose(state.covariance, other.covariance, rtol=1e-9, atol=1e-9 * scale)
+        np.testing.assert_array_equal(state.constrained, other.constrained)
+
+
+def count_calls(monkeypatch, module, name):
+    calls = []
+    original = getattr(module, name)
+
+    def counted(*args, **kwargs):
+        calls.append(args)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(module, name, counted)
+    return calls
+
+
+@pytest.mark.parametrize("name", FAMILY)
+@pytest.mark.parametrize("tags", TAGS)
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3), (4, 5)], ids=str)
+def test_20_steps_equal_the_plain_form(name, tags, batch, monkeypatch):
+    fast = track(name, TAGS[tags], batch)
+    assert fast[-1].mean.shape == (*batch, 12)
+    assert fast[-1].covariance.shape == (*batch, 12, 12)
+    plain(monkeypatch)
+    assert_equal(fast, track(name, TAGS[tags], batch))
+
+
+@pytest.mark.parametrize("name", FAMILY)
+@pytest.mark.parametrize(
+    "case",
+    [
+        {"lost": (4, 5)},
+        {"process": motion.ProcessNoise((0.01, 0.02, 0.03), (0.1, 0.2, 0.0))},
+        {"process": motion.ProcessNoise(0.0, 0.0)},
+        {"prior": 100 * np.eye(12)},
+        {"noise": ranging.RangeNoise(0.02, 0.002)},
+        {"noise": ranging.RangeNoise(0.02, 0.002, reference_tag=0)},
+        {"fixed": True, "common_twist": True},
+        {"fixed": True},
+        {"fixed": True, "common_twist": True, "lost": (4, 5)},
+    ],
+    ids=["lost links", "anisotropic process", "no process", "vague", "weights of each link",
+         "reference tag", "shared", "shared but for the twist", "shared, lost links"],
+)  # fmt: skip
+@pytest.mark.parametrize("tags", ["turned", "uncentred"])
+def test_special_cases_equal_the_plain_form(name, case, tags, monkeypatch):
+    fast = track(name, TAGS[tags], (3, 4), **case)
+    plain(monkeypatch)
+    assert_equal(fast, track(name, TAGS[tags], (3, 4), **case))
+
+
+@pytest.mark.parametrize("name", FAMILY)
+@pytest.mark.parametrize("tags", ["aligned", "turned"])
+@pytest.mark.parametrize("where", ["columns of Q", "rotation and translation", "anisotropic"])
+def test_a_state_with_cross_terms_takes_the_general_path(name, tags, where, monkeypatch):
+    def edit(state):
+        covariance = state.covariance.copy()
+        if where == "columns of Q":
+            covariance[3, 0, 4] = covariance[3, 4, 0] = 1e-3
+        elif where == "rotation and translation":
+            covariance[3, 2, 10] = covariance[3, 10, 2] = 1e-3
+        else:
+            covariance[:, np.arange(3), np.arange(3)] *= 1.5
+        return state._replace(covariance=covariance)
+
+    calls = count_calls(monkeypatch, engines, "batched_update")
+    fast = track(name, TAGS[tags], (12,), edit=edit)
+    structured = where == "anisotropic" and tags == "aligned"
+    # Information wears the cross terms off; the fast path may come back.
+    assert not calls if structured else len(calls) > 4
+    plain(monkeypatch)
+    assert_equal(fast, track(name, TAGS[tags], (12,), edit=edit))
+
+
+@pytest.mark.parametrize("name", FAMILY)
+@pytest.mark.parametrize("tags", ["aligned", "turned"])
+def test_the_intended_path_is_taken(name, tags, monkeypatch):
+    four = count_calls(monkeypatch, engines, "filter_update")
+    common = count_calls(monkeypatch, engines, "shared_update")
+    general = count_calls(monkeypatch, engines, "batched_update")
+    columns = count_calls(monkeypatch, kalman, "column_fit")
+
+    def taken(tags, batch, **case):
+        for calls in (four, common, general, columns):
+            calls.clear()
+        track(name, tags, batch, steps=3, **case)
+        return len(four), len(common), len(general), len(columns)
+
+    newton = 3 * (name == "uc-kf")
+    assert taken(TAGS[tags], (12,)) == (3, 0, 0, newton)
+    assert taken(TAGS[tags], (12,), fixed=True) == (3, 0, 0, newton)
+    assert taken(TAGS[tags], (12,), fixed=True, common_twist=True) == (0, 3, 0, newton)
+    assert taken(TAGS["uncentred"], (12,)) == (0, 0, 3, 0)
+    assert taken(TAGS["uncentred"], (12,), fixed=True, common_twist=True) == (0, 3, 0, 0)
+    assert taken(TAGS[tags], ()) == (0, 0, 0, 0)
+    assert taken(TAGS[tags], (12,), lost=(0, 1, 2)) == (0, 0, 3, 0)
+
+
+def test_a_shared_covariance_stays_shared_and_one_reset_trial_ends_it():
+    states = track("kf", TAGS["uncentred"], (12,), fixed=True, common_twist=True)
+    assert shared(states[-1].covariance) is not None
+    mask = np.arange(12) == 4
+    reset = [
+        np.where(mask.reshape(-1, *[1] * (new.ndim - 1)), old, new)
+        for old, new in zip(states[0], states[-1], strict=True)
+    ]
+    assert shared(reset[1]) is None
+    np.testing.assert_array_equal(reset[1][4], states[0].covariance[4])
+
+
+@pytest.mark.parametrize("tags", ["aligned", "turned"])
+def test_a_state_survives_where_and_pickle_on_the_fast_path(tags, monkeypatch):
+    states = track("kf", TAGS[tags], (12,), steps=5)
+    mask = np.arange(12) % 3 == 0
+    mixed = kalman.KalmanState(*(
+        np.where(mask.reshape(-1, *[1] * (new.ndim - 1)), old, new)
+        for old, new in zip(states[1], states[-1], strict=True)
+    ))  # fmt: skip
+    frame = principal_frame(TAGS[tags])
+    assert frame is not None
+    assert split(frame, mixed.covariance) is not None
+    copy = pickle.loads(pickle.dumps(mixed))
+    filter = estimators.make("kf", tags=TAGS[tags], noise=NOISE, process=PROCESS)
+    rng = np.random.default_rng(1)
+    anchors = shell(rng, (6,))
+    ranges = rng.uniform(12, 18, (12, 6, len(TAGS[tags])))
+    first, second = (filter.update(state, ranges, anchors) for state in (mixed, copy))
+    np.testing.assert_allclose(first.mean, second.mean, rtol=1e-12)
+    single = [filter.update(kalman.KalmanState(*(a[k] for a in mixed)), ranges[k], anchors)
+              for k in range(12)]  # fmt: skip
+    np.testing.assert_allclose(first.mean, [s.mean for s in single], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("tags", ["aligned", "turned", "plate"])
+def test_split_and_join_are_inverses_and_the_covariance_is_the_users(tags):
+    rng = np.random.default_rng(2)
+    frame = principal_frame(TAGS[tags])
+    assert frame is not None
+    assert np.linalg.det(frame.axes) == pytest.approx(1)
+    root = rng.standard_normal((4, 9, 3, 3))
+    dense = root @ root.swapaxes(-1, -2)
+    blocks = np.array([dense[..., i, j] for i, j in four_filters.COMPONENTS])
+    covariance = join(frame, blocks, (9,))
+    again = split(frame, covariance)
+    assert again is not None
+    np.testing.assert_allclose(again, blocks, atol=1e-13)
+    expected = np.zeros((9, 4, 3, 4, 3))
+    for k in range(3):
+        for m in range(3):
+            for n in range(3):
+                expected[:, m, :, n] += frame.axes[m, k] * frame.axes[n, k] * dense[k]
+    expected[:, 3, :, 3] = dense[3]
+    np.testing.assert_allclose(covariance, expected.reshape(9, 12, 12), atol=1e-13)
+    spoilt = covariance.copy()
+    spoilt[4, 1, 7] += 1e-6
+    assert split(frame, spoilt) is None
+
+
+def test_tags_off_their_centroid_have_no_frame():
+    assert principal_frame(TAGS["uncentred"]) is None
+    assert principal_frame(TAGS["aligned"] + 1e-9) is None
+    assert principal_frame(np.zeros((2, 4, 3))) is None
+
+
+def test_a_block_that_is_not_positive_is_left_to_the_general_path():
+    rng = np.random.default_rng(4)
+    root = rng.standard_normal((8, 3, 3))
+    dense = root @ root.swapaxes(-1, -2)
+    pack = [dense[:, i, j] for i, j in four_filters.COMPONENTS]
+    inverses = inverse(np.array(pack))
+    assert inverses is not None
+    np.testing.assert_allclose(inverses[1], np.linalg.inv(dense)[:, 0, 1], rtol=1e-9)
+    for shift in ([0, 1, 1], [1, 0, 1], [1, 1, 0]):
+        assert inverse(np.array([1.0, 0, 0, 1, 0, 1])[:, None] * np.array(
+            [shift[0], 1, 1, shift[1], 1, shift[2]])[:, None]) is None  # fmt: skip
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.5, 2.0])
+def test_the_column_fit_is_procrustes(noise):
+    """Far from a rotation too, where the Hessian is not positive at the start."""
+    rng = np.random.default_rng(5)
+    root = rng.standard_normal((40, 3, 3, 3))
+    blocks = root @ root.swapaxes(-1, -2) + 0.01 * np.eye(3)
+    target = rotations.random(rng, (40,)) + noise * rng.standard_normal((40, 3, 3))
+    packed = np.array([blocks[:, :, i, j].T for i, j in four_filters.COMPONENTS])
+    got = np.moveaxis(unitary.column_fit(np.moveaxis(target, 0, -1), packed), -1, 0)
+    weight = np.zeros((40, 3, 3, 3, 3))
+    for k in range(3):
+        weight[:, k, :, k] = np.linalg.inv(blocks[:, k])
+    want = procrustes(weight.reshape(40, 9, 9), vec(target), rotations.nearest(target))[0]
+    rotations.check_rotation("rotation", got, tolerance=1e-12)
+    np.testing.assert_allclose(got, want, atol=1e-9)
+
+
+def test_the_last_chunk_of_a_large_batch_counts_too(monkeypatch):
+    whole = track("kf", TAGS["turned"], (25,), steps=2)
+    common = track("kf", TAGS["turned"], (25,), steps=2, fixed=True, common_twist=True)
+    monkeypatch.setattr("rbl_gym.estimators.squared_range._CHUNK", 7 * 6 * 4)
+    assert_equal(track("kf", TAGS["turned"], (25,), steps=2), whole)
+    assert_equal(track("kf", TAGS["turned"], (25,), steps=2, fixed=True, common_twist=True), common)
