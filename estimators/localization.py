@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from importlib.metadata import entry_points
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, rotations
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.checks import BoolArray, FloatArray, are_finite, check_array, check_number
 from rbl_gym.estimators import least_squares
 from rbl_gym.estimators.inputs import check_epoch, check_variance
 from rbl_gym.estimators.kalman import state_jacobian
@@ -156,7 +156,7 @@ def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:
     """The fields of a `PoseEstimate` (alternatives as three) for one block of trials."""
     found = fit(epoch)
     rotation, translation = found.rotation, found.translation
-    known = np.isfinite(translation).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    known = are_finite(translation, 1) & are_finite(rotation, 2)
     at = _range_cost(epoch)(
         np.where(known[:, None, None], rotation, np.eye(3)),
         np.where(known[:, None], translation, 0.0),
@@ -175,8 +175,14 @@ def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:
 
 def _rows(epoch: Epoch, rows: slice) -> Epoch:
     """Some of the trials."""
-    stat = Statistic(*(field[rows] for field in epoch.stat))
-    return Epoch(*(field[rows] for field in epoch[:4]), stat, epoch.tag_std_m)
+    return Epoch(
+        epoch.ranges[rows],
+        epoch.anchors[rows],
+        epoch.tags[rows],
+        epoch.weights[rows],
+        Statistic._make(field[rows] for field in epoch.stat),
+        epoch.tag_std_m,
+    )
 
 
 def _epoch(
@@ -195,7 +201,7 @@ def _epoch(
         ranges.shape[:-2], anchors.shape[:-2], tags.shape[:-2], variance.shape[:-2], *masks
     )
 
-    def flat(array: FloatArray) -> FloatArray:
+    def flat(array: Any) -> Any:
         shape = array.shape[-2:]
         return np.broadcast_to(array, (*batch, *shape)).reshape(-1, *shape)
 
@@ -287,7 +293,7 @@ def _ml(epoch: Epoch) -> Fit:
 
 def _two_step(epoch: Epoch) -> Fit:
     rotation, translation = least_squares.points_fit(epoch.stat)
-    usable = np.isfinite(translation).all(axis=-1)
+    usable = are_finite(translation, 1)
     solution = minimize_pose(
         _range_cost(epoch),
         np.where(usable[:, None, None], rotation, np.eye(3)),
@@ -331,12 +337,12 @@ def _linear(
     covariance: FloatArray,
     matrix: FloatArray | None = None,
 ) -> Fit:
-    found = np.isfinite(translation).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    found = are_finite(translation, 1) & are_finite(rotation, 2)
     return Fit(rotation, translation, covariance, found, matrix=matrix)
 
 
 def _nearest(matrix: FloatArray) -> FloatArray:
-    known = np.isfinite(matrix).all(axis=(-2, -1))[:, None, None]
+    known = are_finite(matrix, 2)[:, None, None]
     return np.where(known, rotations.nearest(np.where(known, matrix, np.eye(3))), np.nan)
 
 

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym import bounds, ranging
-from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.checks import BoolArray, FloatArray, are_finite
 from rbl_gym.estimators.least_squares import points_fit
 from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.range_cost import RangeCost, geman_mcclure, huber
@@ -85,7 +85,7 @@ def _usable(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Starts with a stand-in where they are not finite, and the mask of those that are."""
-    usable = np.isfinite(translation).all(axis=-1) & np.isfinite(rotation).all(axis=(-2, -1))
+    usable = are_finite(translation, 1) & are_finite(rotation, 2)
     return (
         np.where(usable[:, None, None], rotation, np.eye(3)),
         np.where(usable[:, None], translation, cost.anchors.mean(axis=-2)),
@@ -188,7 +188,7 @@ def _positions(part: RangeCost) -> FloatArray:
     measured = part.weights[:, 0] > 0
     count = np.maximum(measured.sum(axis=-1), 1)
     squared = np.where(measured, part.ranges[:, 0] ** 2, 0.0).sum(axis=-1) / count
-    seen = measured.any(axis=-1)
+    seen = np.asarray(measured.any(axis=-1))
     anchors = part.anchors[:, 0]
     total = np.maximum(seen.sum(axis=-1), 1)[:, None]
     mean = (anchors * seen[..., None]).sum(axis=-2) / total
@@ -251,21 +251,18 @@ def _rivals(part: RangeCost, solutions: Solution) -> Alternatives:
 
 def merge(solution: Solution, found: Solution, where: BoolArray) -> Solution:
     """`solution` with the trials of the mask replaced by `found`."""
-    fields = [
-        _put(old, new, where)
-        for old, new in zip(
-            (solution.rotation, solution.translation, *solution.at, solution.converged),
-            (found.rotation, found.translation, *found.at, found.converged),
-            strict=True,
-        )
-    ]
-    return Solution(fields[0], fields[1], Linearization(*fields[2:5]), fields[5])
 
+    def put(old: Any, new: Any) -> Any:
+        result = old.copy()
+        result[where] = new
+        return result
 
-def _put(old: FloatArray, new: FloatArray, where: BoolArray) -> FloatArray:
-    result = old.copy()
-    result[where] = new
-    return result
+    return Solution(
+        put(solution.rotation, found.rotation),
+        put(solution.translation, found.translation),
+        Linearization._make(put(*pair) for pair in zip(solution.at, found.at, strict=True)),
+        put(solution.converged, found.converged),
+    )
 
 
 def robust(

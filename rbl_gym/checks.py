@@ -65,6 +65,11 @@ def check_finite(name: str, array: FloatArray) -> FloatArray:
     return array
 
 
+def are_finite(array: FloatArray, trailing: int) -> BoolArray:
+    """Whether all of the last `trailing` axes are finite, (...) of the axes before them."""
+    return np.asarray(np.isfinite(array).all(axis=tuple(range(-trailing, 0))))
+
+
 def check_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
     """`value` as a finite float in ``[low, high]``, or a ValueError that names it."""
     try:

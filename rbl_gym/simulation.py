@@ -216,6 +216,18 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
     )
 
 
+def whole(episode: Episode) -> Epoch:
+    """All epochs of an episode at once: the time axis is the last of the batch's."""
+    return Epoch(
+        episode.rotation,
+        episode.translation,
+        episode.positions,
+        episode.twists,
+        episode.normals,
+        episode.uniforms,
+    )
+
+
 def measure(scene: Scene, at: Epoch, anchors: FloatArray) -> ranging.Measurement:
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3)."""
     measured = ranging.measure(
@@ -244,7 +256,7 @@ def posterior_information(
     anchors: FloatArray,
     links: BoolArray,
     previous: FloatArray | None,
-    prior_covariance: FloatArray | None = None,
+    prior_covariance: FloatArray,
 ) -> FloatArray:
     """Posterior Cramer-Rao information (..., 6, 6) at the true pose of an epoch.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -124,6 +125,7 @@ def test_make_vec_gives_the_native_environment_with_its_arguments():
     env.reset(seed=1)
     ends = [env.step(np.zeros(3, int))[3].all() for _ in range(8)]
     assert ends == [False, False, False, True] * 2
+    assert env.spec is not None
     again = gym.make_vec(env.spec)
     np.testing.assert_array_equal(again.reset(seed=2)[0]["ranges"], env.reset(seed=2)[0]["ranges"])
 
@@ -132,7 +134,7 @@ def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared():
     rollouts = []
     for spoil in (False, True):
         env = TrackingVectorEnv(3, short("auv_buoys", 4))
-        results = [env.reset(seed=9)]
+        results: list[Any] = [env.reset(seed=9)]
         for _ in range(7):
             if spoil:
                 for value in (*results[-1][0].values(), *results[-1][-1].values()):

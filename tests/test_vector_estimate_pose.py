@@ -70,7 +70,7 @@ def test_disabled_restarts_only_what_the_mask_says():
     native, peer = pair(short("drone_yard", 5), AutoresetMode.DISABLED)
     assert_close(native.reset(seed=2), peer.reset(seed=2))
     zeros = np.zeros(3, int)
-    native.step(zeros), peer.step(zeros)
+    assert_close(native.step(zeros)[:4], peer.step(zeros)[:4])
     mask = np.array([False, True, False])
     got = native.reset(options={"reset_mask": mask})[0]
     assert_close(got, peer.reset(options={"reset_mask": mask})[0])

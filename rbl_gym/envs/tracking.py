@@ -106,7 +106,7 @@ class TrackingEnv(gym.Env[Any, Any]):
         self._measured: ranging.Measurement | None = None
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
-            at = simulation.Epoch(*episode[: len(simulation.Epoch._fields)])
+            at = simulation.whole(episode)
             self._measured = simulation.measure(self.scene, at, episode.anchors)
         self._information: FloatArray | None = None
         observation, info, _ = self._observe(episode)

@@ -273,7 +273,7 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         """The posterior Cramer-Rao information of the worlds that started or stepped."""
         if moved.all():
             self._information = simulation.posterior_information(
-                self.scene, at, self._anchors, links, self._information
+                self.scene, at, self._anchors, links, self._information, self._prior_covariance
             )
             return
         if fresh.all():
