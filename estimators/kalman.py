@@ -179,6 +179,11 @@ class KalmanFamily:
         else:
             weights = np.asarray(self.weights, dtype=np.float64)
             weights = weights[..., None] if weights.ndim == 1 else weights
+            if weights.shape[-2] != ranges.shape[-2] or weights.shape[-1] not in (
+                1,
+                len(self.tags),
+            ):
+                raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
         epoch = Epoch(ranges, anchors, self.tags, weights, mask)
         mean, covariance = ENGINES[self.engine].update(
             state.mean, state.covariance, epoch, self._frame

@@ -50,3 +50,20 @@ def textbook_model(ranges, anchors, tags, weights, links=None):
 def simulate(rng, anchors, tags, rotation, translation, noise):
     """Ranges of one epoch."""
     return ranging.simulate(anchors, tags, rotation, translation, noise, rng).ranges
+
+
+def assert_same(got: Any, want: Any, rtol: float = 0.0, atol: float = 0.0) -> None:
+    """Equal through dicts and sequences, arrays to the tolerances (0: to the last bit)."""
+    if isinstance(want, dict):
+        assert got.keys() == want.keys()
+        for key in want:
+            assert_same(got[key], want[key], rtol, atol)
+    elif isinstance(want, list | tuple) or getattr(getattr(want, "dtype", None), "kind", "") == "O":
+        assert len(got) == len(want)
+        for a, b in zip(got, want, strict=True):
+            assert_same(a, b, rtol, atol)
+    elif want is None or isinstance(want, str):
+        assert got == want
+    else:
+        assert np.asarray(got).dtype.kind == np.asarray(want).dtype.kind
+        np.testing.assert_allclose(got, want, rtol=rtol, atol=atol)

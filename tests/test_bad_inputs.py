@@ -109,6 +109,16 @@ def test_motion(name, twist, dt, message):
         filter.predict(filter.initial(**GOOD_PRIOR), twist, dt)
 
 
+@pytest.mark.parametrize("name", NAMES[:4])
+@pytest.mark.parametrize("shape", [(3,), (4, 3)])
+def test_weights_that_do_not_fit_the_links(name, shape):
+    process = motion.ProcessNoise(0.1, 0.1)
+    noise = ranging.RangeNoise(0.1)
+    filter = estimators.make(name, tags=TAGS, noise=noise, process=process, weights=np.ones(shape))
+    with pytest.raises(ValueError, match=r"weights must fit \(4, 5\) links"):
+        filter.update(filter.initial(**GOOD_PRIOR), RANGES, ANCHORS)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_reference_tag_that_is_not_there(name):
     filter = make(name, ranging.RangeNoise(0.1, reference_tag=7))

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from rbl_gym import estimators, simulation
 from rbl_gym.scenes import SCENES
 from rbl_gym.wrappers import EstimatePose
+from tests.helpers import assert_same
 
 ID = "rbl_gym:RBL/Tracking-v0"
 NAMES = list(SCENES)
@@ -48,21 +49,6 @@ def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> list[Any]:
         if results[-1][3]:
             break
     return results
-
-
-def assert_same(got: Any, want: Any) -> None:
-    """Equal to the last bit, through dicts and sequences."""
-    assert type(got) is type(want)
-    if isinstance(got, dict):
-        assert got.keys() == want.keys()
-        for key in got:
-            assert_same(got[key], want[key])
-    elif isinstance(got, list | tuple):
-        assert len(got) == len(want)
-        for a, b in zip(got, want, strict=True):
-            assert_same(a, b)
-    else:
-        np.testing.assert_array_equal(got, want)
 
 
 def tag_spread_by_hand(P: np.ndarray, rotation: np.ndarray, tags: np.ndarray) -> float:

@@ -25,6 +25,7 @@ import rbl_gym
 from rbl_gym import bounds
 from rbl_gym.envs.tracking import TrackingEnv, observation_space
 from rbl_gym.scenes import SCENES
+from tests.helpers import assert_same
 
 ROOT = Path(__file__).resolve().parent.parent
 ID = "rbl_gym:RBL/Tracking-v0"
@@ -57,21 +58,6 @@ def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> Iterator[S
         if result[3] and steps is None:
             break
         assert k < 10**5
-
-
-def assert_same(got: Any, want: Any) -> None:
-    """Equal to the last bit, through dicts and sequences."""
-    assert type(got) is type(want)
-    if isinstance(got, dict):
-        assert got.keys() == want.keys()
-        for key in got:
-            assert_same(got[key], want[key])
-    elif isinstance(got, list | tuple):
-        assert len(got) == len(want)
-        for a, b in zip(got, want, strict=True):
-            assert_same(a, b)
-    else:
-        np.testing.assert_array_equal(got, want)
 
 
 def run_python(code: str) -> str:

@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.scenes import SCENES
+from tests.helpers import assert_same
 
 ID = "rbl_gym:RBL/Tracking-v0"
 LOSSY = {"drop_probability": 0.2, "nlos_probability": 0.1, "reach_m": 500.0}
@@ -23,22 +24,8 @@ def short(name, steps=5, **fields):
 
 
 def assert_equal(got, want):
-    """Nested dicts and arrays, to the last bits that batched arithmetic may turn."""
-    if isinstance(want, dict):
-        assert got.keys() == want.keys()
-        for key in want:
-            assert_equal(got[key], want[key])
-    elif isinstance(want, tuple):
-        for a, b in zip(got, want, strict=True):
-            assert_equal(a, b)
-    elif isinstance(want, np.ndarray) and want.dtype == object:
-        for a, b in zip(got, want, strict=True):
-            assert (a is None) == (b is None)
-            if b is not None:
-                assert_equal(a, b)
-    else:
-        assert np.asarray(got).dtype.kind == np.asarray(want).dtype.kind
-        np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
+    """Equal to the last bits that batched arithmetic may turn."""
+    assert_same(got, want, rtol=1e-9, atol=1e-9)
 
 
 def vectors(scene, mode, n=4, reward="bound"):

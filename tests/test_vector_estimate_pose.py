@@ -10,7 +10,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
-from tests.test_tracking_vector_env import ID, actions_of, assert_equal, short
+from tests.helpers import assert_same
+from tests.test_tracking_vector_env import ID, actions_of, short
 
 LOSSY = {"drop_probability": 0.2}
 
@@ -47,23 +48,8 @@ def test_equals_scalar_wrapped_environments(mode, name, filter, arguments):
 
 
 def assert_close(got, want):
-    """As `assert_equal`, at the precision that a filter's rounding leaves."""
-    if isinstance(want, dict):
-        assert got.keys() == want.keys()
-        for key in want:
-            assert_close(got[key], want[key])
-    elif isinstance(want, tuple):
-        for a, b in zip(got, want, strict=True):
-            assert_close(a, b)
-    elif isinstance(want, np.ndarray) and want.dtype == object:
-        for a, b in zip(got, want, strict=True):
-            assert (a is None) == (b is None)
-            if b is not None:
-                assert_close(a, b)
-    elif np.asarray(want).dtype.kind == "f":
-        np.testing.assert_allclose(got, want, rtol=2e-5, atol=2e-6)
-    else:
-        assert_equal(got, want)
+    """Equal at the precision that a filter's rounding leaves."""
+    assert_same(got, want, rtol=2e-5, atol=2e-6)
 
 
 def test_disabled_restarts_only_what_the_mask_says():
