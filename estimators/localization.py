@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym import bounds, rotations
+from rbl_gym import bounds, ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray, are_finite, check_array, check_number
 from rbl_gym.estimators import least_squares
 from rbl_gym.estimators.inputs import check_epoch, check_variance
@@ -31,7 +31,7 @@ from rbl_gym.ranging import NoiseLaw
 
 ENTRY_POINT_GROUP = "rbl_gym.locators"
 # Trials of a block: their arrays stay in the processor's cache.
-_BLOCK = 256
+_BLOCK = 512
 
 
 class PoseEstimate(NamedTuple):
@@ -86,13 +86,14 @@ class Epoch(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """What a method returns: pose (B, ...), covariance, convergence, cost and rivals if its own."""
+    """What a method returns, (B, ...): pose, covariance, convergence; what else it knows itself."""
 
     rotation: FloatArray
     translation: FloatArray
     covariance: FloatArray
     converged: BoolArray
     cost: FloatArray | None = None
+    information: FloatArray | None = None
     alternatives: Alternatives | None = None
     matrix: FloatArray | None = None
 
@@ -157,20 +158,42 @@ def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:
     found = fit(epoch)
     rotation, translation = found.rotation, found.translation
     known = are_finite(translation, 1) & are_finite(rotation, 2)
-    at = _range_cost(epoch)(
-        np.where(known[:, None, None], rotation, np.eye(3)),
-        np.where(known[:, None], translation, 0.0),
-    )
+    cost, information = found.cost, found.information
+    if cost is None or information is None:
+        cost = _range_cost_of(epoch, rotation, translation, known)
+        rank = _rank_of_tags(epoch.tags)
+    else:
+        rank = bounds.information_rank(information)
     return (
         rotation,
         translation,
         found.covariance,
-        at.cost if found.cost is None else found.cost,
+        cost,
         found.converged,
-        np.where(known, bounds.information_rank(at.hessian), 0),
+        np.where(known, rank, 0),
         *(found.alternatives or no_alternatives(len(known))),
         rotation if found.matrix is None else found.matrix,
     )
+
+
+def _range_cost_of(
+    epoch: Epoch, rotation: FloatArray, translation: FloatArray, known: BoolArray
+) -> FloatArray:
+    """Half the sum of squared whitened range residuals (B,), infinite where no pose is known."""
+    turned = epoch.tags @ np.swapaxes(rotation, -1, -2)
+    residual = ranging.distances(epoch.anchors, turned + translation[:, None]) - epoch.ranges
+    cost = 0.5 * np.einsum("bmn,bmn,bmn->b", epoch.weights, residual, residual)
+    return np.where(known, cost, np.inf)
+
+
+def _rank_of_tags(tags: FloatArray) -> np.ndarray:
+    """Rank of the pose where every tag is located: 3 for a point, 5 for a line, else 6."""
+    if tags.strides[0] == 0:
+        tags = tags[:1]
+    gram = np.einsum("bni,bnj->bij", *[tags - tags.mean(axis=1, keepdims=True)] * 2)
+    values = np.linalg.eigvalsh(gram)
+    spans = (values > 1e-18 * np.maximum(values[:, 2:], 1e-300)).sum(axis=-1)
+    return np.array([3, 5, 6, 6])[spans]
 
 
 def _rows(epoch: Epoch, rows: slice) -> Epoch:
@@ -327,6 +350,7 @@ def _from_solution(solution: Solution, alternatives: Alternatives) -> Fit:
         covariance_of(solution.at.hessian),
         solution.converged,
         solution.at.cost,
+        solution.at.hessian,
         alternatives,
     )
 

@@ -22,7 +22,7 @@ from rbl_gym.estimators.squared_range import statistic
 # A cost this many standard deviations above its chi-square mean calls for a global search.
 _SUSPICIOUS = 5.0
 # So does a rotation that the ranges leave this uncertain (rad): there may be other minima.
-_UNCERTAIN_RAD = 0.15
+_UNCERTAIN_RAD = 0.2
 # Poses within 3 sigma of the best cost are alternatives to it.
 _RIVAL_COST = 4.5
 _MAX_ALTERNATIVES = 3
@@ -67,7 +67,7 @@ def maximum_likelihood(
         Standard deviation of the tags' places on the body, marginalised.
     """
     rotation, translation, usable = _usable(cost, rotation, translation)
-    solution = minimize_pose(cost, rotation, translation, iterations=12)
+    solution = minimize_pose(cost, rotation, translation, iterations=12, tolerance=1e-5)
     judged = _with_tag_noise(cost, solution, tag_std_m)
     alternatives = no_alternatives(len(usable))
     doubtful = ~usable | ~judged.converged | in_doubt(cost, judged.at)
@@ -123,17 +123,20 @@ def in_doubt(cost: RangeCost, at: Linearization) -> BoolArray:
     high = excess > _SUSPICIOUS * np.sqrt(2 * np.maximum(links - 6, 1))
     vague = rotation_std(at.hessian) > _UNCERTAIN_RAD
     spread = cost.anchors - cost.anchors.mean(axis=-2, keepdims=True)
-    values = np.linalg.svd(spread, compute_uv=False)
-    flat = np.ones(len(high), bool) if values.shape[-1] < 3 else values[:, 2] < 0.05 * values[:, 0]
+    squares = np.linalg.eigvalsh(np.swapaxes(spread, -1, -2) @ spread)
+    flat = squares[:, 0] < 0.05**2 * squares[:, 2]
     return high | vague | flat | (cost.anchors.shape[-2] < 5)
 
 
 def rotation_std(hessian: FloatArray) -> FloatArray:
-    """Largest standard deviation (rad) of the rotation, inf where the information is singular."""
+    """Bound (B,) on the rotation's standard deviation (rad), inf where nothing determines it.
+
+    The root of the covariance's trace: at most sqrt(3) times the largest standard deviation.
+    """
     singular = bounds.information_rank(hessian) < 6
     covariance = np.linalg.inv(np.where(singular[:, None, None], np.eye(6), hessian))
-    largest = np.linalg.eigvalsh(covariance[:, :3, :3])[:, -1]
-    return np.where(singular, np.inf, np.sqrt(np.maximum(largest, 0.0)))
+    trace = np.einsum("bii->b", covariance[:, :3, :3])
+    return np.where(singular, np.inf, np.sqrt(np.maximum(trace, 0.0)))
 
 
 def search(part: RangeCost, first: Solution, where: BoolArray) -> tuple[Solution, Alternatives]:
