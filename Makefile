@@ -8,7 +8,7 @@ demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png
 
 test: .venv/dev.stamp
-	$(BIN)/python -m pytest -n 2 -m "not long"
+	$(BIN)/python -m pytest -n 2
 
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .
