@@ -67,7 +67,7 @@ def maximum_likelihood(
         Standard deviation of the tags' places on the body, marginalised.
     """
     rotation, translation, usable = _usable(cost, rotation, translation)
-    solution = minimize_pose(cost, rotation, translation, iterations=12, tolerance=1e-5)
+    solution = minimize_pose(cost, rotation, translation, iterations=12, tolerance=3e-6)
     judged = _with_tag_noise(cost, solution, tag_std_m)
     alternatives = no_alternatives(len(usable))
     doubtful = ~usable | ~judged.converged | in_doubt(cost, judged.at)
