@@ -56,3 +56,14 @@ def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
     if not (variance > 0).all():
         raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
     return variance
+
+
+def spanned_dimensions(points: FloatArray) -> np.ndarray:
+    """Dimensions (...) that points (..., N, 3) span: 0 a point, 1 a line, 2 a plane, 3 space."""
+    return matrix_rank(points - points.mean(axis=-2, keepdims=True))
+
+
+def matrix_rank(rows: FloatArray) -> np.ndarray:
+    """Rank (...) of matrices (..., m, n): singular values above 1e-9 of the largest."""
+    values = np.linalg.svd(rows, compute_uv=False)
+    return (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1)

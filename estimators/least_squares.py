@@ -134,11 +134,11 @@ def procrustes_fit(stat: Statistic, starts: FloatArray) -> tuple[FloatArray, Flo
     Rotation (..., 3, 3) and the translation (..., 3) that belongs to it.
     """
     matrix, vector = information(stat)
-    lower = np.linalg.solve(_loaded(matrix[..., 9:, 9:]), matrix[..., 9:, :9])
+    lower = np.linalg.solve(loaded(matrix[..., 9:, 9:]), matrix[..., 9:, :9])
     weight = matrix[..., :9, :9] - np.swapaxes(matrix[..., 9:, :9], -1, -2) @ lower
     pull = vector[..., :9] - (np.swapaxes(lower, -1, -2) @ vector[..., 9:, None])[..., 0]
     # Coplanar tags leave the weight singular: the loading acts where it carries nothing.
-    target = np.linalg.solve(_loaded(weight), pull[..., None])[..., 0]
+    target = np.linalg.solve(loaded(weight), pull[..., None])[..., 0]
     weight, target = weight[..., None, :, :], target[..., None, :]
     residual = vec(starts) - target
     cost = np.einsum(
@@ -158,8 +158,8 @@ def _total(stat: Statistic) -> FloatArray:
     return stat.G[..., 0, :, :] * n_tags if stat.is_common else stat.G.sum(axis=-3)
 
 
-def _loaded(matrix: FloatArray) -> FloatArray:
-    """A symmetric matrix with 1e-13 of its trace on the diagonal: always invertible."""
+def loaded(matrix: FloatArray) -> FloatArray:
+    """Symmetric matrices (..., n, n) with 1e-13 of its trace on the diagonal: invertible."""
     size = matrix.shape[-1]
     trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
     return matrix + (1e-13 * trace + 1e-300) * np.eye(size)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import bounds, ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray, are_finite, check_array, check_number
 from rbl_gym.estimators import least_squares
-from rbl_gym.estimators.inputs import check_epoch, check_variance
+from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.kalman import state_jacobian
 from rbl_gym.estimators.levenberg_marquardt import Solution, minimize_pose
 from rbl_gym.estimators.maximum_likelihood import (
@@ -245,9 +245,7 @@ _NEEDS = {"ls": (3, 3), "ls-projected": (3, 3), "cls": (3, 2), "procrustes": (3,
 def _check_geometry(method: str, anchors: FloatArray, tags: FloatArray) -> None:
     needs = zip(("anchors", "tags"), (anchors, tags), _NEEDS[method], strict=True)
     for name, points, needed in needs:
-        spread = points - points.mean(axis=-2, keepdims=True)
-        values = np.linalg.svd(spread, compute_uv=False)
-        rank = (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1).min()
+        rank = spanned_dimensions(points).min()
         if rank < needed:
             raise ValueError(
                 f"method {method!r} needs {name} that span {needed} dimensions, got "
@@ -274,7 +272,7 @@ def _ls_projected(epoch: Epoch) -> Fit:
     # w = Jq^+ dq, v = dt + K (dq - Jq w), K = I_tt^-1 I_tq of the linear information.
     J = state_jacobian(rotation)[:, :9, :3]
     info, _ = information(epoch.stat)
-    K = np.linalg.solve(_loaded(info[:, 9:, 9:]), info[:, 9:, :9])
+    K = np.linalg.solve(least_squares.loaded(info[:, 9:, 9:]), info[:, 9:, :9])
     T = np.zeros((len(rotation), 6, 12))
     T[:, :3, :9] = 0.5 * np.swapaxes(J, -1, -2)
     T[:, 3:, :9] = K - K @ J @ T[:, :3, :9]
@@ -293,7 +291,7 @@ def _cls(epoch: Epoch) -> Fit:
         * known
     )
     stacked = J.reshape(len(J), -1, 6)
-    spread = np.linalg.inv(_loaded(np.swapaxes(stacked, 1, 2) @ stacked))
+    spread = np.linalg.inv(least_squares.loaded(np.swapaxes(stacked, 1, 2) @ stacked))
     middle = bounds.lift(J, np.broadcast_to(np.linalg.inv(safe), (*J.shape[:2], 3, 3)))
     return _linear(rotation, translation, spread @ middle @ spread)
 
@@ -370,15 +368,10 @@ def _nearest(matrix: FloatArray) -> FloatArray:
     return np.where(known, rotations.nearest(np.where(known, matrix, np.eye(3))), np.nan)
 
 
-def _loaded(matrix: FloatArray) -> FloatArray:
-    trace = np.trace(matrix, axis1=-2, axis2=-1)[:, None, None]
-    return matrix + (1e-13 * trace + 1e-300) * np.eye(matrix.shape[-1])
-
-
 def _propagated(T: FloatArray, stat: Statistic) -> FloatArray:
     """``T I^-1 T^T`` with the information of the 12 linear states."""
     info, _ = information(stat)
-    return bounds.symmetric(T @ np.linalg.solve(_loaded(info), np.swapaxes(T, -1, -2)))
+    return bounds.symmetric(T @ np.linalg.solve(least_squares.loaded(info), np.swapaxes(T, -1, -2)))
 
 
 def covariance_of(hessian: FloatArray) -> FloatArray:

@@ -27,7 +27,12 @@ from rbl_gym.estimators.components import (
     product,
     trials_last,
 )
-from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
+from rbl_gym.estimators.inputs import (
+    check_covariance,
+    check_epoch,
+    check_variance,
+    spanned_dimensions,
+)
 from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
 from rbl_gym.estimators.range_cost import RangeCost, TagMaps, huber, pick, tag_maps
 from rbl_gym.estimators.rotation_net import ROTATION_NET
@@ -301,9 +306,7 @@ def _translation_given(rotation: FloatArray, problem: MapProblem) -> FloatArray:
 def _check_determined(anchors: FloatArray, tags: FloatArray) -> None:
     """A ValueError where no number of full epochs can tell a pose: collinear anchors or tags."""
     for name, points in (("anchors", anchors), ("tags", tags)):
-        spread = points - points.mean(axis=-2, keepdims=True)
-        values = np.linalg.svd(spread, compute_uv=False)
-        rank = (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1)
+        rank = spanned_dimensions(points)
         if (rank < 2).any():
             raise ValueError(
                 f"{name} must be at least 3 and not collinear where the prior rotation is vague, "

@@ -18,6 +18,7 @@ import numpy as np
 
 from rbl_gym.bounds import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.inputs import matrix_rank, spanned_dimensions
 
 # Ranges that are squared at a time: a quarter of a megabyte stays in the cache.
 _CHUNK = 1 << 15
@@ -178,12 +179,6 @@ def compressed(stat: Statistic) -> tuple[FloatArray, FloatArray]:
 
 def geometric_rank(anchors: FloatArray, tags: FloatArray) -> np.ndarray:
     """How many of the 12 states full links would determine: anchors' rank (<= 3) x tags' (<= 4)."""
-    spread = anchors - anchors.mean(axis=-2, keepdims=True)
     size = np.linalg.norm(tags, axis=-1).max(axis=-1)[..., None, None]
     unit_tags = extended(tags / np.where(size > 0, size, 1.0))
-    return _rank(spread) * _rank(unit_tags)
-
-
-def _rank(rows: FloatArray) -> np.ndarray:
-    values = np.linalg.svd(rows, compute_uv=False)
-    return (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1)
+    return spanned_dimensions(anchors) * matrix_rank(unit_tags)

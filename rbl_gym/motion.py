@@ -301,11 +301,15 @@ def interpolate(
     times: FloatArray, rotation: FloatArray, translation: FloatArray, at: FloatArray
 ) -> Path:
     """Poses at the times `at`, linear in position, geodesic in rotation; the ends are held."""
-    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
-    span = times[before + 1] - times[before]
-    fraction = np.clip((at - times[before]) / span, 0.0, 1.0)[:, None]
-    turn = rotations.error(rotation[before + 1], rotation[before])
-    step = translation[before + 1] - translation[before]
+    final = len(times) - 1
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, final)
+    after = np.minimum(before + 1, final)
+    gap = times[after] - times[before]
+    # The last pose has no neighbour: its gap is 0, and so is the fraction.
+    fraction = (at - times[before]) / np.where(gap > 0, gap, np.inf)
+    fraction = np.clip(fraction, 0.0, 1.0)[..., None]
+    turn = rotations.error(rotation[after], rotation[before])
+    step = translation[after] - translation[before]
     return Path(
         rotations.exp(fraction * turn) @ rotation[before], translation[before] + fraction * step
     )

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rbl_gym import rotations
+from rbl_gym import motion, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
 AnyPath = str | os.PathLike[str]
@@ -132,14 +132,9 @@ def truth_at(
     left = np.clip(np.searchsorted(truth.times, times, side="right") - 1, 0, last)
     right = np.minimum(left + 1, last)
     elapsed, gap = times - truth.times[left], truth.times[right] - truth.times[left]
-    # The last pose has no right neighbour: its gap is 0, and so is the fraction.
-    fraction = np.clip(elapsed / np.where(gap > 0, gap, np.inf), 0.0, 1.0)[..., None]
-    start = truth.translation[left]
-    translation = start + fraction * (truth.translation[right] - start)
-    turn = rotations.error(truth.rotation[right], truth.rotation[left])
-    rotation = rotations.exp(fraction * turn) @ truth.rotation[left]
+    path = motion.interpolate(*truth, times)
     inside = (times >= truth.times[0]) & (times <= truth.times[-1])
-    return rotation, translation, inside & ((gap <= max_gap_s) | (elapsed == 0))
+    return path.rotation, path.translation, inside & ((gap <= max_gap_s) | (elapsed == 0))
 
 
 class _Table(NamedTuple):
