@@ -22,6 +22,10 @@ def _register_environments() -> None:
             "rbl_gym.envs.tracking:TrackingEnv",
             "rbl_gym.envs.tracking_vector:TrackingVectorEnv",
         ),
+        "RBL/AnchorPlacement-v0": (
+            "rbl_gym.envs.placement:AnchorPlacementEnv",
+            "rbl_gym.envs.placement:AnchorPlacementVectorEnv",
+        ),
     }
     for env_id, (scalar, vector) in entry_points.items():
         if env_id not in registry:

@@ -30,6 +30,14 @@ class Region(Protocol):
         """The nearest legal points (..., 3)."""
         ...
 
+    def place(self, action: FloatArray) -> FloatArray:
+        """Legal points (..., 3) that actions (..., 3) name, cut to [-1, 1]."""
+        ...
+
+    def action(self, points: FloatArray) -> FloatArray:
+        """Actions (..., 3) that `place` takes to legal points (..., 3)."""
+        ...
+
 
 def _check_corners(region: Box | Walls, *, flat: bool) -> None:
     for name in ("low", "high"):
@@ -63,6 +71,14 @@ class Box:
     def project(self, points: FloatArray) -> FloatArray:
         """Every coordinate clipped."""
         return np.clip(points, *self.bounds())
+
+    def place(self, action: FloatArray) -> FloatArray:
+        """The box is [-1, 1]^3."""
+        return _scaled(np.clip(action, -1, 1), *self.bounds())
+
+    def action(self, points: FloatArray) -> FloatArray:
+        """Inverse of `place`; zero along an axis without extent."""
+        return _unscaled(points, *self.bounds())
 
 
 @dataclass(frozen=True)
@@ -109,6 +125,22 @@ class Walls:
             inside[..., axis] = np.where(face == index, value, inside[..., axis])
         return inside
 
+    def place(self, action: FloatArray) -> FloatArray:
+        """Where the ray from the middle of the room along the action meets a wall or the ceiling.
+
+        A ray that points down is cut at the floor's height; one to the floor itself goes to the
+        nearest wall.
+        """
+        action = np.clip(action, -1, 1)
+        reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
+        met = np.clip(action / np.maximum(reach, 1e-3)[..., None], -1, 1)
+        points = _scaled(met, *self.bounds())
+        return np.where((reach < 1e-3)[..., None], self.project(points), points)
+
+    def action(self, points: FloatArray) -> FloatArray:
+        """An inverse of `place`: the point itself, in units of the room's half size."""
+        return _unscaled(points, *self.bounds())
+
     def _faces(self) -> list[tuple[int, float]]:
         low, high = self.low, self.high
         return [(0, low[0]), (0, high[0]), (1, low[1]), (1, high[1]), (2, high[2])]
@@ -144,3 +176,28 @@ class Shell:
         legal = np.clip(radius, self.inner_m, self.outer_m)
         outward = points * (legal / np.where(radius > 0, radius, 1.0))
         return np.where(radius > 0, outward, self.inner_m * np.eye(3)[0])
+
+    def place(self, action: FloatArray) -> FloatArray:
+        """The action's direction (x for zero), its length from the inner to the outer sphere."""
+        action = np.clip(action, -1, 1)
+        length = np.linalg.norm(action, axis=-1, keepdims=True)
+        direction = np.where(length > 0, action / np.where(length > 0, length, 1), np.eye(3)[0])
+        radius = self.inner_m + (self.outer_m - self.inner_m) * np.minimum(length, 1.0)
+        return radius * direction
+
+    def action(self, points: FloatArray) -> FloatArray:
+        """Inverse of `place`; a point on the inner sphere keeps a trace of its direction."""
+        radius = np.linalg.norm(points, axis=-1, keepdims=True)
+        length = (radius - self.inner_m) / max(self.outer_m - self.inner_m, 1e-300)
+        return points / radius * np.maximum(length, 1e-12)
+
+
+def _scaled(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Points of the box [low, high] from those of [-1, 1]^3."""
+    return 0.5 * (low + high) + unit * (0.5 * (high - low))
+
+
+def _unscaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Inverse of `_scaled`, zero along an axis without extent."""
+    half = 0.5 * (high - low)
+    return np.where(half > 0, (points - 0.5 * (low + high)) / np.where(half > 0, half, 1.0), 0.0)

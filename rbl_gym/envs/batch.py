@@ -1,0 +1,255 @@
+"""Many worlds in arrays: seeding, autoreset and infos of native vector environments, once for all.
+
+A `BatchEnv` fills in four methods on arrays with a leading axis of worlds. `ScalarEnv` is the
+same code with one world, so that the scalar environment and world i of a vector cannot differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+
+Observation = Any
+
+
+class BatchEnv(VectorEnv[Any, Any, Any]):
+    """Worlds in arrays; a subclass says what they are.
+
+    Seeding: ``reset(seed=s)`` seeds world i with ``s + i``, a list gives each its own. Every
+    world has a generator of its own and draws from it as the scalar environment does, so that
+    world i equals the scalar environment seeded with its seed, episode after episode.
+
+    Autoreset: ``"NextStep"`` (default): the step after an episode's end resets, ignores its
+    action and rewards 0. ``"SameStep"``: the ending step already returns the next episode's
+    first observation, and `info` holds ``final_obs`` and ``final_info``. ``"Disabled"``: call
+    ``reset(options={"reset_mask": mask})``.
+
+    `_configure` is called by subclasses at the end of their ``__init__``.
+    """
+
+    single_observation_space: gym.Space[Any]
+    single_action_space: gym.Space[Any]
+
+    def _configure(
+        self,
+        num_envs: int,
+        render_mode: str | None,
+        steps: int,
+        max_episode_steps: int | None,
+        autoreset_mode: str | AutoresetMode,
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs must be a positive int, got {num_envs!r}")
+        if render_mode is not None:
+            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}")
+        modes = [mode.value for mode in AutoresetMode]
+        if not isinstance(autoreset_mode, AutoresetMode):
+            autoreset_mode = AutoresetMode(check_one_of("autoreset_mode", autoreset_mode, modes))
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.steps_limit = min(steps, max_episode_steps or steps)
+        self.metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._mode = autoreset_mode
+        self._generators: list[np.random.Generator] = []
+        self._done = np.zeros(num_envs, dtype=np.bool_)
+        self._epochs = np.zeros(num_envs, dtype=np.int64)
+
+    # --- what a world is --------------------------------------------------------------------
+
+    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        """Start new episodes of the worlds with these indices."""
+        raise NotImplementedError
+
+    def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
+        """Step the worlds of the mask; rewards and whether they terminated, of all worlds."""
+        raise NotImplementedError
+
+    def _observe(self) -> Observation:
+        """Observations of all worlds, in memory of their own."""
+        raise NotImplementedError
+
+    def _inform(self) -> dict[str, np.ndarray]:
+        """Infos of all worlds, in memory of their own."""
+        raise NotImplementedError
+
+    # --- Gymnasium's side -------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
+        mask = self._reset_mask(options)
+        seeds = self._seeds(seed)
+        if not self._generators:
+            if not mask.all():
+                raise gym.error.ResetNeeded("reset all environments before some of them")
+            self._generators = [seeding.np_random(one)[0] for one in seeds]
+        else:
+            for i in np.flatnonzero(mask):
+                if seeds[i] is not None:
+                    self._generators[i] = seeding.np_random(seeds[i])[0]
+        self._begin(mask)
+        return self._observe(), self._masked_info()
+
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Step every world; see the autoreset mode for those whose episode is over."""
+        if not self._generators:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        checked = self._checked(actions)
+        ended = self._done.copy()
+        if ended.any() and self._mode is AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded("episodes are over: reset them by options['reset_mask']")
+        moving = ~ended
+        self._epochs[moving] += 1
+        reward, terminated = self._advance(checked, moving)
+        reward, terminated = np.where(moving, reward, 0.0), terminated & moving
+        truncated = moving & ~terminated & (self._epochs >= self.steps_limit)
+        self._done = terminated | truncated
+        if ended.any():
+            self._begin(ended)
+        if self._mode is not AutoresetMode.SAME_STEP or not self._done.any():
+            return self._observe(), reward, terminated, truncated, self._masked_info()
+        last = self._done.copy()
+        final = {
+            "final_obs": _rows_as_objects(self._observe(), last),
+            "final_info": self._masked_info(last),
+        }
+        self._begin(last)
+        info = self._masked_info()
+        for name, value in final.items():
+            info[name], info[f"_{name}"] = value, last.copy()
+        return self._observe(), reward, terminated, truncated, info
+
+    def _begin(self, mask: BoolArray) -> None:
+        chosen = np.flatnonzero(mask)
+        self._epochs[chosen] = 0
+        self._done[chosen] = False
+        self._restart(chosen, [self._generators[i] for i in chosen])
+
+    def _masked_info(self, where: BoolArray | None = None) -> dict[str, Any]:
+        """Infos with Gymnasium's masks ``_key`` beside them; zeros outside of `where`."""
+        info: dict[str, Any] = {}
+        for name, value in self._inform().items():
+            if where is not None:
+                value[~where] = 0
+            info[name] = value
+            info[f"_{name}"] = (
+                np.ones(self.num_envs, dtype=np.bool_) if where is None else where.copy()
+            )
+        return info
+
+    def _checked(self, actions: ArrayLike) -> np.ndarray:
+        """Actions as an array that fits the action space in shape and is finite."""
+        space = self.single_action_space
+        array = np.asarray(actions)
+        shape = (self.num_envs, *(space.shape or ()))
+        if array.shape != shape or array.dtype.kind not in "fiub":
+            raise ValueError(
+                f"actions must be numbers of shape {shape}, got {array.shape} of {array.dtype}"
+            )
+        if isinstance(space, gym.spaces.Box):
+            array = array.astype(np.float64)
+            if not np.isfinite(array).all():
+                raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
+        elif not self.action_space.contains(array.astype(self.action_space.dtype)):
+            raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
+        return array
+
+    def _reset_mask(self, options: dict[str, Any] | None) -> BoolArray:
+        if options is None or "reset_mask" not in options:
+            return np.ones(self.num_envs, dtype=np.bool_)
+        mask = np.asarray(options["reset_mask"])
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise ValueError(
+                f"reset_mask must be ({self.num_envs},) booleans, at least one True, "
+                f"got shape {mask.shape} of {mask.dtype}"
+            )
+        return mask
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"seed must hold {self.num_envs} seeds, got {len(seed)}")
+        return list(seed)
+
+
+def _rows_as_objects(observation: Observation, where: BoolArray) -> np.ndarray:
+    """Gymnasium's ``final_obs``: an object array with the observation of each ended world."""
+    rows = np.full(len(where), None, dtype=object)
+    for i in np.flatnonzero(where):
+        rows[i] = _row(observation, i)
+    return rows
+
+
+def _row(observation: Observation, i: int) -> Observation:
+    if isinstance(observation, dict):
+        return {key: value[i].copy() for key, value in observation.items()}
+    return observation[i].copy()
+
+
+class ScalarEnv(gym.Env[Any, Any]):
+    """One world of a `BatchEnv`, as a scalar environment.
+
+    A subclass names its `batch_class`; its ``__init__`` hands the arguments on to
+    `_configure`.
+    """
+
+    batch_class: ClassVar[type[BatchEnv]]
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own form)
+
+    def _configure(self, render_mode: str | None, **arguments: Any) -> None:
+        self.render_mode = render_mode
+        self._batch: Any = self.batch_class(
+            num_envs=1, render_mode=render_mode, autoreset_mode="Disabled", **arguments
+        )
+        self.observation_space = self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode."""
+        super().reset(seed=seed)
+        self._batch._generators = [self.np_random]
+        observation, info = self._batch.reset()
+        return _row(observation, 0), _scalars(info)
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One step."""
+        observation, reward, terminated, truncated, info = self._batch.step(
+            np.asarray(action)[None]
+        )
+        return (
+            _row(observation, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]),
+            _scalars(info),
+        )  # fmt: skip
+
+
+def _scalars(info: dict[str, Any]) -> dict[str, Any]:
+    """Infos of the one world: numbers as Python's own."""
+    return {
+        key: value[0].item() if value[0].ndim == 0 else value[0]
+        for key, value in info.items()
+        if not key.startswith("_")
+    }

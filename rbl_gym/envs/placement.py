@@ -1,0 +1,224 @@
+"""RBL/AnchorPlacement-v0: place M anchors for a work region, one after the other or at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+
+from rbl_gym import placement
+from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+from rbl_gym.envs.batch import BatchEnv, ScalarEnv
+from rbl_gym.placement import Context
+
+MODES = ("sequential", "one-shot", "mounts")
+# Score from which the shaped reward of the mounts counts, metres: about that of no anchor.
+_EMPTY_SCORE_M = 3.0
+
+
+class AnchorPlacementVectorEnv(BatchEnv):
+    """`num_envs` independent `AnchorPlacementEnv` problems in arrays.
+
+    Made by ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64, scene=...)``. Arguments
+    as `AnchorPlacementEnv`; seeding and autoreset as `BatchEnv`.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scene: str | Mapping[str, Any] = "auv_buoys",
+        mode: str = "sequential",
+        racks: int = 0,
+        n_anchors: int | None = None,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        self.task = placement.task(scene, n_anchors, racks)
+        self.mode = check_one_of("mode", mode, MODES)
+        self.single_action_space = self._action_space()
+        size = observation_size(self.task, self.mode)
+        self.single_observation_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
+        steps = 1 if mode == "one-shot" else self.task.n_anchors
+        # An episode terminates by itself with the last anchor.
+        self._configure(num_envs, render_mode, steps + 1, max_episode_steps, autoreset_mode)
+        self._placements = steps
+        self._uniforms = np.zeros((num_envs, placement.context_uniforms(self.task)))
+        self._actions = np.zeros((num_envs, self.task.n_anchors, 3))
+        self._anchors = np.zeros((num_envs, self.task.n_anchors, 3))
+        self._score_m = np.zeros(num_envs)
+        if self.mode == "mounts":
+            self._mounts = placement.mounts(self.task)
+            self._taken = np.zeros((num_envs, len(self._mounts)), dtype=np.bool_)
+            self._sight = np.zeros((num_envs, len(self._mounts)))
+            self._log_score = np.zeros(num_envs)
+
+    def _action_space(self) -> spaces.Space[Any]:
+        if self.mode == "mounts":
+            return spaces.Discrete(len(placement.mounts(self.task)))
+        size = 3 * self.task.n_anchors if self.mode == "one-shot" else 3
+        return spaces.Box(-1.0, 1.0, (size,), np.float32)
+
+    @property
+    def contexts(self) -> Context:
+        """The problems of the current episodes."""
+        return placement.build_contexts(self.task, self._uniforms)
+
+    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        for i, generator in zip(chosen, generators, strict=True):
+            generator.random(out=self._uniforms[i])
+        self._actions[chosen] = 0.0
+        self._anchors[chosen] = 0.0
+        self._score_m[chosen] = 0.0
+        if self.mode == "mounts":
+            fresh = placement.build_contexts(self.task, self._uniforms[chosen])
+            self._taken[chosen] = False
+            self._sight[chosen] = placement.sight_fractions(self.task, fresh, self._mounts)
+            self._log_score[chosen] = math.log(_EMPTY_SCORE_M)
+
+    def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
+        rows = np.flatnonzero(moving)
+        step = self._epochs[rows] - 1
+        complete = np.asarray(moving & (self._epochs == self._placements))
+        if self.mode == "mounts":
+            return self._mount(actions, rows, step), complete
+        if self.mode == "one-shot":
+            self._actions[rows] = np.clip(actions[rows], -1, 1).reshape(
+                len(rows), self.task.n_anchors, 3
+            )
+        else:
+            self._actions[rows, step] = np.clip(actions[rows], -1, 1)
+        self._anchors[rows] = self.task.scene.anchor_region.place(self._actions[rows])
+        reward = np.zeros(self.num_envs)
+        if complete.any():
+            self._score_m[complete] = self._scores(complete)
+            reward[complete] = -np.log(self._score_m[complete])
+        return reward, complete
+
+    def _mount(self, actions: np.ndarray, rows: np.ndarray, step: np.ndarray) -> FloatArray:
+        """Anchors on mounts; the reward is the drop of the log score."""
+        chosen = actions[rows].astype(int)
+        self._anchors[rows, step] = self._mounts[chosen]
+        self._actions[rows, step] = self.task.scene.anchor_region.action(self._mounts[chosen])
+        self._taken[rows, chosen] = True
+        reward = np.zeros(self.num_envs)
+        for count in np.unique(step) + 1:
+            here = rows[step + 1 == count]
+            score_m = self._scores(here, count)
+            reward[here] = self._log_score[here] - np.log(score_m)
+            self._log_score[here] = np.log(score_m)
+            if count == self.task.n_anchors:
+                self._score_m[here] = score_m
+        return reward
+
+    def _scores(self, rows: np.ndarray, count: int | None = None) -> FloatArray:
+        """Scores of the first `count` anchors of some worlds."""
+        contexts = placement.build_contexts(self.task, self._uniforms[rows])
+        return placement.score(self.task, contexts, self._anchors[rows, :count])
+
+    def _observe(self) -> np.ndarray:
+        parts = [context_features(self.task, self.contexts)]
+        if self.mode == "sequential":
+            parts.append(self._actions.reshape(self.num_envs, -1))
+        if self.mode == "mounts":
+            parts += [self._sight, self._taken]
+        if self.mode != "one-shot":
+            parts.append(self._epochs[:, None] == np.arange(self.task.n_anchors))
+        return np.concatenate(parts, axis=-1).astype(np.float32)
+
+    def _inform(self) -> dict[str, np.ndarray]:
+        contexts = self.contexts
+        info: dict[str, np.ndarray] = {
+            "anchors": self._anchors.copy(),
+            "score_m": self._score_m.copy(),
+            "region": np.concatenate([contexts.centre, contexts.half], axis=-1),
+            "racks": contexts.racks.copy(),
+        }
+        if self.mode == "mounts":
+            info["action_mask"] = (~self._taken).astype(np.int8)
+        return info
+
+
+class AnchorPlacementEnv(ScalarEnv):
+    """Where do the anchors go, so that a body in this work region is well localized?
+
+    ## Description
+    Every episode draws a problem: a work region, a box inside the scene's volume, and in rooms
+    up to two racks that block sight. The agent places M anchors on the scene's legal
+    surfaces. The score of a layout is the root mean square tag error in metres, position and
+    orientation together, that the Cramer-Rao bound promises over 32 fixed poses in the region
+    (`rbl_gym.placement.score`).
+
+    ## Action space
+    ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
+    surfaces (`Region.place`). ``"one-shot"``: ``Box(-1, 1, (3 M,))``, all at once.
+    ``"mounts"`` (rooms): ``Discrete(57)``, one of the mount points of
+    `rbl_gym.placement.mounts`; one that is taken already adds a second anchor there.
+
+    ## Observation space
+    ``Box(-1, 1, (n,), float32)``, in order: the region's centre and size, scaled to the volume
+    (6); of each rack its place and half size, scaled to the room (6 each); sequential: the
+    actions so far (3 M); mounts: the share of the poses that each mount sees, and whether it
+    is taken (57 + 57); except in one-shot the one-hot number of the next anchor (M).
+
+    ## Reward
+    ``-log score`` with the last anchor, 0 before. ``"mounts"``: the drop of the log score with
+    every anchor, from that of 3 m.
+
+    ## Episode end
+    Terminates with the last anchor.
+
+    ## Info
+    `anchors` (M, 3), zeros where not yet placed; `region` (centre and half size, metres),
+    `racks` (K, 6); `score_m` of the complete layout, 0 before; mounts: `action_mask` (57).
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+
+    env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", racks=2)
+    env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", mode="mounts", n_anchors=4)
+    ```
+
+    ## Version history
+    * v0: first version.
+    """
+
+    batch_class = AnchorPlacementVectorEnv
+
+    def __init__(
+        self,
+        scene: str | Mapping[str, Any] = "auv_buoys",
+        mode: str = "sequential",
+        racks: int = 0,
+        n_anchors: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        self._configure(render_mode, scene=scene, mode=mode, racks=racks, n_anchors=n_anchors)
+
+
+def observation_size(task: placement.PlacementTask, mode: str) -> int:
+    """Length of the observation."""
+    size = 6 + 6 * task.racks
+    if mode == "one-shot":
+        return size
+    middle = 3 * task.n_anchors if mode == "sequential" else 2 * len(placement.mounts(task))
+    return size + middle + task.n_anchors
+
+
+def context_features(task: placement.PlacementTask, context: Context) -> FloatArray:
+    """A problem as numbers (..., 6 + 6 K) of [-1, 1]: region, then racks."""
+    low, high = task.scene.volume.bounds()
+    half = np.maximum(0.5 * (high - low), 1e-9)
+    region = [(context.centre - 0.5 * (low + high)) / half, 2 * context.half / half - 1]
+    floor, ceiling = task.scene.anchor_region.bounds()
+    room = 0.5 * (ceiling - floor)
+    racks = np.concatenate(
+        [(context.racks[..., :3] - floor) / room - 1, context.racks[..., 3:] / room], axis=-1
+    )
+    racks = racks.reshape((*racks.shape[:-2], 6 * task.racks))
+    return np.clip(np.concatenate([*region, racks], axis=-1), -1, 1)

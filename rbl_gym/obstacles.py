@@ -1,0 +1,53 @@
+"""Boxes that block sight: the slab test, batched.
+
+An obstacle is a row of six numbers, centre and half size of an axis-aligned box, metres.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_array
+
+
+def check_obstacles(obstacles: object) -> FloatArray:
+    """Obstacles (K, 6) as an array, K may be 0; or a ValueError."""
+    array = np.asarray(obstacles, dtype=np.float64)
+    if array.size == 0:
+        return np.empty((0, 6))
+    array = check_array("obstacles", array, ("K", 6))
+    if array.ndim != 2:
+        raise ValueError(f"obstacles must have shape (K, 6), got {array.shape}")
+    if (array[:, 3:] <= 0).any():
+        raise ValueError(f"obstacles must have positive half sizes, got {array[:, 3:].min():g} m")
+    return array
+
+
+def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> np.ndarray:
+    """Which points each anchor sees, (..., P, M) booleans.
+
+    Parameters
+    ----------
+    anchors, points
+        (..., M, 3) and (..., P, 3), metres.
+    obstacles
+        (..., K, 6), centres and half sizes; K may be 0.
+
+    A segment that only touches a face is not blocked; one that ends inside a box is.
+    """
+    batch = np.broadcast_shapes(anchors.shape[:-2], points.shape[:-2], obstacles.shape[:-2])
+    free = np.ones((*batch, points.shape[-2], anchors.shape[-2]), dtype=np.bool_)
+    for k in range(obstacles.shape[-2]):
+        centre, half = obstacles[..., k, :3], obstacles[..., k, 3:]
+        enter = np.zeros(free.shape)
+        leave = np.ones(free.shape)
+        for i in range(3):
+            # Places along the segment from anchor (0) to point (1), axis by axis.
+            begin = anchors[..., None, :, i] - centre[..., None, None, i]
+            along = points[..., :, None, i] - anchors[..., None, :, i]
+            along = np.where(along == 0, 1e-300, along)
+            middle, width = -begin / along, half[..., None, None, i] / np.abs(along)
+            np.maximum(enter, middle - width, out=enter)
+            np.minimum(leave, middle + width, out=leave)
+        free &= enter >= leave
+    return free

@@ -1,0 +1,331 @@
+"""Where do the anchors go so that the pose is good? The problem: contexts, legal places, scores.
+
+A task is a scene, a number of anchors and how many racks may stand in the way. A context is what
+changes from one problem to the next: the work region, a box inside the body's volume, and the
+racks. A layout is an array (..., M, 3) of anchors, and its score on a context is the root mean
+square tag error in metres that the Cramer-Rao bound promises over fixed poses in the work
+region. Everything broadcasts: layouts and contexts of one call may carry any leading axes.
+
+Solutions stand in `layouts` and `layout_search`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds, obstacles, ranging, rotations, scenes
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.regions import Walls
+from rbl_gym.scenes import Scene
+
+# Anchors of a task where nothing else is said: the scenes' own, and one fewer beside racks.
+MAX_RACKS = 2
+# Rotation of the prior that regularises the bound.
+_PRIOR_ROTATION_RAD = math.radians(60)
+# The poses of a task are the same for ever, so that scores can be compared.
+_POSE_SEED = 20130821
+# Range of the work region's half size as a share of the volume's, (x, y, z).
+_LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
+# Uniforms that a context takes: region 6, each rack 6.
+_REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
+# Trials times poses times links that are scored at a time, so that the temporaries stay in cache.
+_BLOCK = 40_000
+
+
+class Context(NamedTuple):
+    """One placement problem of a task, with leading batch axes.
+
+    Attributes
+    ----------
+    centre, half
+        Work region (..., 3), metres.
+    racks
+        (..., K, 6): centre and half size of the boxes that block sight.
+    """
+
+    centre: FloatArray
+    half: FloatArray
+    racks: FloatArray
+
+
+@dataclass(frozen=True)
+class PlacementTask:
+    """A family of placement problems.
+
+    Parameters
+    ----------
+    scene
+        Gives the body, its volume, the noise, and where anchors may stand.
+    n_anchors
+        How many are placed.
+    racks
+        Boxes on the floor that block sight, 0 to 2; only in rooms (scenes with walls).
+    n_poses
+        Poses in the work region over which a layout is scored.
+    blocked_information
+        What is left of a link's information without line of sight. Sight is judged from the
+        anchor to the body's centre.
+    """
+
+    scene: Scene
+    n_anchors: int
+    racks: int = 0
+    n_poses: int = 32
+    blocked_information: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("n_anchors", 1, math.inf), ("racks", 0, MAX_RACKS), ("n_poses", 1, math.inf),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int):
+                raise ValueError(f"{name} must be an int, got {value!r}")
+            check_number(name, value, low=low, high=high)
+        check_number("blocked_information", self.blocked_information, low=0.0, high=1.0)
+        if self.racks and not isinstance(self.scene.anchor_region, Walls):
+            raise ValueError(
+                f"racks must be 0 in a scene without walls, got {self.racks} in {self.scene.name!r}"
+            )
+
+    @functools.cached_property
+    def poses(self) -> tuple[FloatArray, FloatArray]:
+        """Rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size."""
+        rng = np.random.default_rng(_POSE_SEED)
+        offsets = rng.uniform(-1, 1, (self.n_poses, 3))
+        return rotations.random(rng, (self.n_poses,)), offsets
+
+    @functools.cached_property
+    def prior_information(self) -> FloatArray:
+        """(6, 6): 60 degrees, and half of the volume's largest extent."""
+        extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
+        return np.diag([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+
+
+def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:
+    """The task of a scene (a name or overrides, see `scenes.get`).
+
+    `n_anchors` None: as many as the scene has, and one fewer where racks stand in the room.
+
+    Raises
+    ------
+    ValueError
+        On an unknown scene, racks outside a room, a number that is none.
+    """
+    scene = scenes.get(scene)
+    if n_anchors is None:
+        n_anchors = scene.n_anchors - bool(racks)
+    return PlacementTask(scene, n_anchors, racks)
+
+
+# --- contexts --------------------------------------------------------------------------------
+
+
+def context_uniforms(task: PlacementTask) -> int:
+    """How many uniforms a context takes."""
+    return _REGION_UNIFORMS + _RACK_UNIFORMS * task.racks
+
+
+def draw_contexts(
+    task: PlacementTask, rng: np.random.Generator, batch: tuple[int, ...] = ()
+) -> Context:
+    """Random contexts: work regions that fit in the volume, racks on the floor."""
+    return build_contexts(task, rng.random((*batch, context_uniforms(task))))
+
+
+def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
+    """Contexts of uniforms (..., `context_uniforms`)."""
+    low, high = task.scene.volume.bounds()
+    half = (_LEAST + (_MOST - _LEAST) * uniforms[..., :3]) * 0.5 * (high - low)
+    centre = (low + half) + uniforms[..., 3:6] * ((high - half) - (low + half))
+    of_racks = uniforms[..., _REGION_UNIFORMS:]
+    of_racks = of_racks.reshape((*uniforms.shape[:-1], task.racks, _RACK_UNIFORMS))
+    return Context(centre, half, _racks(task, of_racks) if task.racks else of_racks)
+
+
+def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
+    """Racks (..., K, 6) on the floor, in the middle 70 % of the room, long in x or in y."""
+    low, high = task.scene.anchor_region.bounds()
+    racks = np.empty((*uniforms.shape[:-1], 6))
+    middle = 0.15 + 0.7 * uniforms[..., :2]
+    racks[..., :2] = low[:2] + middle * (high - low)[:2]
+    thin, long = 0.2 + 0.2 * uniforms[..., 2], 1 + uniforms[..., 3]
+    along_x = uniforms[..., 4] < 0.5
+    racks[..., 3] = np.where(along_x, long, thin)
+    racks[..., 4] = np.where(along_x, thin, long)
+    racks[..., 5] = 0.6 + 0.6 * uniforms[..., 5]
+    racks[..., 2] = racks[..., 5]
+    return racks
+
+
+def whole_volume(task: PlacementTask) -> Context:
+    """The context whose work region is the body's volume, without racks."""
+    low, high = task.scene.volume.bounds()
+    return Context(0.5 * (low + high), 0.5 * (high - low), np.empty((0, 6)))
+
+
+def positions(task: PlacementTask, context: Context) -> FloatArray:
+    """Places (..., P, 3) of the body's centre at the task's poses."""
+    return context.centre[..., None, :] + task.poses[1] * context.half[..., None, :]
+
+
+# --- scores ----------------------------------------------------------------------------------
+
+
+def information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Fisher information (..., P, 6, 6) at the task's poses, without the prior.
+
+    It is a sum over the anchors: the information of a layout is that of its parts together.
+    """
+    places = positions(task, context)
+    rotation = task.poses[0]
+    links = None
+    if context.racks.shape[-2]:
+        sight = obstacles.in_sight(anchors, places, context.racks)
+        links = np.where(sight, 1.0, task.blocked_information)[..., None]
+    tags = np.asarray(task.scene.tags)
+    spread = anchors[..., None, :, :]
+    return bounds.information_at(spread, tags, rotation, places, task.scene.noise, links)
+
+
+def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Score (...) of layouts (..., M, 3) in metres: small is good.
+
+    The root mean square over the poses of b, ``b^2 = mean_n tr(J_n P J_n^T)`` with ``P = (F +
+    prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
+    coincident anchors from winning.
+    """
+    anchors = check_array("anchors", anchors, ("M", 3))
+    batch = np.broadcast_shapes(anchors.shape[:-2], context.centre.shape[:-1])
+    size = max(1, _BLOCK // (task.n_poses * anchors.shape[-2] * len(task.scene.tags)))
+    if math.prod(batch) <= size:
+        return score_of(task, information(task, context, anchors))
+    flat = [
+        _flat(array, n, batch) for array, n in zip((anchors, *context), (2, 1, 1, 2), strict=True)
+    ]
+    result = np.empty(math.prod(batch))
+    for begin in range(0, len(result), size):
+        part, *rest = (array[begin : begin + size] for array in flat)
+        result[begin : begin + size] = score_of(task, information(task, Context(*rest), part))
+    return result.reshape(batch)
+
+
+def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
+    """The array (..., n) with the batch as its one leading axis."""
+    shape = array.shape[array.ndim - trailing :]
+    return np.broadcast_to(array, (*batch, *shape)).reshape((math.prod(batch), *shape))
+
+
+def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
+    """Score (...) of an information (..., P, 6, 6) at the task's poses."""
+    covariance = np.linalg.inv(information + task.prior_information)
+    tags = np.asarray(task.scene.tags)
+    return np.sqrt((bounds.score(covariance, task.poses[0], tags) ** 2).mean(axis=-1))
+
+
+class Criteria(NamedTuple):
+    """What a layout is worth by other measures, each (...); all small is good.
+
+    Attributes
+    ----------
+    score_m
+        `score`.
+    position_m, rotation_rad
+        Root mean square over the poses of ``sqrt(tr P)`` of translation and rotation.
+    d_optimal_m
+        Geometric mean of the six standard deviations, the rotation in metres at the tags.
+    e_optimal_m
+        Root mean square over the poses of the largest of the six.
+    worst_m
+        b of the worst pose.
+    conditioning
+        Geometric mean over the poses of the condition number of Abar, the weighted anchors less
+        their mean (static paper, Remark 1): large where the linear estimators lose a direction.
+    """
+
+    score_m: FloatArray
+    position_m: FloatArray
+    rotation_rad: FloatArray
+    d_optimal_m: FloatArray
+    e_optimal_m: FloatArray
+    worst_m: FloatArray
+    conditioning: FloatArray
+
+
+def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Criteria:
+    """All criteria of layouts (..., M, 3)."""
+    anchors = check_array("anchors", anchors, ("M", 3))
+    covariance = np.linalg.inv(information(task, context, anchors) + task.prior_information)
+    tags, rotation = np.asarray(task.scene.tags), task.poses[0]
+    b = bounds.score(covariance, rotation, tags)
+    J = bounds.tag_jacobian(rotation, tags)
+    # The pose error in metres at the tags: W = mean_n J_n^T J_n = L L^T, errors L^T (w, v).
+    L = np.linalg.cholesky(np.einsum("pnki,pnkj->pij", J, J) / len(tags))
+    values = np.maximum(np.linalg.eigvalsh(np.swapaxes(L, -1, -2) @ covariance @ L), 1e-300)
+    traces = [
+        np.einsum("...ii->...", covariance[..., part, part]) for part in (slice(3, 6), slice(3))
+    ]
+    singular = np.linalg.svd(_weighted_anchors(task, context, anchors), compute_uv=False)[..., :3]
+    ratio = singular[..., 0] / np.maximum(singular[..., -1], 1e-12 * singular[..., 0])
+    if anchors.shape[-2] < 4:
+        ratio = np.full(ratio.shape, np.inf)
+    return Criteria(
+        np.sqrt((b**2).mean(axis=-1)),
+        *(np.sqrt(trace.mean(axis=-1)) for trace in traces),
+        np.exp(0.5 * np.log(values).mean(axis=(-1, -2))),
+        np.sqrt(values[..., -1].mean(axis=-1)),
+        b.max(axis=-1),
+        np.exp(np.log(ratio).mean(axis=-1)),
+    )
+
+
+def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Abar (..., P, M, 3): anchors less their weighted mean, by the root of the weights."""
+    places = positions(task, context)
+    distance = ranging.distances(anchors[..., None, :, :], places[..., None, :])
+    weight = 1 / task.scene.noise.squared_range_variance(np.maximum(distance, 1e-6))
+    if context.racks.shape[-2]:
+        sight = obstacles.in_sight(anchors, places, context.racks)[..., None]
+        weight = np.where(sight, weight, task.blocked_information * weight)
+    mean = (weight * anchors[..., None, :, :]).sum(axis=-2) / weight.sum(axis=-2)
+    return np.sqrt(weight) * (anchors[..., None, :, :] - mean[..., None, :])
+
+
+# --- mounts ----------------------------------------------------------------------------------
+
+
+def mounts(task: PlacementTask) -> FloatArray:
+    """Mount points (57, 3) of a room: three heights on the walls, nine on the ceiling.
+
+    Raises
+    ------
+    ValueError
+        If the scene is no room.
+    """
+    region = task.scene.anchor_region
+    if not isinstance(region, Walls):
+        raise ValueError(f"scene must have walls for mount points, got {task.scene.name!r}")
+    low, high = region.bounds()
+    x, y, _ = (np.linspace(low, high, 5)).T
+    # Half way up, to the decimetre.
+    heights = (low[2], np.round(0.5 * (low[2] + high[2]) - 1e-9, 1), high[2])
+    points = [(a, b, z) for z in heights for b in (low[1], high[1]) for a in x]
+    points += [(a, b, z) for z in heights for a in (low[0], high[0]) for b in y[1:-1]]
+    points += [(a, b, high[2]) for a in x[1:-1] for b in y[1:-1]]
+    return np.array(points)
+
+
+def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Share (..., M) of the task's poses that each anchor sees."""
+    seen = obstacles.in_sight(anchors, positions(task, context), context.racks)
+    return np.asarray(seen.mean(axis=-2))
+
+
+def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:
+    """Whether each anchor (..., M) stands where the scene allows it."""
+    off = np.abs(task.scene.anchor_region.project(anchors) - anchors).max(axis=-1)
+    return np.asarray(off <= tolerance_m)
