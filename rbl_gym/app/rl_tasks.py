@@ -1,0 +1,70 @@
+"""The learning tasks by name: their environments, and the settings PPO learns them with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+from rbl_gym.checks import check_one_of
+
+
+@dataclass(frozen=True)
+class RlTask:
+    """An environment with arguments, and how PPO is set for it.
+
+    Parameters
+    ----------
+    env_id, arguments
+        What `gym.make_vec` gets.
+    steps
+        Environment steps of a training.
+    rollout
+        Steps of each world between two updates.
+    gamma, gae_lambda
+        Discount and advantage mixing; 1 where only the end counts.
+    num_envs, batch_size, epochs, learning_rate, hidden, log_std_init
+        As their names say; the learning rate falls linearly to zero.
+    """
+
+    env_id: str
+    arguments: dict[str, Any]
+    steps: int
+    rollout: int
+    gamma: float = 1.0
+    gae_lambda: float = 1.0
+    num_envs: int = 64
+    batch_size: int = 512
+    epochs: int = 10
+    learning_rate: float = 1e-3
+    hidden: tuple[int, ...] = (128, 128)
+    log_std_init: float = -0.5
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def make(self, num_envs: int, autoreset_mode: str = "SameStep") -> Any:
+        """The vector environment."""
+        return gym.make_vec(
+            f"rbl_gym:{self.env_id}",
+            num_envs=num_envs,
+            autoreset_mode=autoreset_mode,
+            **self.arguments,
+        )
+
+
+def _placement(steps: int, n_anchors: int, **arguments: Any) -> RlTask:
+    return RlTask("RBL/AnchorPlacement-v0", arguments, steps, 4 * n_anchors)
+
+
+TASKS: dict[str, RlTask] = {
+    "auv_buoys": _placement(300_000, 4, scene="auv_buoys"),
+    "drone_yard": _placement(450_000, 6, scene="drone_yard"),
+    "uwb_room": _placement(1_200_000, 5, scene="uwb_room", racks=2),
+    "satellite": _placement(450_000, 5, scene="satellite"),
+    "mounts": _placement(1_200_000, 5, scene="uwb_room", racks=2, mode="mounts"),
+}
+
+
+def rl_task(name: str) -> RlTask:
+    """The named task, or a ValueError."""
+    return TASKS[check_one_of("task", name, list(TASKS))]
