@@ -115,23 +115,57 @@ def simulate(
     normals
         Standard normals (..., T, 6); None: no process noise.
     """
-    twists = trajectory.twists
-    if normals is not None:
-        twists = twists + normals * (process.std() / np.sqrt(dt))
+    nominal = trajectory.twists
     batch = np.broadcast_shapes(
-        trajectory.rotation.shape[:-2], trajectory.translation.shape[:-1], twists.shape[:-2]
+        trajectory.rotation.shape[:-2],
+        trajectory.translation.shape[:-1],
+        nominal.shape[:-2],
+        () if normals is None else normals.shape[:-2],
     )
-    twists = np.broadcast_to(twists, (*batch, *twists.shape[-2:]))
-    steps = rotations.exp(twists[..., :3] * dt)
-    rotation = np.empty((*batch, steps.shape[-3] + 1, 3, 3))
+    n_steps = nominal.shape[-2]
+    twists = _trials_last(batch, n_steps, 6)
+    if normals is None:
+        twists[...] = nominal
+    else:
+        np.multiply(normals, process.std() / np.sqrt(dt), out=twists)
+        twists += nominal
+    twists *= dt
+    rotation = _trials_last(batch, n_steps + 1, 3, 3)
     rotation[..., 0, :, :] = trajectory.rotation
-    for k in range(steps.shape[-3]):
-        np.matmul(steps[..., k, :, :], rotation[..., k, :, :], out=rotation[..., k + 1, :, :])
-    translation = np.empty((*twists.shape[:-2], twists.shape[-2] + 1, 3))
+    rotations.exp(twists[..., :3], out=rotation[..., 1:, :, :])
+    _chain(rotation)
+    translation = _trials_last(batch, n_steps + 1, 3)
     translation[..., 0, :] = 0.0
-    np.cumsum(twists[..., 3:] * dt, axis=-2, out=translation[..., 1:, :])
+    np.cumsum(twists[..., 3:], axis=-2, out=translation[..., 1:, :])
     translation += trajectory.translation[..., None, :]
     return Path(rotation, translation)
+
+
+def _trials_last(batch: tuple[int, ...], *trailing: int) -> FloatArray:
+    """An empty array (*batch, *trailing) whose memory runs along the trials.
+
+    Loops over inner axes of 3 or 6 are slow; these run over all trials instead.
+    """
+    if not batch:
+        return np.empty(trailing)
+    memory = np.empty((*trailing[::-1], *batch))
+    inner = range(len(trailing))
+    return memory.transpose(*range(len(trailing), memory.ndim), *reversed(inner))
+
+
+def _chain(rotation: FloatArray) -> None:
+    """Turn a start and T steps (..., T + 1, 3, 3) into the rotations they lead to, in place."""
+    if rotation.ndim == 3:
+        for before, step in zip(rotation[:-1], rotation[1:], strict=True):
+            step[...] = step @ before
+        return
+    # Row i, column j of every trial side by side; a matrix product of each alone is slow.
+    planes = np.moveaxis(rotation, (-3, -2, -1), (0, 1, 2))
+    for before, step in zip(planes[:-1], planes[1:], strict=True):
+        product = step[:, 0, None] * before[0]
+        for i in (1, 2):
+            product += step[:, i, None] * before[i]
+        step[...] = product
 
 
 def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike) -> FloatArray:
@@ -215,19 +249,37 @@ def waypoints(
     speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
     dt = check_number("dt", dt, low=1e-12)
     spin = check_array("spin_rad_s", spin_rad_s, (3,))
-    legs = np.linalg.norm(np.diff(points, axis=-2), axis=-1)
-    reached = np.cumsum(legs, axis=-1)
     travelled = speed_m_s * dt * np.arange(_check_steps(steps) + 1)
-    leg = (reached[..., None, :] <= travelled[:, None]).sum(axis=-1)
-    leg = np.minimum(leg, legs.shape[-1] - 1)
-    begin = np.take_along_axis(reached - legs, leg, axis=-1)
-    length = np.maximum(np.take_along_axis(legs, leg, axis=-1), 1e-12)
-    fraction = np.clip((travelled - begin) / length, 0.0, 1.0)[..., None]
-    start = np.take_along_axis(points, leg[..., None], axis=-2)
-    stop = np.take_along_axis(points, leg[..., None] + 1, axis=-2)
-    velocity = np.diff(start + fraction * (stop - start), axis=-2) / dt
-    twists = np.concatenate(np.broadcast_arrays(spin[..., None, :], velocity), axis=-1)
+    velocity = np.diff(_along(points, travelled), axis=-2) / dt
+    batch = np.broadcast_shapes(spin.shape[:-1], velocity.shape[:-2])
+    twists = _trials_last(batch, len(travelled) - 1, 6)
+    twists[..., :3], twists[..., 3:] = spin[..., None, :], velocity
     return Trajectory(rotation, points[..., 0, :], twists)
+
+
+def _along(points: FloatArray, travelled: FloatArray) -> FloatArray:
+    """Places (..., T, 3) on polylines (..., K, 3) at the distances `travelled` (T,), rising.
+
+    The memory runs along the trials.
+    """
+    *batch, n_points, _ = points.shape
+    line = np.ascontiguousarray(points.reshape(-1, n_points, 3).transpose(2, 1, 0))
+    trials = line.shape[-1]
+    step = np.diff(line, axis=1)
+    legs = np.sqrt((step * step).sum(axis=0))
+    reached = np.cumsum(legs, axis=0)
+    # The leg at an epoch is the number of ends reached by then.
+    index = np.searchsorted(travelled, reached) * trials + np.arange(trials)
+    ends = np.bincount(index.ravel(), minlength=(len(travelled) + 1) * trials)
+    leg = np.cumsum(ends.reshape(-1, trials)[:-1], axis=0)
+    at = np.minimum(leg, n_points - 2) * trials + np.arange(trials)
+    fraction = travelled[:, None] - (reached - legs).ravel()[at]
+    fraction /= np.maximum(legs, 1e-12).ravel()[at]
+    np.clip(fraction, 0.0, 1.0, out=fraction)
+    places = np.take(step.reshape(3, -1), at, axis=1)
+    places *= fraction
+    places += np.take(line.reshape(3, -1), at, axis=1)
+    return places.transpose(2, 1, 0).reshape(*batch, len(travelled), 3)
 
 
 def lawn_mower_points(low: ArrayLike, high: ArrayLike, spacing_m: float) -> FloatArray:

@@ -8,9 +8,10 @@ recognise the papers' case.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from numbers import Integral
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -92,7 +93,16 @@ class RangeNoise:
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
         """Ranges with noise of this law, never below zero."""
-        return np.maximum(distances + np.sqrt(self.variance(distances)) * normals, 0.0)
+        if self.proportional == 0:
+            std: Any = math.sqrt(self.floor_m**2)
+        else:
+            std = self.proportional * self._scale(distances, None)
+            std *= std
+            std += self.floor_m**2
+            np.sqrt(std, out=std)
+        ranges = std * normals
+        ranges += distances
+        return np.maximum(ranges, 0.0, out=ranges)
 
     def _scale(self, ranges: FloatArray, links: BoolArray | None) -> FloatArray:
         if self.reference_tag is None:
@@ -128,8 +138,10 @@ class SquaredRangeNoise:
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
         """Ranges with noise of this law; a negative square counts as zero."""
-        noise = self.sigma_m * distances[..., :1] * normals
-        return np.sqrt(np.maximum(distances**2 + noise, 0.0))
+        squares = self.sigma_m * distances[..., :1] * normals
+        squares += distances**2
+        np.maximum(squares, 0.0, out=squares)
+        return np.sqrt(squares, out=squares)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,6 +246,11 @@ class Measurement(NamedTuple):
 def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
     """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
     rotation, tags = np.asarray(rotation), np.asarray(tags)
+    if rotation.ndim > 2 and rotation.strides[-1] > rotation.strides[0]:
+        # Memory that runs along the trials: products of whole rows of trials.
+        positions = np.einsum("...ij,...nj->...ni", rotation, tags)
+        positions += np.asarray(translation)[..., None, :]
+        return positions
     if tags.ndim == 2:
         # Tags that all trials share: one matrix product in place of one for each trial.
         turned = (rotation.reshape(-1, 3) @ tags.T).reshape((*rotation.shape[:-1], len(tags)))
@@ -246,8 +263,17 @@ def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) 
 
 def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
     """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
-    difference = np.asarray(positions)[..., None, :, :] - np.asarray(anchors)[..., :, None, :]
-    return np.sqrt(np.einsum("...i,...i->...", difference, difference))
+    positions, anchors = np.asarray(positions), np.asarray(anchors)
+    # Axis by axis, so that the same sum gives the same last bits in every memory order.
+    squared, y, z = (
+        np.subtract(positions[..., None, :, i], anchors[..., :, None, i], dtype=np.float64)
+        for i in range(3)
+    )
+    squared *= squared
+    for gap in (y, z):
+        gap *= gap
+        squared += gap
+    return np.sqrt(squared, out=squared)
 
 
 def measure(
@@ -274,7 +300,7 @@ def measure(
     ranges = noise.sample(true_distances, normals)
     links = np.ones(ranges.shape, dtype=np.bool_)
     nlos = np.zeros(ranges.shape, dtype=np.bool_)
-    if link_model is None:
+    if link_model is None or not (link_model.is_random or link_model.reach_m is not None):
         return Measurement(ranges, links, nlos)
     if link_model.is_random:
         if uniforms is None:

@@ -5,6 +5,7 @@ A region draws points from uniforms, and projects any point onto itself; arrays 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -70,7 +71,13 @@ class Box:
 
     def project(self, points: FloatArray) -> FloatArray:
         """Every coordinate clipped."""
-        return np.clip(points, *self.bounds())
+        low, high = self._corners
+        clipped = np.maximum(points, low)
+        return np.minimum(clipped, high, out=clipped)
+
+    @functools.cached_property
+    def _corners(self) -> tuple[FloatArray, FloatArray]:
+        return self.bounds()
 
     def place(self, action: FloatArray) -> FloatArray:
         """The box is [-1, 1]^3."""

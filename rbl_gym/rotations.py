@@ -78,9 +78,15 @@ def inverse_coefficient(squared: FloatArray) -> FloatArray:
     return np.where(small, series, (1 - x / (2 * np.tan(0.5 * x))) / safe)
 
 
-def _series(w: FloatArray, a: FloatArray, b: FloatArray, diagonal: FloatArray) -> FloatArray:
+def _series(
+    w: FloatArray,
+    a: FloatArray,
+    b: FloatArray,
+    diagonal: FloatArray,
+    out: FloatArray | None = None,
+) -> FloatArray:
     """``diagonal * I + a [w]x + b w w^T``, the common form of exp and its Jacobians."""
-    M = np.empty((*w.shape, 3))
+    M = np.empty((*w.shape, 3)) if out is None else out
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
         M[..., i, i] = diagonal + b * (w[..., i] * w[..., i])
         product, turn = b * (w[..., j] * w[..., k]), a * w[..., i]
@@ -113,15 +119,18 @@ def _one_coefficients(w: FloatArray) -> tuple[float, float, float, float]:
     return s, sine / x, 2 * half * half / s, (x - sine) / (s * x)
 
 
-def exp(w: ArrayLike) -> FloatArray:
-    """Rotation matrix (..., 3, 3) of the rotation vector ``w`` (..., 3) in radians (Rodrigues)."""
+def exp(w: ArrayLike, out: FloatArray | None = None) -> FloatArray:
+    """Rotation matrix (..., 3, 3) of the rotation vector ``w`` (..., 3) in radians (Rodrigues).
+
+    `out`: an array to write it into, in any memory order.
+    """
     w = np.asarray(w, dtype=np.float64)
-    if w.ndim == 1:
+    if w.ndim == 1 and out is None:
         s, a, b, _ = _one_coefficients(w)
         return _one_series(w, a, b, 1.0 - b * s)
     squared = np.einsum("...i,...i->...", w, w)
     a, b, _ = coefficients(squared)
-    return _series(w, a, b, 1.0 - b * squared)
+    return _series(w, a, b, 1.0 - b * squared, out)
 
 
 def left_jacobian(w: ArrayLike) -> FloatArray:

@@ -233,9 +233,10 @@ def measure(scene: Scene, at: Epoch, anchors: FloatArray) -> ranging.Measurement
     measured = ranging.measure(
         ranging.distances(anchors, at.positions), scene.noise, at.normals, scene.links, at.uniforms
     )
+    ranges = np.minimum(measured.ranges, scene.range_limit_m, order="C")
     # A range of zero has no variance under a proportional law: such a reading is no reading.
-    links = measured.links & (measured.ranges > 0)
-    return measured._replace(ranges=np.minimum(measured.ranges, scene.range_limit_m), links=links)
+    links = np.logical_and(measured.links, ranges > 0, order="C")
+    return ranging.Measurement(ranges, links, np.ascontiguousarray(measured.nlos))
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:
@@ -245,9 +246,12 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
     one than 1 is cut to 1, and the place is projected onto the anchors' region.
     """
     velocity = action.reshape(*action.shape[:-1], scene.n_anchors, 3)
-    length = np.linalg.norm(velocity, axis=-1, keepdims=True)
-    velocity = velocity * (scene.anchor_speed_m_s / np.maximum(length, 1.0))
-    return scene.anchor_region.project(anchors + scene.dt * velocity)
+    x, y, z = velocity[..., 0], velocity[..., 1], velocity[..., 2]
+    length = np.sqrt(x * x + y * y + z * z)
+    velocity = velocity * (scene.anchor_speed_m_s / np.maximum(length, 1.0))[..., None]
+    velocity *= scene.dt
+    velocity += anchors
+    return scene.anchor_region.project(velocity)
 
 
 def posterior_information(

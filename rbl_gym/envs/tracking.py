@@ -175,6 +175,11 @@ def check_action(action: ArrayLike, size: int) -> FloatArray:
     return array
 
 
+def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
+    """Whether an action is the only one of fixed anchors: zeros of this shape."""
+    return action.shape == shape and action.dtype.kind in "iub" and not action.any()
+
+
 def observation_space(scene: scenes.Scene) -> spaces.Dict:
     """Finite bounds of a scene's observations."""
     links = (scene.n_anchors, len(scene.tags))

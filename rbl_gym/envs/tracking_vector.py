@@ -14,11 +14,8 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
-from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
-
-# Fields of an episode that have a time axis; here it comes first, so that a step reads and
-# writes contiguous memory.
-_TIMED = simulation.Epoch._fields
+from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.envs.tracking import REWARDS, action_space, are_zeros, observation_space
 
 
 class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
@@ -79,7 +76,10 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._tags = np.asarray(self.scene.tags)
         self._generators: list[np.random.Generator] = []
-        self._timed: dict[str, FloatArray] | None = None
+        self._episodes = EpisodeStore(self.scene, num_envs)
+        # Worlds last in memory, as in the store.
+        self._anchors = np.empty((num_envs, self.scene.n_anchors, 3), order="F")
+        self._prior_covariance = np.empty((num_envs, 6, 6))
         self._done = np.zeros(num_envs, dtype=np.bool_)
         self._epochs = np.zeros(num_envs, dtype=np.int64)
 
@@ -94,7 +94,7 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
         mask = self._reset_mask(options)
         seeds = self._seeds(seed)
-        if self._timed is None and not mask.all():
+        if self._episodes.empty and not mask.all():
             raise gym.error.ResetNeeded("reset all environments before some of them")
         if not self._generators:
             self._generators = [seeding.np_random(one)[0] for one in seeds]
@@ -129,29 +129,15 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
     def _restart(self, mask: BoolArray) -> dict[str, Any]:
         """New episodes where the mask says; returns their priors as info."""
         chosen = np.flatnonzero(mask)
-        draws = simulation.draw_each(self.scene, [self._generators[i] for i in chosen])
-        episode = simulation.build_episode(self.scene, draws)
-        timed = {
-            name: np.moveaxis(value, 1, 0)
-            for name, value in zip(_TIMED, episode[: len(_TIMED)], strict=True)
-            if value is not None
-        }
-        if self._timed is None or mask.all():
-            self._timed = {name: np.ascontiguousarray(value) for name, value in timed.items()}
-            self._anchors = episode.anchors.copy()
-            self._prior_covariance = episode.prior_covariance.copy()
-        else:
-            for name, value in timed.items():
-                self._timed[name][:, chosen] = value
-            self._anchors[chosen] = episode.anchors
-            self._prior_covariance[chosen] = episode.prior_covariance
+        start = self._episodes.begin(chosen, [self._generators[i] for i in chosen])
+        self._anchors[chosen] = start["anchors"]
+        self._prior_covariance[chosen] = start["prior_covariance"]
         self._epochs[chosen] = 0
         self._done[chosen] = False
         info: dict[str, Any] = {}
         for name in ("prior_rotation", "prior_translation", "prior_covariance"):
-            value = getattr(episode, name)
-            full = np.zeros((self.num_envs, *value.shape[1:]))
-            full[chosen] = value
+            full = np.zeros((self.num_envs, *start[name].shape[1:]))
+            full[chosen] = start[name]
             info[name], info[f"_{name}"] = full, mask.copy()
         return info
 
@@ -161,7 +147,7 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         self, actions: ArrayLike
     ) -> tuple[dict[str, np.ndarray], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Step every world; see the autoreset mode for those whose episode is over."""
-        if self._timed is None:
+        if self._episodes.empty:
             raise gym.error.ResetNeeded("call reset() before step()")
         ended = self._done.copy()
         if ended.any() and self._mode is AutoresetMode.DISABLED:
@@ -189,12 +175,14 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
             if velocities.ndim != 2:
                 shape = (self.num_envs, size)
                 raise ValueError(f"actions must have shape {shape}, got {velocities.shape}")
-            moved = simulation.move_anchors(self.scene, self._anchors, velocities)
+            velocities = np.asfortranarray(velocities)
             # Those that reset in this step get their anchors from the new episode.
-            self._anchors = moved if moving.all() else np.where(
-                moving[:, None, None], moved, self._anchors
-            )  # fmt: skip
-        elif not self.action_space.contains(np.asarray(actions)):
+            np.copyto(
+                self._anchors,
+                simulation.move_anchors(self.scene, self._anchors, velocities),
+                where=moving[:, None, None],
+            )
+        elif not are_zeros(np.asarray(actions), (self.num_envs,)):
             raise ValueError(f"actions must be {self.num_envs} zeros where the anchors are fixed")
 
     def _same_step(
@@ -223,17 +211,6 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
 
     # --- what is seen -----------------------------------------------------------------------
 
-    def _at(self) -> simulation.Epoch:
-        """The worlds at their epochs: one slice where all clocks agree."""
-        assert self._timed is not None
-        first = self._epochs[0]
-        if (self._epochs == first).all():
-            slices = {name: value[first] for name, value in self._timed.items()}
-        else:
-            index = np.arange(self.num_envs)
-            slices = {name: value[self._epochs, index] for name, value in self._timed.items()}
-        return simulation.Epoch(*(slices.get(name) for name in _TIMED))  # pyright: ignore[reportArgumentType]
-
     def _observe(
         self, *, fresh: BoolArray, moved: BoolArray
     ) -> tuple[dict[str, np.ndarray], dict[str, Any], FloatArray]:
@@ -242,38 +219,47 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         `fresh` worlds are at the start of an episode, `moved` ones have just stepped: their bound
         is carried on. The others are only looked at again.
         """
-        at = self._at()
-        fast = at._replace(positions=_worlds_last(at.positions), normals=_worlds_last(at.normals))
-        measured = simulation.measure(self.scene, fast, _worlds_last(self._anchors))
+        stored = self._episodes.at(self._epochs)
+        at = stored._replace(
+            rotation=stored.rotation.copy(),
+            translation=stored.translation.copy(),
+            twist=stored.twist.copy(),
+        )
+        measured = simulation.measure(self.scene, at, self._anchors)
+        observation = {
+            "ranges": measured.ranges,
+            "links": measured.links.view(np.int8),
+            "anchors": self._anchors.copy(),
+            "twist": at.twist,
+        }
         info: dict[str, Any] = {
-            "rotation": at.rotation.copy(),
-            "translation": at.translation.copy(),
+            "rotation": at.rotation,
+            "translation": at.translation,
             "nlos": measured.nlos,
             "epoch": self._epochs.copy(),
         }
         reward = np.zeros(self.num_envs)
         if self.reward_mode == "bound":
-            self._carry_bound(at, measured.links, fresh, moved)
+            self._carry_bound(at, observation["anchors"], measured.links, fresh, moved)
             covariance = np.linalg.inv(self._information)
             info["score_m"] = bounds.score(covariance, at.rotation, self._tags)
             reward = -np.log(info["score_m"])
         for key in list(info):
             info[f"_{key}"] = np.ones(self.num_envs, dtype=np.bool_)
-        observation = {
-            "ranges": np.ascontiguousarray(measured.ranges),
-            "links": measured.links.astype(np.int8, order="C"),
-            "anchors": self._anchors.copy(),
-            "twist": at.twist.copy(),
-        }
         return observation, info, reward
 
     def _carry_bound(
-        self, at: simulation.Epoch, links: BoolArray, fresh: BoolArray, moved: BoolArray
+        self,
+        at: simulation.Epoch,
+        anchors: FloatArray,
+        links: BoolArray,
+        fresh: BoolArray,
+        moved: BoolArray,
     ) -> None:
         """The posterior Cramer-Rao information of the worlds that started or stepped."""
         if moved.all():
             self._information = simulation.posterior_information(
-                self.scene, at, self._anchors, links, self._information, self._prior_covariance
+                self.scene, at, anchors, links, self._information, self._prior_covariance
             )
             return
         if fresh.all():
@@ -284,13 +270,8 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
                 self._information[rows] = simulation.posterior_information(
                     self.scene,
                     part,
-                    self._anchors[rows],
+                    anchors[rows],
                     links[rows],
                     None if started else self._information[rows],
                     self._prior_covariance[rows],
                 )
-
-
-def _worlds_last(array: FloatArray) -> FloatArray:
-    """A copy (B, ...) whose memory runs along the worlds: small inner axes make slow loops."""
-    return np.moveaxis(np.ascontiguousarray(np.moveaxis(array, 0, -1)), -1, 0)
