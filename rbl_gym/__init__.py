@@ -26,6 +26,14 @@ def _register_environments() -> None:
             "rbl_gym.envs.placement:AnchorPlacementEnv",
             "rbl_gym.envs.placement:AnchorPlacementVectorEnv",
         ),
+        "RBL/MobileAnchors-v0": (
+            "rbl_gym.wrappers.tasks:MobileAnchorsEnv",
+            "rbl_gym.wrappers.tasks:MobileAnchorsVectorEnv",
+        ),
+        "RBL/AnchorSelection-v0": (
+            "rbl_gym.wrappers.tasks:AnchorSelectionEnv",
+            "rbl_gym.wrappers.tasks:AnchorSelectionVectorEnv",
+        ),
     }
     for env_id, (scalar, vector) in entry_points.items():
         if env_id not in registry:

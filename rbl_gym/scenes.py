@@ -17,6 +17,7 @@ import numpy as np
 from rbl_gym import bodies, rotations
 from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.motion import ProcessNoise
+from rbl_gym.obstacles import check_obstacles
 from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box, Region, Shell, Walls
 
@@ -43,12 +44,19 @@ class Scene:
     anchor_region, n_anchors, anchors
         Where anchors may stand, how many, and their places (M, 3) at the start of every
         episode; `anchors` None draws them anew in the region at every reset.
+    anchor_start_m
+        Anchors that are drawn start within so much of the body on every axis; None: anywhere
+        in their region.
     anchor_speed_m_s
         Limit on the anchors' speed; 0: they are fixed.
     tags
         Places (N, 3) on the body, in the body frame.
     noise, links
         The range law and what else happens to a link.
+    obstacles, blocked_information
+        Boxes (K, 6) that block sight, centre and half size; a link without line of sight from
+        the anchor to the body's origin keeps this share of its information: its noise is
+        stronger.
     process
         Noise of the motion: standard deviations after 1 s.
     dt, steps
@@ -60,8 +68,9 @@ class Scene:
         circle about the volume's centre, its radius 0.35 of the shorter side, nose first.
         ``"lawn-mower"``: lanes along x, a fifth of the volume apart. On way-points and lanes
         the body turns at a rate drawn once an episode with standard deviation `spin_rad_s`.
-    start_rotation, start_translation
-        Pose at the start; None: drawn (uniform on SO(3), uniform in the volume).
+    start_rotation, start_translation, start_volume
+        Pose at the start; None: drawn (uniform on SO(3), uniform in the start volume, which
+        None takes to be the volume).
     initial_rotation_rad, initial_translation_m
         Standard deviations of the prior.
     prior
@@ -81,7 +90,10 @@ class Scene:
     initial_rotation_rad: float
     initial_translation_m: float
     anchors: Points | None = None
+    anchor_start_m: float | None = None
     anchor_speed_m_s: float = 0.0
+    obstacles: tuple[tuple[float, ...], ...] = ()
+    blocked_information: float = 0.02
     links: LinkModel = field(default_factory=LinkModel)
     steps: int = 100
     trajectory: str = "waypoints"
@@ -90,6 +102,7 @@ class Scene:
     twist: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     start_rotation: Points | None = None
     start_translation: tuple[float, float, float] | None = None
+    start_volume: Box | None = None
     prior: str = "drawn"
 
     def __post_init__(self) -> None:
@@ -101,6 +114,12 @@ class Scene:
             check_number(name, getattr(self, name), low=1e-9)
         for name in ("anchor_speed_m_s", "speed_m_s", "spin_rad_s"):
             check_number(name, getattr(self, name), low=0.0)
+        check_number("blocked_information", self.blocked_information, low=1e-9, high=1.0)
+        if self.anchor_start_m is not None:
+            check_number("anchor_start_m", self.anchor_start_m, low=0.0)
+        if not isinstance(self.start_volume, Box | None):
+            raise ValueError(f"start_volume must be a Box or None, got {self.start_volume!r:.80}")
+        object.__setattr__(self, "obstacles", _tuples(check_obstacles(self.obstacles)))
         check_one_of("trajectory", self.trajectory, TRAJECTORIES)
         check_one_of("prior", self.prior, ("drawn", "start"))
         for name in ("n_anchors", "steps"):
@@ -167,6 +186,8 @@ class Scene:
         spread = 10 * float(self.process.std()[3:].max()) * math.sqrt(duration)
         reach = np.full((1, len(self.tags)), extent + speed * (duration + self.dt) + spread + body)
         noise = 10 * float(np.sqrt(self.noise.variance(reach).max()))
+        if self.obstacles:
+            noise /= math.sqrt(self.blocked_information)
         return float(reach[0, 0]) + noise + self.links.nlos_bias_m
 
 
@@ -251,6 +272,46 @@ SCENES: dict[str, Scene] = {
             initial_translation_m=0.5,
         ),
         Scene(
+            name="auv_craft",
+            volume=Box((-150, -150, -80), (150, 150, -20)),
+            start_volume=Box((-100, -100, -80), (100, 100, -20)),
+            anchor_region=Box((-600, -600, 0), (600, 600, 0)),
+            n_anchors=3,
+            anchor_start_m=150.0,
+            anchor_speed_m_s=4.0,
+            tags=_tuples(bodies.pyramid(2.0)),
+            noise=RangeNoise(0.05, 0.002),
+            process=_per_step(0.3, 2.0, 2.0),
+            dt=2.0,
+            speed_m_s=1.5,
+            spin_rad_s=0.03,
+            initial_rotation_rad=math.radians(10),
+            initial_translation_m=3.0,
+        ),
+        Scene(
+            name="hall",
+            volume=Box((-17, -8, 0.5), (17, 8, 3)),
+            anchor_region=Walls((-20, -10, 0), (20, 10, 6)),
+            n_anchors=12,
+            anchors=(
+                (20, 2.679, 4.125), (20, 10, 5.486), (5.359, 10, 4.878), (-5.359, 10, 2.126),
+                (-20, 10, 2.501), (-20, 2.679, 5.368), (-20, -2.679, 1.026), (-20, -10, 5.106),
+                (-5.359, -10, 4.985), (5.359, -10, 3.34), (20, -10, 2.515), (20, -2.679, 2.392),
+            ),
+            obstacles=(
+                (-8, 2, 1.5, 0.5, 5, 1.5), (0, -3, 2, 0.5, 4, 2),
+                (9, 1, 1.5, 4, 0.5, 1.5), (5, -6, 1.2, 3, 0.5, 1.2),
+            ),
+            tags=_tuples(bodies.octahedron(0.8)),
+            noise=RangeNoise(0.10, 0.005),
+            process=_per_step(0.05, 2.0, 0.2),
+            dt=0.2,
+            speed_m_s=2.0,
+            spin_rad_s=0.2,
+            initial_rotation_rad=math.radians(10),
+            initial_translation_m=0.5,
+        ),
+        Scene(
             name="camsap2013",
             volume=Box((0, 0, 0), (0, 0, 0)),
             anchor_region=Box((-1000, -1000, -1000), (1000, 1000, 1000)),
@@ -296,9 +357,6 @@ SCENES: dict[str, Scene] = {
         ),
     )
 }  # fmt: skip
-
-_REGIONS = {"box": Box, "walls": Walls, "shell": Shell}
-_NOISES = {"range": RangeNoise, "squared-range": SquaredRangeNoise}
 
 
 def get(scene: str | Mapping[str, Any] | Scene) -> Scene:

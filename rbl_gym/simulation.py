@@ -13,6 +13,7 @@ import numpy as np
 
 from rbl_gym import bounds, motion, ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.obstacles import in_sight
 from rbl_gym.scenes import Scene
 
 
@@ -153,7 +154,12 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
         )
         twists = np.concatenate([np.zeros((*batch, 1, 6)), twists], axis=-2)
     if scene.anchors is None:
-        anchors = scene.anchor_region.draw(spots.reshape((*batch, scene.n_anchors, 3)))
+        spots = spots.reshape((*batch, scene.n_anchors, 3))
+        if scene.anchor_start_m is None:
+            anchors = scene.anchor_region.draw(spots)
+        else:
+            around = path.translation[..., :1, :] + scene.anchor_start_m * (2 * spots - 1)
+            anchors = scene.anchor_region.project(around)
     else:
         anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
     shape = (scene.n_anchors, len(scene.tags))
@@ -182,7 +188,10 @@ def _trajectory(
     if scene.start_rotation is not None:
         rotation = np.broadcast_to(scene.start_rotation, (*batch, 3, 3))
     low, high = scene.volume.bounds()
-    points = low + places.reshape((*batch, -1, 3)) * (high - low)
+    places = places.reshape((*batch, -1, 3))
+    points = low + places * (high - low)
+    if scene.start_volume is not None:
+        points[..., 0, :] = scene.start_volume.draw(places[..., 0, :])
     first = points[..., 0, :]
     if scene.start_translation is not None:
         first = np.broadcast_to(scene.start_translation, (*batch, 3))
@@ -230,13 +239,23 @@ def whole(episode: Episode) -> Epoch:
 
 def measure(scene: Scene, at: Epoch, anchors: FloatArray) -> ranging.Measurement:
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3)."""
+    normals = at.normals
+    if scene.obstacles:
+        normals = normals / np.sqrt(link_quality(scene, at, anchors))[..., None]
     measured = ranging.measure(
-        ranging.distances(anchors, at.positions), scene.noise, at.normals, scene.links, at.uniforms
+        ranging.distances(anchors, at.positions), scene.noise, normals, scene.links, at.uniforms
     )
     ranges = np.minimum(measured.ranges, scene.range_limit_m, order="C")
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     links = np.logical_and(measured.links, ranges > 0, order="C")
     return ranging.Measurement(ranges, links, np.ascontiguousarray(measured.nlos))
+
+
+def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
+    """Share (..., M) of its information that the sight from each anchor leaves a link."""
+    obstacles = np.array(scene.obstacles).reshape(-1, 6)
+    sight = in_sight(anchors, at.translation[..., None, :], obstacles)[..., 0, :]
+    return np.where(sight, 1.0, scene.blocked_information)
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:

@@ -44,9 +44,7 @@ class Sb3VecEnv(VecEnv):
         if mode is not AutoresetMode.SAME_STEP:
             raise ValueError(f"envs must have autoreset_mode 'SameStep', got {mode}")
         self.envs = envs
-        super().__init__(
-            envs.num_envs, envs.single_observation_space, envs.single_action_space
-        )
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         self._actions: np.ndarray | None = None
         self._begin = time.perf_counter()
         self._returns = np.zeros(envs.num_envs)
@@ -112,9 +110,7 @@ class Sb3VecEnv(VecEnv):
         """Refused: the worlds have no methods of their own."""
         raise NotImplementedError("the worlds of a native vector environment share methods")
 
-    def env_is_wrapped(
-        self, wrapper_class: type[Any], indices: VecEnvIndices = None
-    ) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """Whether the worlds' infos hold what Monitor writes; no other wrapper is there."""
         is_monitor = wrapper_class.__name__ == "Monitor"
         return [is_monitor] * len(list(self._get_indices(indices)))

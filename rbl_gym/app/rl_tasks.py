@@ -52,6 +52,10 @@ class RlTask:
         )
 
 
+def _loop(env_id: str, steps: int, **arguments: Any) -> RlTask:
+    return RlTask(env_id, arguments, steps, 50, gamma=0.95, gae_lambda=0.9)
+
+
 def _placement(steps: int, n_anchors: int, **arguments: Any) -> RlTask:
     return RlTask("RBL/AnchorPlacement-v0", arguments, steps, 4 * n_anchors)
 
@@ -62,6 +66,10 @@ TASKS: dict[str, RlTask] = {
     "uwb_room": _placement(1_200_000, 5, scene="uwb_room", racks=2),
     "satellite": _placement(450_000, 5, scene="satellite"),
     "mounts": _placement(1_200_000, 5, scene="uwb_room", racks=2, mode="mounts"),
+    "mobile-easy": _loop("RBL/MobileAnchors-v0", 600_000, difficulty="easy"),
+    "mobile-hard": _loop("RBL/MobileAnchors-v0", 1_500_000, difficulty="hard"),
+    "selection": _loop("RBL/AnchorSelection-v0", 600_000, k=3),
+    "selection-priced": _loop("RBL/AnchorSelection-v0", 600_000, mode="priced"),
 }
 
 
