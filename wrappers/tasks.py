@@ -173,7 +173,7 @@ class MobileAnchorsVectorEnv(FilterLoop):
         self.single_observation_space = spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32)
         self._configure(num_envs, render_mode, world.steps, max_episode_steps, autoreset_mode)
         self._configure_loop(world, num_envs)
-        self._order = np.tile(np.arange(world.n_anchors), (num_envs, 1))
+        self.order = np.tile(np.arange(world.n_anchors), (num_envs, 1))
 
     def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
         self._start(chosen, generators)
@@ -185,7 +185,7 @@ class MobileAnchorsVectorEnv(FilterLoop):
         velocity = np.zeros((len(rows), self.scene.n_anchors, 3))
         level = actions[rows].reshape(len(rows), self.scene.n_anchors, 2)
         # Action k is that of the k-th craft in the observation.
-        np.put_along_axis(velocity[..., :2], self._order[rows][..., None], level, axis=1)
+        np.put_along_axis(velocity[..., :2], self.order[rows][..., None], level, axis=1)
         self.anchors[rows] = simulation.move_anchors(
             self.scene, self.anchors[rows], velocity.reshape(len(rows), -1)
         )
@@ -198,11 +198,11 @@ class MobileAnchorsVectorEnv(FilterLoop):
         """Craft by bearing from the estimate, so that equal situations look equal."""
         if self.sort_craft:
             gap = self.anchors - self.state.translation[:, None]
-            self._order = np.argsort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1)
+            self.order = np.argsort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1)
 
     def _observe(self) -> np.ndarray:
         gap = self.anchors[..., :2] - self.state.translation[:, None, :2]
-        gap = np.take_along_axis(gap, self._order[..., None], axis=1)
+        gap = np.take_along_axis(gap, self.order[..., None], axis=1)
         depth = self.state.translation[:, 2:]
         distance = np.sqrt((gap**2).sum(axis=-1) + depth**2)
         return _flat([

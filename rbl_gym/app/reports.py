@@ -94,3 +94,30 @@ def print_replay(result: dict[str, Any]) -> None:
         f"mean yaw error {result['yaw_mean_deg']:.2f} deg, NEES per degree of freedom "
         f"{result['anees']:.1f} (1: honest; above: overconfident)"
     )
+
+
+def print_training(result: dict[str, Any]) -> None:
+    """The learning curve in a few points, and where the time went."""
+    console = _console()
+    curve = result["curve"]
+    for point in curve[:: max(1, len(curve) // 10)]:
+        console.print(f"{point['steps']:>10,} steps  mean return {point['mean_return']:.4f}")
+    console.print(
+        f"{result['steps']:,} steps in {result['seconds']:.0f} s; the environment took "
+        f"{100 * result['env_share']:.0f} % of the processor's time\npolicy: {result['policy']}"
+    )
+
+
+def print_evaluation(result: dict[str, Any]) -> None:
+    """Policies and references, the best first."""
+    console = _console()
+    table = Table(title=f"{result['task']}, {result['worlds']} held-out worlds")
+    table.add_column("policy")
+    for heading in ("mean log b", "score (m)", "normalised", "95 %"):
+        table.add_column(heading, justify="right")
+    for name, row in sorted(result["methods"].items(), key=lambda item: item[1]["loss"]):
+        interval = f"{row['normalised_low']:.3f} to {row['normalised_high']:.3f}"
+        table.add_row(name, f"{row['loss']:.4f} +- {row['loss_std_error']:.4f}",
+                      f"{row['score_m']:.4f}", f"{row['normalised']:.3f}", interval)  # fmt: skip
+    console.print(table)
+    console.print(f"normalised: 0 is random, 1 is {result['best_reference']}")

@@ -1,0 +1,94 @@
+"""The commands rbl-gym train and rbl-gym evaluate."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rbl_gym.app.rl_tasks import TASKS, rl_task
+from rbl_gym.app.terminal import (
+    MissingExtraError,
+    add_json,
+    natural,
+    positive,
+    progress,
+    write_json,
+)
+
+
+def add_train(commands: Any) -> None:
+    """The parser of ``rbl-gym train``."""
+    train = commands.add_parser(
+        "train",
+        help="learn a policy by PPO (extra rl)",
+        description="Train a policy by PPO on a task; the same seed gives the same policy.",
+    )
+    train.add_argument("task", choices=sorted(TASKS))
+    train.add_argument("--steps", type=positive, help="default: what the task's figures took")
+    train.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
+    train.add_argument("--out", metavar="F", help="default out/TASK-SEED.npz")
+    add_json(train)
+    train.set_defaults(run=_train)
+
+
+def add_evaluate(commands: Any) -> None:
+    """The parser of ``rbl-gym evaluate``."""
+    evaluate = commands.add_parser(
+        "evaluate",
+        help="policies and references on held-out worlds",
+        description="Score policies against the references on held-out worlds, with 95 % "
+        "intervals of the paired bootstrap.",
+    )
+    evaluate.add_argument("task", choices=sorted(TASKS))
+    evaluate.add_argument("--policy", action="append", default=[], metavar="F",
+                          help="of rbl-gym train; may be given again")  # fmt: skip
+    evaluate.add_argument("--references", metavar="A,B", help="default all of the task's")
+    evaluate.add_argument("--worlds", type=positive, default=256, help="default 256")
+    evaluate.add_argument("--seed", type=natural, default=0, help="which worlds, default 0")
+    add_json(evaluate)
+    evaluate.set_defaults(run=_evaluate)
+
+
+def _train(options: argparse.Namespace) -> int:
+    from rbl_gym.app import policies, training
+
+    task = rl_task(options.task)
+    steps = options.steps or task.steps
+    path = Path(options.out or f"out/{options.task}-{options.seed}.npz")
+    try:
+        with progress(f"PPO on {options.task}", steps) as advance:
+            policy, result = training.train(options.task, task, steps, options.seed, advance)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"training needs the extra rl ({error.name} is missing): pip install 'rbl-gym[rl]'"
+        ) from error
+    policies.save(policy, path)
+    result["policy"] = str(path)
+    if write_json(result, options.json):
+        from rbl_gym.app import reports
+
+        reports.print_training(result)
+    return 0
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from rbl_gym.app import evaluation, policies
+
+    task = rl_task(options.task)
+    loaded = {Path(path).stem: policies.load(path) for path in options.policy}
+    names = options.references.split(",") if options.references else evaluation.references(task)
+    units = evaluation.work_units(task, names, len(loaded))
+    try:
+        with progress(options.task, units) as advance:
+            result = evaluation.evaluate(
+                task, loaded, names, options.worlds, options.seed, advance
+            )
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(str(error)) from error
+    result["task"] = options.task
+    if write_json(result, options.json):
+        from rbl_gym.app import reports
+
+        reports.print_evaluation(result)
+    return 0
