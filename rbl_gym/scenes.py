@@ -413,7 +413,8 @@ def _replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
 
 
 def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
-    kinds = next((k for k in (_REGIONS, _NOISES) if isinstance(old, tuple(k.values()))), {})
+    unset = {"box": Box} if old is None else {}
+    kinds = next((k for k in (_REGIONS, _NOISES) if isinstance(old, tuple(k.values()))), unset)
     if "kind" not in value:
         if not dataclasses.is_dataclass(old):
             raise ValueError(f"{path} is not a nested field, got a dict {dict(value)!r:.80}")

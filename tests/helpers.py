@@ -67,3 +67,12 @@ def assert_same(got: Any, want: Any, rtol: float = 0.0, atol: float = 0.0) -> No
     else:
         assert np.asarray(got).dtype.kind == np.asarray(want).dtype.kind
         np.testing.assert_allclose(got, want, rtol=rtol, atol=atol)
+
+
+def share_by_hand(scene, anchor: np.ndarray, point: np.ndarray) -> float:
+    """Share of a link's information: points along the sight are tried against every obstacle."""
+    along = anchor + np.linspace(0, 1, 4001)[:, None] * (np.asarray(point) - anchor)
+    for box in np.array(scene.obstacles).reshape(-1, 6):
+        if (np.abs(along - box[:3]) <= box[3:]).all(axis=1).any():
+            return scene.blocked_information
+    return 1.0

@@ -47,6 +47,21 @@ TABLE: dict[str, dict[str, Any]] = {
         "anchor_speed_m_s": 1.0, "speed_m_s": 0.05, "spin_rad_s": 0.012, "process": (0.02, 1.0),
         "initial": (5, 0.5), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
     },
+    "auv_craft": {
+        "volume": Box((-150, -150, -80), (150, 150, -20)),
+        "start_volume": Box((-100, -100, -80), (100, 100, -20)), "anchor_start_m": 150.0,
+        "n_anchors": 3, "noise": RangeNoise(0.05, 0.002), "body": ("pyramid", 2), "dt": 2.0,
+        "anchor_speed_m_s": 4.0, "speed_m_s": 1.5, "spin_rad_s": 0.03, "process": (0.3, 2.0),
+        "initial": (10, 3.0), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+    },
+    "hall": {
+        "volume": Box((-17, -8, 0.5), (17, 8, 3)),
+        "anchor_region": Walls((-20, -10, 0), (20, 10, 6)), "n_anchors": 12,
+        "noise": RangeNoise(0.10, 0.005), "body": ("octahedron", 0.8), "dt": 0.2,
+        "anchor_speed_m_s": 0.0, "speed_m_s": 2.0, "spin_rad_s": 0.2, "process": (0.05, 2.0),
+        "initial": (10, 0.5), "steps": 100, "trajectory": "waypoints", "prior": "drawn",
+        "blocked_information": 0.02,
+    },
     "camsap2013": {
         "anchor_region": Box((-1000, -1000, -1000), (1000, 1000, 1000)), "n_anchors": 4,
         "noise": SquaredRangeNoise(0.0316), "body": ("pyramid", 1), "dt": 1.0, "steps": 20,

@@ -14,6 +14,7 @@ from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box
 from rbl_gym.scenes import SCENES, Scene
 from rbl_gym.simulation import Episode
+from tests.helpers import share_by_hand
 
 NAMES = list(SCENES)
 MOVABLE = [name for name, scene in SCENES.items() if scene.anchor_speed_m_s > 0]
@@ -76,7 +77,8 @@ def ranges_by_hand(scene: Scene, episode: Episode, k: int, anchors: np.ndarray) 
     distances = distances_by_hand(scene, episode, k, anchors)
     result = np.empty_like(distances)
     for m, n in np.ndindex(distances.shape):
-        z = episode.normals[k, m, n]
+        share = share_by_hand(scene, anchors[m], episode.translation[k])
+        z = episode.normals[k, m, n] / share**0.5
         if isinstance(scene.noise, SquaredRangeNoise):
             square = distances[m, n] ** 2 + scene.noise.sigma_m * distances[m, 0] * z
             result[m, n] = max(square, 0.0) ** 0.5
@@ -136,9 +138,22 @@ def test_episodes_of_a_batch_differ(name):
         SCENES[name].prior == "start"
     )
     if SCENES[name].anchors is None:
-        assert (episode.anchors[0] != episode.anchors[1]).all()
+        low, high = SCENES[name].anchor_region.bounds()
+        assert ((episode.anchors[0] != episode.anchors[1]) | (low == high)).all()
     else:
         np.testing.assert_array_equal(episode.anchors[0], SCENES[name].anchors)
+
+
+def test_craft_start_near_the_body_and_the_body_in_its_start_volume():
+    scene = SCENES["auv_craft"]
+    episode = draw(scene, 1, (200,))
+    gap = episode.anchors - episode.translation[:, :1]
+    assert np.abs(gap[..., :2]).max() <= 150
+    assert np.abs(gap[..., :2]).max() > 140
+    assert (episode.anchors[..., 2] == 0).all()
+    start = episode.translation[:, 0]
+    assert np.abs(start[:, :2]).max() <= 100
+    assert np.abs(episode.translation[..., :2]).max() > 105
 
 
 def test_drawn_anchors_lie_in_the_region():

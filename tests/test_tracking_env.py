@@ -25,7 +25,7 @@ import rbl_gym
 from rbl_gym import bounds
 from rbl_gym.envs.tracking import TrackingEnv, observation_space
 from rbl_gym.scenes import SCENES
-from tests.helpers import assert_same
+from tests.helpers import assert_same, share_by_hand
 
 ROOT = Path(__file__).resolve().parent.parent
 ID = "rbl_gym:RBL/Tracking-v0"
@@ -314,7 +314,8 @@ def test_ranges_are_those_of_the_true_pose_to_the_anchors_seen(name):
             )
             variance = np.broadcast_to(env.scene.noise.variance(distances[None]), (1, len(tags)))
             error = observation["ranges"][m, n] - np.linalg.norm(tag - observation["anchors"][m])
-            assert abs(error) < 6 * variance[0, n] ** 0.5
+            share = share_by_hand(env.scene, observation["anchors"][m], info["translation"])
+            assert abs(error) < 6 * (variance[0, n] / share) ** 0.5
 
 
 # --- reward -----------------------------------------------------------------------------------
