@@ -81,9 +81,7 @@ def _evaluate(options: argparse.Namespace) -> int:
     units = evaluation.work_units(task, names, len(loaded))
     try:
         with progress(options.task, units) as advance:
-            result = evaluation.evaluate(
-                task, loaded, names, options.worlds, options.seed, advance
-            )
+            result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)
     except ModuleNotFoundError as error:
         raise MissingExtraError(str(error)) from error
     result["task"] = options.task
