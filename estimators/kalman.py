@@ -219,13 +219,16 @@ class KalmanFamily:
         common = shared(state.covariance)
         covariance = state.covariance if common is None else common
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-        vague_rotation = variance[..., :9].max(axis=-1) > _VAGUE_ENTRY_VARIANCE
-        largest = variance[..., 9:].max(axis=-1)
-        # Two anchors bound the extent from below, and mostly settle it.
-        apart = np.abs(anchors[..., 0, :] - anchors[..., -1, :]).max(axis=-1)
-        if not (vague_rotation | (largest > apart**2)).any():
+        # The first and last anchor bound the extent from below, and mostly settle it.
+        apart = np.abs(anchors[..., 0, :] - anchors[..., -1, :]).max(axis=-1).min(initial=np.inf)
+        if (
+            variance[..., :9].max(initial=0) <= _VAGUE_ENTRY_VARIANCE
+            and variance[..., 9:].max(initial=0) <= apart**2
+        ):
             return
-        vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
+        extent = np.ptp(anchors, axis=-2).max(axis=-1)
+        vague = variance[..., :9].max(axis=-1) > _VAGUE_ENTRY_VARIANCE
+        vague = vague | (variance[..., 9:].max(axis=-1) > extent**2)
         if not vague.any():
             return
         rank = geometric_rank(anchors, self.tags)
@@ -281,7 +284,7 @@ def _newton(
     if frame is not None and blocks is not None:
         # Nothing across the four filters: (23) and (26)-(27) are the same problem.
         x = split_mean(frame, posterior.mean)
-        x[:, :3] = column_fit(x[:, :3], blocks[:, :3])
+        x[:, :3] = column_fit(x[:, :3], blocks[:, :, :3])
         mean = join_mean(frame, x, posterior.mean.shape[:-1])
         return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
     stat = epoch.statistic()

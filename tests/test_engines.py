@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import bodies, estimators, motion, ranging, rotations
-from rbl_gym.estimators import engines, four_filters, kalman, unitary
+from rbl_gym.estimators import engines, kalman, unitary
 from rbl_gym.estimators.four_filters import inverse, join, principal_frame, split
 from rbl_gym.estimators.least_squares import procrustes, vec
 from rbl_gym.estimators.shared_covariance import shared
@@ -218,7 +218,7 @@ def test_split_and_join_are_inverses_and_the_covariance_is_the_users(tags):
     assert np.linalg.det(frame.axes) == pytest.approx(1)
     root = rng.standard_normal((4, 9, 3, 3))
     dense = root @ root.swapaxes(-1, -2)
-    blocks = np.array([dense[..., i, j] for i, j in four_filters.COMPONENTS])
+    blocks = np.ascontiguousarray(dense.transpose(2, 3, 0, 1))
     covariance = join(frame, blocks, (9,))
     again = split(frame, covariance)
     assert again is not None
@@ -245,13 +245,11 @@ def test_a_block_that_is_not_positive_is_left_to_the_general_path():
     rng = np.random.default_rng(4)
     root = rng.standard_normal((8, 3, 3))
     dense = root @ root.swapaxes(-1, -2)
-    pack = [dense[:, i, j] for i, j in four_filters.COMPONENTS]
-    inverses = inverse(np.array(pack))
+    inverses = inverse(np.moveaxis(dense, 0, -1))
     assert inverses is not None
-    np.testing.assert_allclose(inverses[1], np.linalg.inv(dense)[:, 0, 1], rtol=1e-9)
-    for shift in ([0, 1, 1], [1, 0, 1], [1, 1, 0]):
-        assert inverse(np.array([1.0, 0, 0, 1, 0, 1])[:, None] * np.array(
-            [shift[0], 1, 1, shift[1], 1, shift[2]])[:, None]) is None  # fmt: skip
+    np.testing.assert_allclose(np.moveaxis(inverses, -1, 0), np.linalg.inv(dense), rtol=1e-9)
+    for diagonal in ([0, 1, 1], [1, 0, 1], [1, 1, 0], [1, np.nan, 1]):
+        assert inverse(np.diag(diagonal).astype(float)[..., None]) is None
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.5, 2.0])
@@ -261,8 +259,8 @@ def test_the_column_fit_is_procrustes(noise):
     root = rng.standard_normal((40, 3, 3, 3))
     blocks = root @ root.swapaxes(-1, -2) + 0.01 * np.eye(3)
     target = rotations.random(rng, (40,)) + noise * rng.standard_normal((40, 3, 3))
-    packed = np.array([blocks[:, :, i, j].T for i, j in four_filters.COMPONENTS])
-    got = np.moveaxis(unitary.column_fit(np.moveaxis(target, 0, -1), packed), -1, 0)
+    got = unitary.column_fit(np.moveaxis(target, 0, -1), blocks.transpose(2, 3, 1, 0))
+    got = np.moveaxis(got, -1, 0)
     weight = np.zeros((40, 3, 3, 3, 3))
     for k in range(3):
         weight[:, k, :, k] = np.linalg.inv(blocks[:, k])
