@@ -120,7 +120,9 @@ def plain_predict(
     F = transition(motion.step)
     mean = mean @ F.T if F.ndim == 2 else (F @ mean[..., None])[..., 0]
     mean[..., 9:] += motion.shift
-    return mean, symmetric(F @ P @ np.swapaxes(F, -1, -2)) + np.diag(motion.noise)
+    P = symmetric(F @ P @ np.swapaxes(F, -1, -2))
+    P.reshape(*P.shape[:-2], 144)[..., ::13] += motion.noise
+    return mean, P
 
 
 def plain_update(mean: FloatArray, P: FloatArray, stat: Statistic) -> tuple[FloatArray, FloatArray]:
@@ -201,29 +203,22 @@ def posterior_covariance(P: FloatArray, matrix: FloatArray) -> FloatArray:
     except np.linalg.LinAlgError:
         return symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
     transposed = lower.swapaxes(-1, -2)
-    damped = transposed @ matrix @ lower + np.eye(12)
-    root = lower_inverse(np.linalg.cholesky(damped)) @ transposed
-    return root.swapaxes(-1, -2) @ root
+    damped = transposed @ matrix @ lower
+    damped.reshape(-1, 144)[:, ::13] += 1.0
+    root = lower_solve(np.linalg.cholesky(damped), transposed)
+    # Two copies: of a matrix and its own transpose, matmul makes a slower product.
+    return np.ascontiguousarray(root.T) @ np.ascontiguousarray(root.transpose(2, 0, 1))
 
 
-def lower_inverse(lower: FloatArray) -> FloatArray:
-    """Inverses of lower triangular matrices (..., n, n), n = 3, 6, 12, by halves."""
-    result = np.zeros(lower.shape)
-    n = lower.shape[-1]
-    if n == 3:
-        r = [1 / lower[..., i, i] for i in range(3)]
-        l10, l20, l21 = (lower[..., i, j] for i, j in ((1, 0), (2, 0), (2, 1)))
-        for i in range(3):
-            result[..., i, i] = r[i]
-        result[..., 1, 0] = -l10 * r[0] * r[1]
-        result[..., 2, 1] = -l21 * r[1] * r[2]
-        result[..., 2, 0] = (l10 * l21 * r[1] - l20) * r[0] * r[2]
-        return result
-    half = n // 2
-    result[..., :half, :half] = first = lower_inverse(lower[..., :half, :half])
-    result[..., half:, half:] = second = lower_inverse(lower[..., half:, half:])
-    result[..., half:, :half] = -second @ lower[..., half:, :half] @ first
-    return result
+def lower_solve(lower: FloatArray, right: FloatArray) -> FloatArray:
+    """``L^-1 R`` (n, k, B), trials last, of lower triangular L (B, n, n) and R (B, n, k)."""
+    L = np.ascontiguousarray(lower.transpose(1, 2, 0))
+    X = np.ascontiguousarray(right.transpose(1, 2, 0))
+    for i in range(len(X)):
+        if i > 0:
+            X[i] -= np.einsum("jb,jkb->kb", L[i, :i], X[:i])
+        X[i] /= L[i, i]
+    return X
 
 
 def epoch_moments(

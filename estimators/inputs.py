@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_links
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_finite,
+    check_links,
+    check_shape,
+)
+
+# Ranges that stay in the cache from one look at them to the next.
+_PART = 1 << 14
 
 
 def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
@@ -40,12 +50,24 @@ def check_epoch(
         ranges = np.where(mask, np.asarray(ranges, dtype=np.float64), 0.0)
         if mask.all():
             mask = None
-    ranges = check_array("ranges", ranges, shape)
+    ranges = check_shape("ranges", ranges, shape)
+    if mask is None and _all_positive(ranges):
+        return ranges, anchors, None
+    check_finite("ranges", ranges)
     wrong = ranges <= 0 if mask is None else (ranges <= 0) & mask
     if wrong.any():
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise ValueError(f"ranges must be positive where measured, got {ranges[index]} at {index}")
     return ranges, anchors, mask
+
+
+def _all_positive(values: FloatArray) -> bool:
+    """Whether all are positive and finite, without a mask of them: NaN fails both comparisons."""
+    if not values.flags.c_contiguous:
+        return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < np.inf)
+    flat = values.reshape(-1)
+    parts = (flat[begin : begin + _PART] for begin in range(0, flat.size, _PART))
+    return all(part.min() > 0 and part.max() < np.inf for part in parts)
 
 
 def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:

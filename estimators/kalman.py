@@ -219,16 +219,14 @@ class KalmanFamily:
         common = shared(state.covariance)
         covariance = state.covariance if common is None else common
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        rotation = np.maximum(np.maximum(variance[..., :3], variance[..., 3:6]), variance[..., 6:9])
+        vague_rotation = _largest_of_three(rotation) > _VAGUE_ENTRY_VARIANCE
+        largest = _largest_of_three(variance[..., 9:])
         # The first and last anchor bound the extent from below, and mostly settle it.
-        apart = np.abs(anchors[..., 0, :] - anchors[..., -1, :]).max(axis=-1).min(initial=np.inf)
-        if (
-            variance[..., :9].max(initial=0) <= _VAGUE_ENTRY_VARIANCE
-            and variance[..., 9:].max(initial=0) <= apart**2
-        ):
+        apart = _largest_of_three(np.abs(anchors[..., 0, :] - anchors[..., -1, :]))
+        if not (vague_rotation | (largest > apart**2)).any():
             return
-        extent = np.ptp(anchors, axis=-2).max(axis=-1)
-        vague = variance[..., :9].max(axis=-1) > _VAGUE_ENTRY_VARIANCE
-        vague = vague | (variance[..., 9:].max(axis=-1) > extent**2)
+        vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
         if not vague.any():
             return
         rank = geometric_rank(anchors, self.tags)
@@ -239,6 +237,11 @@ class KalmanFamily:
                 f"too vague to stand in; got {anchors.shape[-2]} anchors, {len(self.tags)} tags. "
                 "Use 'iekf', or a tighter prior covariance"
             )
+
+
+def _largest_of_three(values: FloatArray) -> FloatArray:
+    """Maximum (...) over a last axis of 3, which a reduction would walk through slowly."""
+    return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
 
 
 # --- constraints: what happens to the rotation after the linear update --------------------
