@@ -16,6 +16,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.four_filters import Frame, join, join_mean, split, split_mean
 from rbl_gym.estimators.four_filters import predict as filter_predict
 from rbl_gym.estimators.four_filters import update as filter_update
+from rbl_gym.estimators.inputs import check_ranges
 from rbl_gym.estimators.shared_covariance import shared, spread_out
 from rbl_gym.estimators.shared_covariance import update as shared_update
 from rbl_gym.estimators.squared_range import (
@@ -53,17 +54,28 @@ class Prediction(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """One epoch of checked ranges (..., M, N), anchors, tags, weights and links (None: all)."""
+    """One epoch: ranges (..., M, N), anchors, tags, weights and links (None: all).
+
+    Ranges that are not `checked` are finite and positive only after `check_ranges`: where the
+    weights are fixed, nobody has read them before the engine.
+    """
 
     ranges: FloatArray
     anchors: FloatArray
     tags: FloatArray
     weights: FloatArray
     links: BoolArray | None
+    checked: bool = True
 
     def statistic(self) -> Statistic:
-        """The statistic of `squared_range`."""
-        return statistic(*self)
+        """The statistic of `squared_range`, of checked ranges."""
+        self.check()
+        return statistic(*self[:5])
+
+    def check(self) -> None:
+        """Look at the ranges, if nobody has."""
+        if not self.checked:
+            check_ranges(self.ranges, self.links)
 
 
 class Batched:
@@ -121,7 +133,7 @@ def plain_predict(
     mean = mean @ F.T if F.ndim == 2 else (F @ mean[..., None])[..., 0]
     mean[..., 9:] += motion.shift
     P = symmetric(F @ P @ np.swapaxes(F, -1, -2))
-    P.reshape(*P.shape[:-2], 144)[..., ::13] += motion.noise
+    np.einsum("...ii->...i", P)[...] += motion.noise
     return mean, P
 
 
@@ -204,7 +216,7 @@ def posterior_covariance(P: FloatArray, matrix: FloatArray) -> FloatArray:
         return symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
     transposed = lower.swapaxes(-1, -2)
     damped = transposed @ matrix @ lower
-    damped.reshape(-1, 144)[:, ::13] += 1.0
+    np.einsum("bii->bi", damped)[...] += 1.0
     root = lower_solve(np.linalg.cholesky(damped), transposed)
     # Two copies: of a matrix and its own transpose, matmul makes a slower product.
     return np.ascontiguousarray(root.T) @ np.ascontiguousarray(root.transpose(2, 0, 1))
@@ -225,6 +237,7 @@ def epoch_moments(
     epoch: Epoch, tags: FloatArray, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """`moments` of a batch, trials last: G (3, 3, B) and B (3, 4, B) for extended tags (N, 4)."""
+    epoch.check()
     anchors, weights = (
         array[None] if array.ndim == 2 else _flat(array, 2, batch)
         for array in (epoch.anchors, epoch.weights)

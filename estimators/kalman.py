@@ -172,7 +172,8 @@ class KalmanFamily:
             cannot determine the 12 states and the state is too vague to stand in (the
             message names the rank).
         """
-        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
+        fixed = self.weights is not None
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=not fixed)
         self._check_determined(state, anchors)
         if self.weights is None:
             weights = 1 / check_variance(self.noise.squared_range_variance(ranges, mask), mask)
@@ -184,7 +185,9 @@ class KalmanFamily:
                 len(self.tags),
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
-        epoch = Epoch(ranges, anchors, self.tags, weights, mask)
+        epoch = Epoch(
+            ranges, anchors, self.tags, weights, mask, checked=not fixed or mask is not None
+        )
         mean, covariance = ENGINES[self.engine].update(
             state.mean, state.covariance, epoch, self._frame
         )

@@ -18,7 +18,12 @@ import numpy as np
 
 from rbl_gym.bounds import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.inputs import matrix_rank, spanned_dimensions
+from rbl_gym.estimators.inputs import (
+    are_positive,
+    check_ranges,
+    matrix_rank,
+    spanned_dimensions,
+)
 
 # Ranges that are squared at a time: a quarter of a megabyte stays in the cache.
 _CHUNK = 1 << 15
@@ -127,13 +132,21 @@ def moments(
     return G, B
 
 
-def squares_times(ranges: FloatArray, matrix: FloatArray) -> FloatArray:
-    """``(r * r) @ matrix`` for ranges (K, n) and a matrix (n, p), a few rows at a time."""
+def squares_times(
+    ranges: FloatArray, matrix: FloatArray, unchecked: FloatArray | None = None
+) -> FloatArray:
+    """``(r * r) @ matrix`` for ranges (K, n) and a matrix (n, p), a few rows at a time.
+
+    `unchecked` is the array that the ranges are rows of, if it has yet to pass `check_ranges`:
+    each part is looked at while it is in the cache.
+    """
     product = np.empty((len(ranges), matrix.shape[1]))
     size = max(1, _CHUNK // ranges.shape[1])
     squares = np.empty((min(size, len(ranges)), ranges.shape[1]))
     for begin in range(0, len(ranges), size):
         part = ranges[begin : begin + size]
+        if unchecked is not None and not are_positive(part):
+            check_ranges(unchecked)
         here = np.multiply(part, part, out=squares[: len(part)])
         np.matmul(here, matrix, out=product[begin : begin + size])
     return product
