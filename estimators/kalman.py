@@ -145,13 +145,10 @@ class KalmanFamily:
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         step = rotations.exp(twist[..., :3] * dt)
-        std = self.process.std()
-        sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
-        noise = dt * np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
         mean, covariance = ENGINES[self.engine].predict(
             state.mean,
             state.covariance,
-            Prediction(step, twist[..., 3:] * dt, noise),
+            Prediction(step, twist[..., 3:] * dt, dt * self._variance_rate),
             self._frame,
         )
         return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
@@ -217,6 +214,13 @@ class KalmanFamily:
     @cached_property
     def _frame(self) -> Frame | None:
         return principal_frame(np.asarray(self.tags, dtype=np.float64))
+
+    @cached_property
+    def _variance_rate(self) -> FloatArray:
+        """Process noise (12,) of the state after 1 s."""
+        std = self.process.std()
+        sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
+        return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
 
     def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
         common = shared(state.covariance)

@@ -12,6 +12,7 @@ from rbl_gym.estimators import engines, kalman, unitary
 from rbl_gym.estimators.four_filters import inverse, join, principal_frame, split
 from rbl_gym.estimators.least_squares import procrustes, vec
 from rbl_gym.estimators.shared_covariance import shared
+from rbl_gym.estimators.squared_range import extended, moments, paper_matrices, statistic
 from tests.helpers import simulate
 
 FAMILY = ["kf", "uc-kf", "et-kf", "kf-ortho"]
@@ -275,3 +276,44 @@ def test_the_last_chunk_of_a_large_batch_counts_too(monkeypatch):
     monkeypatch.setattr("rbl_gym.estimators.squared_range._CHUNK", 7 * 6 * 4)
     assert_equal(track("kf", TAGS["turned"], (25,), steps=2), whole)
     assert_equal(track("kf", TAGS["turned"], (25,), steps=2, fixed=True, common_twist=True), common)
+
+
+@pytest.mark.parametrize("weights", [None, np.linspace(1, 2, 7)], ids=["measured", "fixed"])
+@pytest.mark.parametrize("centred", [True, False])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.nan, r"ranges must be finite, got nan at index \(9, 3, 2\)"),
+        (np.inf, r"ranges must be finite, got inf at index \(9, 3, 2\)"),
+        (-1.0, r"ranges must be positive where measured, got -1.0 at \(9, 3, 2\)"),
+        (0.0, r"ranges must be positive where measured, got 0.0 at \(9, 3, 2\)"),
+    ],
+)
+def test_no_path_lets_a_bad_range_through(weights, centred, value, message, monkeypatch):
+    monkeypatch.setattr("rbl_gym.estimators.squared_range._CHUNK", 7 * 6 * 4)
+    monkeypatch.setattr("rbl_gym.estimators.inputs._PART", 100)
+    rng = np.random.default_rng(6)
+    tags = TAGS["turned" if centred else "uncentred"]
+    filter = estimators.make("kf", tags=tags, noise=NOISE, process=PROCESS, weights=weights)
+    anchors = shell(rng, (7,))
+    own_anchors = np.repeat(anchors[None], 12, axis=0)
+    ranges = rng.uniform(12, 18, (12, 7, len(tags)))
+    ranges[9, 3, 2] = value
+    state = filter.initial(np.eye(3), np.zeros((12, 3)), PRIOR)
+    for places in (anchors, own_anchors):
+        for measured in (ranges, np.asfortranarray(ranges)):
+            with pytest.raises(ValueError, match=message):
+                filter.update(state, measured, places)
+    single = kalman.KalmanState(*(array[0] for array in state))
+    with pytest.raises(ValueError, match="ranges must be"):
+        filter.update(single, ranges[9], anchors)
+
+
+def test_moments_in_parts_are_those_of_the_statistic(monkeypatch):
+    rng = np.random.default_rng(7)
+    anchors, tags = shell(rng, (11, 7)) + 1e4, TAGS["uncentred"]
+    ranges, weights = rng.uniform(12, 18, (11, 7, len(tags))), rng.uniform(1e-6, 1, (11, 7, 1))
+    want = paper_matrices(statistic(ranges, anchors, tags, weights))
+    monkeypatch.setattr("rbl_gym.estimators.squared_range._COLUMNS", 7 * 4)
+    for got, expected in zip(moments(ranges, anchors, extended(tags), weights), want, strict=True):
+        np.testing.assert_allclose(np.moveaxis(got, -1, 0), expected, rtol=1e-7)
