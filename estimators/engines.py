@@ -6,22 +6,17 @@ Both read the statistic of an epoch; a test holds them to each other on the same
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym.bounds import symmetric
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.four_filters import (
-    Frame,
-    join,
-    join_mean,
-    predict_blocks,
-    predict_mean,
-    split,
-    split_mean,
-)
+from rbl_gym.estimators.four_filters import Frame, join, join_mean, split, split_mean
+from rbl_gym.estimators.four_filters import predict as filter_predict
 from rbl_gym.estimators.four_filters import update as filter_update
+from rbl_gym.estimators.inputs import check_ranges
 from rbl_gym.estimators.shared_covariance import shared, spread_out
 from rbl_gym.estimators.shared_covariance import update as shared_update
 from rbl_gym.estimators.squared_range import (
@@ -36,6 +31,8 @@ from rbl_gym.estimators.squared_range import (
 
 # Below this many trials the calls of numpy cost more than the arithmetic that they save.
 FEW_TRIALS = 64
+# Trials whose 12 x 12 matrices stay in the cache from one product to the next.
+_BLOCK = 128
 
 
 class Prediction(NamedTuple):
@@ -57,17 +54,28 @@ class Prediction(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """One epoch of checked ranges (..., M, N), anchors, tags, weights and links (None: all)."""
+    """One epoch: ranges (..., M, N), anchors, tags, weights and links (None: all).
+
+    Ranges that are not `checked` are finite and positive only after `check_ranges`: where the
+    weights are fixed, nobody has read them before the engine.
+    """
 
     ranges: FloatArray
     anchors: FloatArray
     tags: FloatArray
     weights: FloatArray
     links: BoolArray | None
+    checked: bool = True
 
     def statistic(self) -> Statistic:
-        """The statistic of `squared_range`."""
-        return statistic(*self)
+        """The statistic of `squared_range`, of checked ranges."""
+        self.check()
+        return statistic(*self[:5])
+
+    def check(self) -> None:
+        """Look at the ranges, if nobody has."""
+        if not self.checked:
+            check_ranges(self.ranges, self.links)
 
 
 class Batched:
@@ -78,7 +86,7 @@ class Batched:
         mean: FloatArray, P: FloatArray, motion: Prediction, frame: Frame | None
     ) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance after ``x <- F x + [0; shift]``, ``P <- F P F^T + Q``."""
-        step, shift, noise = motion
+        step = motion.step
         if mean.ndim == 1 and P.ndim == 2 and step.ndim == 2:
             return plain_predict(mean, P, motion)
         common = shared(P)
@@ -86,13 +94,11 @@ class Batched:
             mean, common = plain_predict(mean, common, motion)
             return mean, spread_out(common, mean.shape[:-1])
         batch = np.broadcast_shapes(mean.shape[:-1], step.shape[:-2])
-        if frame is not None and math.prod(batch) >= FEW_TRIALS:
-            blocks = split(frame, _as_batch(P, 2, batch) if common is None else common)
-            if blocks is not None:
-                turn = np.ascontiguousarray(np.moveaxis(step, (-2, -1), (0, 1)))
-                blocks = predict_blocks(blocks, turn, noise, batch)
-                return predict_mean(mean, turn, shift), join(frame, blocks, batch)
-        return plain_predict(mean, P, motion)
+        if math.prod(batch) < FEW_TRIALS:
+            return plain_predict(mean, P, motion)
+        if frame is None:
+            return batched_predict(mean, P, motion, batch)
+        return predict_trials_last(mean, P if common is None else common, motion, batch)
 
     @staticmethod
     def update(
@@ -126,7 +132,9 @@ def plain_predict(
     F = transition(motion.step)
     mean = mean @ F.T if F.ndim == 2 else (F @ mean[..., None])[..., 0]
     mean[..., 9:] += motion.shift
-    return mean, symmetric(F @ P @ np.swapaxes(F, -1, -2)) + np.diag(motion.noise)
+    P = symmetric(F @ P @ np.swapaxes(F, -1, -2))
+    np.einsum("...ii->...i", P)[...] += motion.noise
+    return mean, P
 
 
 def plain_update(mean: FloatArray, P: FloatArray, stat: Statistic) -> tuple[FloatArray, FloatArray]:
@@ -144,61 +152,97 @@ def correct(
     return mean + (posterior @ innovation)[..., 0]
 
 
+def predict_trials_last(
+    mean: FloatArray, P: FloatArray, motion: Prediction, batch: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """`plain_predict` of many trials by `four_filters.predict`."""
+    step, shift, noise = motion
+    mean, P = filter_predict(
+        _trials_last(mean, 1, batch),
+        _trials_last(P, 2, batch),
+        np.ascontiguousarray(_trials_last(step, 2, batch)),
+        _trials_last(shift, 1, batch),
+        noise,
+    )
+    mean, P = mean.reshape(12, *batch), P.reshape(12, 12, *batch)
+    return np.moveaxis(mean, 0, -1), np.moveaxis(P, (0, 1), (-2, -1))
+
+
+def batched_predict(
+    mean: FloatArray, P: FloatArray, motion: Prediction, batch: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """`plain_predict` of many trials, a block of them at a time."""
+    means, covariances = np.empty((*batch, 12)), np.empty((*batch, 12, 12))
+    flat = [_flat(mean, 1, batch), _flat(P, 2, batch), _flat(motion.step, 2, batch)]
+    shift = _flat(motion.shift, 1, batch)
+    new_mean, new_P = means.reshape(-1, 12), covariances.reshape(-1, 12, 12)
+    for part in _blocks(len(shift)):
+        x, old, step = (array[part] for array in flat)
+        here = Prediction(step, shift[part], motion.noise)
+        new_mean[part], new_P[part] = plain_predict(x, old, here)
+    return means, covariances
+
+
 def batched_update(
     mean: FloatArray, P: FloatArray, epoch: Epoch, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """`plain_update` of many trials: of common weights, no solver of general matrices."""
+    """`plain_update` of many trials, a block of them at a time."""
     if epoch.links is not None or epoch.weights.shape[-1] != 1 or epoch.tags.ndim != 2:
-        matrix, vector = information(epoch.statistic())
+        told = information(epoch.statistic())
     else:
         tags = extended(epoch.tags)
-        matrix, vector = information_of_moments(*epoch_moments(epoch, tags, batch), tags)
-        matrix = matrix[0] if len(matrix) == 1 else matrix.reshape(*batch, 12, 12)
-        vector = vector.reshape(*batch, 12)
+        told = None
+        G, B = epoch_moments(epoch, tags, batch)
+    means, covariances = np.empty((*batch, 12)), np.empty((*batch, 12, 12))
+    new_mean, new_P = means.reshape(-1, 12), covariances.reshape(-1, 12, 12)
+    mean, P = _flat(mean, 1, batch), _flat(P, 2, batch)
+    if told is not None:
+        matrices, vectors = _flat(told[0], 2, batch), _flat(told[1], 1, batch)
+    for part in _blocks(len(mean)):
+        if told is None:
+            matrix, vector = information_of_moments(G[..., part], B[..., part], tags)
+        else:
+            matrix, vector = matrices[part], vectors[part]
+        new_P[part] = posterior = posterior_covariance(P[part], matrix)
+        new_mean[part] = correct(mean[part], posterior, matrix, vector)
+    return means, covariances
+
+
+def posterior_covariance(P: FloatArray, matrix: FloatArray) -> FloatArray:
+    """``(I + P G)^-1 P`` (B, 12, 12), by two Cholesky factors where P has one."""
     try:
         lower = np.linalg.cholesky(P)
     except np.linalg.LinAlgError:
-        return plain_update(mean, P, epoch.statistic())
+        return symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
     transposed = lower.swapaxes(-1, -2)
-    damped = transposed @ matrix @ lower + np.eye(12)
-    root = lower_inverse(np.linalg.cholesky(damped)) @ transposed
-    P = root.swapaxes(-1, -2) @ root
-    return correct(mean, P, matrix, vector), P
+    damped = transposed @ matrix @ lower
+    np.einsum("bii->bi", damped)[...] += 1.0
+    root = lower_solve(np.linalg.cholesky(damped), transposed)
+    # Two copies: of a matrix and its own transpose, matmul makes a slower product.
+    return np.ascontiguousarray(root.T) @ np.ascontiguousarray(root.transpose(2, 0, 1))
 
 
-def lower_inverse(lower: FloatArray) -> FloatArray:
-    """Inverses of lower triangular matrices (..., n, n), n = 3, 6, 12, by halves."""
-    result = np.zeros(lower.shape)
-    n = lower.shape[-1]
-    if n == 3:
-        r = [1 / lower[..., i, i] for i in range(3)]
-        l10, l20, l21 = (lower[..., i, j] for i, j in ((1, 0), (2, 0), (2, 1)))
-        for i in range(3):
-            result[..., i, i] = r[i]
-        result[..., 1, 0] = -l10 * r[0] * r[1]
-        result[..., 2, 1] = -l21 * r[1] * r[2]
-        result[..., 2, 0] = (l10 * l21 * r[1] - l20) * r[0] * r[2]
-        return result
-    half = n // 2
-    result[..., :half, :half] = first = lower_inverse(lower[..., :half, :half])
-    result[..., half:, half:] = second = lower_inverse(lower[..., half:, half:])
-    result[..., half:, :half] = -second @ lower[..., half:, :half] @ first
-    return result
+def lower_solve(lower: FloatArray, right: FloatArray) -> FloatArray:
+    """``L^-1 R`` (n, k, B), trials last, of lower triangular L (B, n, n) and R (B, n, k)."""
+    L = np.ascontiguousarray(lower.transpose(1, 2, 0))
+    X = np.ascontiguousarray(right.transpose(1, 2, 0))
+    for i in range(len(X)):
+        if i > 0:
+            X[i] -= np.einsum("jb,jkb->kb", L[i, :i], X[:i])
+        X[i] /= L[i, i]
+    return X
 
 
 def epoch_moments(
     epoch: Epoch, tags: FloatArray, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """`moments` of a batch, flat: G (B or 1, 3, 3) and B (B, 3, 4) for extended tags (N, 4)."""
-    ranges = _as_batch(epoch.ranges, 2, batch)
+    """`moments` of a batch, trials last: G (3, 3, B) and B (3, 4, B) for extended tags (N, 4)."""
+    epoch.check()
     anchors, weights = (
-        array if array.ndim == 2 else _as_batch(array, 2, batch)
+        array[None] if array.ndim == 2 else _flat(array, 2, batch)
         for array in (epoch.anchors, epoch.weights)
     )
-    ranges, anchors, weights = (
-        array.reshape(-1, *array.shape[-2:]) for array in (ranges, anchors, weights)
-    )
-    return moments(ranges, anchors, tags, weights)
+    return moments(_flat(epoch.ranges, 2, batch), anchors, tags, weights)
 
 
 def four_filters_update(
@@ -209,11 +253,7 @@ def four_filters_update(
     blocks = split(frame, _as_batch(P, 2, batch) if common is None else common)
     if blocks is None:
         return None
-    # Contiguous copies, so that every step of the filters runs along memory.
-    G, B = (
-        np.ascontiguousarray(np.moveaxis(array, 0, -1))
-        for array in epoch_moments(epoch, frame.tags, batch)
-    )
+    G, B = epoch_moments(epoch, frame.tags, batch)
     posterior = filter_update(frame, split_mean(frame, _as_batch(mean, 1, batch)), blocks, G, B)
     if posterior is None:
         return None
@@ -222,6 +262,26 @@ def four_filters_update(
 
 def _as_batch(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:
     return np.broadcast_to(array, (*batch, *array.shape[array.ndim - core :]))
+
+
+def _flat(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:
+    """The array (B, ...) of a batch of any number of axes."""
+    return _as_batch(array, core, batch).reshape(-1, *array.shape[array.ndim - core :])
+
+
+def _trials_last(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:
+    """The array (..., B) of a batch, B = 1 where it has no leading axes."""
+    if array.ndim == core:
+        return array[..., None]
+    view = _as_batch(array, core, batch)
+    axes = tuple(range(len(batch)))
+    view = np.moveaxis(view, axes, tuple(a + core for a in axes))
+    return view.reshape(*view.shape[:core], -1)
+
+
+def _blocks(n_trials: int) -> Iterator[slice]:
+    for begin in range(0, n_trials, _BLOCK):
+        yield slice(begin, begin + _BLOCK)
 
 
 def transition(step: FloatArray) -> FloatArray:

@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_links
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_finite,
+    check_links,
+    check_shape,
+)
+
+# Ranges that stay in the cache from one look at them to the next.
+_PART = 1 << 15
 
 
 def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
@@ -24,9 +34,16 @@ def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArra
 
 
 def check_epoch(
-    ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None, tags: FloatArray
+    ranges: ArrayLike,
+    anchors: ArrayLike,
+    links: ArrayLike | None,
+    tags: FloatArray,
+    *,
+    values: bool = True,
 ) -> tuple[FloatArray, FloatArray, BoolArray | None]:
     """One epoch as (ranges, anchors, links): links None where all measured, else 0 behind False.
+
+    Without `values` the ranges of an epoch of all links still have to pass `check_ranges`.
 
     Raises
     ------
@@ -40,12 +57,29 @@ def check_epoch(
         ranges = np.where(mask, np.asarray(ranges, dtype=np.float64), 0.0)
         if mask.all():
             mask = None
-    ranges = check_array("ranges", ranges, shape)
-    wrong = ranges <= 0 if mask is None else (ranges <= 0) & mask
+    ranges = check_shape("ranges", ranges, shape)
+    if values or mask is not None:
+        check_ranges(ranges, mask)
+    return ranges, anchors, mask
+
+
+def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
+    """A ValueError on NaN, inf, or a range that is not positive behind a True link."""
+    if links is None and are_positive(ranges):
+        return
+    check_finite("ranges", ranges)
+    wrong = ranges <= 0 if links is None else (ranges <= 0) & links
     if wrong.any():
         index = tuple(int(i) for i in np.argwhere(wrong)[0])
         raise ValueError(f"ranges must be positive where measured, got {ranges[index]} at {index}")
-    return ranges, anchors, mask
+
+
+def are_positive(values: FloatArray) -> bool:
+    """Whether all are positive and finite, without a mask of them: NaN fails both comparisons."""
+    if values.size <= _PART or not values.flags.c_contiguous:
+        return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < np.inf)
+    flat = values.reshape(-1)
+    return all(are_positive(flat[k : k + _PART]) for k in range(0, flat.size, _PART))
 
 
 def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:

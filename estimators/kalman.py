@@ -145,13 +145,10 @@ class KalmanFamily:
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         step = rotations.exp(twist[..., :3] * dt)
-        std = self.process.std()
-        sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
-        noise = dt * np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
         mean, covariance = ENGINES[self.engine].predict(
             state.mean,
             state.covariance,
-            Prediction(step, twist[..., 3:] * dt, noise),
+            Prediction(step, twist[..., 3:] * dt, dt * self._variance_rate),
             self._frame,
         )
         return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
@@ -172,7 +169,8 @@ class KalmanFamily:
             cannot determine the 12 states and the state is too vague to stand in (the
             message names the rank).
         """
-        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
+        fixed = self.weights is not None
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=not fixed)
         self._check_determined(state, anchors)
         if self.weights is None:
             weights = 1 / check_variance(self.noise.squared_range_variance(ranges, mask), mask)
@@ -184,7 +182,9 @@ class KalmanFamily:
                 len(self.tags),
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
-        epoch = Epoch(ranges, anchors, self.tags, weights, mask)
+        epoch = Epoch(
+            ranges, anchors, self.tags, weights, mask, checked=not fixed or mask is not None
+        )
         mean, covariance = ENGINES[self.engine].update(
             state.mean, state.covariance, epoch, self._frame
         )
@@ -215,14 +215,22 @@ class KalmanFamily:
     def _frame(self) -> Frame | None:
         return principal_frame(np.asarray(self.tags, dtype=np.float64))
 
+    @cached_property
+    def _variance_rate(self) -> FloatArray:
+        """Process noise (12,) of the state after 1 s."""
+        std = self.process.std()
+        sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
+        return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
+
     def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
         common = shared(state.covariance)
         covariance = state.covariance if common is None else common
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-        vague_rotation = variance[..., :9].max(axis=-1) > _VAGUE_ENTRY_VARIANCE
-        largest = variance[..., 9:].max(axis=-1)
-        # Two anchors bound the extent from below, and mostly settle it.
-        apart = np.abs(anchors[..., 0, :] - anchors[..., -1, :]).max(axis=-1)
+        rotation = np.maximum(np.maximum(variance[..., :3], variance[..., 3:6]), variance[..., 6:9])
+        vague_rotation = _largest_of_three(rotation) > _VAGUE_ENTRY_VARIANCE
+        largest = _largest_of_three(variance[..., 9:])
+        # The first and last anchor bound the extent from below, and mostly settle it.
+        apart = _largest_of_three(np.abs(anchors[..., 0, :] - anchors[..., -1, :]))
         if not (vague_rotation | (largest > apart**2)).any():
             return
         vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
@@ -236,6 +244,11 @@ class KalmanFamily:
                 f"too vague to stand in; got {anchors.shape[-2]} anchors, {len(self.tags)} tags. "
                 "Use 'iekf', or a tighter prior covariance"
             )
+
+
+def _largest_of_three(values: FloatArray) -> FloatArray:
+    """Maximum (...) over a last axis of 3, which a reduction would walk through slowly."""
+    return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
 
 
 # --- constraints: what happens to the rotation after the linear update --------------------
@@ -281,7 +294,7 @@ def _newton(
     if frame is not None and blocks is not None:
         # Nothing across the four filters: (23) and (26)-(27) are the same problem.
         x = split_mean(frame, posterior.mean)
-        x[:, :3] = column_fit(x[:, :3], blocks[:, :3])
+        x[:, :3] = column_fit(x[:, :3], blocks[:, :, :3])
         mean = join_mean(frame, x, posterior.mean.shape[:-1])
         return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
     stat = epoch.statistic()

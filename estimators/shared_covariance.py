@@ -42,7 +42,7 @@ def update(
     mean, P
         (..., 12) and (12, 12).
     ranges
-        (..., M, N), metres.
+        (..., M, N), metres; checked in passing.
     anchors, tags, weights
         (M, 3), (N, 3), (M, 1) or (M, N): the same for all trials.
     """
@@ -54,7 +54,7 @@ def update(
     spread = weights[..., None] * (anchors[:, None] - centre)
     slope = -2 * (extended(tags)[:, :, None] * spread[:, :, None]).reshape(-1, 12)
     batch = np.broadcast_shapes(mean.shape[:-1], ranges.shape[:-2])
-    moved = squares_times(ranges.reshape(-1, len(slope)), slope @ P)
+    moved = squares_times(ranges.reshape(-1, len(slope)), slope @ P, unchecked=ranges)
     moved = moved.reshape(*ranges.shape[:-2], 12)
     kept = mean @ (np.eye(12) - matrix @ P) + constant @ P
     return np.broadcast_to(kept, (*batch, 12)) + moved, P

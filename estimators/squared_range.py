@@ -18,10 +18,17 @@ import numpy as np
 
 from rbl_gym.bounds import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.inputs import matrix_rank, spanned_dimensions
+from rbl_gym.estimators.inputs import (
+    are_positive,
+    check_ranges,
+    matrix_rank,
+    spanned_dimensions,
+)
 
 # Ranges that are squared at a time: a quarter of a megabyte stays in the cache.
 _CHUNK = 1 << 15
+# Anchors x trials that `moments` takes at a time, eight numbers each.
+_COLUMNS = 1 << 13
 
 
 class Statistic(NamedTuple):
@@ -86,7 +93,7 @@ def statistic(
 def moments(
     ranges: FloatArray, anchors: FloatArray, tags: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """G and ``B = sum_n b_n c_n^T`` of common weights, without the b of each tag.
+    """G and ``B = sum_n b_n c_n^T`` of common weights, without the b of each tag; trials last.
 
     Parameters
     ----------
@@ -97,31 +104,49 @@ def moments(
 
     Returns
     -------
-    G (B or 1, 3, 3) and B (B, 3, 4).
+    G (3, 3, B) and B (3, 4, B).
     """
     n_trials, n_anchors, n_tags = ranges.shape
-    # Anchors along memory: A (3 x M) of the papers, less its weighted mean.
-    A = np.ascontiguousarray(anchors.swapaxes(-1, -2))
-    w = weights.swapaxes(-1, -2)
-    total = w.sum(axis=-1, keepdims=True)
-    share = w / np.where(total > 0, total, 1.0)
-    spread = A - A @ share.swapaxes(-1, -2)
-    weighted = w * spread
-    sums = squares_times(ranges.reshape(-1, n_tags), tags).reshape(n_trials, n_anchors, 4)
-    squared = (A * A).sum(axis=-2)
-    for k, of_tags in enumerate(tags.sum(axis=0)):
-        if of_tags != 0:
-            sums[..., k] -= of_tags * squared
-    return 4 * weighted @ spread.swapaxes(-1, -2), -2 * weighted @ sums
+    size = max(1, min(n_trials, _COLUMNS // n_anchors))
+    G, B = np.empty((3, 3, n_trials)), np.empty((3, 4, n_trials))
+    columns = np.empty((8, n_anchors, size))
+    of_tags = tags.sum(axis=0)
+    for begin in range(0, n_trials, size):
+        part = slice(begin, begin + size)
+        here = ranges[part]
+        w = np.ascontiguousarray((weights[part] if len(weights) > 1 else weights)[..., 0].T)
+        sums, spread, squared = np.split(columns[..., : len(here)], (4, 7))
+        product = squares_times(here.reshape(-1, n_tags), tags)
+        sums[:] = product.reshape(-1, n_anchors, 4).T
+        spread[:] = (anchors[part] if len(anchors) > 1 else anchors).T
+        total = w.sum(axis=0)
+        mean = np.einsum("imb,mb->ib", spread, w / np.where(total > 0, total, 1.0))
+        spread -= mean[:, None]
+        np.einsum("imb,imb->mb", spread, spread, out=squared[0])
+        # With the anchors about their mean a, |a_m|^2 - |a|^2 is |spread|^2 + 2 a^T spread.
+        moment = np.einsum("imb,jmb->ijb", w * spread, columns[..., : len(here)])
+        gram = moment[:, 4:7]
+        about = moment[:, 7] + 2 * np.einsum("ijb,jb->ib", gram, mean)
+        np.multiply(4, gram, out=G[..., part])
+        np.multiply(-2, moment[:, :4] - of_tags[:, None] * about[:, None], out=B[..., part])
+    return G, B
 
 
-def squares_times(ranges: FloatArray, matrix: FloatArray) -> FloatArray:
-    """``(r * r) @ matrix`` for ranges (K, n) and a matrix (n, p), a few rows at a time."""
+def squares_times(
+    ranges: FloatArray, matrix: FloatArray, unchecked: FloatArray | None = None
+) -> FloatArray:
+    """``(r * r) @ matrix`` for ranges (K, n) and a matrix (n, p), a few rows at a time.
+
+    `unchecked` is the array that the ranges are rows of, if it has yet to pass `check_ranges`:
+    each part is looked at while it is in the cache.
+    """
     product = np.empty((len(ranges), matrix.shape[1]))
     size = max(1, _CHUNK // ranges.shape[1])
     squares = np.empty((min(size, len(ranges)), ranges.shape[1]))
     for begin in range(0, len(ranges), size):
         part = ranges[begin : begin + size]
+        if unchecked is not None and not are_positive(part):
+            check_ranges(unchecked)
         here = np.multiply(part, part, out=squares[: len(part)])
         np.matmul(here, matrix, out=product[begin : begin + size])
     return product
@@ -153,12 +178,12 @@ def information(stat: Statistic) -> tuple[FloatArray, FloatArray]:
 def information_of_moments(
     G: FloatArray, B: FloatArray, tags: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """`information` from the `moments` of extended tags (N, 4)."""
+    """`information`, trials first, from the `moments` of extended tags (N, 4)."""
     gram = tags.T @ tags
     # One product with a matrix of the tags, which is a fraction of the time of an einsum.
     kron = np.einsum("kl,ia,jb->abkilj", gram, np.eye(3), np.eye(3)).reshape(9, 144)
-    matrix = (G.reshape(-1, 9) @ kron).reshape(-1, 12, 12)
-    return matrix, B.swapaxes(-1, -2).reshape(-1, 12)
+    matrix = (G.reshape(9, -1).T @ kron).reshape(-1, 12, 12)
+    return matrix, B.T.reshape(-1, 12)
 
 
 def compressed(stat: Statistic) -> tuple[FloatArray, FloatArray]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rbl_gym import rotations
@@ -72,13 +74,14 @@ def column_fit(target: FloatArray, blocks: FloatArray) -> FloatArray:
     target
         (3, 3, B), row, column, trial.
     blocks
-        (6, 3, B), upper triangles of the three covariances (`four_filters`).
+        (3, 3, 3, B), the three covariances as the third axis (`four_filters`).
 
     Returns
     -------
     Rotation (3, 3, B).
     """
-    W = _inverse(blocks)
+    (p00, p01, p02), (_, p11, p12), (_, _, p22) = blocks
+    W = _inverse((p00, p01, p02, p11, p12, p22))
     start = np.moveaxis(rotations.nearest(np.moveaxis(target, -1, 0)), 0, -1)
     q = np.ascontiguousarray(start)
     e, y = _residual(W, q, target)
@@ -102,9 +105,9 @@ def column_fit(target: FloatArray, blocks: FloatArray) -> FloatArray:
     return q
 
 
-def _inverse(blocks: FloatArray) -> FloatArray:
-    """Inverses (6, ...) of symmetric 3 x 3 matrices by their cofactors."""
-    p00, p01, p02, p11, p12, p22 = blocks
+def _inverse(upper: Sequence[FloatArray]) -> FloatArray:
+    """Inverses (6, ...) of symmetric 3 x 3 matrices, by rows of their upper triangles."""
+    p00, p01, p02, p11, p12, p22 = upper
     c00, c01, c02 = p11 * p22 - p12 * p12, p02 * p12 - p01 * p22, p01 * p12 - p02 * p11
     cofactors = [c00, c01, c02, p00 * p22 - p02 * p02, p01 * p02 - p00 * p12, p00 * p11 - p01 * p01]
     return np.stack(cofactors) / (p00 * c00 + p01 * c01 + p02 * c02)

@@ -35,6 +35,11 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
     ValueError
         If `value` is not numeric, has other trailing axes, or holds NaN or inf.
     """
+    return check_finite(name, check_shape(name, value, shape))
+
+
+def check_shape(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> FloatArray:
+    """`check_array` without the look at the values."""
     array = as_float(name, value)
     sizes = array.shape[array.ndim - len(shape) :]
     if array.ndim < len(shape) or any(
@@ -43,7 +48,7 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
     ):
         wanted = ", ".join(["...", *map(str, shape)])
         raise ValueError(f"{name} must have shape ({wanted}), got {array.shape}")
-    return check_finite(name, array)
+    return array
 
 
 def as_float(name: str, value: Any) -> FloatArray:

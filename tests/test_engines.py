@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from rbl_gym import bodies, estimators, motion, ranging, rotations
-from rbl_gym.estimators import engines, four_filters, kalman, unitary
+from rbl_gym.estimators import engines, kalman, unitary
 from rbl_gym.estimators.four_filters import inverse, join, principal_frame, split
 from rbl_gym.estimators.least_squares import procrustes, vec
 from rbl_gym.estimators.shared_covariance import shared
+from rbl_gym.estimators.squared_range import extended, moments, paper_matrices, statistic
 from tests.helpers import simulate
 
 FAMILY = ["kf", "uc-kf", "et-kf", "kf-ortho"]
@@ -218,7 +219,7 @@ def test_split_and_join_are_inverses_and_the_covariance_is_the_users(tags):
     assert np.linalg.det(frame.axes) == pytest.approx(1)
     root = rng.standard_normal((4, 9, 3, 3))
     dense = root @ root.swapaxes(-1, -2)
-    blocks = np.array([dense[..., i, j] for i, j in four_filters.COMPONENTS])
+    blocks = np.ascontiguousarray(dense.transpose(2, 3, 0, 1))
     covariance = join(frame, blocks, (9,))
     again = split(frame, covariance)
     assert again is not None
@@ -245,13 +246,11 @@ def test_a_block_that_is_not_positive_is_left_to_the_general_path():
     rng = np.random.default_rng(4)
     root = rng.standard_normal((8, 3, 3))
     dense = root @ root.swapaxes(-1, -2)
-    pack = [dense[:, i, j] for i, j in four_filters.COMPONENTS]
-    inverses = inverse(np.array(pack))
+    inverses = inverse(np.moveaxis(dense, 0, -1))
     assert inverses is not None
-    np.testing.assert_allclose(inverses[1], np.linalg.inv(dense)[:, 0, 1], rtol=1e-9)
-    for shift in ([0, 1, 1], [1, 0, 1], [1, 1, 0]):
-        assert inverse(np.array([1.0, 0, 0, 1, 0, 1])[:, None] * np.array(
-            [shift[0], 1, 1, shift[1], 1, shift[2]])[:, None]) is None  # fmt: skip
+    np.testing.assert_allclose(np.moveaxis(inverses, -1, 0), np.linalg.inv(dense), rtol=1e-9)
+    for diagonal in ([0, 1, 1], [1, 0, 1], [1, 1, 0], [1, np.nan, 1]):
+        assert inverse(np.diag(diagonal).astype(float)[..., None]) is None
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.5, 2.0])
@@ -261,8 +260,8 @@ def test_the_column_fit_is_procrustes(noise):
     root = rng.standard_normal((40, 3, 3, 3))
     blocks = root @ root.swapaxes(-1, -2) + 0.01 * np.eye(3)
     target = rotations.random(rng, (40,)) + noise * rng.standard_normal((40, 3, 3))
-    packed = np.array([blocks[:, :, i, j].T for i, j in four_filters.COMPONENTS])
-    got = np.moveaxis(unitary.column_fit(np.moveaxis(target, 0, -1), packed), -1, 0)
+    got = unitary.column_fit(np.moveaxis(target, 0, -1), blocks.transpose(2, 3, 1, 0))
+    got = np.moveaxis(got, -1, 0)
     weight = np.zeros((40, 3, 3, 3, 3))
     for k in range(3):
         weight[:, k, :, k] = np.linalg.inv(blocks[:, k])
@@ -277,3 +276,44 @@ def test_the_last_chunk_of_a_large_batch_counts_too(monkeypatch):
     monkeypatch.setattr("rbl_gym.estimators.squared_range._CHUNK", 7 * 6 * 4)
     assert_equal(track("kf", TAGS["turned"], (25,), steps=2), whole)
     assert_equal(track("kf", TAGS["turned"], (25,), steps=2, fixed=True, common_twist=True), common)
+
+
+@pytest.mark.parametrize("weights", [None, np.linspace(1, 2, 7)], ids=["measured", "fixed"])
+@pytest.mark.parametrize("centred", [True, False])
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.nan, r"ranges must be finite, got nan at index \(9, 3, 2\)"),
+        (np.inf, r"ranges must be finite, got inf at index \(9, 3, 2\)"),
+        (-1.0, r"ranges must be positive where measured, got -1.0 at \(9, 3, 2\)"),
+        (0.0, r"ranges must be positive where measured, got 0.0 at \(9, 3, 2\)"),
+    ],
+)
+def test_no_path_lets_a_bad_range_through(weights, centred, value, message, monkeypatch):
+    monkeypatch.setattr("rbl_gym.estimators.squared_range._CHUNK", 7 * 6 * 4)
+    monkeypatch.setattr("rbl_gym.estimators.inputs._PART", 100)
+    rng = np.random.default_rng(6)
+    tags = TAGS["turned" if centred else "uncentred"]
+    filter = estimators.make("kf", tags=tags, noise=NOISE, process=PROCESS, weights=weights)
+    anchors = shell(rng, (7,))
+    own_anchors = np.repeat(anchors[None], 12, axis=0)
+    ranges = rng.uniform(12, 18, (12, 7, len(tags)))
+    ranges[9, 3, 2] = value
+    state = filter.initial(np.eye(3), np.zeros((12, 3)), PRIOR)
+    for places in (anchors, own_anchors):
+        for measured in (ranges, np.asfortranarray(ranges)):
+            with pytest.raises(ValueError, match=message):
+                filter.update(state, measured, places)
+    single = kalman.KalmanState(*(array[0] for array in state))
+    with pytest.raises(ValueError, match="ranges must be"):
+        filter.update(single, ranges[9], anchors)
+
+
+def test_moments_in_parts_are_those_of_the_statistic(monkeypatch):
+    rng = np.random.default_rng(7)
+    anchors, tags = shell(rng, (11, 7)) + 1e4, TAGS["uncentred"]
+    ranges, weights = rng.uniform(12, 18, (11, 7, len(tags))), rng.uniform(1e-6, 1, (11, 7, 1))
+    want = paper_matrices(statistic(ranges, anchors, tags, weights))
+    monkeypatch.setattr("rbl_gym.estimators.squared_range._COLUMNS", 7 * 4)
+    for got, expected in zip(moments(ranges, anchors, extended(tags), weights), want, strict=True):
+        np.testing.assert_allclose(np.moveaxis(got, -1, 0), expected, rtol=1e-7)
