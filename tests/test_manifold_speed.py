@@ -8,7 +8,7 @@ import pytest
 from rbl_gym import bodies, bounds, estimators, motion, ranging, rotations
 from rbl_gym.estimators import components, manifold
 from rbl_gym.estimators.manifold import PoseState
-from rbl_gym.estimators.range_cost import RangeCost, huber, tag_maps
+from rbl_gym.estimators.range_cost import RangeCost, huber, lift_map
 from tests.helpers import random_world, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
@@ -151,7 +151,7 @@ def test_vague_priors_in_a_later_block_start_globally_and_alone():
 def test_shared_tags_give_the_sums_of_tags_of_their_own(loss):
     _, tags, anchors, ranges, (rotation, translation, _) = world(20)
     weights = 1 / NOISE.variance(ranges)
-    common = RangeCost(ranges, weights, anchors, tags, loss, maps=tag_maps(tags))
+    common = RangeCost(ranges, weights, anchors, tags, loss, lift=lift_map(tags))
     own = RangeCost(ranges, weights, anchors, np.tile(tags, (20, 1, 1)), loss)
     for a, b in zip(common(rotation, translation), own(rotation, translation), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())
