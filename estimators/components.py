@@ -11,10 +11,6 @@ import numpy as np
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray
 
-_IDENTITY = np.eye(3)
-# [w]x as a tensor: hat(w)[i, j] = _HAT[i, j, k] w[k].
-_HAT = np.moveaxis(rotations.hat(np.eye(3)), 0, -1)
-
 
 def first(array: FloatArray, trailing: int, batch: int = 0) -> FloatArray:
     """View (n, ..., batch) of (batch, n, ...): the `trailing` axes first, the batch axes last.
@@ -125,19 +121,20 @@ def inverse(A: FloatArray) -> FloatArray:
         inverted = np.linalg.inv(A)
         return 0.5 * (inverted + inverted.T)
     X = np.empty_like(A)
-    for k in range(len(A)):
-        row = A[k, :k]
-        u = _combined(row, X[:k, :k])
-        pivot = A[k, k] - np.einsum("i...,i...->...", row, u)
-        smallest = np.min(pivot, initial=np.inf)
-        if not smallest > 0:
-            raise np.linalg.LinAlgError(
-                f"matrix must be positive definite, got a pivot {smallest:g}"
-            )
-        v = u / pivot
-        X[:k, :k] += u[:, None] * v
-        X[k, :k] = X[:k, k] = np.negative(v, out=v)
-        np.divide(1, pivot, out=X[k, k])
+    pivots = [A[0, 0]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        np.divide(1, A[0, 0], out=X[0, 0])
+        for k in range(1, len(A)):
+            row = A[k, :k]
+            left = _combined(row, X[:k, :k])
+            pivots.append(A[k, k] - np.einsum("i...,i...->...", row, left))
+            scaled = left / pivots[k]
+            X[:k, :k] += left[:, None] * scaled
+            X[k, :k] = X[:k, k] = np.negative(scaled, out=scaled)
+            np.divide(1, pivots[k], out=X[k, k])
+    smallest = np.min(pivots, initial=np.inf)
+    if not smallest > 0:
+        raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
     return X
 
 

@@ -7,6 +7,7 @@ cost alone, the iterated EKF adds a prior, robust estimation changes the loss.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -112,7 +113,7 @@ class RangeCost:
             rotation.ndim - 2, translation.ndim - 1, self.ranges.ndim - 2,
             self.weights.ndim - 2, self.anchors.ndim - 2, self.tags.ndim - 2,
         )  # fmt: skip
-        ranges, weights = first(self.ranges, 2, ndim), first(self.weights, 2, ndim)
+        ranges, root = first(self.ranges, 2, ndim), first(self._root, 2, ndim)
         tags = first(self.tags, 2, ndim).swapaxes(0, 1)
         Q = first(rotation, 2, ndim)
         away = first(self.anchors, 2, ndim) - first(translation, 1, ndim)
@@ -120,22 +121,22 @@ class RangeCost:
         difference = tags[:, None] - anchors[:, :, None]
         square = np.einsum("imn...,imn...->mn...", difference, difference)
         # Where an anchor stands on a tag the difference is zero, and so is the direction.
-        np.maximum(square, 1e-200, out=square)
-        distance = np.sqrt(square)
+        distance = np.sqrt(np.maximum(square, 1e-200, out=square), out=square)
         residual = distance - ranges
-        pull = weights * residual
+        if self.loss is not None:
+            costs, factor = self.loss(last(np.square(root * residual), 2))
+            root = root * np.sqrt(first(factor, 2))
+        # Every link's row of the whitened problem: direction and residual.
+        rows = np.empty((4, *np.broadcast_shapes(residual.shape, root.shape)))
+        np.multiply(difference, root / distance, out=rows[:3])
+        np.multiply(residual, root, out=rows[3])
         if self.loss is None:
-            cost = 0.5 * np.einsum("mn...,mn...->...", pull, residual)
+            cost = 0.5 * np.einsum("mn...,mn...->...", rows[3], rows[3])
         else:
-            costs, factor = self.loss(last(pull * residual, 2))
-            cost, factor = costs.sum(axis=(-2, -1)), first(factor, 2)
-            weights, pull = weights * factor, pull * factor
-        scaled = np.empty((4, *pull.shape))
-        np.multiply(weights / square, difference, out=scaled[:3])
-        np.divide(pull, distance, out=scaled[3])
-        sums = np.empty((len(_SUMS), *pull.shape[1:]))
-        for j, rows in enumerate((sums[:4], sums[4:7], sums[7:])):
-            np.einsum("imn...,mn...->in...", scaled[j:], difference[j], out=rows)
+            cost = costs.sum(axis=(-2, -1))
+        sums = np.empty((len(_SUMS), *rows.shape[2:]))
+        for j, out in enumerate((sums[:4], sums[4:7], sums[7:])):
+            np.einsum("imn...,mn...->in...", rows[j:], rows[j], out=out)
         # Blocks of the rotation and of the translation turn alike: blkdiag(Q, Q).
         half = np.einsum("ij...,ajk...->aik...", Q, self._lift(sums))
         hessian = half[:, :, :6].reshape((2, 3, 2, 3, *cost.shape))
@@ -149,6 +150,10 @@ class RangeCost:
             return at
         _, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
         return self._with_tag_noise(at, J, last(residual, 2), self.tag_unit)
+
+    @functools.cached_property
+    def _root(self) -> FloatArray:
+        return np.sqrt(self.weights)
 
     def _lift(self, sums: FloatArray) -> FloatArray:
         """``sum_n T_n S_n T_n^T`` beside ``sum_n T_n f_n``, (2, 3, 7, ...), of the tags' sums."""
