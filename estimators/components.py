@@ -35,6 +35,8 @@ def last(array: FloatArray, leading: int) -> FloatArray:
 
 def trials_last(array: FloatArray, trailing: int) -> FloatArray:
     """The array (batch, n, ...) with its memory laid out as (n, ..., batch)."""
+    if array.ndim == trailing:
+        return array
     return last(np.ascontiguousarray(first(array, trailing)), trailing)
 
 
