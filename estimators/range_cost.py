@@ -123,17 +123,17 @@ class RangeCost:
         # Where an anchor stands on a tag the difference is zero, and so is the direction.
         distance = np.sqrt(np.maximum(square, 1e-200, out=square), out=square)
         residual = distance - ranges
-        if self.loss is not None:
-            costs, factor = self.loss(last(np.square(root * residual), 2))
-            root = root * np.sqrt(first(factor, 2))
-        # Every link's row of the whitened problem: direction and residual.
-        rows = np.empty((4, *np.broadcast_shapes(residual.shape, root.shape)))
-        np.multiply(difference, root / distance, out=rows[:3])
-        np.multiply(residual, root, out=rows[3])
+        whitened = root * residual
         if self.loss is None:
-            cost = 0.5 * np.einsum("mn...,mn...->...", rows[3], rows[3])
+            cost = 0.5 * np.einsum("mn...,mn...->...", whitened, whitened)
         else:
-            cost = costs.sum(axis=(-2, -1))
+            costs, factor = self.loss(last(np.square(whitened), 2))
+            cost, share = costs.sum(axis=(-2, -1)), np.sqrt(first(factor, 2))
+            root, whitened = root * share, whitened * share
+        # Every link's row of the whitened problem: direction and residual.
+        rows = np.empty((4, *whitened.shape))
+        np.multiply(difference, root / distance, out=rows[:3])
+        rows[3] = whitened
         sums = np.empty((len(_SUMS), *rows.shape[2:]))
         for j, out in enumerate((sums[:4], sums[4:7], sums[7:])):
             np.einsum("imn...,mn...->in...", rows[j:], rows[j], out=out)
