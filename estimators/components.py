@@ -11,10 +11,6 @@ import numpy as np
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray
 
-_IDENTITY = np.eye(3)
-# [w]x as a tensor: hat(w)[i, j] = _HAT[i, j, k] w[k].
-_HAT = np.moveaxis(rotations.hat(np.eye(3)), 0, -1)
-
 
 def first(array: FloatArray, trailing: int, batch: int = 0) -> FloatArray:
     """View (n, ..., batch) of (batch, n, ...): the `trailing` axes first, the batch axes last.
@@ -39,6 +35,8 @@ def last(array: FloatArray, leading: int) -> FloatArray:
 
 def trials_last(array: FloatArray, trailing: int) -> FloatArray:
     """The array (batch, n, ...) with its memory laid out as (n, ..., batch)."""
+    if array.ndim == trailing:
+        return array
     return last(np.ascontiguousarray(first(array, trailing)), trailing)
 
 
@@ -97,23 +95,24 @@ def solve(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:
     diagonal = _diagonal(A)
     if A.ndim == 2:
         return np.linalg.solve(A + np.diag((damping + 1e-14) * diagonal + 1e-300), b)
-    U = np.concatenate([A, b[:, None]], axis=1)
+    L, U = np.empty_like(A), np.empty((n, n + 1, *A.shape[2:]))
+    U[:, :n], U[:, n] = A, b
     if damping.any():
         U[range(n), range(n)] += damping * diagonal
     floor = 1e-14 * diagonal + 1e-300
-    pivots = []
     for k in range(n):
-        pivots.append(np.maximum(U[k, k], floor[k]))
-        U[k + 1 :, k + 1 :] -= (U[k + 1 :, k] / pivots[k])[:, None] * U[k, k + 1 :]
-    x = U[:, n]
-    for k in reversed(range(n)):
-        x[k] /= pivots[k]
-        x[:k] -= U[:k, k] * x[k]
+        if k:
+            U[k, k:] -= _combined(L[k, :k], U[:k, k:])
+        np.maximum(U[k, k], floor[k], out=U[k, k])
+        np.divide(U[k, k + 1 : n], U[k, k], out=L[k + 1 :, k])
+    x = U[:, n] / _diagonal(U[:, :n])
+    for k in reversed(range(n - 1)):
+        x[k] -= np.einsum("j...,j...->...", L[k + 1 :, k], x[k + 1 :])
     return x
 
 
 def inverse(A: FloatArray) -> FloatArray:
-    """Inverse (n, n, ...) of symmetric positive definite matrices by Gauss-Jordan sweeps.
+    """Inverse (n, n, ...) of symmetric positive definite matrices, bordered row by row.
 
     Raises
     ------
@@ -123,21 +122,27 @@ def inverse(A: FloatArray) -> FloatArray:
     if A.ndim == 2:
         inverted = np.linalg.inv(A)
         return 0.5 * (inverted + inverted.T)
-    A = A.copy()
-    pivots = []
+    X = np.empty_like(A)
+    pivots = [A[0, 0]]
     with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(len(A)):
-            column = A[k].copy()
-            pivots.append(column[k])
-            row = column / column[k]
-            A -= column[:, None] * row
-            # Swept matrices stay symmetric; a sweep leaves minus the inverse of what it swept.
-            A[k] = A[:, k] = row
-            np.divide(-1, column[k], out=A[k, k])
+        np.divide(1, A[0, 0], out=X[0, 0])
+        for k in range(1, len(A)):
+            row = A[k, :k]
+            left = _combined(row, X[:k, :k])
+            pivots.append(A[k, k] - np.einsum("i...,i...->...", row, left))
+            scaled = left / pivots[k]
+            X[:k, :k] += left[:, None] * scaled
+            X[k, :k] = X[:k, k] = np.negative(scaled, out=scaled)
+            np.divide(1, pivots[k], out=X[k, k])
     smallest = np.min(pivots, initial=np.inf)
     if not smallest > 0:
         raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
-    return np.negative(A, out=A)
+    return X
+
+
+def _combined(weights: FloatArray, rows: FloatArray) -> FloatArray:
+    """Sum (n, ...) of rows (k, n, ...) by their weights (k, ...)."""
+    return np.einsum("j...,ji...->i...", weights, rows)
 
 
 def _diagonal(A: FloatArray) -> FloatArray:

@@ -71,6 +71,8 @@ def minimize_pose(
         better = (new.cost <= at.cost * (1 + 1e-12)) | (decrease < 1e-8)
         if better.all():
             (rotation, translation), at = candidate, new
+            if damping.any():
+                damping = np.where(damping > 1e-5, 0.1 * damping, 0.0)
         else:
             rotation = np.where(better[..., None, None], candidate[0], rotation)
             translation = np.where(better[..., None], candidate[1], translation)
@@ -79,9 +81,8 @@ def minimize_pose(
                 np.where(better[..., None], new.gradient, at.gradient),
                 np.where(better[..., None, None], new.hessian, at.hessian),
             )
-        damping = np.where(
-            better, np.where(damping > 1e-5, 0.1 * damping, 0.0), np.maximum(10 * damping, 1e-3)
-        )
+            eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
+            damping = np.where(better, eased, np.maximum(10 * damping, 1e-3))
         if converged.all():
             break
     return Solution(rotation, translation, at, converged)

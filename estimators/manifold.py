@@ -34,7 +34,7 @@ from rbl_gym.estimators.inputs import (
     spanned_dimensions,
 )
 from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
-from rbl_gym.estimators.range_cost import RangeCost, TagMaps, huber, pick, tag_maps
+from rbl_gym.estimators.range_cost import Index, RangeCost, huber, lift_map, pick
 from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import statistic
 from rbl_gym.motion import ProcessNoise, propagate
@@ -91,8 +91,8 @@ class IteratedEkf:
             raise ValueError(f"robust must be True or False, got {self.robust!r}")
 
     @functools.cached_property
-    def _tag_maps(self) -> TagMaps:
-        return tag_maps(self.tags)
+    def _lift(self) -> FloatArray:
+        return lift_map(self.tags)
 
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
@@ -169,7 +169,7 @@ class IteratedEkf:
     ) -> PoseState:
         """The update of one block of trials, links as weights (..., M, N)."""
         loss = huber(HUBER) if self.robust else None
-        data = RangeCost(ranges, weights, anchors, self.tags, loss, maps=self._tag_maps)
+        data = RangeCost(ranges, weights, anchors, self.tags, loss, lift=self._lift)
         prior = PoseState(*(trials_last(a, n) for a, n in zip(state, _TRAILING[:3], strict=True)))
         information = last(inverse(first(prior.covariance, 2)), 2)
         problem = MapProblem(prior, information, data)
@@ -228,14 +228,17 @@ class MapProblem:
         hessian[3:, 3:] += information[3:, 3:]
         return data._replace(cost=cost)
 
-    def take(self, where: BoolArray) -> MapProblem:
-        """The trials of a mask (...) on one flat axis, with a further axis of 1 for starts."""
+    def take(self, batch: tuple[int, ...], where: Index) -> MapProblem:
+        """The trials (K,) at an index into the batch."""
         prior = PoseState(
-            pick(self.prior.rotation, where, 2),
-            pick(self.prior.translation, where, 1),
-            pick(self.prior.covariance, where, 2),
+            pick(self.prior.rotation, batch, where, 2),
+            pick(self.prior.translation, batch, where, 1),
+            pick(self.prior.covariance, batch, where, 2),
         )
-        return MapProblem(prior, pick(self.prior_information, where, 2), self.data.take(where))
+        prior = PoseState(*(trials_last(a, n) for a, n in zip(prior, _TRAILING[:3], strict=True)))
+        information = trials_last(pick(self.prior_information, batch, where, 2), 2)
+        data = self.data.each(lambda array, trailing: pick(array, batch, where, trailing))
+        return MapProblem(prior, information, data)
 
 
 def _is_vague(covariance: FloatArray) -> BoolArray:
@@ -268,39 +271,56 @@ def global_start(problem: MapProblem, vague: BoolArray) -> tuple[FloatArray, Flo
     """
     data = problem.data
     batch = np.broadcast_shapes(vague.shape, data.ranges.shape[:-2], data.anchors.shape[:-2])
-    vague = np.broadcast_to(vague, batch)
-    part = problem.take(vague)
+    # A trial alone has no axis to index: it gets one for the search.
+    axes = batch or (1,)
+    rotation = np.broadcast_to(problem.prior.rotation, (*axes, 3, 3)).copy()
+    translation = np.broadcast_to(problem.prior.translation, (*axes, 3)).copy()
+    trials = np.broadcast_to(vague, axes).nonzero()
+    size = 1 + _BLOCK // len(_NET)
+    for start in range(0, len(trials[0]), size):
+        where = tuple(axis[start : start + size] for axis in trials)
+        rotation[where], translation[where] = _best_of_net(problem, axes, where)
+    return rotation.reshape((*batch, 3, 3)), translation.reshape((*batch, 3))
+
+
+def _best_of_net(
+    problem: MapProblem, batch: tuple[int, ...], where: Index
+) -> tuple[FloatArray, FloatArray]:
+    """The best local solve (K, 3, 3), (K, 3) of the trials at an index into the batch."""
+    part = problem.take(batch, where)
     rotation = _spread(part.prior)
     translation = _translation_given(rotation, part)
-    solution = minimize_pose(part, rotation, translation, iterations=12, tolerance=1e-3)
-    best = np.argmin(solution.at.cost, axis=-1)
-    row = np.arange(len(best))
-    start_rotation = np.broadcast_to(problem.prior.rotation, (*batch, 3, 3)).copy()
-    start_translation = np.broadcast_to(problem.prior.translation, (*batch, 3)).copy()
-    start_rotation[vague] = solution.rotation[row, best]
-    start_translation[vague] = solution.translation[row, best]
-    return start_rotation, start_translation
+    # Every start is a trial of its own, so that calls run over all of them.
+    starts = problem.take(batch, tuple(np.repeat(axis, len(_NET)) for axis in where))
+    solution = minimize_pose(
+        starts, rotation.reshape(-1, 3, 3), translation.reshape(-1, 3), 12, tolerance=1e-3
+    )
+    cost = solution.at.cost.reshape(-1, len(_NET))
+    best = np.arange(len(cost)) * len(_NET) + np.argmin(cost, axis=1)
+    return solution.rotation[best], solution.translation[best]
 
 
 def _spread(prior: PoseState) -> FloatArray:
-    """Rotations (B, 24, 3, 3) around the prior, on each axis as far as it is uncertain."""
+    """Rotations (K, 24, 3, 3) around priors (K, ...), on each axis as far as it is uncertain."""
     values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
     reach = np.minimum(np.sqrt(values) / VAGUE_ROTATION_RAD, 1.0)
     shape = (vectors * reach[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return rotations.exp((shape @ _NET[..., None])[..., 0]) @ prior.rotation
+    return rotations.exp(_NET @ shape) @ prior.rotation[:, None]
 
 
 def _translation_given(rotation: FloatArray, problem: MapProblem) -> FloatArray:
-    """Translation of the linear squared-range model with its prior, the rotation given."""
+    """Translations (K, 24, 3) of the linear squared-range model with its prior, given rotations."""
     data = problem.data
     # To first order var(r^2) = 4 r^2 var(r).
     scale = 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
     stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale)
     information = np.linalg.inv(problem.prior.covariance[..., 3:, 3:])
     turned = data.tags @ np.swapaxes(rotation, -1, -2)
-    per_tag = stat.b - (stat.G @ turned[..., None])[..., 0]
-    right = (information @ problem.prior.translation[..., None])[..., 0] + per_tag.sum(axis=-2)
-    return np.linalg.solve(information + stat.G.sum(axis=-3), right[..., None])[..., 0]
+    per_tag = stat.b[:, None] - (stat.G[:, None] @ turned[..., None])[..., 0]
+    held = information @ problem.prior.translation[..., None]
+    right = held + np.swapaxes(per_tag.sum(axis=-2), -1, -2)
+    solved = np.linalg.solve(information + stat.G.sum(axis=-3), right)
+    return np.swapaxes(solved, -1, -2)
 
 
 def _check_determined(anchors: FloatArray, tags: FloatArray) -> None:

@@ -7,9 +7,9 @@ cost alone, the iterated EKF adds a prior, robust estimation changes the loss.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,8 @@ from rbl_gym.estimators.levenberg_marquardt import Linearization
 
 # A loss takes squared whitened residuals to (their cost, the weight of each in least squares).
 Loss = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+# Trials of a batch: a mask (...), or one array (K,) of positions for every axis of the batch.
+Index = BoolArray | tuple[np.ndarray, ...]
 
 
 def huber(threshold: float) -> Loss:
@@ -44,18 +46,27 @@ def geman_mcclure(scale: FloatArray | float) -> Loss:
     return loss
 
 
-class TagMaps(NamedTuple):
-    """Linear maps (6, 3 N) and (36, 9 N) from all tags' forces and information to the pose's."""
+# Rows (i, j) of the sums over anchors that a pose needs of every tag: the information
+# S[i, j] = S[j, i] about its place, and the force on it as S[3, j].
+_SUMS = [(i, j) for j in range(3) for i in range(j, 4)]
+_INFORMATION = [[_SUMS.index((max(i, j), min(i, j))) for j in range(3)] for i in range(3)]
+_FORCE = [_SUMS.index((3, j)) for j in range(3)]
 
-    gradient: FloatArray
-    hessian: FloatArray
 
+def lift_map(tags: FloatArray) -> FloatArray:
+    """The matrix (42, 9 N) from all tags' sums to the pose's Hessian beside its gradient (6, 7).
 
-def tag_maps(tags: FloatArray) -> TagMaps:
-    """The maps of tags (N, 3): constant in the body frame, so that one product lifts a batch."""
+    It is constant in the body frame, so that one product lifts a whole batch.
+    """
     T = np.swapaxes(bounds.tag_jacobian(np.eye(3), tags), -1, -2)
-    hessian = np.einsum("nai,nbj->abijn", T, T)
-    return TagMaps(np.einsum("nai->ain", T).reshape(6, -1), hessian.reshape(36, -1))
+    hessian = np.einsum("nai,nbj->ijabn", T, T)
+    lift = np.zeros((6, 7, len(_SUMS), len(tags)))
+    for row, (i, j) in enumerate(_SUMS):
+        if i == 3:
+            lift[:, 6, row] = T[..., j].T
+        else:
+            lift[:, :6, row] = hessian[i, j] if i == j else hessian[i, j] + hessian[j, i]
+    return lift.reshape(42, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +85,8 @@ class RangeCost:
         Variance [m^2] of every tag's place on the body, per axis, marginalised to first order
         about unit vectors (..., M, N, 3) from anchors to tags: it ties the ranges of a tag to
         each other. Least squares only.
-    maps
-        `tag_maps` of the tags where all trials share them: the same sums in less time.
+    lift
+        `lift_map` of the tags where all trials share them: the same sums in less time.
     """
 
     ranges: FloatArray
@@ -85,7 +96,7 @@ class RangeCost:
     loss: Loss | None = None
     tag_variance: float = 0.0
     tag_unit: FloatArray | None = None
-    maps: TagMaps | None = None
+    lift: FloatArray | None = None
 
     def __post_init__(self) -> None:
         for name in ("ranges", "weights", "anchors", "tags"):
@@ -102,34 +113,37 @@ class RangeCost:
             rotation.ndim - 2, translation.ndim - 1, self.ranges.ndim - 2,
             self.weights.ndim - 2, self.anchors.ndim - 2, self.tags.ndim - 2,
         )  # fmt: skip
-        ranges, weights = first(self.ranges, 2, ndim), first(self.weights, 2, ndim)
+        ranges, root = first(self.ranges, 2, ndim), first(self._root, 2, ndim)
         tags = first(self.tags, 2, ndim).swapaxes(0, 1)
         Q = first(rotation, 2, ndim)
         away = first(self.anchors, 2, ndim) - first(translation, 1, ndim)
         anchors = np.einsum("ji...,mj...->im...", Q, away)
         difference = tags[:, None] - anchors[:, :, None]
-        distance = np.sqrt(np.einsum("imn...,imn...->mn...", difference, difference))
+        square = np.einsum("imn...,imn...->mn...", difference, difference)
         # Where an anchor stands on a tag the difference is zero, and so is the direction.
-        unit = np.divide(difference, np.maximum(distance, 1e-300), out=difference)
+        distance = np.sqrt(np.maximum(square, 1e-200, out=square), out=square)
         residual = distance - ranges
-        pull = weights * residual
-        squared = pull * residual
+        whitened = root * residual
         if self.loss is None:
-            cost = 0.5 * squared.sum(axis=(0, 1))
+            cost = 0.5 * np.einsum("mn...,mn...->...", whitened, whitened)
         else:
-            costs, factor = self.loss(last(squared, 2))
-            cost, factor = costs.sum(axis=(-2, -1)), first(factor, 2)
-            weights, pull = weights * factor, pull * factor
-        S = np.einsum("imn...,jmn...->ijn...", weights * unit, unit)
-        force = np.einsum("mn...,imn...->in...", pull, unit)
-        gradient, hessian = self._lift(force, S)
+            costs, factor = self.loss(last(np.square(whitened), 2))
+            cost, share = costs.sum(axis=(-2, -1)), np.sqrt(first(factor, 2))
+            root, whitened = root * share, whitened * share
+        # Every link's row of the whitened problem: direction and residual.
+        rows = np.empty((4, *whitened.shape))
+        np.multiply(difference, root / distance, out=rows[:3])
+        rows[3] = whitened
+        sums = np.empty((len(_SUMS), *rows.shape[2:]))
+        for j, out in enumerate((sums[:4], sums[4:7], sums[7:])):
+            np.einsum("imn...,mn...->in...", rows[j:], rows[j], out=out)
         # Blocks of the rotation and of the translation turn alike: blkdiag(Q, Q).
-        half = np.einsum("ij...,ajbk...->aibk...", Q, hessian)
-        hessian = np.einsum("aibj...,kj...->aibk...", half, Q)
-        gradient = np.einsum("ij...,aj...->ai...", Q, gradient)
+        half = np.einsum("ij...,ajk...->aik...", Q, self._lift(sums))
+        hessian = half[:, :, :6].reshape((2, 3, 2, 3, *cost.shape))
+        hessian = np.einsum("aibj...,kj...->aibk...", hessian, Q)
         at = Linearization(
             cost,
-            last(gradient.reshape((6, *cost.shape)), 1),
+            last(half[:, :, 6].reshape((6, *cost.shape)), 1),
             last(hessian.reshape((6, 6, *cost.shape)), 2),
         )
         if self.tag_unit is None:
@@ -137,23 +151,27 @@ class RangeCost:
         _, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
         return self._with_tag_noise(at, J, last(residual, 2), self.tag_unit)
 
-    def _lift(self, force: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sums of ``T_n f_n`` (2, 3, ...) and ``T_n S_n T_n^T`` (2, 3, 2, 3, ...) over the tags."""
-        batch = S.shape[3:]
-        if self.maps is not None:
-            gradient = self.maps.gradient @ force.reshape((self.maps.gradient.shape[-1], -1))
-            hessian = self.maps.hessian @ S.reshape((self.maps.hessian.shape[-1], -1))
-            return gradient.reshape((2, 3, *batch)), hessian.reshape((2, 3, 2, 3, *batch))
+    @functools.cached_property
+    def _root(self) -> FloatArray:
+        return np.sqrt(self.weights)
+
+    def _lift(self, sums: FloatArray) -> FloatArray:
+        """``sum_n T_n S_n T_n^T`` beside ``sum_n T_n f_n``, (2, 3, 7, ...), of the tags' sums."""
+        batch = sums.shape[2:]
+        if self.lift is not None:
+            lifted = self.lift @ sums.reshape((self.lift.shape[1], -1))
+            return lifted.reshape((2, 3, 7, *batch))
         tags = first(self.tags, 2, len(batch)).swapaxes(0, 1)
-        gradient, hessian = np.empty((2, 3, *batch)), np.empty((2, 3, 2, 3, *batch))
-        lifted = cross(tags, S)
-        gradient[0] = cross(tags, force[:, None])[:, 0].sum(axis=1)
-        gradient[1] = force.sum(axis=1)
-        hessian[0, :, 0] = cross(tags, lifted.swapaxes(0, 1)).sum(axis=2)
-        hessian[0, :, 1] = lifted.sum(axis=2)
-        hessian[1, :, 0] = hessian[0, :, 1].swapaxes(0, 1)
-        hessian[1, :, 1] = S.sum(axis=2)
-        return gradient, hessian
+        S, force = sums[_INFORMATION], sums[_FORCE]
+        lifted = np.empty((2, 3, 7, *batch))
+        moved = cross(tags, S)
+        lifted[0, :, :3] = cross(tags, moved.swapaxes(0, 1)).sum(axis=2)
+        lifted[0, :, 3:6] = moved.sum(axis=2)
+        lifted[1, :, :3] = lifted[0, :, 3:6].swapaxes(0, 1)
+        lifted[1, :, 3:6] = S.sum(axis=2)
+        lifted[0, :, 6] = cross(tags, force[:, None])[:, 0].sum(axis=1)
+        lifted[1, :, 6] = force.sum(axis=1)
+        return lifted
 
     def _with_tag_noise(
         self, at: Linearization, J: FloatArray, residual: FloatArray, unit: FloatArray
@@ -177,17 +195,20 @@ class RangeCost:
 
     def take(self, where: BoolArray) -> RangeCost:
         """The trials of a mask (...) on one flat axis, with a further axis of 1 for starts."""
+        return self.each(lambda array, n: pick(array, where.shape, where, n)[:, None])
+
+    def each(self, function: Callable[[FloatArray, int], FloatArray]) -> RangeCost:
+        """The cost with a function of (array, number of trailing axes) applied to its arrays."""
         return dataclasses.replace(
             self,
-            ranges=pick(self.ranges, where, 2),
-            weights=pick(self.weights, where, 2),
-            anchors=pick(self.anchors, where, 2),
-            tags=pick(self.tags, where, 2),
-            tag_unit=None if self.tag_unit is None else pick(self.tag_unit, where, 3),
+            ranges=function(self.ranges, 2),
+            weights=function(self.weights, 2),
+            anchors=function(self.anchors, 2),
+            tags=function(self.tags, 2) if self.lift is None else self.tags,
+            tag_unit=None if self.tag_unit is None else function(self.tag_unit, 3),
         )
 
 
-def pick(array: FloatArray, where: BoolArray, trailing: int) -> FloatArray:
-    """The entries of a mask (...), (K, 1, ...): flat, with an axis of 1 for starts."""
-    shape = (*where.shape, *array.shape[array.ndim - trailing :])
-    return np.broadcast_to(array, shape)[where][:, None]
+def pick(array: FloatArray, batch: tuple[int, ...], where: Index, trailing: int) -> FloatArray:
+    """The entries (K, ...) at an index, or of a mask, into an array that broadcasts to a batch."""
+    return np.broadcast_to(array, (*batch, *array.shape[array.ndim - trailing :]))[where]

@@ -31,7 +31,14 @@ def tag_error(
     """Root mean square (...) over the tags of their displacement, metres."""
     turned = np.asarray(tags) @ np.swapaxes(np.asarray(rotation_hat) - rotation, -1, -2)
     shift = (np.asarray(translation_hat) - translation)[..., None, :]
-    return np.sqrt(np.mean(np.sum((turned + shift) ** 2, axis=-1), axis=-1))
+    displacement = turned + shift
+    square = np.einsum("...ni,...ni->...", displacement, displacement)
+    return np.sqrt(square / displacement.shape[-2])
+
+
+def length(vector: FloatArray) -> FloatArray:
+    """Euclidean length (...) of vectors (..., n)."""
+    return np.sqrt(np.einsum("...i,...i->...", vector, vector))
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -174,9 +174,7 @@ def log(Q: ArrayLike) -> FloatArray:
     vector = vee(Q)
     sine = np.sqrt(np.einsum("...i,...i->...", vector, vector))
     cosine = 0.5 * (np.einsum("...ii->...", Q) - 1)
-    small = sine < 1e-9
-    scale = np.where(small, 1.0, np.arctan2(sine, cosine) / np.where(small, 1.0, sine))
-    vector *= scale[..., None]
+    vector *= (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[..., None]
     wide = cosine < -0.9
     if wide.any():
         vector[wide] = _wide_log(Q[wide])

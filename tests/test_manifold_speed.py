@@ -8,7 +8,7 @@ import pytest
 from rbl_gym import bodies, bounds, estimators, motion, ranging, rotations
 from rbl_gym.estimators import components, manifold
 from rbl_gym.estimators.manifold import PoseState
-from rbl_gym.estimators.range_cost import RangeCost, huber, tag_maps
+from rbl_gym.estimators.range_cost import RangeCost, huber, lift_map
 from tests.helpers import random_world, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)
@@ -147,11 +147,26 @@ def test_vague_priors_in_a_later_block_start_globally_and_alone():
         assert_equal_poses([a[k] for a in got], filter.update(alone, ranges[k], anchors[k]))
 
 
+def test_vague_priors_of_a_batch_of_two_axes_are_those_of_one():
+    """More of them than one block of starts holds, good priors in between."""
+    _, tags, anchors, ranges, prior = world(40, anchors=7)
+    P = prior[2].copy()
+    P[::2] = np.diag([10.0] * 3 + [100.0] * 3)
+    filter = estimators.make("iekf", tags=tags, noise=NOISE, process=PROCESS, iterations=6)
+    flat = filter.update(filter.initial(*prior[:2], P), ranges, anchors)
+    state = PoseState(*(a.reshape(4, 10, *a.shape[1:]) for a in (*prior[:2], P)))
+    grid = ranges.reshape(4, 10, 7, 6), anchors.reshape(4, 10, 7, 3)
+    assert_equal_poses([a.reshape(40, *a.shape[2:]) for a in filter.update(state, *grid)], flat)
+    for k in (0, 21, 38):
+        alone = filter.initial(prior[0][k], prior[1][k], P[k])
+        assert_equal_poses([a[k] for a in flat], filter.update(alone, ranges[k], anchors[k]))
+
+
 @pytest.mark.parametrize("loss", [None, huber(1.5)])
 def test_shared_tags_give_the_sums_of_tags_of_their_own(loss):
     _, tags, anchors, ranges, (rotation, translation, _) = world(20)
     weights = 1 / NOISE.variance(ranges)
-    common = RangeCost(ranges, weights, anchors, tags, loss, maps=tag_maps(tags))
+    common = RangeCost(ranges, weights, anchors, tags, loss, lift=lift_map(tags))
     own = RangeCost(ranges, weights, anchors, np.tile(tags, (20, 1, 1)), loss)
     for a, b in zip(common(rotation, translation), own(rotation, translation), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(b).max())

@@ -193,3 +193,9 @@ def test_angular_errors_of_a_batch_are_a_loop():
         want = metrics.expected_mean_angular_error(P[j], Q[i, j])
         np.testing.assert_allclose(expected[i, j], want)
         np.testing.assert_allclose(error[i, j], metrics.mean_angular_error(matrix[i, j], Q[i, j]))
+
+
+def test_length_is_the_euclidean_norm():
+    vector = np.random.default_rng(11).standard_normal((4, 5, 3))
+    np.testing.assert_allclose(metrics.length(vector), np.linalg.norm(vector, axis=-1), rtol=1e-14)
+    assert metrics.length(np.array([3.0, 4.0, 12.0])) == 13.0

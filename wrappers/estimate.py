@@ -146,8 +146,8 @@ def judge(
     truth = rotation, translation
     error = metrics.pose_error(belief.rotation, belief.translation, *truth)
     return {
-        "rotation_error_rad": np.linalg.norm(error[..., :3], axis=-1),
-        "position_error_m": np.linalg.norm(error[..., 3:], axis=-1),
+        "rotation_error_rad": metrics.length(error[..., :3]),
+        "position_error_m": metrics.length(error[..., 3:]),
         "tag_error_m": metrics.tag_error(belief.rotation, belief.translation, *truth, tags),
         "nees": metrics.nees(error, belief.covariance),
         "score_m": bounds.score(belief.covariance, belief.rotation, tags),
@@ -207,7 +207,7 @@ def flat_observation(
     scale = np.array([np.pi / 10 / scene.dt] * 3 + [speed] * 3)
     std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
     relative = observation["anchors"] - belief.translation[..., None, :]
-    distance = np.linalg.norm(relative, axis=-1)
+    distance = metrics.length(relative)
     batch = belief.translation.shape[:-1]
     parts = [
         (belief.translation - 0.5 * (low + high)) / half,

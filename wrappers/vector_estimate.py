@@ -72,7 +72,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         """Start the filters of the worlds that reset from their priors."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._start(observation, info, info["_prior_rotation"])
-        self._judge(info)
+        self._report(self._figures(info, np.zeros(self.num_envs, dtype=np.bool_)), info)
         return self._present(observation), info
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
@@ -94,7 +94,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             self._finish(info, figures, last)
         if fresh.any():
             self._start(observation, info, fresh)
-        self._judge(info)
+            figures = self._figures(info, np.zeros_like(last))
+        self._report(figures, info)
         return self._present(observation), reward, terminated, truncated, info
 
     def _advance(
@@ -159,9 +160,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             info["final_info"][name] = np.where(last, value, 0.0)
             info["final_info"][f"_{name}"] = last.copy()
 
-    def _judge(self, info: dict[str, Any]) -> None:
-        none = np.zeros(self.num_envs, dtype=np.bool_)
-        for name, value in self._figures(info, none).items():
+    def _report(self, figures: dict[str, FloatArray], info: dict[str, Any]) -> None:
+        for name, value in figures.items():
             info[name], info[f"_{name}"] = value, np.ones(self.num_envs, dtype=np.bool_)
 
     def _present(self, observation: dict[str, np.ndarray]) -> Any:

@@ -1,0 +1,150 @@
+"""The batched iterated EKF beside filterpy's linear filter: time per trial and step, one run.
+
+One step is predict and update, from ranges to state; filterpy has a KalmanFilter per trial on the
+squared ranges (`benchmarks/filters.py`), its measurement matrix of (M - 1) N rows ready-made. The
+two do not compute the same thing: filterpy's loop is the yardstick of the machine. The iterated
+EKF is first held to a plain loop over trials. One body alone is timed as well.
+Process time, one thread, medians over interleaved repeats.
+
+    python benchmarks/iekf.py [--json F] [--repeats 7] [--trials 1024] [--seed 0]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+# First of all, as it sets the number of threads before numpy is loaded.
+import filters  # isort: skip
+
+import numpy as np
+
+from rbl_gym import bounds, estimators, rotations
+from rbl_gym.estimators.manifold import PoseState
+
+SIZES = ((4, 5), (10, 6))
+ITERATIONS = (2, 4)
+PEER_TRIALS, ONE_BODY_REPEATS = 10, 20
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", metavar="F")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--trials", type=int, default=1024)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    results = {
+        f"{m}x{n}": measure(m, n, options.trials, options.repeats, options.seed) for m, n in SIZES
+    }
+    print(f"{'M x N':<7} {'path':<24} {'us/trial':>9} {'filterpy us':>12} {'ratio':>7}")
+    for size, rows in results.items():
+        for path, row in rows.items():
+            print(f"{size:<7} {path:<24} {row['microseconds']:9.2f} "
+                  f"{row['peer_microseconds']:12.1f} {row['ratio']:7.2f}")  # fmt: skip
+    if options.json:
+        Path(options.json).write_text(json.dumps(results, indent=1) + "\n")
+
+
+def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, dict[str, float]]:
+    """Medians per path at one number of anchors and tags."""
+    world = filters.World(np.random.default_rng([seed, m, n]), "kf", m, n, trials)
+    start = world.filter.belief(world.prior)
+    jobs: dict[str, tuple[Callable[[], Any], int]] = {
+        "peer": (world.peer(range(PEER_TRIALS)), PEER_TRIALS)
+    }
+    for iterations in ITERATIONS:
+        filter = estimators.make(
+            "iekf", tags=world.tags, noise=filters.NOISE, process=filters.PROCESS,
+            iterations=iterations,
+        )  # fmt: skip
+        prior = filter.initial(start.rotation, start.translation, np.diag([0.02] * 3 + [1.0] * 3))
+        run = runner(filter, prior, world.twist, world.ranges, world.anchors)
+        check(run(), prior, world, iterations)
+        jobs[f"{iterations} iterations"] = run, trials
+        one = runner(
+            filter, PoseState(*(field[0] for field in prior)), world.twist[0],
+            [ranges[0] for ranges in world.ranges], world.anchors[0],
+        )  # fmt: skip
+        jobs[f"{iterations} iterations, one body"] = one, 1
+    times: dict[str, list[float]] = {path: [] for path in jobs}
+    for _ in range(repeats):
+        for path, (run, count) in jobs.items():
+            times[path].append(clock(run, ONE_BODY_REPEATS if count == 1 else 1) / count)
+    peer = times.pop("peer")
+    return {
+        path: {
+            "microseconds": 1e6 * float(np.median(values)),
+            "peer_microseconds": 1e6 * float(np.median(peer)),
+            "ratio": float(np.median(np.divide(peer, values))),
+        }
+        for path, values in times.items()
+    }
+
+
+def clock(run: Callable[[], Any], repeats: int) -> float:
+    """Process time of one step of a run, seconds."""
+    begin = time.process_time()
+    for _ in range(repeats):
+        run()
+    return (time.process_time() - begin) / (filters.STEPS * repeats)
+
+
+def runner(
+    filter: Any, prior: PoseState, twist: np.ndarray, epochs: list[np.ndarray], anchors: np.ndarray
+) -> Callable[[], PoseState]:
+    """All steps of all trials."""
+
+    def run() -> PoseState:
+        state = prior
+        for ranges in epochs:
+            state = filter.update(filter.predict(state, twist, filters.DT), ranges, anchors)
+        return state
+
+    return run
+
+
+def check(state: PoseState, prior: PoseState, world: filters.World, iterations: int) -> None:
+    """The filter equals a plain loop on some trials, or the run stops."""
+    for k in range(PEER_TRIALS):
+        plain = tuple(field[k] for field in prior)
+        for ranges in world.ranges:
+            plain = plain_step(plain, world, k, ranges[k], iterations)
+        for got, want in zip(state, plain, strict=True):
+            if np.abs(got[k] - want).max() > 1e-8 * max(1.0, np.abs(want).max()):
+                raise AssertionError(f"trial {k}: off the plain loop by {np.abs(got[k] - want)}")
+
+
+def plain_step(
+    prior: tuple[np.ndarray, ...], world: filters.World, k: int, ranges: np.ndarray, iterations: int
+) -> tuple[np.ndarray, ...]:
+    """One step of one trial with 6 x 6 matrices, as it is printed in textbooks."""
+    rotation, translation, P = prior
+    twist = world.twist[k]
+    Q0 = rotations.exp(twist[:3] * filters.DT) @ rotation
+    t0 = translation + twist[3:] * filters.DT
+    information = np.linalg.inv(bounds.predict_covariance(P, twist, filters.DT, filters.PROCESS))
+    weights = 1 / np.broadcast_to(filters.NOISE.variance(ranges), ranges.shape).ravel()
+    Q, t = Q0, t0
+    for last in [False] * iterations + [True]:
+        distance, J = bounds.range_jacobian(world.anchors[k], world.tags, Q, t)
+        error = np.concatenate([rotations.log(Q @ Q0.T), t - t0])
+        D = np.eye(6)
+        D[:3, :3] = rotations.left_jacobian_inverse(error[:3])
+        hessian = (J * weights) @ J.T + D.T @ information @ D
+        if last:
+            break
+        gradient = J @ (weights * (distance - ranges).ravel()) + D.T @ information @ error
+        step = -np.linalg.solve(hessian, gradient)
+        Q, t = rotations.exp(step[:3]) @ Q, t + step[3:]
+    return Q, t, np.linalg.inv(hessian)
+
+
+if __name__ == "__main__":
+    main()
