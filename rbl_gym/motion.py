@@ -146,11 +146,7 @@ def _trials_last(batch: tuple[int, ...], *trailing: int) -> FloatArray:
 
     Loops over inner axes of 3 or 6 are slow; these run over all trials instead.
     """
-    if not batch:
-        return np.empty(trailing)
-    memory = np.empty((*trailing[::-1], *batch))
-    inner = range(len(trailing))
-    return memory.transpose(*range(len(trailing), memory.ndim), *reversed(inner))
+    return np.empty((*batch, *trailing), order="F" if batch else "C")
 
 
 def _chain(rotation: FloatArray) -> None:

@@ -246,11 +246,12 @@ class Measurement(NamedTuple):
 def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
     """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
     rotation, tags = np.asarray(rotation), np.asarray(tags)
-    if rotation.ndim > 2 and rotation.strides[-1] > rotation.strides[0]:
-        # Memory that runs along the trials: products of whole rows of trials.
-        positions = np.einsum("...ij,...nj->...ni", rotation, tags)
-        positions += np.asarray(translation)[..., None, :]
-        return positions
+    if tags.ndim == 2 and rotation.ndim > 2 and rotation.flags.f_contiguous:
+        # Memory that runs along the trials: one product of the tags with rows of all trials.
+        columns = rotation.T.reshape(3, -1)
+        turned = (tags @ columns).reshape((len(tags), *rotation.T.shape[1:]))
+        turned += np.asarray(translation).T
+        return np.moveaxis(turned.T, -1, -2)
     if tags.ndim == 2:
         # Tags that all trials share: one matrix product in place of one for each trial.
         turned = (rotation.reshape(-1, 3) @ tags.T).reshape((*rotation.shape[:-1], len(tags)))

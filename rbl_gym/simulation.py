@@ -6,7 +6,7 @@ is arithmetic on arrays with leading batch axes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -80,14 +80,30 @@ def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) ->
     )
 
 
-def draw_each(scene: Scene, generators: Sequence[np.random.Generator]) -> Draws:
-    """`draw` once by each generator, (B, n) and (B, m): what a vector environment resets with."""
-    normals = np.empty((len(generators), sum(_normal_sizes(scene))))
-    uniforms = np.empty((len(generators), sum(_uniform_sizes(scene))))
-    for generator, normal_row, uniform_row in zip(generators, normals, uniforms, strict=True):
-        generator.standard_normal(out=normal_row)
-        generator.random(out=uniform_row)
-    return Draws(normals, uniforms)
+def empty_draws(scene: Scene, count: int) -> Draws:
+    """Room for the random numbers of `count` episodes, (count, n) and (count, m)."""
+    return Draws(
+        np.empty((count, sum(_normal_sizes(scene)))),
+        np.empty((count, sum(_uniform_sizes(scene)))),
+    )
+
+
+def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.Generator]) -> None:
+    """`draw` into some rows, each by its own generator: what a vector environment resets with."""
+    for row, generator in zip(rows, generators, strict=True):
+        generator.standard_normal(out=draws.normals[row])
+        generator.random(out=draws.uniforms[row])
+
+
+def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
+    """Views of the draws: `normals` and `uniforms` of an `Episode`."""
+    batch, shape = draws.normals.shape[:-1], (scene.n_anchors, len(scene.tags))
+    normals = _split(draws.normals, _normal_sizes(scene))[2]
+    normals = normals.reshape((*batch, scene.steps + 1, *shape))
+    if not scene.links.is_random:
+        return normals, None
+    uniforms = _split(draws.uniforms, _uniform_sizes(scene))[3]
+    return normals, uniforms.reshape((*batch, scene.steps + 1, 2, *shape))
 
 
 def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:
@@ -131,21 +147,23 @@ def _n_points(scene: Scene) -> int:
 def build_episode(scene: Scene, draws: Draws) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, noise, held = _split(draws.normals, _normal_sizes(scene))
-    places, phase, spots, chances = _split(draws.uniforms, _uniform_sizes(scene))
+    start, process, _, held = _split(draws.normals, _normal_sizes(scene))
+    places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = _steps(scene)
     path = motion.simulate(trajectory, scene.dt, scene.process, process.reshape((*batch, steps, 6)))
     twists = np.broadcast_to(trajectory.twists, (*batch, steps, 6))
     offset = start[..., 7:]
-    covariance = np.broadcast_to(scene.prior_covariance, (*batch, 6, 6))
+    covariance = scene.prior_covariance
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
+    positions = ranging.tag_positions(*path, scene.tags)
     if scene.prior == "start":
-        prior = motion.propagate(rotation, translation, twists[..., 0, :], scene.dt)
-        covariance = bounds.predict_covariance(
-            covariance, twists[..., 0, :], scene.dt, scene.process
-        )
+        # The same for all episodes of a constant twist: its leading axes are few or none.
+        first = trajectory.twists[..., 0, :]
+        prior = motion.propagate(rotation, translation, first, scene.dt)
+        covariance = bounds.predict_covariance(covariance, first, scene.dt, scene.process)
         path = motion.Path(path.rotation[..., 1:, :, :], path.translation[..., 1:, :])
+        positions = positions[..., 1:, :, :]
     else:
         prior = (
             rotations.exp(scene.initial_rotation_rad * offset[..., :3]) @ rotation,
@@ -156,16 +174,9 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
         anchors = scene.anchor_region.draw(spots.reshape((*batch, scene.n_anchors, 3)))
     else:
         anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
-    shape = (scene.n_anchors, len(scene.tags))
+    covariance = np.broadcast_to(covariance, (*batch, 6, 6))
     return Episode(
-        *path,
-        ranging.tag_positions(*path, scene.tags),
-        twists,
-        noise.reshape((*batch, scene.steps + 1, *shape)),
-        chances.reshape((*batch, scene.steps + 1, 2, *shape)) if scene.links.is_random else None,
-        *prior,
-        covariance,
-        anchors,
+        *path, positions, twists, *of_ranges(scene, draws), *prior, covariance, anchors
     )
 
 
@@ -178,14 +189,15 @@ def _trajectory(
 ) -> motion.Trajectory:
     """The scene's nominal motion; way-points and the start are uniform in its volume."""
     batch, steps = start.shape[:-1], _steps(scene)
-    rotation = rotations.from_quaternion(start[..., :4])
-    if scene.start_rotation is not None:
-        rotation = np.broadcast_to(scene.start_rotation, (*batch, 3, 3))
+    if scene.start_rotation is None:
+        rotation = rotations.from_quaternion(start[..., :4])
+    else:
+        rotation = np.asarray(scene.start_rotation)
     low, high = scene.volume.bounds()
     points = low + places.reshape((*batch, -1, 3)) * (high - low)
     first = points[..., 0, :]
     if scene.start_translation is not None:
-        first = np.broadcast_to(scene.start_translation, (*batch, 3))
+        first = np.asarray(scene.start_translation)
         points[..., 0, :] = first
     if scene.trajectory == "constant":
         return motion.constant_twist(rotation, first, scene.twist, steps)
