@@ -127,7 +127,8 @@ def simulate(
     if normals is None:
         twists[...] = nominal
     else:
-        np.multiply(normals, process.std() / np.sqrt(dt), out=twists)
+        twists[...] = normals
+        twists *= process.std() / np.sqrt(dt)
         twists += nominal
     twists *= dt
     rotation = _trials_last(batch, n_steps + 1, 3, 3)
@@ -136,7 +137,8 @@ def simulate(
     _chain(rotation)
     translation = _trials_last(batch, n_steps + 1, 3)
     translation[..., 0, :] = 0.0
-    np.cumsum(twists[..., 3:], axis=-2, out=translation[..., 1:, :])
+    for k in range(n_steps):
+        np.add(translation[..., k, :], twists[..., k, 3:], out=translation[..., k + 1, :])
     translation += trajectory.translation[..., None, :]
     return Path(rotation, translation)
 

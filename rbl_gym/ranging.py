@@ -265,15 +265,11 @@ def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) 
 def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
     """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
     positions, anchors = np.asarray(positions), np.asarray(anchors)
-    # Axis by axis, so that the same sum gives the same last bits in every memory order.
-    squared, y, z = (
-        np.subtract(positions[..., None, :, i], anchors[..., :, None, i], dtype=np.float64)
-        for i in range(3)
-    )
-    squared *= squared
-    for gap in (y, z):
-        gap *= gap
-        squared += gap
+    # Summed axis by axis: the same last bits in every memory order.
+    gap = np.subtract(positions[..., None, :, :], anchors[..., :, None, :], dtype=np.float64)
+    gap *= gap
+    squared = gap[..., 0] + gap[..., 1]
+    squared += gap[..., 2]
     return np.sqrt(squared, out=squared)
 
 

@@ -28,9 +28,8 @@ class Episode(NamedTuple):
 
     Attributes
     ----------
-    rotation, translation, positions
-        True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3), and the places of
-        the tags (..., T + 1, N, 3).
+    rotation, translation
+        True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3).
     twists
         Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
         unless the prior is older than it.
@@ -45,7 +44,6 @@ class Episode(NamedTuple):
 
     rotation: FloatArray
     translation: FloatArray
-    positions: FloatArray
     twists: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
@@ -56,11 +54,10 @@ class Episode(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An episode at one epoch: the first six fields of `Episode` without their time axis."""
+    """An episode at one epoch: the first five fields of `Episode` without their time axis."""
 
     rotation: FloatArray
     translation: FloatArray
-    positions: FloatArray
     twist: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
@@ -156,14 +153,12 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     offset = start[..., 7:]
     covariance = scene.prior_covariance
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
-    positions = ranging.tag_positions(*path, scene.tags)
     if scene.prior == "start":
         # The same for all episodes of a constant twist: its leading axes are few or none.
         first = trajectory.twists[..., 0, :]
         prior = motion.propagate(rotation, translation, first, scene.dt)
         covariance = bounds.predict_covariance(covariance, first, scene.dt, scene.process)
         path = motion.Path(path.rotation[..., 1:, :, :], path.translation[..., 1:, :])
-        positions = positions[..., 1:, :, :]
     else:
         prior = (
             rotations.exp(scene.initial_rotation_rad * offset[..., :3]) @ rotation,
@@ -175,9 +170,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     else:
         anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
     covariance = np.broadcast_to(covariance, (*batch, 6, 6))
-    return Episode(
-        *path, positions, twists, *of_ranges(scene, draws), *prior, covariance, anchors
-    )
+    return Episode(*path, twists, *of_ranges(scene, draws), *prior, covariance, anchors)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
@@ -221,7 +214,6 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
     return Epoch(
         episode.rotation[..., epoch, :, :],
         episode.translation[..., epoch, :],
-        episode.positions[..., epoch, :, :],
         episode.twists[..., epoch, :],
         episode.normals[..., epoch, :, :],
         None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
@@ -230,21 +222,20 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
 
 def whole(episode: Episode) -> Epoch:
     """All epochs of an episode at once: the time axis is the last of the batch's."""
-    return Epoch(
-        episode.rotation,
-        episode.translation,
-        episode.positions,
-        episode.twists,
-        episode.normals,
-        episode.uniforms,
-    )
+    return Epoch(*episode[: len(Epoch._fields)])
 
 
-def measure(scene: Scene, at: Epoch, anchors: FloatArray) -> ranging.Measurement:
-    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3)."""
-    measured = ranging.measure(
-        ranging.distances(anchors, at.positions), scene.noise, at.normals, scene.links, at.uniforms
-    )
+def measure(
+    scene: Scene, at: Epoch, anchors: FloatArray, positions: FloatArray | None = None
+) -> ranging.Measurement:
+    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
+
+    `positions`: those of the tags (..., N, 3), where they are known already.
+    """
+    if positions is None:
+        positions = ranging.tag_positions(at.rotation, at.translation, scene.tags)
+    distances = ranging.distances(anchors, positions)
+    measured = ranging.measure(distances, scene.noise, at.normals, scene.links, at.uniforms)
     ranges = np.minimum(measured.ranges, scene.range_limit_m, order="C")
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     links = np.logical_and(measured.links, ranges > 0, order="C")
@@ -258,12 +249,11 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
     one than 1 is cut to 1, and the place is projected onto the anchors' region.
     """
     velocity = action.reshape(*action.shape[:-1], scene.n_anchors, 3)
-    x, y, z = velocity[..., 0], velocity[..., 1], velocity[..., 2]
-    length = np.sqrt(x * x + y * y + z * z)
-    velocity = velocity * (scene.anchor_speed_m_s / np.maximum(length, 1.0))[..., None]
-    velocity *= scene.dt
-    velocity += anchors
-    return scene.anchor_region.project(velocity)
+    length = np.sqrt(np.add.reduce(velocity * velocity, axis=-1))
+    reach = (scene.anchor_speed_m_s * scene.dt) / np.maximum(length, 1.0)
+    moved = velocity * reach[..., None]
+    moved += anchors
+    return scene.anchor_region.project(moved)
 
 
 def posterior_information(

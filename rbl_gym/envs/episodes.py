@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,6 +13,20 @@ from rbl_gym.scenes import Scene
 
 # Worlds that are drawn and built together: what they need on the way fits the cache.
 _BLOCK = 256
+
+
+@contextlib.contextmanager
+def whole_rows() -> Iterator[None]:
+    """Let numpy compute on rows of worlds where they are.
+
+    It copies operands into its buffer (8192 numbers) when their rows are shorter and do not
+    join up, which takes longer than the arithmetic.
+    """
+    before = np.setbufsize(256)
+    try:
+        yield
+    finally:
+        np.setbufsize(before)
 
 
 class EpisodeStore:
@@ -40,15 +55,16 @@ class EpisodeStore:
 
         Returns the fields of `simulation.Episode` that have no time axis, of these worlds.
         """
-        starts: list[list[FloatArray]] = []
+        starts: list[tuple[FloatArray, ...]] = []
         for first in range(0, len(worlds), _BLOCK):
             block = worlds[first : first + _BLOCK]
             simulation.draw_each(self._draws, block, generators[first : first + _BLOCK])
             rows = _rows(block)
             draws = simulation.Draws(*(field[rows] for field in self._draws))
-            episode = simulation.build_episode(self._scene, draws)
-            self._write(rows, episode)
-            starts.append(list(episode[len(simulation.Epoch._fields) :]))
+            with whole_rows():
+                episode = simulation.build_episode(self._scene, draws)
+                self._write(rows, episode)
+            starts.append(episode[len(simulation.Epoch._fields) :])
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
             name: np.concatenate(parts)
@@ -56,7 +72,7 @@ class EpisodeStore:
         }
 
     def _write(self, rows: slice | np.ndarray, episode: simulation.Episode) -> None:
-        fields = (episode.rotation, episode.translation, episode.positions, episode.twists)
+        fields = episode.rotation, episode.translation, episode.twists
         if not self._timed:
             self._timed = [
                 np.empty((self._num_envs, *field.shape[1:]), order="F") for field in fields
@@ -65,15 +81,12 @@ class EpisodeStore:
             stored[rows] = field
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
-        """All worlds, each at its epoch (B,): views of the store where all clocks agree."""
+        """All worlds, each at its epoch (B,), in Fortran's order."""
         together = (epochs == epochs[0]).all()
         rows = slice(None) if together else np.arange(self._num_envs)
         where = rows, epochs[0] if together else epochs
-        return simulation.Epoch(
-            *(field[where] for field in self._timed),
-            np.asfortranarray(self._normals[where]),
-            None if self._uniforms is None else np.asfortranarray(self._uniforms[where]),
-        )
+        fields = *self._timed, self._normals, self._uniforms
+        return simulation.Epoch(*(f if f is None else np.asfortranarray(f[where]) for f in fields))  # pyright: ignore[reportArgumentType]
 
 
 def _rows(worlds: np.ndarray) -> slice | np.ndarray:
