@@ -8,6 +8,7 @@ Kinematics (tracking paper, (10)-(15), Omega carrying the time step tau):
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -154,12 +155,12 @@ def _trials_last(batch: tuple[int, ...], *trailing: int) -> FloatArray:
 def _chain(rotation: FloatArray) -> None:
     """Turn a start and T steps (..., T + 1, 3, 3) into the rotations they lead to, in place."""
     if rotation.ndim == 3:
-        for before, step in zip(rotation[:-1], rotation[1:], strict=True):
+        for before, step in itertools.pairwise(rotation):
             step[...] = step @ before
         return
     # Row i, column j of every trial side by side; a matrix product of each alone is slow.
     planes = np.moveaxis(rotation, (-3, -2, -1), (0, 1, 2))
-    for before, step in zip(planes[:-1], planes[1:], strict=True):
+    for before, step in itertools.pairwise(planes):
         product = step[:, 0, None] * before[0]
         for i in (1, 2):
             product += step[:, i, None] * before[i]

@@ -40,7 +40,6 @@ class EpisodeStore:
         self._scene = scene
         self._num_envs = num_envs
         self._draws = simulation.empty_draws(scene, num_envs)
-        self._normals, self._uniforms = simulation.of_ranges(scene, self._draws)
         self._timed: list[FloatArray] = []
 
     @property
@@ -65,6 +64,8 @@ class EpisodeStore:
                 episode = simulation.build_episode(self._scene, draws)
                 self._write(rows, episode)
             starts.append(episode[len(simulation.Epoch._fields) :])
+        # Views, taken anew because a pickled store comes back with copies of them.
+        self._normals, self._uniforms = simulation.of_ranges(self._scene, self._draws)
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
             name: np.concatenate(parts)
