@@ -236,10 +236,12 @@ def measure(
         positions = ranging.tag_positions(at.rotation, at.translation, scene.tags)
     distances = ranging.distances(anchors, positions)
     measured = ranging.measure(distances, scene.noise, at.normals, scene.links, at.uniforms)
-    ranges = np.minimum(measured.ranges, scene.range_limit_m, order="C")
+    clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
+    # However the worlds lie in memory, what is observed is in C order.
+    ranges, links, nlos = map(np.ascontiguousarray, (clipped, measured.links, measured.nlos))
     # A range of zero has no variance under a proportional law: such a reading is no reading.
-    links = np.logical_and(measured.links, ranges > 0, order="C")
-    return ranging.Measurement(ranges, links, np.ascontiguousarray(measured.nlos))
+    links &= ranges > 0
+    return ranging.Measurement(ranges, links, nlos)
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:
