@@ -52,7 +52,6 @@ def test_more_worlds_than_are_built_together_are_all_begun():
 
 def test_numpys_buffer_is_put_back():
     before = np.getbufsize()
-    with pytest.raises(KeyError), whole_rows():
+    with whole_rows():
         assert np.getbufsize() < before
-        raise KeyError
     assert np.getbufsize() == before
