@@ -8,6 +8,7 @@ Kinematics (tracking paper, (10)-(15), Omega carrying the time step tau):
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -127,7 +128,8 @@ def simulate(
     if normals is None:
         twists[...] = nominal
     else:
-        np.multiply(normals, process.std() / np.sqrt(dt), out=twists)
+        twists[...] = normals
+        twists *= process.std() / np.sqrt(dt)
         twists += nominal
     twists *= dt
     rotation = _trials_last(batch, n_steps + 1, 3, 3)
@@ -136,7 +138,8 @@ def simulate(
     _chain(rotation)
     translation = _trials_last(batch, n_steps + 1, 3)
     translation[..., 0, :] = 0.0
-    np.cumsum(twists[..., 3:], axis=-2, out=translation[..., 1:, :])
+    for k in range(n_steps):
+        np.add(translation[..., k, :], twists[..., k, 3:], out=translation[..., k + 1, :])
     translation += trajectory.translation[..., None, :]
     return Path(rotation, translation)
 
@@ -146,22 +149,18 @@ def _trials_last(batch: tuple[int, ...], *trailing: int) -> FloatArray:
 
     Loops over inner axes of 3 or 6 are slow; these run over all trials instead.
     """
-    if not batch:
-        return np.empty(trailing)
-    memory = np.empty((*trailing[::-1], *batch))
-    inner = range(len(trailing))
-    return memory.transpose(*range(len(trailing), memory.ndim), *reversed(inner))
+    return np.empty((*batch, *trailing), order="F" if batch else "C")
 
 
 def _chain(rotation: FloatArray) -> None:
     """Turn a start and T steps (..., T + 1, 3, 3) into the rotations they lead to, in place."""
     if rotation.ndim == 3:
-        for before, step in zip(rotation[:-1], rotation[1:], strict=True):
+        for before, step in itertools.pairwise(rotation):
             step[...] = step @ before
         return
     # Row i, column j of every trial side by side; a matrix product of each alone is slow.
     planes = np.moveaxis(rotation, (-3, -2, -1), (0, 1, 2))
-    for before, step in zip(planes[:-1], planes[1:], strict=True):
+    for before, step in itertools.pairwise(planes):
         product = step[:, 0, None] * before[0]
         for i in (1, 2):
             product += step[:, i, None] * before[i]

@@ -246,11 +246,12 @@ class Measurement(NamedTuple):
 def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
     """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
     rotation, tags = np.asarray(rotation), np.asarray(tags)
-    if rotation.ndim > 2 and rotation.strides[-1] > rotation.strides[0]:
-        # Memory that runs along the trials: products of whole rows of trials.
-        positions = np.einsum("...ij,...nj->...ni", rotation, tags)
-        positions += np.asarray(translation)[..., None, :]
-        return positions
+    if tags.ndim == 2 and rotation.ndim > 2 and rotation.flags.f_contiguous:
+        # Memory that runs along the trials: one product of the tags with rows of all trials.
+        columns = rotation.T.reshape(3, -1)
+        turned = (tags @ columns).reshape((len(tags), *rotation.T.shape[1:]))
+        turned += np.asarray(translation).T
+        return np.moveaxis(turned.T, -1, -2)
     if tags.ndim == 2:
         # Tags that all trials share: one matrix product in place of one for each trial.
         turned = (rotation.reshape(-1, 3) @ tags.T).reshape((*rotation.shape[:-1], len(tags)))
@@ -264,15 +265,11 @@ def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) 
 def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
     """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
     positions, anchors = np.asarray(positions), np.asarray(anchors)
-    # Axis by axis, so that the same sum gives the same last bits in every memory order.
-    squared, y, z = (
-        np.subtract(positions[..., None, :, i], anchors[..., :, None, i], dtype=np.float64)
-        for i in range(3)
-    )
-    squared *= squared
-    for gap in (y, z):
-        gap *= gap
-        squared += gap
+    # Summed axis by axis: the same last bits in every memory order.
+    gap = np.subtract(positions[..., None, :, :], anchors[..., :, None, :], dtype=np.float64)
+    gap *= gap
+    squared = gap[..., 0] + gap[..., 1]
+    squared += gap[..., 2]
     return np.sqrt(squared, out=squared)
 
 

@@ -6,7 +6,7 @@ is arithmetic on arrays with leading batch axes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -29,9 +29,8 @@ class Episode(NamedTuple):
 
     Attributes
     ----------
-    rotation, translation, positions
-        True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3), and the places of
-        the tags (..., T + 1, N, 3).
+    rotation, translation
+        True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3).
     twists
         Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
         unless the prior is older than it.
@@ -46,7 +45,6 @@ class Episode(NamedTuple):
 
     rotation: FloatArray
     translation: FloatArray
-    positions: FloatArray
     twists: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
@@ -57,11 +55,10 @@ class Episode(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An episode at one epoch: the first six fields of `Episode` without their time axis."""
+    """An episode at one epoch: the first five fields of `Episode` without their time axis."""
 
     rotation: FloatArray
     translation: FloatArray
-    positions: FloatArray
     twist: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
@@ -81,14 +78,30 @@ def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) ->
     )
 
 
-def draw_each(scene: Scene, generators: Sequence[np.random.Generator]) -> Draws:
-    """`draw` once by each generator, (B, n) and (B, m): what a vector environment resets with."""
-    normals = np.empty((len(generators), sum(_normal_sizes(scene))))
-    uniforms = np.empty((len(generators), sum(_uniform_sizes(scene))))
-    for generator, normal_row, uniform_row in zip(generators, normals, uniforms, strict=True):
-        generator.standard_normal(out=normal_row)
-        generator.random(out=uniform_row)
-    return Draws(normals, uniforms)
+def empty_draws(scene: Scene, count: int) -> Draws:
+    """Room for the random numbers of `count` episodes, (count, n) and (count, m)."""
+    return Draws(
+        np.empty((count, sum(_normal_sizes(scene)))),
+        np.empty((count, sum(_uniform_sizes(scene)))),
+    )
+
+
+def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.Generator]) -> None:
+    """`draw` into some rows, each by its own generator: what a vector environment resets with."""
+    for row, generator in zip(rows, generators, strict=True):
+        generator.standard_normal(out=draws.normals[row])
+        generator.random(out=draws.uniforms[row])
+
+
+def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
+    """Views of the draws: `normals` and `uniforms` of an `Episode`."""
+    batch, shape = draws.normals.shape[:-1], (scene.n_anchors, len(scene.tags))
+    normals = _split(draws.normals, _normal_sizes(scene))[2]
+    normals = normals.reshape((*batch, scene.steps + 1, *shape))
+    if not scene.links.is_random:
+        return normals, None
+    uniforms = _split(draws.uniforms, _uniform_sizes(scene))[3]
+    return normals, uniforms.reshape((*batch, scene.steps + 1, 2, *shape))
 
 
 def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:
@@ -132,20 +145,20 @@ def _n_points(scene: Scene) -> int:
 def build_episode(scene: Scene, draws: Draws) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, noise, held = _split(draws.normals, _normal_sizes(scene))
-    places, phase, spots, chances = _split(draws.uniforms, _uniform_sizes(scene))
+    start, process, _, held = _split(draws.normals, _normal_sizes(scene))
+    places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = _steps(scene)
     path = motion.simulate(trajectory, scene.dt, scene.process, process.reshape((*batch, steps, 6)))
     twists = np.broadcast_to(trajectory.twists, (*batch, steps, 6))
     offset = start[..., 7:]
-    covariance = np.broadcast_to(scene.prior_covariance, (*batch, 6, 6))
+    covariance = scene.prior_covariance
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
     if scene.prior == "start":
-        prior = motion.propagate(rotation, translation, twists[..., 0, :], scene.dt)
-        covariance = bounds.predict_covariance(
-            covariance, twists[..., 0, :], scene.dt, scene.process
-        )
+        # The same for all episodes of a constant twist: its leading axes are few or none.
+        first = trajectory.twists[..., 0, :]
+        prior = motion.propagate(rotation, translation, first, scene.dt)
+        covariance = bounds.predict_covariance(covariance, first, scene.dt, scene.process)
         path = motion.Path(path.rotation[..., 1:, :, :], path.translation[..., 1:, :])
     else:
         prior = (
@@ -162,17 +175,8 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
             anchors = scene.anchor_region.project(around)
     else:
         anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
-    shape = (scene.n_anchors, len(scene.tags))
-    return Episode(
-        *path,
-        ranging.tag_positions(*path, scene.tags),
-        twists,
-        noise.reshape((*batch, scene.steps + 1, *shape)),
-        chances.reshape((*batch, scene.steps + 1, 2, *shape)) if scene.links.is_random else None,
-        *prior,
-        covariance,
-        anchors,
-    )
+    covariance = np.broadcast_to(covariance, (*batch, 6, 6))
+    return Episode(*path, twists, *of_ranges(scene, draws), *prior, covariance, anchors)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
@@ -184,9 +188,10 @@ def _trajectory(
 ) -> motion.Trajectory:
     """The scene's nominal motion; way-points and the start are uniform in its volume."""
     batch, steps = start.shape[:-1], _steps(scene)
-    rotation = rotations.from_quaternion(start[..., :4])
-    if scene.start_rotation is not None:
-        rotation = np.broadcast_to(scene.start_rotation, (*batch, 3, 3))
+    if scene.start_rotation is None:
+        rotation = rotations.from_quaternion(start[..., :4])
+    else:
+        rotation = np.asarray(scene.start_rotation)
     low, high = scene.volume.bounds()
     places = places.reshape((*batch, -1, 3))
     points = low + places * (high - low)
@@ -194,7 +199,7 @@ def _trajectory(
         points[..., 0, :] = scene.start_volume.draw(places[..., 0, :])
     first = points[..., 0, :]
     if scene.start_translation is not None:
-        first = np.broadcast_to(scene.start_translation, (*batch, 3))
+        first = np.asarray(scene.start_translation)
         points[..., 0, :] = first
     if scene.trajectory == "constant":
         return motion.constant_twist(rotation, first, scene.twist, steps)
@@ -218,7 +223,6 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
     return Epoch(
         episode.rotation[..., epoch, :, :],
         episode.translation[..., epoch, :],
-        episode.positions[..., epoch, :, :],
         episode.twists[..., epoch, :],
         episode.normals[..., epoch, :, :],
         None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
@@ -227,28 +231,29 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
 
 def whole(episode: Episode) -> Epoch:
     """All epochs of an episode at once: the time axis is the last of the batch's."""
-    return Epoch(
-        episode.rotation,
-        episode.translation,
-        episode.positions,
-        episode.twists,
-        episode.normals,
-        episode.uniforms,
-    )
+    return Epoch(*episode[: len(Epoch._fields)])
 
 
-def measure(scene: Scene, at: Epoch, anchors: FloatArray) -> ranging.Measurement:
-    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3)."""
+def measure(
+    scene: Scene, at: Epoch, anchors: FloatArray, positions: FloatArray | None = None
+) -> ranging.Measurement:
+    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
+
+    `positions`: those of the tags (..., N, 3), where they are known already.
+    """
+    if positions is None:
+        positions = ranging.tag_positions(at.rotation, at.translation, scene.tags)
     normals = at.normals
     if scene.obstacles:
         normals = normals / np.sqrt(link_quality(scene, at, anchors))[..., None]
-    measured = ranging.measure(
-        ranging.distances(anchors, at.positions), scene.noise, normals, scene.links, at.uniforms
-    )
-    ranges = np.minimum(measured.ranges, scene.range_limit_m, order="C")
+    distances = ranging.distances(anchors, positions)
+    measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
+    clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
+    # However the worlds lie in memory, what is observed is in C order.
+    ranges, links, nlos = map(np.ascontiguousarray, (clipped, measured.links, measured.nlos))
     # A range of zero has no variance under a proportional law: such a reading is no reading.
-    links = np.logical_and(measured.links, ranges > 0, order="C")
-    return ranging.Measurement(ranges, links, np.ascontiguousarray(measured.nlos))
+    links &= ranges > 0
+    return ranging.Measurement(ranges, links, nlos)
 
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
@@ -265,12 +270,11 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
     one than 1 is cut to 1, and the place is projected onto the anchors' region.
     """
     velocity = action.reshape(*action.shape[:-1], scene.n_anchors, 3)
-    x, y, z = velocity[..., 0], velocity[..., 1], velocity[..., 2]
-    length = np.sqrt(x * x + y * y + z * z)
-    velocity = velocity * (scene.anchor_speed_m_s / np.maximum(length, 1.0))[..., None]
-    velocity *= scene.dt
-    velocity += anchors
-    return scene.anchor_region.project(velocity)
+    length = np.sqrt(np.add.reduce(velocity * velocity, axis=-1))
+    reach = (scene.anchor_speed_m_s * scene.dt) / np.maximum(length, 1.0)
+    moved = velocity * reach[..., None]
+    moved += anchors
+    return scene.anchor_region.project(moved)
 
 
 def posterior_information(

@@ -102,7 +102,7 @@ def test_normals_of_many_trials_spread_one_trajectory():
     normals = np.random.default_rng(0).standard_normal((5, *start.twists.shape))
     path = motion.simulate(start, 0.1, ProcessNoise(0.1, 0.1), normals)
     one = motion.simulate(start, 0.1, ProcessNoise(0.1, 0.1), normals[3])
-    np.testing.assert_array_equal(path.rotation[3], one.rotation)
+    np.testing.assert_allclose(path.rotation[3], one.rotation, atol=1e-14)
     np.testing.assert_allclose(path.translation[3], one.translation, rtol=1e-14)
 
 

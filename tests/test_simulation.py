@@ -111,7 +111,6 @@ def test_every_array_of_a_batch_has_the_stated_shape(name, batch):
     shapes = {
         "rotation": (8, 3, 3),
         "translation": (8, 3),
-        "positions": (8, links[1], 3),
         "twists": (8, 6),
         "prior_rotation": (3, 3),
         "prior_translation": (3,),

@@ -1,8 +1,9 @@
-"""Episodes of many worlds in arrays that a step reads contiguous memory of."""
+"""The running episodes of many worlds, in memory that runs along the worlds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -11,21 +12,35 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.scenes import Scene
 
 # Worlds that are drawn and built together: what they need on the way fits the cache.
-_BLOCK = 128
-# Fields of an episode that have a time axis.
-_TIMED = simulation.Epoch._fields
+_BLOCK = 256
+
+
+@contextlib.contextmanager
+def whole_rows() -> Iterator[None]:
+    """Let numpy compute on rows of worlds where they are.
+
+    It copies operands into its buffer (8192 numbers) when their rows are shorter and do not
+    join up, which takes longer than the arithmetic.
+    """
+    before = np.setbufsize(256)
+    try:
+        yield
+    finally:
+        np.setbufsize(before)
 
 
 class EpisodeStore:
-    """The running episodes of B worlds, epochs first and worlds last: (T + 1, ..., B).
+    """The running episodes of B worlds: arrays (B, T + 1, ...) in Fortran's order.
 
-    Its arrays are written anew by every reset, not made anew: fresh memory is slow.
+    An epoch is then whole rows of worlds, which a step computes with. The arrays are written
+    anew by every reset, not made anew: fresh memory is slow.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
         self._scene = scene
         self._num_envs = num_envs
-        self._timed: list[FloatArray | None] = []
+        self._draws = simulation.empty_draws(scene, num_envs)
+        self._timed: list[FloatArray] = []
 
     @property
     def empty(self) -> bool:
@@ -39,37 +54,43 @@ class EpisodeStore:
 
         Returns the fields of `simulation.Episode` that have no time axis, of these worlds.
         """
-        starts: list[list[FloatArray]] = []
+        starts: list[tuple[FloatArray, ...]] = []
         for first in range(0, len(worlds), _BLOCK):
-            block = slice(first, first + _BLOCK)
-            draws = simulation.draw_each(self._scene, generators[block])
-            episode = simulation.build_episode(self._scene, draws)
-            self._write(worlds[block], episode)
-            starts.append(list(episode[len(_TIMED) :]))
-        names = simulation.Episode._fields[len(_TIMED) :]
+            block = worlds[first : first + _BLOCK]
+            simulation.draw_each(self._draws, block, generators[first : first + _BLOCK])
+            rows = _rows(block)
+            draws = simulation.Draws(*(field[rows] for field in self._draws))
+            with whole_rows():
+                episode = simulation.build_episode(self._scene, draws)
+                self._write(rows, episode)
+            starts.append(episode[len(simulation.Epoch._fields) :])
+        # Views, taken anew because a pickled store comes back with copies of them.
+        self._normals, self._uniforms = simulation.of_ranges(self._scene, self._draws)
+        names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
             name: np.concatenate(parts)
             for name, parts in zip(names, zip(*starts, strict=True), strict=True)
         }
 
-    def _write(self, worlds: np.ndarray, episode: simulation.Episode) -> None:
-        fields = episode[: len(_TIMED)]
+    def _write(self, rows: slice | np.ndarray, episode: simulation.Episode) -> None:
+        fields = episode.rotation, episode.translation, episode.twists
         if not self._timed:
             self._timed = [
-                None if field is None else np.empty((*field.shape[1:], self._num_envs))
-                for field in fields
+                np.empty((self._num_envs, *field.shape[1:]), order="F") for field in fields
             ]
-        first, last = worlds[0], worlds[-1]
-        where = slice(first, last + 1) if last - first + 1 == len(worlds) else worlds
         for stored, field in zip(self._timed, fields, strict=True):
-            if stored is not None:
-                stored[..., where] = np.moveaxis(field, 0, -1)
+            stored[rows] = field
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
-        """All worlds, each at its epoch (B,): views of the store where all clocks agree."""
-        if (epochs == epochs[0]).all():
-            fields = [f if f is None else np.moveaxis(f[epochs[0]], -1, 0) for f in self._timed]
-        else:
-            index = np.arange(self._num_envs)
-            fields = [f if f is None else f[epochs, ..., index] for f in self._timed]
-        return simulation.Epoch(*fields)  # pyright: ignore[reportArgumentType]
+        """All worlds, each at its epoch (B,), in Fortran's order."""
+        together = (epochs == epochs[0]).all()
+        rows = slice(None) if together else np.arange(self._num_envs)
+        where = rows, epochs[0] if together else epochs
+        fields = *self._timed, self._normals, self._uniforms
+        return simulation.Epoch(*(f if f is None else np.asfortranarray(f[where]) for f in fields))  # pyright: ignore[reportArgumentType]
+
+
+def _rows(worlds: np.ndarray) -> slice | np.ndarray:
+    """Indices in ascending order, as a slice where they are neighbours."""
+    first, last = worlds[0], worlds[-1]
+    return slice(first, last + 1) if last - first + 1 == len(worlds) else worlds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -103,11 +104,12 @@ class TrackingEnv(gym.Env[Any, Any]):
         self._episode = episode
         self._epoch = 0
         self._anchors = episode.anchors.copy()
+        self._whole = at = simulation.whole(episode)
+        self._positions = ranging.tag_positions(at.rotation, at.translation, self._tags)
         self._measured: ranging.Measurement | None = None
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
-            at = simulation.whole(episode)
-            self._measured = simulation.measure(self.scene, at, episode.anchors)
+            self._measured = simulation.measure(self.scene, at, episode.anchors, self._positions)
         self._information: FloatArray | None = None
         observation, info, _ = self._observe(episode)
         info["prior_rotation"] = episode.prior_rotation.copy()
@@ -134,9 +136,9 @@ class TrackingEnv(gym.Env[Any, Any]):
         self, episode: simulation.Episode
     ) -> tuple[dict[str, np.ndarray], dict[str, Any], float]:
         k = self._epoch
-        at = simulation.epoch_of(episode, k)
+        at = simulation.Epoch(*(f if f is None else f[k] for f in self._whole))  # pyright: ignore[reportArgumentType]
         if self._measured is None:
-            measured = simulation.measure(self.scene, at, self._anchors)
+            measured = simulation.measure(self.scene, at, self._anchors, self._positions[k])
         else:
             measured = ranging.Measurement(*(field[k].copy() for field in self._measured))
         info: dict[str, Any] = {
@@ -160,7 +162,7 @@ class TrackingEnv(gym.Env[Any, Any]):
             reward = -float(np.log(info["score_m"]))
         observation = {
             "ranges": measured.ranges,
-            "links": measured.links.astype(np.int8),
+            "links": measured.links.view(np.int8),
             "anchors": self._anchors.copy(),
             "twist": at.twist.copy(),
         }
@@ -169,6 +171,11 @@ class TrackingEnv(gym.Env[Any, Any]):
 
 def check_action(action: ArrayLike, size: int) -> FloatArray:
     """An action as a finite vector of its size, or a ValueError."""
+    if isinstance(action, np.ndarray) and action.shape == (size,) and action.dtype.kind == "f":
+        array = action.astype(np.float64)
+        # The quick way out; a sum of squares that overflows goes the long way.
+        if math.isfinite(array.dot(array)):
+            return array
     array = check_array("action", action, (size,))
     if array.ndim != 1:
         raise ValueError(f"action must have shape ({size},), got {array.shape}")

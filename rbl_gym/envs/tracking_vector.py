@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
-from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.envs.episodes import EpisodeStore, whole_rows
 from rbl_gym.envs.tracking import REWARDS, action_space, are_zeros, observation_space
 
 
@@ -177,11 +177,12 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
                 raise ValueError(f"actions must have shape {shape}, got {velocities.shape}")
             velocities = np.asfortranarray(velocities)
             # Those that reset in this step get their anchors from the new episode.
-            np.copyto(
-                self._anchors,
-                simulation.move_anchors(self.scene, self._anchors, velocities),
-                where=moving[:, None, None],
-            )
+            with whole_rows():
+                moved = simulation.move_anchors(self.scene, self._anchors, velocities)
+            if moving.all():
+                self._anchors = moved
+            else:
+                self._anchors[moving] = moved[moving]
         elif not are_zeros(np.asarray(actions), (self.num_envs,)):
             raise ValueError(f"actions must be {self.num_envs} zeros where the anchors are fixed")
 
@@ -219,13 +220,14 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         `fresh` worlds are at the start of an episode, `moved` ones have just stepped: their bound
         is carried on. The others are only looked at again.
         """
-        stored = self._episodes.at(self._epochs)
+        with whole_rows():
+            stored = self._episodes.at(self._epochs)
+            measured = simulation.measure(self.scene, stored, self._anchors)
         at = stored._replace(
             rotation=stored.rotation.copy(),
             translation=stored.translation.copy(),
             twist=stored.twist.copy(),
         )
-        measured = simulation.measure(self.scene, at, self._anchors)
         observation = {
             "ranges": measured.ranges,
             "links": measured.links.view(np.int8),
