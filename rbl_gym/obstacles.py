@@ -33,21 +33,21 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
     obstacles
         (..., K, 6), centres and half sizes; K may be 0.
 
-    A segment that only touches a face is not blocked; one that ends inside a box is.
+    A segment that only touches a box is not blocked; one that ends inside a box is.
     """
     batch = np.broadcast_shapes(anchors.shape[:-2], points.shape[:-2], obstacles.shape[:-2])
     free = np.ones((*batch, points.shape[-2], anchors.shape[-2]), dtype=np.bool_)
-    for k in range(obstacles.shape[-2]):
-        centre, half = obstacles[..., k, :3], obstacles[..., k, 3:]
-        enter = np.zeros(free.shape)
-        leave = np.ones(free.shape)
-        for i in range(3):
-            # Places along the segment from anchor (0) to point (1), axis by axis.
-            begin = anchors[..., None, :, i] - centre[..., None, None, i]
-            along = points[..., :, None, i] - anchors[..., None, :, i]
-            along = np.where(along == 0, 1e-300, along)
-            middle, width = -begin / along, half[..., None, None, i] / np.abs(along)
-            np.maximum(enter, middle - width, out=enter)
-            np.minimum(leave, middle + width, out=leave)
-        free &= enter >= leave
+    along = [points[..., :, None, i] - anchors[..., None, :, i] for i in range(3)]
+    # Along a face the quotients are 0/0, and NaN never blocks.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for k in range(obstacles.shape[-2]):
+            # Places along the segment from anchor (0) to point (1) where it enters and leaves.
+            enter, leave = np.float64(0), np.float64(1)
+            for i in range(3):
+                away = obstacles[..., k, None, None, i] - anchors[..., None, :, i]
+                half = obstacles[..., k, None, None, 3 + i]
+                low, high = (away - half) / along[i], (away + half) / along[i]
+                enter = np.maximum(enter, np.minimum(low, high))
+                leave = np.minimum(leave, np.maximum(low, high))
+            free &= ~(enter < leave)
     return free

@@ -19,7 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import bounds, obstacles, ranging, rotations, scenes
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    as_float,
+    check_array,
+    check_finite,
+    check_number,
+)
 from rbl_gym.regions import Walls
 from rbl_gym.scenes import Scene
 
@@ -33,8 +40,9 @@ _POSE_SEED = 20130821
 _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
 # Uniforms that a context takes: region 6, each rack 6.
 _REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
-# Trials times poses times links that are scored at a time, so that the temporaries stay in cache.
-_BLOCK = 40_000
+# Trials times poses times links, and trials times poses, that are computed at a time, so that the
+# temporaries stay in cache.
+_LINKS_AT_ONCE, _POSES_AT_ONCE = 40_000, 512
 
 
 class Context(NamedTuple):
@@ -79,6 +87,8 @@ class PlacementTask:
     blocked_information: float = 0.01
 
     def __post_init__(self) -> None:
+        if not isinstance(self.scene, Scene):
+            raise ValueError(f"scene must be a Scene, got {self.scene!r:.80}")
         for name, low, high in (
             ("n_anchors", 1, math.inf), ("racks", 0, MAX_RACKS), ("n_poses", 1, math.inf),
         ):  # fmt: skip
@@ -87,6 +97,10 @@ class PlacementTask:
                 raise ValueError(f"{name} must be an int, got {value!r}")
             check_number(name, value, low=low, high=high)
         check_number("blocked_information", self.blocked_information, low=0.0, high=1.0)
+        if not np.ptp(self.scene.volume.bounds(), axis=0).any():
+            raise ValueError(
+                f"scene must have a volume with an extent, {self.scene.name!r} has none"
+            )
         if self.racks and not isinstance(self.scene.anchor_region, Walls):
             raise ValueError(
                 f"racks must be 0 in a scene without walls, got {self.racks} in {self.scene.name!r}"
@@ -104,6 +118,13 @@ class PlacementTask:
         """(6, 6): 60 degrees, and half of the volume's largest extent."""
         extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
         return np.diag([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+
+    @functools.cached_property
+    def tag_spread(self) -> FloatArray:
+        """C (6, 6, P) with ``C C^T = mean_n J_n^T J_n``: what a pose error moves, at the poses."""
+        J = bounds.tag_jacobian(self.poses[0], np.asarray(self.scene.tags))
+        values, vectors = np.linalg.eigh(np.einsum("pnki,pnkj->pij", J, J) / J.shape[1])
+        return np.moveaxis(vectors * np.sqrt(np.maximum(values, 0.0))[:, None], 0, -1).copy()
 
 
 def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:
@@ -199,9 +220,9 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
     coincident anchors from winning.
     """
-    anchors = check_array("anchors", anchors, ("M", 3))
+    anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
     batch = np.broadcast_shapes(anchors.shape[:-2], context.centre.shape[:-1])
-    size = max(1, _BLOCK // (task.n_poses * anchors.shape[-2] * len(task.scene.tags)))
+    size = max(1, _LINKS_AT_ONCE // (task.n_poses * anchors.shape[-2] * len(task.scene.tags)))
     if math.prod(batch) <= size:
         return score_of(task, information(task, context, anchors))
     flat = [
@@ -214,6 +235,15 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     return result.reshape(batch)
 
 
+def _checked(context: Context) -> Context:
+    """The context with finite arrays of the right shapes, or a ValueError."""
+    centre, half = (check_array(name, getattr(context, name), (3,)) for name in ("centre", "half"))
+    racks = check_finite("racks", as_float("racks", context.racks))
+    if racks.ndim < 2 or racks.shape[-1] != 6:
+        raise ValueError(f"racks must have shape (..., K, 6), got {racks.shape}")
+    return Context(centre, half, racks)
+
+
 def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
     """The array (..., n) with the batch as its one leading axis."""
     shape = array.shape[array.ndim - trailing :]
@@ -221,10 +251,34 @@ def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArra
 
 
 def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
-    """Score (...) of an information (..., P, 6, 6) at the task's poses."""
-    covariance = np.linalg.inv(information + task.prior_information)
-    tags = np.asarray(task.scene.tags)
-    return np.sqrt((bounds.score(covariance, task.poses[0], tags) ** 2).mean(axis=-1))
+    """Score (...) of an information (..., P, 6, 6) at the task's poses.
+
+    With ``A = F + prior = L L^T`` and ``mean_n J_n^T J_n = C C^T``, b^2 is the sum of squares of
+    ``L^-1 C``, found by elimination on ``[A | C]`` for many poses at once.
+    """
+    flat = information.reshape((-1, *information.shape[-3:]))
+    square = np.empty(len(flat))
+    size = max(1, _POSES_AT_ONCE // task.n_poses)
+    for begin in range(0, len(flat), size):
+        part = flat[begin : begin + size] + task.prior_information
+        square[begin : begin + size] = _mean_square(np.moveaxis(part, (-2, -1), (0, 1)), task)
+    if not np.isfinite(square).all():
+        raise ValueError(f"information must be positive and finite, got a score of {square.max()}")
+    return np.sqrt(square).reshape(information.shape[:-3])
+
+
+def _mean_square(A: FloatArray, task: PlacementTask) -> FloatArray:
+    """Mean of b^2 over the poses, (n,), of regularised information (6, 6, n, P)."""
+    A, C = np.ascontiguousarray(A), task.tag_spread[:, :, None]
+    square = np.zeros(A.shape[2:])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        while len(A):
+            root = 1 / np.sqrt(A[0, 0])
+            column, row = A[1:, 0] * root, C[0] * root
+            square += (row * row).sum(axis=0)
+            A = A[1:, 1:] - column[:, None] * column
+            C = C[1:] - column[:, None] * row
+    return np.asarray(square.mean(axis=-1))
 
 
 class Criteria(NamedTuple):
@@ -258,29 +312,35 @@ class Criteria(NamedTuple):
 
 def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Criteria:
     """All criteria of layouts (..., M, 3)."""
-    anchors = check_array("anchors", anchors, ("M", 3))
+    anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
     covariance = np.linalg.inv(information(task, context, anchors) + task.prior_information)
     tags, rotation = np.asarray(task.scene.tags), task.poses[0]
     b = bounds.score(covariance, rotation, tags)
-    J = bounds.tag_jacobian(rotation, tags)
-    # The pose error in metres at the tags: W = mean_n J_n^T J_n = L L^T, errors L^T (w, v).
-    L = np.linalg.cholesky(np.einsum("pnki,pnkj->pij", J, J) / len(tags))
-    values = np.maximum(np.linalg.eigvalsh(np.swapaxes(L, -1, -2) @ covariance @ L), 1e-300)
+    # The pose error (w, v) in metres at the tags: C^T (w, v).
+    C = np.moveaxis(task.tag_spread, -1, 0)
+    values = np.maximum(np.linalg.eigvalsh(np.swapaxes(C, -1, -2) @ covariance @ C), 1e-300)
     traces = [
         np.einsum("...ii->...", covariance[..., part, part]) for part in (slice(3, 6), slice(3))
     ]
-    singular = np.linalg.svd(_weighted_anchors(task, context, anchors), compute_uv=False)[..., :3]
-    ratio = singular[..., 0] / np.maximum(singular[..., -1], 1e-12 * singular[..., 0])
-    if anchors.shape[-2] < 4:
-        ratio = np.full(ratio.shape, np.inf)
     return Criteria(
         np.sqrt((b**2).mean(axis=-1)),
         *(np.sqrt(trace.mean(axis=-1)) for trace in traces),
         np.exp(0.5 * np.log(values).mean(axis=(-1, -2))),
         np.sqrt(values[..., -1].mean(axis=-1)),
         b.max(axis=-1),
-        np.exp(np.log(ratio).mean(axis=-1)),
+        _conditioning(_weighted_anchors(task, context, anchors)),
     )
+
+
+def _conditioning(spread: FloatArray) -> FloatArray:
+    """Geometric mean (...) of the condition numbers of Abar (..., P, M, 3); fewer than 4: inf."""
+    if spread.shape[-2] < 4:
+        return np.full(spread.shape[:-3], np.inf)
+    singular = np.linalg.svd(spread, compute_uv=False)
+    least = np.maximum(singular[..., 2], 1e-12 * singular[..., 0])
+    # Anchors that all coincide leave nothing at all.
+    ratio = np.divide(singular[..., 0], least, out=np.full(least.shape, 1e12), where=least > 0)
+    return np.exp(np.log(ratio).mean(axis=-1))
 
 
 def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
