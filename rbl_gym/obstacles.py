@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_array
+from rbl_gym.checks import FloatArray, as_float, check_array
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
     """Obstacles (K, 6) as an array, K may be 0; or a ValueError."""
-    array = np.asarray(obstacles, dtype=np.float64)
+    array = as_float("obstacles", obstacles)
     if array.size == 0:
         return np.empty((0, 6))
     array = check_array("obstacles", array, ("K", 6))
@@ -37,6 +37,8 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
     """
     batch = np.broadcast_shapes(anchors.shape[:-2], points.shape[:-2], obstacles.shape[:-2])
     free = np.ones((*batch, points.shape[-2], anchors.shape[-2]), dtype=np.bool_)
+    if not obstacles.shape[-2]:
+        return free
     along = [points[..., :, None, i] - anchors[..., None, :, i] for i in range(3)]
     # Along a face the quotients are 0/0, and NaN never blocks.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

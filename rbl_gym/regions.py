@@ -129,7 +129,7 @@ class Walls:
         """Where the ray from the middle of the room along the action meets a wall or the ceiling.
 
         A ray that points down is cut at the floor's height; one to the floor itself goes to the
-        nearest wall.
+        nearest legal point.
         """
         action = _cut(action)
         reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
