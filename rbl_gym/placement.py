@@ -223,7 +223,7 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
     batch = np.broadcast_shapes(anchors.shape[:-2], context.centre.shape[:-1])
     size = max(1, _LINKS_AT_ONCE // (task.n_poses * anchors.shape[-2] * len(task.scene.tags)))
-    if math.prod(batch) <= size:
+    if 0 < math.prod(batch) <= size:
         return score_of(task, information(task, context, anchors))
     flat = [
         _flat(array, n, batch) for array, n in zip((anchors, *context), (2, 1, 1, 2), strict=True)
