@@ -16,7 +16,7 @@ from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.placement import Context
 
 MODES = ("sequential", "one-shot", "mounts")
-# Score from which the shaped reward of the mounts counts, metres: about that of no anchor.
+# Score from which the shaped reward of the mounts counts, metres.
 _EMPTY_SCORE_M = 3.0
 
 
@@ -95,13 +95,10 @@ class AnchorPlacementVectorEnv(BatchEnv):
         complete = np.asarray(moving & (self._epochs == self._placements))
         if self.mode == "mounts":
             return self._mount(actions, rows, step, complete), complete
-        if self.mode == "one-shot":
-            self._actions[rows] = np.clip(actions[rows], -1, 1).reshape(
-                len(rows), self.task.n_anchors, 3
-            )
-        else:
-            self._actions[rows, step] = np.clip(actions[rows], -1, 1)
-        self._anchors[rows] = self.task.scene.anchor_region.place(self._actions[rows])
+        # One-shot: all anchors of a world; else the next one.
+        new = (rows,) if self.mode == "one-shot" else (rows, step)
+        self._actions[new] = np.clip(actions[rows], -1, 1).reshape(self._actions[new].shape)
+        self._anchors[new] = self.task.scene.anchor_region.place(self._actions[new])
         reward = np.zeros(self.num_envs)
         if complete.any():
             problems = Context(*(field[complete] for field in self._contexts))
