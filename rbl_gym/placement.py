@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -40,9 +41,10 @@ _POSE_SEED = 20130821
 _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
 # Uniforms that a context takes: region 6, each rack 6.
 _REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
-# Trials times poses times links, and trials times poses, that are computed at a time, so that the
-# temporaries stay in cache.
-_LINKS_AT_ONCE, _POSES_AT_ONCE = 40_000, 512
+# Problems times poses times links, and so on, that are computed at a time: temporaries in cache.
+_LINKS_AT_ONCE, _POSES_AT_ONCE, _SIGHTS_AT_ONCE = 16_000, 512, 16_000
+# The six entries of a symmetric 3 x 3 matrix.
+_ENTRIES = [(i, j) for i in range(3) for j in range(i, 3)]
 
 
 class Context(NamedTuple):
@@ -118,6 +120,20 @@ class PlacementTask:
         """(6, 6): 60 degrees, and half of the volume's largest extent."""
         extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
         return np.diag([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+
+    @functools.cached_property
+    def turned_tags(self) -> FloatArray:
+        """Tags (P, N, 3) as the poses turn them."""
+        return np.asarray(self.scene.tags) @ np.swapaxes(self.poses[0], -1, -2)
+
+    @functools.cached_property
+    def tag_lift(self) -> FloatArray:
+        """(P, 36, 6 N): pose information by the six entries of that about each tag's place."""
+        J = bounds.tag_jacobian(self.poses[0], np.asarray(self.scene.tags))
+        products = np.einsum("pnia,pnjb->pabnij", J, J)
+        products = products + np.where(np.eye(3, dtype=bool), 0, np.swapaxes(products, -1, -2))
+        rows, columns = zip(*_ENTRIES, strict=True)
+        return products[..., rows, columns].reshape((len(J), 36, -1))
 
     @functools.cached_property
     def tag_spread(self) -> FloatArray:
@@ -202,15 +218,41 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
 
     It is a sum over the anchors: the information of a layout is that of its parts together.
     """
+    return _in_blocks(
+        lambda *some: _information(task, *some).transpose(3, 2, 0, 1),
+        context, anchors, _problems_at_once(task, anchors), (task.n_poses, 6, 6),
+    )  # fmt: skip
+
+
+def _information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """`information` as (6, 6, P, B), of one batch axis.
+
+    That of each tag's place, ``U_n = sum_m w u u^T``, lifted to the pose, ``sum_n J_n^T U_n J_n``;
+    arrays (P, N, M, B), so that every step runs along the problems.
+    """
     places = positions(task, context)
-    rotation = task.poses[0]
-    links = None
+    between = np.moveaxis(places[:, :, None] - anchors[:, None], 0, -1)  # (P, M, 3, B)
+    tags = task.turned_tags[..., None, None]
+    d = [np.ascontiguousarray(between[:, :, i])[:, None] + tags[:, :, i] for i in range(3)]
+    square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
+    # The laws know the tags as the last axis.
+    variance = task.scene.noise.variance(np.moveaxis(np.sqrt(square), 1, -1))
+    # Where an anchor stands on a tag the range has no gradient: that link tells nothing.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        weight = np.where(square > 0, 1 / (np.moveaxis(variance, -1, 1) * square), 0.0)
     if context.racks.shape[-2]:
-        sight = obstacles.in_sight(anchors, places, context.racks)
-        links = np.where(sight, 1.0, task.blocked_information)[..., None]
-    tags = np.asarray(task.scene.tags)
-    spread = anchors[..., None, :, :]
-    return bounds.information_at(spread, tags, rotation, places, task.scene.noise, links)
+        sight = np.moveaxis(obstacles.in_sight(anchors, places, context.racks), 0, -1)
+        weight *= np.where(sight, 1.0, task.blocked_information)[:, None]
+    weighted = [weight * component for component in d]
+    of_tags = np.empty((*square.shape[:2], 6, square.shape[-1]))
+    for k, (i, j) in enumerate(_ENTRIES):
+        (weighted[i] * d[j]).sum(axis=2, out=of_tags[:, :, k])
+    lifted = task.tag_lift @ of_tags.reshape((len(of_tags), -1, of_tags.shape[-1]))
+    return np.moveaxis(lifted, 0, 1).reshape((6, 6, *np.shape(lifted)[::2]))
+
+
+def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
+    return _LINKS_AT_ONCE // (task.n_poses * anchors.shape[-2] * len(task.scene.tags))
 
 
 def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
@@ -221,18 +263,31 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     coincident anchors from winning.
     """
     anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
+    prior = task.prior_information[..., None, None]
+    square = _in_blocks(
+        lambda *some: _mean_square(task, _information(task, *some) + prior),
+        context, anchors, _problems_at_once(task, anchors), (),
+    )  # fmt: skip
+    return _root(square)
+
+
+def _in_blocks(
+    function: Callable[[Context, FloatArray], FloatArray],
+    context: Context,
+    anchors: FloatArray,
+    size: int,
+    shape: tuple[int, ...],
+) -> FloatArray:
+    """Results (..., *shape) of a function of one batch axis, `size` problems at a time."""
     batch = np.broadcast_shapes(anchors.shape[:-2], context.centre.shape[:-1])
-    size = max(1, _LINKS_AT_ONCE // (task.n_poses * anchors.shape[-2] * len(task.scene.tags)))
-    if 0 < math.prod(batch) <= size:
-        return score_of(task, information(task, context, anchors))
-    flat = [
-        _flat(array, n, batch) for array, n in zip((anchors, *context), (2, 1, 1, 2), strict=True)
-    ]
-    result = np.empty(math.prod(batch))
-    for begin in range(0, len(result), size):
-        part, *rest = (array[begin : begin + size] for array in flat)
-        result[begin : begin + size] = score_of(task, information(task, Context(*rest), part))
-    return result.reshape(batch)
+    arrays = zip((*context, anchors), (1, 1, 2, 2), strict=True)
+    flat = [_flat(array, trailing, batch) for array, trailing in arrays]
+    result = np.empty((math.prod(batch), *shape))
+    for begin in range(0, len(result), max(1, size)):
+        some = slice(begin, begin + max(1, size))
+        *fields, part = (array[some] for array in flat)
+        result[some] = function(Context(*fields), part)
+    return result.reshape((*batch, *shape))
 
 
 def _checked(context: Context) -> Context:
@@ -261,15 +316,19 @@ def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
     size = max(1, _POSES_AT_ONCE // task.n_poses)
     for begin in range(0, len(flat), size):
         part = flat[begin : begin + size] + task.prior_information
-        square[begin : begin + size] = _mean_square(np.moveaxis(part, (-2, -1), (0, 1)), task)
+        square[begin : begin + size] = _mean_square(task, part.transpose(2, 3, 1, 0))
+    return _root(square).reshape(information.shape[:-3])
+
+
+def _root(square: FloatArray) -> FloatArray:
     if not np.isfinite(square).all():
-        raise ValueError(f"information must be positive and finite, got a score of {square.max()}")
-    return np.sqrt(square).reshape(information.shape[:-3])
+        raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
+    return np.sqrt(square)
 
 
-def _mean_square(A: FloatArray, task: PlacementTask) -> FloatArray:
-    """Mean of b^2 over the poses, (n,), of regularised information (6, 6, n, P)."""
-    A, C = np.ascontiguousarray(A), task.tag_spread[:, :, None]
+def _mean_square(task: PlacementTask, A: FloatArray) -> FloatArray:
+    """Mean of b^2 over the poses, (n,), of regularised information (6, 6, P, n)."""
+    A, C = np.ascontiguousarray(A), task.tag_spread[..., None]
     square = np.zeros(A.shape[2:])
     with np.errstate(divide="ignore", invalid="ignore"):
         while len(A):
@@ -278,7 +337,7 @@ def _mean_square(A: FloatArray, task: PlacementTask) -> FloatArray:
             square += (row * row).sum(axis=0)
             A = A[1:, 1:] - column[:, None] * column
             C = C[1:] - column[:, None] * row
-    return np.asarray(square.mean(axis=-1))
+    return np.asarray(square.mean(axis=0))
 
 
 class Criteria(NamedTuple):
@@ -381,8 +440,11 @@ def mounts(task: PlacementTask) -> FloatArray:
 
 def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """Share (..., M) of the task's poses that each anchor sees."""
-    seen = obstacles.in_sight(anchors, positions(task, context), context.racks)
-    return np.asarray(seen.mean(axis=-2))
+    return _in_blocks(
+        lambda some, part: obstacles.in_sight(part, positions(task, some), some.racks).mean(axis=1),
+        context, anchors, _SIGHTS_AT_ONCE // (task.n_poses * anchors.shape[-2]),
+        anchors.shape[-2:-1],
+    )  # fmt: skip
 
 
 def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:
