@@ -5,6 +5,9 @@ An obstacle is a row of six numbers, centre and half size of an axis-aligned box
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from rbl_gym.checks import FloatArray, as_float, check_array
@@ -39,17 +42,34 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
     free = np.ones((*batch, points.shape[-2], anchors.shape[-2]), dtype=np.bool_)
     if not obstacles.shape[-2]:
         return free
-    along = [points[..., :, None, i] - anchors[..., None, :, i] for i in range(3)]
+    start = [anchors[..., None, :, i] for i in range(3)]
+    along = [points[..., :, None, i] - start[i] for i in range(3)]
+    boxes = np.moveaxis(obstacles, (-2, -1), (0, 1))[..., None, None]
+    return free & clear(start, along, boxes)
+
+
+def clear(
+    start: Sequence[FloatArray] | FloatArray, along: Sequence[FloatArray], boxes: FloatArray
+) -> np.ndarray:
+    """Whether segments pass by all boxes.
+
+    Parameters
+    ----------
+    start, along
+        Three components (...) each: one end, and the other end less it.
+    boxes
+        (K, 6, ...), K at least 1.
+    """
+    free: Any = True
     # Along a face the quotients are 0/0, and NaN never blocks.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for k in range(obstacles.shape[-2]):
-            # Places along the segment from anchor (0) to point (1) where it enters and leaves.
+        for box in boxes:
+            # Places along the segment where it enters and leaves.
             enter, leave = np.float64(0), np.float64(1)
             for i in range(3):
-                away = obstacles[..., k, None, None, i] - anchors[..., None, :, i]
-                half = obstacles[..., k, None, None, 3 + i]
+                away, half = box[i] - start[i], box[3 + i]
                 low, high = (away - half) / along[i], (away + half) / along[i]
                 enter = np.maximum(enter, np.minimum(low, high))
                 leave = np.minimum(leave, np.maximum(low, high))
-            free &= ~(enter < leave)
+            free = free & ~(enter < leave)
     return free

@@ -30,6 +30,7 @@ from rbl_gym.checks import (
 )
 from rbl_gym.regions import Walls
 from rbl_gym.scenes import Scene
+from rbl_gym.shared_poses import SharedPoses
 
 # Anchors of a task where nothing else is said: the scenes' own, and one fewer beside racks.
 MAX_RACKS = 2
@@ -43,8 +44,6 @@ _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
 _REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
 # Problems times poses times links, and so on, that are computed at a time: temporaries in cache.
 _LINKS_AT_ONCE, _POSES_AT_ONCE, _SIGHTS_AT_ONCE = 16_000, 512, 16_000
-# The six entries of a symmetric 3 x 3 matrix.
-_ENTRIES = [(i, j) for i in range(3) for j in range(i, 3)]
 
 
 class Context(NamedTuple):
@@ -122,25 +121,9 @@ class PlacementTask:
         return np.diag([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
 
     @functools.cached_property
-    def turned_tags(self) -> FloatArray:
-        """Tags (P, N, 3) as the poses turn them."""
-        return np.asarray(self.scene.tags) @ np.swapaxes(self.poses[0], -1, -2)
-
-    @functools.cached_property
-    def tag_lift(self) -> FloatArray:
-        """(P, 36, 6 N): pose information by the six entries of that about each tag's place."""
-        J = bounds.tag_jacobian(self.poses[0], np.asarray(self.scene.tags))
-        products = np.einsum("pnia,pnjb->pabnij", J, J)
-        products = products + np.where(np.eye(3, dtype=bool), 0, np.swapaxes(products, -1, -2))
-        rows, columns = zip(*_ENTRIES, strict=True)
-        return products[..., rows, columns].reshape((len(J), 36, -1))
-
-    @functools.cached_property
-    def tag_spread(self) -> FloatArray:
-        """C (6, 6, P) with ``C C^T = mean_n J_n^T J_n``: what a pose error moves, at the poses."""
-        J = bounds.tag_jacobian(self.poses[0], np.asarray(self.scene.tags))
-        values, vectors = np.linalg.eigh(np.einsum("pnki,pnkj->pij", J, J) / J.shape[1])
-        return np.moveaxis(vectors * np.sqrt(np.maximum(values, 0.0))[:, None], 0, -1).copy()
+    def shared(self) -> SharedPoses:
+        """What the poses and the tags alone decide."""
+        return SharedPoses(self.poses[0], np.asarray(self.scene.tags))
 
 
 def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:
@@ -225,30 +208,16 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
 
 
 def _information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """`information` as (6, 6, P, B), of one batch axis.
-
-    That of each tag's place, ``U_n = sum_m w u u^T``, lifted to the pose, ``sum_n J_n^T U_n J_n``;
-    arrays (P, N, M, B), so that every step runs along the problems.
-    """
-    places = positions(task, context)
-    between = np.moveaxis(places[:, :, None] - anchors[:, None], 0, -1)  # (P, M, 3, B)
-    tags = task.turned_tags[..., None, None]
-    d = [np.ascontiguousarray(between[:, :, i])[:, None] + tags[:, :, i] for i in range(3)]
-    square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-    # The laws know the tags as the last axis.
-    variance = task.scene.noise.variance(np.moveaxis(np.sqrt(square), 1, -1))
-    # Where an anchor stands on a tag the range has no gradient: that link tells nothing.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weight = np.where(square > 0, 1 / (np.moveaxis(variance, -1, 1) * square), 0.0)
+    """`information` as (6, 6, P, B), of one batch axis."""
+    end = np.moveaxis(positions(task, context), 0, -1).copy()
+    start = np.moveaxis(anchors, 0, -1).copy()
+    away = [end[:, None, i] - start[:, i] for i in range(3)]
+    share = None
     if context.racks.shape[-2]:
-        sight = np.moveaxis(obstacles.in_sight(anchors, places, context.racks), 0, -1)
-        weight *= np.where(sight, 1.0, task.blocked_information)[:, None]
-    weighted = [weight * component for component in d]
-    of_tags = np.empty((*square.shape[:2], 6, square.shape[-1]))
-    for k, (i, j) in enumerate(_ENTRIES):
-        (weighted[i] * d[j]).sum(axis=2, out=of_tags[:, :, k])
-    lifted = task.tag_lift @ of_tags.reshape((len(of_tags), -1, of_tags.shape[-1]))
-    return np.moveaxis(lifted, 0, 1).reshape((6, 6, *np.shape(lifted)[::2]))
+        boxes = np.moveaxis(context.racks, 0, -1).copy()
+        sight = obstacles.clear(start.swapaxes(0, 1), away, boxes)
+        share = np.where(sight, 1.0, task.blocked_information)
+    return task.shared.information(away, task.scene.noise, share)
 
 
 def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
@@ -265,7 +234,7 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
     prior = task.prior_information[..., None, None]
     square = _in_blocks(
-        lambda *some: _mean_square(task, _information(task, *some) + prior),
+        lambda *some: task.shared.mean_square(_information(task, *some) + prior),
         context, anchors, _problems_at_once(task, anchors), (),
     )  # fmt: skip
     return _root(square)
@@ -306,17 +275,13 @@ def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArra
 
 
 def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
-    """Score (...) of an information (..., P, 6, 6) at the task's poses.
-
-    With ``A = F + prior = L L^T`` and ``mean_n J_n^T J_n = C C^T``, b^2 is the sum of squares of
-    ``L^-1 C``, found by elimination on ``[A | C]`` for many poses at once.
-    """
+    """Score (...) of an information (..., P, 6, 6) at the task's poses."""
     flat = information.reshape((-1, *information.shape[-3:]))
     square = np.empty(len(flat))
     size = max(1, _POSES_AT_ONCE // task.n_poses)
     for begin in range(0, len(flat), size):
         part = flat[begin : begin + size] + task.prior_information
-        square[begin : begin + size] = _mean_square(task, part.transpose(2, 3, 1, 0))
+        square[begin : begin + size] = task.shared.mean_square(part.transpose(2, 3, 1, 0))
     return _root(square).reshape(information.shape[:-3])
 
 
@@ -324,20 +289,6 @@ def _root(square: FloatArray) -> FloatArray:
     if not np.isfinite(square).all():
         raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
     return np.sqrt(square)
-
-
-def _mean_square(task: PlacementTask, A: FloatArray) -> FloatArray:
-    """Mean of b^2 over the poses, (n,), of regularised information (6, 6, P, n)."""
-    A, C = np.ascontiguousarray(A), task.tag_spread[..., None]
-    square = np.zeros(A.shape[2:])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        while len(A):
-            root = 1 / np.sqrt(A[0, 0])
-            column, row = A[1:, 0] * root, C[0] * root
-            square += (row * row).sum(axis=0)
-            A = A[1:, 1:] - column[:, None] * column
-            C = C[1:] - column[:, None] * row
-    return np.asarray(square.mean(axis=0))
 
 
 class Criteria(NamedTuple):
@@ -376,7 +327,7 @@ def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Crit
     tags, rotation = np.asarray(task.scene.tags), task.poses[0]
     b = bounds.score(covariance, rotation, tags)
     # The pose error (w, v) in metres at the tags: C^T (w, v).
-    C = np.moveaxis(task.tag_spread, -1, 0)
+    C = np.moveaxis(task.shared.spread, -1, 0)
     values = np.maximum(np.linalg.eigvalsh(np.swapaxes(C, -1, -2) @ covariance @ C), 1e-300)
     traces = [
         np.einsum("...ii->...", covariance[..., part, part]) for part in (slice(3, 6), slice(3))
