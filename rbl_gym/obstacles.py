@@ -49,7 +49,7 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
 
 
 def clear(
-    start: Sequence[FloatArray] | FloatArray, along: Sequence[FloatArray], boxes: FloatArray
+    start: Sequence[FloatArray], along: Sequence[FloatArray], boxes: FloatArray
 ) -> np.ndarray:
     """Whether segments pass by all boxes.
 

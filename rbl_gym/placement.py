@@ -209,15 +209,25 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
 
 def _information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """`information` as (6, 6, P, B), of one batch axis."""
-    end = np.moveaxis(positions(task, context), 0, -1).copy()
-    start = np.moveaxis(anchors, 0, -1).copy()
-    away = [end[:, None, i] - start[:, i] for i in range(3)]
+    start, away = _segments(task, context, anchors)
     share = None
     if context.racks.shape[-2]:
-        boxes = np.moveaxis(context.racks, 0, -1).copy()
-        sight = obstacles.clear(start.swapaxes(0, 1), away, boxes)
-        share = np.where(sight, 1.0, task.blocked_information)
+        share = np.where(_sight(context, start, away), 1.0, task.blocked_information)
     return task.shared.information(away, task.scene.noise, share)
+
+
+def _segments(
+    task: PlacementTask, context: Context, anchors: FloatArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Components of the anchors (M, B), and of the body's places less them (P, M, B)."""
+    end = np.moveaxis(positions(task, context), 0, -1).copy()
+    start = np.moveaxis(anchors, 0, -1).copy()
+    return [start[:, i] for i in range(3)], [end[:, None, i] - start[:, i] for i in range(3)]
+
+
+def _sight(context: Context, start: list[FloatArray], away: list[FloatArray]) -> BoolArray:
+    """Which anchor sees which place, (P, M, B); needs racks."""
+    return obstacles.clear(start, away, np.moveaxis(context.racks, 0, -1).copy())
 
 
 def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
@@ -391,8 +401,10 @@ def mounts(task: PlacementTask) -> FloatArray:
 
 def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """Share (..., M) of the task's poses that each anchor sees."""
+    if not context.racks.shape[-2]:
+        return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
     return _in_blocks(
-        lambda some, part: obstacles.in_sight(part, positions(task, some), some.racks).mean(axis=1),
+        lambda some, part: _sight(some, *_segments(task, some, part)).mean(axis=0).T,
         context, anchors, _SIGHTS_AT_ONCE // (task.n_poses * anchors.shape[-2]),
         anchors.shape[-2:-1],
     )  # fmt: skip
