@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_array
+from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.layouts import Layout
 from rbl_gym.placement import Context, PlacementTask, information, score, score_of
 
@@ -20,6 +20,7 @@ def best_of_random(
     task: PlacementTask, context: Context, rng: np.random.Generator, tries: int = 100
 ) -> FloatArray:
     """The best of `tries` random layouts."""
+    check_number("tries", tries, low=1)
     batch = context.centre.shape[:-1]
     drawn = task.scene.anchor_region.draw(rng.random((*batch, tries, task.n_anchors, 3)))
     best = score(task, expand(context), drawn).argmin(axis=-1)
@@ -162,6 +163,8 @@ def shared_layout(
     sigma: float = 0.6,
 ) -> FloatArray:
     """One layout (M, 3) for all contexts (C,): CMA-ES on the mean log score."""
+    if contexts.centre.ndim != 2:
+        raise ValueError(f"contexts must have one batch axis, got {contexts.centre.shape[:-1]}")
     size = 3 * task.n_anchors
     strategy = _strategy(0.1 * rng.standard_normal(size), sigma, population, rng)
     best, best_value = np.zeros(size), math.inf

@@ -5,14 +5,17 @@ An obstacle is a row of six numbers, centre and half size of an axis-aligned box
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_array
+from rbl_gym.checks import FloatArray, as_float, check_array
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
     """Obstacles (K, 6) as an array, K may be 0; or a ValueError."""
-    array = np.asarray(obstacles, dtype=np.float64)
+    array = as_float("obstacles", obstacles)
     if array.size == 0:
         return np.empty((0, 6))
     array = check_array("obstacles", array, ("K", 6))
@@ -33,21 +36,40 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
     obstacles
         (..., K, 6), centres and half sizes; K may be 0.
 
-    A segment that only touches a face is not blocked; one that ends inside a box is.
+    A segment that only touches a box is not blocked; one that ends inside a box is.
     """
     batch = np.broadcast_shapes(anchors.shape[:-2], points.shape[:-2], obstacles.shape[:-2])
     free = np.ones((*batch, points.shape[-2], anchors.shape[-2]), dtype=np.bool_)
-    for k in range(obstacles.shape[-2]):
-        centre, half = obstacles[..., k, :3], obstacles[..., k, 3:]
-        enter = np.zeros(free.shape)
-        leave = np.ones(free.shape)
-        for i in range(3):
-            # Places along the segment from anchor (0) to point (1), axis by axis.
-            begin = anchors[..., None, :, i] - centre[..., None, None, i]
-            along = points[..., :, None, i] - anchors[..., None, :, i]
-            along = np.where(along == 0, 1e-300, along)
-            middle, width = -begin / along, half[..., None, None, i] / np.abs(along)
-            np.maximum(enter, middle - width, out=enter)
-            np.minimum(leave, middle + width, out=leave)
-        free &= enter >= leave
+    if not obstacles.shape[-2]:
+        return free
+    start = [anchors[..., None, :, i] for i in range(3)]
+    along = [points[..., :, None, i] - start[i] for i in range(3)]
+    boxes = np.moveaxis(obstacles, (-2, -1), (0, 1))[..., None, None]
+    return free & clear(start, along, boxes)
+
+
+def clear(
+    start: Sequence[FloatArray], along: Sequence[FloatArray], boxes: FloatArray
+) -> np.ndarray:
+    """Whether segments pass by all boxes.
+
+    Parameters
+    ----------
+    start, along
+        Three components (...) each: one end, and the other end less it.
+    boxes
+        (K, 6, ...), K at least 1.
+    """
+    free: Any = True
+    # Along a face the quotients are 0/0, and NaN never blocks.
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for box in boxes:
+            # Places along the segment where it enters and leaves.
+            enter, leave = np.float64(0), np.float64(1)
+            for i in range(3):
+                away, half = box[i] - start[i], box[3 + i]
+                low, high = (away - half) / along[i], (away + half) / along[i]
+                enter = np.maximum(enter, np.minimum(low, high))
+                leave = np.minimum(leave, np.maximum(low, high))
+            free = free & ~(enter < leave)
     return free

@@ -13,15 +13,24 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym import bounds, obstacles, ranging, rotations, scenes
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    as_float,
+    check_array,
+    check_finite,
+    check_number,
+)
 from rbl_gym.regions import Walls
 from rbl_gym.scenes import Scene
+from rbl_gym.shared_poses import SharedPoses
 
 # Anchors of a task where nothing else is said: the scenes' own, and one fewer beside racks.
 MAX_RACKS = 2
@@ -33,8 +42,8 @@ _POSE_SEED = 20130821
 _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
 # Uniforms that a context takes: region 6, each rack 6.
 _REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
-# Trials times poses times links that are scored at a time, so that the temporaries stay in cache.
-_BLOCK = 40_000
+# Problems times poses times links, and so on, that are computed at a time: temporaries in cache.
+_LINKS_AT_ONCE, _POSES_AT_ONCE, _SIGHTS_AT_ONCE = 16_000, 512, 16_000
 
 
 class Context(NamedTuple):
@@ -79,6 +88,8 @@ class PlacementTask:
     blocked_information: float = 0.01
 
     def __post_init__(self) -> None:
+        if not isinstance(self.scene, Scene):
+            raise ValueError(f"scene must be a Scene, got {self.scene!r:.80}")
         for name, low, high in (
             ("n_anchors", 1, math.inf), ("racks", 0, MAX_RACKS), ("n_poses", 1, math.inf),
         ):  # fmt: skip
@@ -87,6 +98,10 @@ class PlacementTask:
                 raise ValueError(f"{name} must be an int, got {value!r}")
             check_number(name, value, low=low, high=high)
         check_number("blocked_information", self.blocked_information, low=0.0, high=1.0)
+        if not np.ptp(self.scene.volume.bounds(), axis=0).any():
+            raise ValueError(
+                f"scene must have a volume with an extent, {self.scene.name!r} has none"
+            )
         if self.racks and not isinstance(self.scene.anchor_region, Walls):
             raise ValueError(
                 f"racks must be 0 in a scene without walls, got {self.racks} in {self.scene.name!r}"
@@ -104,6 +119,11 @@ class PlacementTask:
         """(6, 6): 60 degrees, and half of the volume's largest extent."""
         extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
         return np.diag([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+
+    @functools.cached_property
+    def shared(self) -> SharedPoses:
+        """What the poses and the tags alone decide."""
+        return SharedPoses(self.poses[0], np.asarray(self.scene.tags))
 
 
 def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:
@@ -181,15 +201,37 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
 
     It is a sum over the anchors: the information of a layout is that of its parts together.
     """
-    places = positions(task, context)
-    rotation = task.poses[0]
-    links = None
+    return _in_blocks(
+        lambda *some: _information(task, *some).transpose(3, 2, 0, 1),
+        context, anchors, _problems_at_once(task, anchors), (task.n_poses, 6, 6),
+    )  # fmt: skip
+
+
+def _information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """`information` as (6, 6, P, B), of one batch axis."""
+    start, away = _segments(task, context, anchors)
+    share = None
     if context.racks.shape[-2]:
-        sight = obstacles.in_sight(anchors, places, context.racks)
-        links = np.where(sight, 1.0, task.blocked_information)[..., None]
-    tags = np.asarray(task.scene.tags)
-    spread = anchors[..., None, :, :]
-    return bounds.information_at(spread, tags, rotation, places, task.scene.noise, links)
+        share = np.where(_sight(context, start, away), 1.0, task.blocked_information)
+    return task.shared.information(away, task.scene.noise, share)
+
+
+def _segments(
+    task: PlacementTask, context: Context, anchors: FloatArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Components of the anchors (M, B), and of the body's places less them (P, M, B)."""
+    end = np.moveaxis(positions(task, context), 0, -1).copy()
+    start = np.moveaxis(anchors, 0, -1).copy()
+    return [start[:, i] for i in range(3)], [end[:, None, i] - start[:, i] for i in range(3)]
+
+
+def _sight(context: Context, start: list[FloatArray], away: list[FloatArray]) -> BoolArray:
+    """Which anchor sees which place, (P, M, B); needs racks."""
+    return obstacles.clear(start, away, np.moveaxis(context.racks, 0, -1).copy())
+
+
+def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
+    return _LINKS_AT_ONCE // (task.n_poses * anchors.shape[-2] * len(task.scene.tags))
 
 
 def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
@@ -199,19 +241,41 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
     coincident anchors from winning.
     """
-    anchors = check_array("anchors", anchors, ("M", 3))
+    anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
+    prior = task.prior_information[..., None, None]
+    square = _in_blocks(
+        lambda *some: task.shared.mean_square(_information(task, *some) + prior),
+        context, anchors, _problems_at_once(task, anchors), (),
+    )  # fmt: skip
+    return _root(square)
+
+
+def _in_blocks(
+    function: Callable[[Context, FloatArray], FloatArray],
+    context: Context,
+    anchors: FloatArray,
+    size: int,
+    shape: tuple[int, ...],
+) -> FloatArray:
+    """Results (..., *shape) of a function of one batch axis, `size` problems at a time."""
     batch = np.broadcast_shapes(anchors.shape[:-2], context.centre.shape[:-1])
-    size = max(1, _BLOCK // (task.n_poses * anchors.shape[-2] * len(task.scene.tags)))
-    if math.prod(batch) <= size:
-        return score_of(task, information(task, context, anchors))
-    flat = [
-        _flat(array, n, batch) for array, n in zip((anchors, *context), (2, 1, 1, 2), strict=True)
-    ]
-    result = np.empty(math.prod(batch))
-    for begin in range(0, len(result), size):
-        part, *rest = (array[begin : begin + size] for array in flat)
-        result[begin : begin + size] = score_of(task, information(task, Context(*rest), part))
-    return result.reshape(batch)
+    arrays = zip((*context, anchors), (1, 1, 2, 2), strict=True)
+    flat = [_flat(array, trailing, batch) for array, trailing in arrays]
+    result = np.empty((math.prod(batch), *shape))
+    for begin in range(0, len(result), max(1, size)):
+        some = slice(begin, begin + max(1, size))
+        *fields, part = (array[some] for array in flat)
+        result[some] = function(Context(*fields), part)
+    return result.reshape((*batch, *shape))
+
+
+def _checked(context: Context) -> Context:
+    """The context with finite arrays of the right shapes, or a ValueError."""
+    centre, half = (check_array(name, getattr(context, name), (3,)) for name in ("centre", "half"))
+    racks = check_finite("racks", as_float("racks", context.racks))
+    if racks.ndim < 2 or racks.shape[-1] != 6:
+        raise ValueError(f"racks must have shape (..., K, 6), got {racks.shape}")
+    return Context(centre, half, racks)
 
 
 def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
@@ -222,9 +286,19 @@ def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArra
 
 def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
     """Score (...) of an information (..., P, 6, 6) at the task's poses."""
-    covariance = np.linalg.inv(information + task.prior_information)
-    tags = np.asarray(task.scene.tags)
-    return np.sqrt((bounds.score(covariance, task.poses[0], tags) ** 2).mean(axis=-1))
+    flat = information.reshape((-1, *information.shape[-3:]))
+    square = np.empty(len(flat))
+    size = max(1, _POSES_AT_ONCE // task.n_poses)
+    for begin in range(0, len(flat), size):
+        part = flat[begin : begin + size] + task.prior_information
+        square[begin : begin + size] = task.shared.mean_square(part.transpose(2, 3, 1, 0))
+    return _root(square).reshape(information.shape[:-3])
+
+
+def _root(square: FloatArray) -> FloatArray:
+    if not np.isfinite(square).all():
+        raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
+    return np.sqrt(square)
 
 
 class Criteria(NamedTuple):
@@ -258,29 +332,35 @@ class Criteria(NamedTuple):
 
 def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Criteria:
     """All criteria of layouts (..., M, 3)."""
-    anchors = check_array("anchors", anchors, ("M", 3))
+    anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
     covariance = np.linalg.inv(information(task, context, anchors) + task.prior_information)
     tags, rotation = np.asarray(task.scene.tags), task.poses[0]
     b = bounds.score(covariance, rotation, tags)
-    J = bounds.tag_jacobian(rotation, tags)
-    # The pose error in metres at the tags: W = mean_n J_n^T J_n = L L^T, errors L^T (w, v).
-    L = np.linalg.cholesky(np.einsum("pnki,pnkj->pij", J, J) / len(tags))
-    values = np.maximum(np.linalg.eigvalsh(np.swapaxes(L, -1, -2) @ covariance @ L), 1e-300)
+    # The pose error (w, v) in metres at the tags: C^T (w, v).
+    C = np.moveaxis(task.shared.spread, -1, 0)
+    values = np.maximum(np.linalg.eigvalsh(np.swapaxes(C, -1, -2) @ covariance @ C), 1e-300)
     traces = [
         np.einsum("...ii->...", covariance[..., part, part]) for part in (slice(3, 6), slice(3))
     ]
-    singular = np.linalg.svd(_weighted_anchors(task, context, anchors), compute_uv=False)[..., :3]
-    ratio = singular[..., 0] / np.maximum(singular[..., -1], 1e-12 * singular[..., 0])
-    if anchors.shape[-2] < 4:
-        ratio = np.full(ratio.shape, np.inf)
     return Criteria(
         np.sqrt((b**2).mean(axis=-1)),
         *(np.sqrt(trace.mean(axis=-1)) for trace in traces),
         np.exp(0.5 * np.log(values).mean(axis=(-1, -2))),
         np.sqrt(values[..., -1].mean(axis=-1)),
         b.max(axis=-1),
-        np.exp(np.log(ratio).mean(axis=-1)),
+        _conditioning(_weighted_anchors(task, context, anchors)),
     )
+
+
+def _conditioning(spread: FloatArray) -> FloatArray:
+    """Geometric mean (...) of the condition numbers of Abar (..., P, M, 3); fewer than 4: inf."""
+    if spread.shape[-2] < 4:
+        return np.full(spread.shape[:-3], np.inf)
+    singular = np.linalg.svd(spread, compute_uv=False)
+    least = np.maximum(singular[..., 2], 1e-12 * singular[..., 0])
+    # Anchors that all coincide leave nothing at all.
+    ratio = np.divide(singular[..., 0], least, out=np.full(least.shape, 1e12), where=least > 0)
+    return np.exp(np.log(ratio).mean(axis=-1))
 
 
 def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
@@ -321,8 +401,13 @@ def mounts(task: PlacementTask) -> FloatArray:
 
 def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """Share (..., M) of the task's poses that each anchor sees."""
-    seen = obstacles.in_sight(anchors, positions(task, context), context.racks)
-    return np.asarray(seen.mean(axis=-2))
+    if not context.racks.shape[-2]:
+        return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
+    return _in_blocks(
+        lambda some, part: _sight(some, *_segments(task, some, part)).mean(axis=0).T,
+        context, anchors, _SIGHTS_AT_ONCE // (task.n_poses * anchors.shape[-2]),
+        anchors.shape[-2:-1],
+    )  # fmt: skip
 
 
 def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:

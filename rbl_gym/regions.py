@@ -81,7 +81,7 @@ class Box:
 
     def place(self, action: FloatArray) -> FloatArray:
         """The box is [-1, 1]^3."""
-        return _scaled(np.clip(action, -1, 1), *self.bounds())
+        return _scaled(_cut(action), *self.bounds())
 
     def action(self, points: FloatArray) -> FloatArray:
         """Inverse of `place`; zero along an axis without extent."""
@@ -136,9 +136,9 @@ class Walls:
         """Where the ray from the middle of the room along the action meets a wall or the ceiling.
 
         A ray that points down is cut at the floor's height; one to the floor itself goes to the
-        nearest wall.
+        nearest legal point.
         """
-        action = np.clip(action, -1, 1)
+        action = _cut(action)
         reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
         met = np.clip(action / np.maximum(reach, 1e-3)[..., None], -1, 1)
         points = _scaled(met, *self.bounds())
@@ -186,17 +186,24 @@ class Shell:
 
     def place(self, action: FloatArray) -> FloatArray:
         """The action's direction (x for zero), its length from the inner to the outer sphere."""
-        action = np.clip(action, -1, 1)
+        action = _cut(action)
         length = np.linalg.norm(action, axis=-1, keepdims=True)
-        direction = np.where(length > 0, action / np.where(length > 0, length, 1), np.eye(3)[0])
+        # Shorter ones lose their direction in the squares.
+        far = length > 1e-150
+        direction = np.where(far, action / np.where(far, length, 1), np.eye(3)[0])
         radius = self.inner_m + (self.outer_m - self.inner_m) * np.minimum(length, 1.0)
         return radius * direction
 
     def action(self, points: FloatArray) -> FloatArray:
         """Inverse of `place`; a point on the inner sphere keeps a trace of its direction."""
         radius = np.linalg.norm(points, axis=-1, keepdims=True)
-        length = (radius - self.inner_m) / max(self.outer_m - self.inner_m, 1e-300)
-        return points / radius * np.maximum(length, 1e-12)
+        length = (radius - self.inner_m) / max(self.outer_m - self.inner_m, 1e-12)
+        return points / np.where(radius > 0, radius, 1.0) * np.clip(length, 1e-12, 1.0)
+
+
+def _cut(action: FloatArray) -> FloatArray:
+    """The action in [-1, 1]^3, in full precision."""
+    return np.clip(action, -1, 1, dtype=np.float64)
 
 
 def _scaled(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

@@ -217,3 +217,107 @@ def test_corners_from_lists_are_equal_and_hashable(kind):
 def test_bad_region_is_refused(kind, arguments, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         kind(*arguments)
+
+
+# --- actions ----------------------------------------------------------------------------------
+
+ACTIONS = st.tuples(*[st.floats(-2, 2)] * 3).map(np.array)
+every_action = np.stack(np.meshgrid(*[[-1.5, -1, -1e-4, 0, 1e-200, 3e-4, 0.3, 1]] * 3), axis=-1)
+
+
+@every_region
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_places_of_actions_are_legal(kind, dtype):
+    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (5000, 3))
+    for some in (actions, 1e-3 * actions, every_action.reshape(-1, 3)):
+        points = REGIONS[kind].place(some.astype(dtype))
+        assert points.dtype == np.float64
+        assert distance_outside(REGIONS[kind], points).max() <= 1e-9
+
+
+@pytest.mark.parametrize("kind", REGIONS)
+@settings(PROPERTY, max_examples=100)
+@given(ACTIONS)
+def test_place_of_any_action_is_legal_and_actions_are_cut(kind, action):
+    region = REGIONS[kind]
+    point = region.place(action)
+    assert distance_outside(region, point) <= 1e-9
+    np.testing.assert_array_equal(point, region.place(np.clip(action, -1, 1)))
+
+
+@every_region
+def test_action_is_the_inverse_of_place(kind):
+    region = REGIONS[kind]
+    for points in (draw(region, 3000), region.project(around(region, 3000))):
+        actions = region.action(points)
+        assert np.abs(actions).max() <= 1 + 1e-9
+        np.testing.assert_allclose(region.place(actions), points, atol=1e-8)
+
+
+@every_region
+def test_every_place_can_be_named(kind):
+    """Places of random actions come as near to any legal point as their number lets one hope."""
+    region = REGIONS[kind]
+    placed = region.place(np.random.default_rng(3).uniform(-1, 1, (5000, 3)))
+    low, high = region.bounds()
+    far = max(np.linalg.norm(placed - point, axis=-1).min() for point in draw(region, 30))
+    assert far <= 0.2 * np.linalg.norm(high - low) + 1e-12
+
+
+def test_a_box_scales_the_action():
+    box = Box((-1, 2, 0), (3, 4, 10))
+    np.testing.assert_allclose(box.place(np.array([0.5, -1, 0])), [2, 2, 5])
+    np.testing.assert_allclose(box.place(np.array([9, -9, 0.2])), [3, 2, 6])
+    np.testing.assert_array_equal(Box((0, 0, 5), (2, 2, 5)).action(np.array([1, 2, 5])), [0, 1, 0])
+
+
+@pytest.mark.parametrize("kind", ["low room", "tower"])
+def test_walls_by_the_formula(kind):
+    """u = a / max(|ax|, |ay|, max(az, 0), 1e-3), cut to [-1, 1]^3, times the half size."""
+    room = REGIONS[kind]
+    low, high = room.bounds()
+    for a in np.random.default_rng(4).uniform(-1, 1, (500, 3)) * [1, 1, 3]:
+        a = np.clip(a, -1, 1)
+        u = np.clip(a / max(abs(a[0]), abs(a[1]), max(a[2], 0.0), 1e-3), -1, 1)
+        np.testing.assert_allclose(room.place(a), (low + high) / 2 + u * (high - low) / 2)
+
+
+def test_walls_in_words():
+    places = {
+        (1, 0, 0): (10, 4, 1.65),
+        (0, -0.2, 0): (5, 0, 1.65),
+        (0, 0, 0.1): (5, 4, 3),
+        (0.5, 0, 0.5): (10, 4, 3),
+        (0.5, 0, -1): (10, 4, 0.3),
+        (0.5, 0, -0.25): (10, 4, 1.65 - 1.35 / 2),
+    }
+    for action, place in places.items():
+        np.testing.assert_allclose(ROOM.place(np.array(action, float)), place, atol=1e-12)
+    # No direction: the legal point nearest to the middle; straight down: nearest to the floor's.
+    np.testing.assert_allclose(ROOM.place(np.zeros(3)), [5, 4, 3])
+    np.testing.assert_allclose(ROOM.place(np.array([0, 0, -1.0])), [5, 4, 3])
+
+
+def test_a_shell_by_the_formula():
+    shell = Shell(50, 300)
+    np.testing.assert_allclose(shell.place(np.zeros(3)), [50, 0, 0])
+    np.testing.assert_allclose(shell.place(np.array([0, -0.2, 0])), [0, -100, 0])
+    np.testing.assert_allclose(shell.place(np.ones(3)), np.full(3, 300 / 3**0.5))
+    np.testing.assert_allclose(shell.place(np.array([0, 0, 7.0])), [0, 0, 300])
+    tiny = shell.place(np.array([0, 1e-12, 0]))
+    np.testing.assert_allclose(tiny, [0, 50, 0], atol=1e-9)
+
+
+@every_region
+def test_batches_of_actions_are_loops(kind):
+    region = REGIONS[kind]
+    actions = np.random.default_rng(5).uniform(-1.2, 1.2, (2, 3, 3))
+    points = region.place(actions)
+    back = region.action(points)
+    before = actions.copy()
+    for index in np.ndindex(2, 3):
+        np.testing.assert_allclose(points[index], region.place(actions[index]), rtol=1e-14)
+        np.testing.assert_allclose(back[index], region.action(points[index]), rtol=1e-12)
+    np.testing.assert_array_equal(actions, before)
+    assert region.place(actions[:0]).shape == (0, 3, 3)
+    assert region.action(points[:0]).shape == (0, 3, 3)

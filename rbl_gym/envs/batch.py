@@ -116,7 +116,9 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         checked = self._checked(actions)
         ended = self._done.copy()
         if ended.any() and self._mode is AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded("episodes are over: reset them by options['reset_mask']")
+            raise gym.error.ResetNeeded(
+                "episodes are over: reset (some of many: options['reset_mask'])"
+            )
         moving = ~ended
         self._epochs[moving] += 1
         reward, terminated = self._advance(checked, moving)
@@ -161,11 +163,13 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         space = self.single_action_space
         array = np.asarray(actions)
         shape = (self.num_envs, *(space.shape or ()))
-        if array.shape != shape or array.dtype.kind not in "fiub":
+        is_box = isinstance(space, gym.spaces.Box)
+        if array.shape != shape or array.dtype.kind not in ("fiub" if is_box else "iub"):
+            kind = "numbers" if is_box else "integers"
             raise ValueError(
-                f"actions must be numbers of shape {shape}, got {array.shape} of {array.dtype}"
+                f"actions must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
             )
-        if isinstance(space, gym.spaces.Box):
+        if is_box:
             array = array.astype(np.float64)
             if not np.isfinite(array).all():
                 raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")

@@ -16,7 +16,7 @@ from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.placement import Context
 
 MODES = ("sequential", "one-shot", "mounts")
-# Score from which the shaped reward of the mounts counts, metres: about that of no anchor.
+# Score from which the shaped reward of the mounts counts, metres.
 _EMPTY_SCORE_M = 3.0
 
 
@@ -47,7 +47,9 @@ class AnchorPlacementVectorEnv(BatchEnv):
         # An episode terminates by itself with the last anchor.
         self._configure(num_envs, render_mode, steps + 1, max_episode_steps, autoreset_mode)
         self._placements = steps
-        self._uniforms = np.zeros((num_envs, placement.context_uniforms(self.task)))
+        uniforms = np.zeros((num_envs, placement.context_uniforms(self.task)))
+        self._contexts = placement.build_contexts(self.task, uniforms)
+        self._features = context_features(self.task, self._contexts)
         self._actions = np.zeros((num_envs, self.task.n_anchors, 3))
         self._anchors = np.zeros((num_envs, self.task.n_anchors, 3))
         self._score_m = np.zeros(num_envs)
@@ -55,6 +57,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
             self._mounts = placement.mounts(self.task)
             self._taken = np.zeros((num_envs, len(self._mounts)), dtype=np.bool_)
             self._sight = np.zeros((num_envs, len(self._mounts)))
+            self._information = np.zeros((num_envs, self.task.n_poses, 6, 6))
             self._log_score = np.zeros(num_envs)
 
     def _action_space(self) -> spaces.Space[Any]:
@@ -66,72 +69,72 @@ class AnchorPlacementVectorEnv(BatchEnv):
     @property
     def contexts(self) -> Context:
         """The problems of the current episodes."""
-        return placement.build_contexts(self.task, self._uniforms)
+        return Context(*(field.copy() for field in self._contexts))
 
     def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        for i, generator in zip(chosen, generators, strict=True):
-            generator.random(out=self._uniforms[i])
+        size = placement.context_uniforms(self.task)
+        uniforms = np.array([generator.random(size) for generator in generators])
+        fresh = placement.build_contexts(self.task, uniforms)
+        for held, new in zip(self._contexts, fresh, strict=True):
+            held[chosen] = new
+        self._features[chosen] = context_features(self.task, fresh)
         self._actions[chosen] = 0.0
         self._anchors[chosen] = 0.0
         self._score_m[chosen] = 0.0
         if self.mode == "mounts":
-            fresh = placement.build_contexts(self.task, self._uniforms[chosen])
             self._taken[chosen] = False
             self._sight[chosen] = placement.sight_fractions(self.task, fresh, self._mounts)
+            self._information[chosen] = 0.0
             self._log_score[chosen] = math.log(_EMPTY_SCORE_M)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         rows = np.flatnonzero(moving)
+        if not len(rows):
+            return np.zeros(self.num_envs), moving
         step = self._epochs[rows] - 1
         complete = np.asarray(moving & (self._epochs == self._placements))
         if self.mode == "mounts":
-            return self._mount(actions, rows, step), complete
-        if self.mode == "one-shot":
-            self._actions[rows] = np.clip(actions[rows], -1, 1).reshape(
-                len(rows), self.task.n_anchors, 3
-            )
-        else:
-            self._actions[rows, step] = np.clip(actions[rows], -1, 1)
-        self._anchors[rows] = self.task.scene.anchor_region.place(self._actions[rows])
+            return self._mount(actions, rows, step, complete), complete
+        # One-shot: all anchors of a world; else the next one.
+        new = (rows,) if self.mode == "one-shot" else (rows, step)
+        self._actions[new] = np.clip(actions[rows], -1, 1).reshape(self._actions[new].shape)
+        self._anchors[new] = self.task.scene.anchor_region.place(self._actions[new])
         reward = np.zeros(self.num_envs)
         if complete.any():
-            self._score_m[complete] = self._scores(complete)
+            problems = Context(*(field[complete] for field in self._contexts))
+            self._score_m[complete] = placement.score(self.task, problems, self._anchors[complete])
             reward[complete] = -np.log(self._score_m[complete])
         return reward, complete
 
-    def _mount(self, actions: np.ndarray, rows: np.ndarray, step: np.ndarray) -> FloatArray:
+    def _mount(
+        self, actions: np.ndarray, rows: np.ndarray, step: np.ndarray, complete: BoolArray
+    ) -> FloatArray:
         """Anchors on mounts; the reward is the drop of the log score."""
         chosen = actions[rows].astype(int)
-        self._anchors[rows, step] = self._mounts[chosen]
-        self._actions[rows, step] = self.task.scene.anchor_region.action(self._mounts[chosen])
+        anchors = self._mounts[chosen]
+        self._anchors[rows, step] = anchors
         self._taken[rows, chosen] = True
-        reward = np.zeros(self.num_envs)
-        for count in np.unique(step) + 1:
-            here = rows[step + 1 == count]
-            score_m = self._scores(here, count)
-            reward[here] = self._log_score[here] - np.log(score_m)
-            self._log_score[here] = np.log(score_m)
-            if count == self.task.n_anchors:
-                self._score_m[here] = score_m
+        problems = Context(*(field[rows] for field in self._contexts))
+        # Information is a sum over the anchors: each step adds its own.
+        self._information[rows] += placement.information(self.task, problems, anchors[:, None])
+        log_score = self._log_score.copy()
+        log_score[rows] = np.log(placement.score_of(self.task, self._information[rows]))
+        reward, self._log_score = self._log_score - log_score, log_score
+        self._score_m[complete] = np.exp(log_score[complete])
         return reward
 
-    def _scores(self, rows: np.ndarray, count: int | None = None) -> FloatArray:
-        """Scores of the first `count` anchors of some worlds."""
-        contexts = placement.build_contexts(self.task, self._uniforms[rows])
-        return placement.score(self.task, contexts, self._anchors[rows, :count])
-
     def _observe(self) -> np.ndarray:
-        parts = [context_features(self.task, self.contexts)]
+        parts = [self._features]
         if self.mode == "sequential":
             parts.append(self._actions.reshape(self.num_envs, -1))
         if self.mode == "mounts":
             parts += [self._sight, self._taken]
         if self.mode != "one-shot":
             parts.append(self._epochs[:, None] == np.arange(self.task.n_anchors))
-        return np.concatenate(parts, axis=-1).astype(np.float32)
+        return np.concatenate(parts, axis=-1, dtype=np.float32)
 
     def _inform(self) -> dict[str, np.ndarray]:
-        contexts = self.contexts
+        contexts = self._contexts
         info: dict[str, np.ndarray] = {
             "anchors": self._anchors.copy(),
             "score_m": self._score_m.copy(),

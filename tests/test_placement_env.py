@@ -1,0 +1,456 @@
+"""RBL/AnchorPlacement-v0: Gymnasium's contract, the score by hand, scalar against vector."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from rbl_gym import placement
+from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
+from rbl_gym.placement import Context
+from tests.helpers import assert_same
+
+ID = "rbl_gym:RBL/AnchorPlacement-v0"
+WORLDS: dict[str, dict[str, Any]] = {
+    "auv": {},
+    "yard": {"scene": "drone_yard"},
+    "satellite": {"scene": "satellite", "n_anchors": 2},
+    "room with racks": {"scene": "uwb_room", "racks": 2},
+    "one rack, one anchor": {"scene": "uwb_room", "racks": 1, "n_anchors": 1},
+    "own scene": {"scene": {"name": "icassp2013", "noise": {"floor_m": 0.1}}, "n_anchors": 3},
+    "at once": {"scene": "uwb_room", "mode": "one-shot", "racks": 1},
+    "at once, auv": {"mode": "one-shot"},
+    "mounts": {"scene": "uwb_room", "mode": "mounts", "n_anchors": 3},
+    "mounts and racks": {"scene": "uwb_room", "mode": "mounts", "racks": 2},
+}
+every_world = pytest.mark.parametrize("kind", WORLDS)
+some_worlds = pytest.mark.parametrize("kind", ["auv", "at once", "mounts and racks"])
+
+
+def close(got, want):
+    """Equal to the last bits that batched arithmetic may turn."""
+    assert_same(got, want, rtol=1e-9, atol=1e-9)
+
+
+def actions_of(env, rng):
+    """Actions of all worlds, beyond the box too."""
+    space = env.single_action_space
+    if isinstance(space, gym.spaces.Discrete):
+        return rng.integers(space.n, size=env.num_envs)
+    return rng.uniform(-1.3, 1.3, env.action_space.shape).astype(np.float32)
+
+
+def episode(env, seed=0):
+    """All steps of an episode of the scalar environment, the reset first."""
+    env.action_space.seed(seed)
+    observation, info = env.reset(seed=seed)
+    steps: list[Any] = [(observation, 0.0, False, False, info)]
+    actions = []
+    while not steps[-1][2]:
+        actions.append(env.action_space.sample())
+        steps.append(env.step(actions[-1]))
+    return steps, actions
+
+
+def context_of(info) -> Context:
+    return Context(info["region"][:3], info["region"][3:], info["racks"])
+
+
+# --- Gymnasium --------------------------------------------------------------------------------
+
+
+@every_world
+def test_gymnasiums_checker_has_no_complaint(kind):
+    check_env(gym.make(ID, **WORLDS[kind]).unwrapped)
+
+
+@every_world
+def test_specs_round_trip(kind):
+    env = gym.make(ID, **WORLDS[kind])
+    assert env.spec is not None
+    text = env.spec.to_json()
+    again = gym.make(EnvSpec.from_json(text))
+    assert again.spec is not None
+    assert json.loads(again.spec.to_json()) == json.loads(text)
+    assert_same(episode(again, 3), episode(env, 3))
+
+
+@every_world
+@pytest.mark.parametrize("twin_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
+                         ids=["copy", "pickle"])  # fmt: skip
+def test_twins_in_mid_episode_go_on_alike(kind, twin_of):
+    env = AnchorPlacementVectorEnv(3, **WORLDS[kind])
+    rng = np.random.default_rng(1)
+    env.reset(seed=1)
+    env.step(actions_of(env, rng))
+    twin = twin_of(env)
+    for _ in range(8):
+        actions = actions_of(env, rng)
+        assert_same(twin.step(actions), env.step(actions))
+
+
+@every_world
+def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared(kind):
+    def spoil(value):
+        if isinstance(value, dict):
+            for item in value.values():
+                spoil(item)
+        elif isinstance(value, np.ndarray):
+            value[...] = 1
+
+    last = []
+    for spoiled in (False, True):
+        env = AnchorPlacementVectorEnv(3, **WORLDS[kind], autoreset_mode="SameStep")
+        rng = np.random.default_rng(2)
+        results: list[Any] = [env.reset(seed=9)]
+        for _ in range(7):
+            if spoiled:
+                spoil(results[-1][0])
+                spoil(results[-1][-1])
+                spoil(env.contexts._asdict())
+            results.append(env.step(actions_of(env, rng)))
+        last.append(results[-1])
+    assert last[0][0].tobytes() == last[1][0].tobytes()
+    assert last[0][1].tobytes() == last[1][1].tobytes()
+    assert_same(last[0], last[1])
+
+
+@every_world
+def test_seeds_decide_and_episodes_differ(kind):
+    env = AnchorPlacementEnv(**WORLDS[kind])
+    first, second = episode(env, 4), episode(env, 4)
+    assert_same(first, second)
+    region = first[0][0][-1]["region"]
+    assert (env.reset()[1]["region"] != region).any()
+    assert (env.reset(seed=5)[1]["region"] != region).any()
+    problem = placement.draw_contexts(env.unwrapped._batch.task, np.random.default_rng(4))
+    np.testing.assert_array_equal(region, np.concatenate([problem.centre, problem.half]))
+
+
+# --- what an episode is -----------------------------------------------------------------------
+
+
+@every_world
+def test_rewards_are_the_score_of_the_anchors_in_info(kind):
+    env = AnchorPlacementEnv(**WORLDS[kind])
+    task = env.unwrapped._batch.task
+    for seed in range(3):
+        steps, _ = episode(env, seed)
+        one_shot = WORLDS[kind].get("mode") == "one-shot"
+        assert len(steps) == 1 + (1 if one_shot else task.n_anchors)
+        info = steps[-1][4]
+        assert placement.is_legal(task, info["anchors"]).all()
+        score = float(placement.score(task, context_of(info), info["anchors"]))
+        np.testing.assert_allclose(info["score_m"], score, rtol=1e-9)
+        rewards = [step[1] for step in steps]
+        if WORLDS[kind].get("mode") == "mounts":
+            np.testing.assert_allclose(sum(rewards), math.log(3) - math.log(score))
+            for k in range(1, len(steps)):
+                placed = steps[k][4]["anchors"][:k]
+                value = math.log(placement.score(task, context_of(info), placed))
+                np.testing.assert_allclose(sum(rewards[: k + 1]), math.log(3) - value)
+        else:
+            np.testing.assert_allclose(rewards[-1], -math.log(score))
+            assert not any(rewards[:-1])
+        for k, (_, reward, terminated, truncated, info) in enumerate(steps):
+            assert type(reward) is float
+            assert terminated is (k == len(steps) - 1)
+            assert truncated is False
+            assert type(info["score_m"]) is float
+            assert (info["score_m"] > 0) is terminated
+
+
+@pytest.mark.parametrize("kind", ["auv", "satellite", "room with racks"])
+def test_sequential_places_each_action_by_the_region(kind):
+    env = AnchorPlacementEnv(**WORLDS[kind])
+    task = env.unwrapped._batch.task
+    steps, actions = episode(env, 6)
+    for k, step in enumerate(steps):
+        placed = task.scene.anchor_region.place(np.array(actions[:k], float).reshape(-1, 3))
+        np.testing.assert_allclose(step[4]["anchors"][:k], placed)
+        assert not step[4]["anchors"][k:].any()  # zeros where no anchor stands yet
+
+
+@every_world
+def test_observations_by_hand(kind):
+    env = AnchorPlacementEnv(**WORLDS[kind])
+    task, mode = env.unwrapped._batch.task, WORLDS[kind].get("mode", "sequential")
+    low, high = (np.array(corner) for corner in (task.scene.volume.low, task.scene.volume.high))
+    m = task.n_anchors
+    steps, actions = episode(env, 7)
+    for k, (observation, _, _, _, info) in enumerate(steps):
+        assert observation.dtype == np.float32
+        assert env.observation_space.contains(observation)
+        centre, half, racks = context_of(info)
+        parts = [2 * (centre - low) / (high - low) - 1, 4 * half / (high - low) - 1]
+        for rack in racks:
+            floor, top = task.scene.anchor_region.bounds()
+            parts += [2 * (rack[:3] - floor) / (top - floor) - 1, 2 * rack[3:] / (top - floor)]
+        if mode == "sequential":
+            done = np.zeros((m, 3))
+            done[:k] = np.array(actions[:k]).reshape(-1, 3)
+            parts.append(done.ravel())
+        if mode == "mounts":
+            mounts = placement.mounts(task)
+            parts.append(placement.sight_fractions(task, context_of(info), mounts))
+            taken = np.zeros(57)
+            taken[np.array(actions[:k], int)] = 1
+            parts.append(taken)
+            np.testing.assert_array_equal(info["action_mask"], 1 - taken)
+            assert info["action_mask"].dtype == np.int8
+            np.testing.assert_array_equal(info["anchors"][:k], mounts[np.array(actions[:k], int)])
+        if mode != "one-shot":
+            parts.append(np.arange(m) == k)
+        wanted = np.clip(np.concatenate(parts), -1, 1)
+        np.testing.assert_allclose(observation, wanted, atol=1e-6)
+
+
+def test_actions_beyond_the_box_are_cut():
+    env = AnchorPlacementEnv(n_anchors=1)
+    env.reset(seed=1)
+    observation, _, _, _, info = env.step(np.array([3.0, -9, 0.5]))
+    np.testing.assert_allclose(info["anchors"], [[200, -200, 0]])
+    np.testing.assert_allclose(observation[6:9], [1, -1, 0.5])
+    assert env.observation_space.contains(observation)
+
+
+def test_one_shot_equals_sequential():
+    actions = np.random.default_rng(3).uniform(-1, 1, (4, 3)).astype(np.float32)
+    once, stepwise = AnchorPlacementEnv(mode="one-shot"), AnchorPlacementEnv()
+    once.reset(seed=2)
+    stepwise.reset(seed=2)
+    got = once.step(actions.ravel())
+    for action in actions:
+        want = stepwise.step(action)
+    np.testing.assert_array_equal(got[4]["anchors"], want[4]["anchors"])
+    assert got[1] == want[1]
+
+
+def test_a_mount_twice_adds_a_second_anchor_there():
+    env = AnchorPlacementEnv("uwb_room", "mounts", n_anchors=2)
+    task = env.unwrapped._batch.task
+    _, info = env.reset(seed=8)
+    first = env.step(20)
+    second = env.step(20)
+    np.testing.assert_array_equal(second[4]["anchors"], placement.mounts(task)[[20, 20]])
+    assert second[4]["action_mask"].sum() == 56
+    total = 2 * placement.information(task, context_of(info), placement.mounts(task)[[20]])
+    np.testing.assert_allclose(second[4]["score_m"], placement.score_of(task, total), rtol=1e-9)
+    np.testing.assert_allclose(first[1] + second[1], math.log(3 / second[4]["score_m"]))
+
+
+# --- vector -----------------------------------------------------------------------------------
+
+
+def vectors(kind, mode, n=4):
+    """The native vector environment, and Gymnasium's own around scalar ones."""
+    native = AnchorPlacementVectorEnv(n, **WORLDS[kind], autoreset_mode=mode)
+    makers = [lambda: AnchorPlacementEnv(**WORLDS[kind])] * n
+    return native, SyncVectorEnv(makers, autoreset_mode=mode)
+
+
+@every_world
+def test_next_step_equals_scalar_environments(kind):
+    native, peer = vectors(kind, AutoresetMode.NEXT_STEP)
+    rng = np.random.default_rng(1)
+    close(native.reset(seed=5), peer.reset(seed=5))
+    ends = 0
+    for _ in range(16):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got, want, strict=True):
+            close(a, b)
+        assert native.observation_space.contains(got[0])
+        ends += got[2].all()
+    assert ends >= 2
+
+
+@every_world
+def test_same_step_equals_scalar_environments_with_final_observation_and_info(kind):
+    native, peer = vectors(kind, AutoresetMode.SAME_STEP)
+    rng = np.random.default_rng(2)
+    close(native.reset(seed=[3, 1, 4, 1]), peer.reset(seed=[3, 1, 4, 1]))
+    seen = 0
+    for _ in range(12):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got, want, strict=True):
+            close(a, b)
+        if "final_obs" in got[4]:
+            seen += 1
+            assert (got[4]["final_info"]["score_m"] > 0).all()
+            assert not got[4]["score_m"].any()
+    assert seen >= 2
+
+
+@every_world
+def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(kind):
+    native, peer = vectors(kind, AutoresetMode.DISABLED)
+    rng = np.random.default_rng(3)
+    close(native.reset(seed=7), peer.reset(seed=7))
+    for step in range(1, 14):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got, want, strict=True):
+            close(a, b)
+        mask = got[2].copy()
+        if step == 2:
+            mask[[1, 3]] = True  # in mid-episode: from here on the clocks differ
+        if mask.any():
+            a, info = native.reset(options={"reset_mask": mask.copy()})
+            b, peer_info = peer.reset(options={"reset_mask": mask.copy()})
+            close(a, b)
+            for key in ("region", "racks", "anchors"):
+                close(info[key][mask], peer_info[key][mask])
+
+
+def test_next_step_with_clocks_that_differ_mixes_resets_and_steps():
+    """Worlds that were reset half way stand at other anchors of the sequence."""
+    for kind in ("auv", "mounts and racks"):
+        native, peer = vectors(kind, AutoresetMode.NEXT_STEP)
+        rng = np.random.default_rng(4)
+        native.reset(seed=1)
+        peer.reset(seed=1)
+        native.step(actions := actions_of(native, rng))
+        peer.step(actions)
+        # By hand what both offer only without autoreset: worlds 0 and 2 begin again.
+        chosen = np.array([True, False, True, False])
+        native._begin(chosen)
+        for i in np.flatnonzero(chosen):
+            peer.envs[i].reset()
+        kinds = set()
+        for _ in range(12):
+            actions = actions_of(native, rng)
+            got, want = native.step(actions), peer.step(actions)
+            for a, b in zip(got[:4], want[:4], strict=True):
+                close(a, b)
+            kinds.add(tuple(got[2].tolist()))
+        assert tuple(chosen.tolist()) in kinds
+
+
+@some_worlds
+def test_make_vec_gives_the_native_environment(kind):
+    env = gym.make_vec(ID, num_envs=3, **WORLDS[kind], autoreset_mode="SameStep")
+    assert isinstance(env.unwrapped, AnchorPlacementVectorEnv)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert env.spec is not None
+    again = gym.make_vec(env.spec)
+    np.testing.assert_array_equal(again.reset(seed=2)[0], env.reset(seed=2)[0])
+
+
+def test_a_time_limit_truncates():
+    env = gym.make_vec(ID, num_envs=2, max_episode_steps=2, autoreset_mode="SameStep")
+    env.reset(seed=1)
+    ends = []
+    for _ in range(4):
+        _, reward, terminated, truncated, _ = env.step(np.zeros((2, 3)))
+        ends.append(bool(truncated.all()))
+        assert not terminated.any()
+        assert not reward.any()
+    assert ends == [False, True, False, True]
+
+
+def test_contexts_are_those_in_info():
+    env = AnchorPlacementVectorEnv(5, "uwb_room", racks=2)
+    _, info = env.reset(seed=3)
+    contexts = env.contexts
+    np.testing.assert_array_equal(np.hstack([contexts.centre, contexts.half]), info["region"])
+    np.testing.assert_array_equal(contexts.racks, info["racks"])
+
+
+# --- what is refused --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"scene": "attic"}, "scene must be one of"),
+        ({"scene": "camsap2013"}, "scene must have a volume with an extent"),
+        ({"scene": 7}, "scene must be a name or a dict"),
+        ({"mode": "all"}, "mode must be one of 'sequential', 'one-shot', 'mounts', got 'all'"),
+        ({"mode": "mounts"}, "scene must have walls for mount points, got 'auv_buoys'"),
+        ({"racks": 1}, "racks must be 0 in a scene without walls"),
+        ({"racks": 1.5}, "racks must be an int, got 1.5"),
+        ({"n_anchors": 0}, "n_anchors must be"),
+        ({"n_anchors": "four"}, "n_anchors must be an int, got 'four'"),
+        ({"render_mode": "human"}, "render_mode must be None"),
+    ],
+)
+@pytest.mark.parametrize("kind", [AnchorPlacementEnv, AnchorPlacementVectorEnv])
+def test_bad_arguments_are_named(kind, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be a positive int, got 0"),
+        ({"num_envs": 2.0}, "num_envs must be a positive int, got 2.0"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode must be one of 'NextStep'"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be"),
+    ],
+)
+def test_bad_vector_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        AnchorPlacementVectorEnv(**{"num_envs": 2, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("kind", "action", "message"),
+    [
+        ("auv", np.zeros(2), r"actions must be numbers of shape \(1, 3\)"),
+        ("auv", np.zeros((1, 3)), "actions must be numbers"),
+        ("auv", [0, 0, math.nan], "actions must be finite, got nan"),
+        ("auv", [0, 0, -math.inf], "actions must be finite, got -inf"),
+        ("auv", "north", "actions must be numbers"),
+        ("auv", None, "actions must be numbers"),
+        ("auv", np.zeros(3, complex), "actions must be numbers"),
+        ("at once", np.zeros(3), r"actions must be numbers of shape \(1, 15\)"),
+        ("mounts", 57, "actions must lie in"),
+        ("mounts", -1, "actions must lie in"),
+        ("mounts", 2**63, "actions must lie in"),
+        ("mounts", 3.7, "actions must be integers"),
+        ("mounts", math.nan, "actions must be integers"),
+        ("mounts", [1], "actions must be integers"),
+    ],
+)
+def test_bad_actions_are_named_and_change_nothing(kind, action, message):
+    env, peer = AnchorPlacementEnv(**WORLDS[kind]), AnchorPlacementEnv(**WORLDS[kind])
+    with pytest.raises(ResetNeeded):
+        env.step(env.action_space.sample())
+    env.reset(seed=1)
+    peer.reset(seed=1)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    env.action_space.seed(1)
+    good = env.action_space.sample()
+    assert_same(env.step(good), peer.step(good))
+
+
+def test_bad_calls_are_named():
+    env = AnchorPlacementVectorEnv(2, autoreset_mode="Disabled", n_anchors=1)
+    with pytest.raises(ResetNeeded):
+        env.step(np.zeros((2, 3)))
+    with pytest.raises(ResetNeeded, match="reset all environments"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(ValueError, match="seed must hold 2 seeds, got 3"):
+        env.reset(seed=[1, 2, 3])
+    env.reset(seed=1)
+    for mask in (np.zeros(2, bool), np.ones(3, bool), np.ones(2, int)):
+        with pytest.raises(ValueError, match="reset_mask must be"):
+            env.reset(options={"reset_mask": mask})
+    env.step(np.zeros((2, 3)))
+    with pytest.raises(ResetNeeded, match="reset_mask"):
+        env.step(np.zeros((2, 3)))
