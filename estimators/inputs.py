@@ -7,6 +7,9 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_links
 
+# Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
+VAGUE_ENTRY_VARIANCE = 1 / 3
+
 
 def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
     """A symmetric positive definite covariance of one of the sizes, or a ValueError."""
