@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rbl_gym import bodies, estimators, motion, ranging, rotations, statistic
+from rbl_gym import bodies, estimators, motion, ranging, rotations, scenes, statistic
+from rbl_gym.app import monte_carlo
 from rbl_gym.estimators import squared_range
 from tests.helpers import random_world, simulate
 
@@ -158,6 +159,35 @@ def test_rmse_of_the_kf_is_that_of_raw_ranges():
         allowed = 4 * np.sqrt((raw.var() + drawn.var()) / trials)
         assert abs(raw.mean() - drawn.mean()) < allowed
         assert allowed < 0.1 * raw.mean()  # or the test says nothing
+
+
+def test_monte_carlo_of_the_tracking_paper_agrees_in_both_modes():
+    """RMSE of KF per step, both modes, within 4 standard deviations."""
+    scene = scenes.get({"name": "camsap2013", "steps": 5})
+    errors = []
+    for seed, observation in enumerate(monte_carlo.OBSERVATIONS):
+        rng = np.random.default_rng([11, seed])
+        world = monte_carlo.simulate_world(scene, 4000, rng, observation)
+        trace = monte_carlo.run(world, "kf", {})
+        errors.append([trace.frobenius**2, (trace.error[..., 3:] ** 2).sum(axis=-1)])
+    raw, drawn = np.array(errors)
+    allowed = 4 * np.sqrt((raw.var(axis=-1) + drawn.var(axis=-1)) / raw.shape[-1])
+    assert (np.abs(raw.mean(axis=-1) - drawn.mean(axis=-1)) < allowed).all()
+    assert (allowed < 0.2 * raw.mean(axis=-1)).all()  # or the test says nothing
+
+
+def test_monte_carlo_names_what_has_no_statistic():
+    rng = np.random.default_rng(12)
+    with pytest.raises(ValueError, match="observation must be one of 'ranges', 'statistic'"):
+        monte_carlo.simulate_world(scenes.get("camsap2013"), 2, rng, "raw")
+    with pytest.raises(ValueError, match="noise must be a SquaredRangeNoise"):
+        monte_carlo.simulate_world(scenes.get("uwb_room"), 2, rng, "statistic")
+    lossy = scenes.get({"name": "camsap2013", "links": {"drop_probability": 0.1}})
+    with pytest.raises(ValueError, match="scene must have all its links"):
+        monte_carlo.simulate_world(lossy, 2, rng, "statistic")
+    world = monte_carlo.simulate_world(scenes.get("camsap2013"), 2, rng, "statistic")
+    with pytest.raises(ValueError, match="filter must be of the KF family"):
+        monte_carlo.run(world, "iekf", {})
 
 
 # --- filters ----------------------------------------------------------------------------------
