@@ -33,6 +33,12 @@ def raw_statistic(ranges, anchors, tags, rotation, translation):
     return squared_range.paper_matrices(stat)
 
 
+def make(name, **options):
+    filter = estimators.make(name, **options)
+    assert isinstance(filter, estimators.KalmanFamily)
+    return filter
+
+
 def gram(tags):
     extended = squared_range.extended(tags)
     return extended.T @ extended
@@ -131,7 +137,7 @@ def test_rmse_of_the_kf_is_that_of_raw_ranges():
     for mode in ("raw", "statistic"):
         rng = np.random.default_rng([6, mode == "raw"])
         truth = motion.Path(rotation, translation)
-        filter = estimators.make("kf", tags=tags, noise=NOISE, process=PROCESS)
+        filter = make("kf", tags=tags, noise=NOISE, process=PROCESS)
         start = rotations.exp(0.1 * rng.standard_normal((trials, 3))) @ rotation
         state = filter.initial(start, translation, np.diag([0.01] * 3 + [0.25] * 3))
         errors = []
@@ -145,9 +151,7 @@ def test_rmse_of_the_kf_is_that_of_raw_ranges():
             else:
                 true = ranging.distances(anchors, ranging.tag_positions(*truth, tags))
                 weights = 1 / NOISE.squared_range_variance(true)
-                weighted = estimators.make(
-                    "kf", tags=tags, noise=NOISE, process=PROCESS, weights=weights
-                )
+                weighted = make("kf", tags=tags, noise=NOISE, process=PROCESS, weights=weights)
                 ranges = simulate(rng, anchors, tags, *truth, NOISE)
                 state = weighted.update(state, ranges, anchors)
             belief = filter.belief(state)
@@ -209,7 +213,7 @@ def test_update_from_the_statistic_is_the_update_from_ranges(name, tags, batch):
     )  # fmt: skip
     prior = rotations.exp(0.1 * rng.standard_normal((*batch, 3))) @ rotation
     for engine in ("batched", "filterpy") if batch == () else ("batched",):
-        filter = estimators.make(name, tags=body, noise=NOISE, process=PROCESS, engine=engine)
+        filter = make(name, tags=body, noise=NOISE, process=PROCESS, engine=engine)
         state = filter.initial(prior, translation, np.diag([0.01] * 3 + [0.25] * 3))
         state = filter.predict(state, 0.3 * rng.standard_normal((*batch, 6)), 0.1)
         want, got = filter.update(state, ranges, anchors), filter.update_statistic(state, G, B)
@@ -225,7 +229,7 @@ def test_one_covariance_of_all_trials_stays_one(tags):
     body = TAGS[tags]
     poses = np.broadcast_to(rotation, (100, 3, 3)), np.broadcast_to(translation, (100, 3))
     G, B = statistic.simulate_statistic(anchors, body, *poses, NOISE, rng)
-    filter = estimators.make("kf", tags=body, noise=NOISE, process=PROCESS)
+    filter = make("kf", tags=body, noise=NOISE, process=PROCESS)
     state = filter.initial(*poses, np.diag([0.01] * 3 + [0.25] * 3))
     together, apart = (filter.update_statistic(state, g, B) for g in (G[0], G))
     assert not any(together.covariance.strides[:-2])
@@ -280,7 +284,7 @@ def test_bad_worlds_are_named(changes, message):
     ],
 )
 def test_bad_statistics_are_named(G, B, message):
-    filter = estimators.make("kf", tags=PYRAMID, noise=NOISE, process=PROCESS)
+    filter = make("kf", tags=PYRAMID, noise=NOISE, process=PROCESS)
     state = filter.initial(np.eye(3), np.zeros(3), 0.01 * np.eye(6))
     with pytest.raises(ValueError, match=message):
         filter.update_statistic(state, G, B)
@@ -290,20 +294,20 @@ def test_a_vague_rotation_needs_rank_12():
     rng = np.random.default_rng(10)
     anchors, _, rotation, translation = random_world(rng, 6, 1)
     for body, places in ((PYRAMID, anchors * FLAT), (TAGS["plate"], anchors)):
-        filter = estimators.make("kf", tags=body, noise=NOISE, process=PROCESS)
+        filter = make("kf", tags=body, noise=NOISE, process=PROCESS)
         both = statistic.simulate_statistic(places, body, rotation, translation, NOISE, rng)
         vague = filter.initial(rotation, translation, 100 * np.eye(12))
         with pytest.raises(ValueError, match=r"determine only rank [89] of the filter's 12 states"):
             filter.update_statistic(vague, *both)
         known = filter.initial(rotation, translation, 0.01 * np.eye(6))
         assert np.isfinite(filter.update_statistic(known, *both).mean).all()
-    filter = estimators.make("kf", tags=PYRAMID, noise=NOISE, process=PROCESS)
+    filter = make("kf", tags=PYRAMID, noise=NOISE, process=PROCESS)
     both = statistic.simulate_statistic(anchors, PYRAMID, rotation, translation, NOISE, rng)
     filter.update_statistic(filter.initial(rotation, translation, 100 * np.eye(12)), *both)
 
 
 def test_filterpy_takes_one_body():
-    filter = estimators.make("kf", tags=PYRAMID, noise=NOISE, process=PROCESS, engine="filterpy")
+    filter = make("kf", tags=PYRAMID, noise=NOISE, process=PROCESS, engine="filterpy")
     state = filter.initial(np.eye(3), np.zeros(3), 0.01 * np.eye(6))
     with pytest.raises(ValueError, match="must be of one body"):
         filter.update_statistic(state, np.eye(3), np.zeros((2, 3, 4)))
