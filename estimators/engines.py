@@ -139,7 +139,13 @@ def plain_predict(
 
 def plain_update(mean: FloatArray, P: FloatArray, stat: Statistic) -> tuple[FloatArray, FloatArray]:
     """The information form ``(I + P G)^-1 P``: exact for vague priors."""
-    matrix, vector = information(stat)
+    return information_update(mean, P, *information(stat))
+
+
+def information_update(
+    mean: FloatArray, P: FloatArray, matrix: FloatArray, vector: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`plain_update` from the information matrix (..., 12, 12) and vector (..., 12) themselves."""
     P = symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
     return correct(mean, P, matrix, vector), P
 

@@ -17,6 +17,9 @@ from rbl_gym.checks import (
 # Ranges that stay in the cache from one look at them to the next.
 _PART = 1 << 15
 
+# Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
+VAGUE_ENTRY_VARIANCE = 1 / 3
+
 
 def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
     """A symmetric positive definite covariance of one of the sizes, or a ValueError."""

@@ -33,16 +33,20 @@ from rbl_gym.estimators.four_filters import (
     split,
     split_mean,
 )
-from rbl_gym.estimators.inputs import check_covariance, check_epoch, check_variance
+from rbl_gym.estimators.from_statistic import StatisticEpoch, check_informed, check_statistic
+from rbl_gym.estimators.from_statistic import update as update_from_statistic
+from rbl_gym.estimators.inputs import (
+    VAGUE_ENTRY_VARIANCE,
+    check_covariance,
+    check_epoch,
+    check_variance,
+)
 from rbl_gym.estimators.least_squares import unvec, vec
 from rbl_gym.estimators.shared_covariance import shared, spread_out
 from rbl_gym.estimators.squared_range import geometric_rank
 from rbl_gym.estimators.unitary import column_fit, coupled_fit, decoupled_fit
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
-
-# Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
-_VAGUE_ENTRY_VARIANCE = 1 / 3
 
 
 class KalmanState(NamedTuple):
@@ -188,8 +192,42 @@ class KalmanFamily:
         mean, covariance = ENGINES[self.engine].update(
             state.mean, state.covariance, epoch, self._frame
         )
+        return self._constrained(state, mean, covariance, epoch)
+
+    def update_statistic(self, state: KalmanState, G: ArrayLike, B: ArrayLike) -> KalmanState:
+        """State after one epoch of which only the statistic is known, all links measured.
+
+        Equal to `update` with the ranges behind it; noise and weights are in the two already.
+
+        Parameters
+        ----------
+        state
+            Before the epoch.
+        G, B
+            (..., 3, 3) and (..., 3, 4), `rbl_gym.statistic.EpochStatistic`.
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, NaN, a G that is not symmetric positive semidefinite, and where the
+            epoch has not rank 12 while the prior of the rotation says nothing.
+        """
+        epoch = check_statistic(G, B, self.tags)
+        check_informed(state.covariance, epoch)
+        mean, covariance = update_from_statistic(
+            state.mean, state.covariance, epoch, self._frame, self.engine
+        )
+        return self._constrained(state, mean, covariance, epoch)
+
+    def _constrained(
+        self,
+        prior: KalmanState,
+        mean: FloatArray,
+        covariance: FloatArray,
+        epoch: Epoch | StatisticEpoch,
+    ) -> KalmanState:
         posterior = KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
-        return _CONSTRAINTS[self.constraint](self, state, posterior, epoch)
+        return _CONSTRAINTS[self.constraint](self, prior, posterior, epoch)
 
     def belief(self, state: KalmanState) -> PoseBelief:
         """Pose, its covariance, and the raw matrix.
@@ -227,7 +265,7 @@ class KalmanFamily:
         covariance = state.covariance if common is None else common
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
         rotation = np.maximum(np.maximum(variance[..., :3], variance[..., 3:6]), variance[..., 6:9])
-        vague_rotation = _largest_of_three(rotation) > _VAGUE_ENTRY_VARIANCE
+        vague_rotation = _largest_of_three(rotation) > VAGUE_ENTRY_VARIANCE
         largest = _largest_of_three(variance[..., 9:])
         # The first and last anchor bound the extent from below, and mostly settle it.
         apart = _largest_of_three(np.abs(anchors[..., 0, :] - anchors[..., -1, :]))
@@ -255,7 +293,7 @@ def _largest_of_three(values: FloatArray) -> FloatArray:
 
 
 def _no_constraint(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
 ) -> KalmanState:
     return posterior
 
@@ -269,13 +307,13 @@ def _project(posterior: KalmanState, where: BoolArray) -> KalmanState:
 
 
 def _always(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
 ) -> KalmanState:
     return _project(posterior, np.ones(posterior.mean.shape[:-1], bool))
 
 
 def _above_threshold(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
 ) -> KalmanState:
     matrix = unvec(posterior.mean[..., :9])
     defect = np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)
@@ -283,7 +321,7 @@ def _above_threshold(
 
 
 def _newton(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
 ) -> KalmanState:
     """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
 

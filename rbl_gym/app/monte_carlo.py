@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym import bounds, estimators, metrics, ranging, scenes, simulation
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.statistic import EpochStatistic, simulate_statistic
+
+OBSERVATIONS = ("ranges", "statistic")
 
 
 class World(NamedTuple):
     """A batch of episodes with its measurements and its posterior Cramer-Rao bound.
 
-    `bound` (K, B, 6, 6) is a covariance per epoch and trial.
+    `measurements` are ranges, or their statistic where that is observed; `bound` (K, B, 6, 6)
+    is a covariance per epoch and trial, of the ranges in either case.
     """
 
     scene: scenes.Scene
     episode: simulation.Episode
-    measurements: list[ranging.Measurement]
+    measurements: Sequence[ranging.Measurement | EpochStatistic]
     bound: FloatArray
 
 
@@ -57,17 +61,32 @@ class Trace(NamedTuple):
     seconds: float
 
 
-def simulate_world(scene: scenes.Scene, trials: int, rng: np.random.Generator) -> World:
-    """Episodes of a scene, with anchors that stay where they start."""
+def simulate_world(
+    scene: scenes.Scene, trials: int, rng: np.random.Generator, observation: str = "ranges"
+) -> World:
+    """Episodes of a scene, with anchors that stay where they start.
+
+    ``observation="statistic"``: every epoch is drawn as its `EpochStatistic`, which the KF family
+    reads; for scenes whose noise is `SquaredRangeNoise` and whose links all measure.
+    """
+    check_one_of("observation", observation, OBSERVATIONS)
+    if observation == "statistic" and (scene.links.is_random or scene.links.reach_m is not None):
+        raise ValueError(f"scene must have all its links for the statistic, got {scene.links}")
     episode = simulation.draw_episode(scene, rng, (trials,))
-    measurements = []
+    measurements: list[ranging.Measurement | EpochStatistic] = []
     covariances = []
     information = None
     for epoch in range(scene.steps + 1):
         at = simulation.epoch_of(episode, epoch)
-        measured = simulation.measure(scene, at, episode.anchors)
+        if observation == "statistic":
+            pose = np.asarray(scene.tags), at.rotation, at.translation
+            measured = simulate_statistic(episode.anchors, *pose, scene.noise, rng)
+            links = np.ones(at.normals.shape, dtype=np.bool_)
+        else:
+            measured = simulation.measure(scene, at, episode.anchors)
+            links = measured.links
         information = simulation.posterior_information(
-            scene, at, episode.anchors, measured.links, information, episode.prior_covariance
+            scene, at, episode.anchors, links, information, episode.prior_covariance
         )
         measurements.append(measured)
         covariances.append(np.linalg.inv(information))
@@ -90,7 +109,12 @@ def beliefs(world: World, filter: estimators.Filter) -> Iterator[tuple[Any, esti
     for epoch, measured in enumerate(world.measurements):
         if epoch:
             state = filter.predict(state, episode.twists[:, epoch], world.scene.dt)
-        state = filter.update(state, measured.ranges, episode.anchors, measured.links)
+        if isinstance(measured, EpochStatistic):
+            if not isinstance(filter, estimators.KalmanFamily):
+                raise ValueError(f"filter must be of the KF family to read G and B, got {filter!r}")
+            state = filter.update_statistic(state, *measured)
+        else:
+            state = filter.update(state, measured.ranges, episode.anchors, measured.links)
         yield state, filter.belief(state)
 
 
