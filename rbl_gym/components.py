@@ -56,6 +56,13 @@ def exp(w: FloatArray) -> FloatArray:
     return _series(w, a, b, 1.0 - b * squared)
 
 
+def exp_and_left_jacobian(w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`exp` and `rotations.left_jacobian` (3, 3, ...) of rotation vectors (3, ...), trials last."""
+    squared = np.einsum("i...,i...->...", w, w)
+    a, b, c = rotations.coefficients(squared)
+    return _series(w, a, b, 1.0 - b * squared), _series(w, b, c, 1.0 - c * squared)
+
+
 def log(Q: FloatArray) -> FloatArray:
     """Rotation vectors (3, ...) of rotation matrices (3, 3, ...); `rotations.log`."""
     return np.ascontiguousarray(first(rotations.log(last(Q, 2)), 1))
@@ -113,7 +120,7 @@ def solve(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:
 
 
 def inverse(A: FloatArray) -> FloatArray:
-    """Inverse (n, n, ...) of symmetric positive definite matrices by Gauss-Jordan sweeps.
+    """Inverse (6, 6, ...) of symmetric positive definite matrices, by their halves.
 
     Raises
     ------
@@ -123,21 +130,49 @@ def inverse(A: FloatArray) -> FloatArray:
     if A.ndim == 2:
         inverted = np.linalg.inv(A)
         return 0.5 * (inverted + inverted.T)
-    A = A.copy()
-    pivots = []
+    corner = A[:3, 3:]
+    upper = _inverse_of_half(A[:3, :3])
+    W = product(upper, corner)
+    lower = _inverse_of_half(A[3:, 3:] - product(corner.swapaxes(0, 1), W))
+    V = product(W, lower)
+    inverted = np.empty_like(A, order="C")
+    np.add(upper, product(V, W.swapaxes(0, 1)), out=inverted[:3, :3])
+    for i, j in ((1, 0), (2, 0), (2, 1)):
+        inverted[i, j] = inverted[j, i]
+    np.negative(V, out=inverted[:3, 3:])
+    inverted[3:, :3] = inverted[:3, 3:].swapaxes(0, 1)
+    inverted[3:, 3:] = lower
+    return inverted
+
+
+def _inverse_of_half(A: FloatArray) -> FloatArray:
+    """Inverse (3, 3, ...) of symmetric positive definite ``A = L D L^T``, as stable as that is."""
+    a, b, c = A[0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(len(A)):
-            column = A[k].copy()
-            pivots.append(column[k])
-            row = column / column[k]
-            A -= column[:, None] * row
-            # Swept matrices stay symmetric; a sweep leaves minus the inverse of what it swept.
-            A[k] = A[:, k] = row
-            np.divide(-1, column[k], out=A[k, k])
-    smallest = np.min(pivots, initial=np.inf)
+        p = 1 / a
+        l10, l20 = b * p, c * p
+        d = A[1, 1] - l10 * b
+        e = A[1, 2] - l10 * c
+        q = 1 / d
+        l21 = e * q
+        f = A[2, 2] - l20 * c - l21 * e
+        r = 1 / f
+    smallest = min(float(pivot.min(initial=np.inf)) for pivot in (a, d, f))
     if not smallest > 0:
         raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
-    return np.negative(A, out=A)
+    # L^-1 = [[1, 0, 0], [-l10, 1, 0], [m, -l21, 1]].
+    m = l10 * l21 - l20
+    inverted = np.empty_like(A, order="C")
+    mr, lr, lq = m * r, l21 * r, l10 * q
+    np.add(p, l10 * lq + m * mr, out=inverted[0, 0])
+    np.negative(lq + m * lr, out=inverted[0, 1])
+    inverted[0, 2] = mr
+    np.add(q, l21 * lr, out=inverted[1, 1])
+    np.negative(lr, out=inverted[1, 2])
+    inverted[2, 2] = r
+    for i, j in ((1, 0), (2, 0), (2, 1)):
+        inverted[i, j] = inverted[j, i]
+    return inverted
 
 
 def _diagonal(A: FloatArray) -> FloatArray:
