@@ -120,7 +120,7 @@ def solve(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:
 
 
 def inverse(A: FloatArray) -> FloatArray:
-    """Inverse (6, 6, ...) of symmetric positive definite matrices, by their halves.
+    """Inverse (n, n, ...) of symmetric positive definite matrices by Gauss-Jordan sweeps.
 
     Raises
     ------
@@ -130,48 +130,46 @@ def inverse(A: FloatArray) -> FloatArray:
     if A.ndim == 2:
         inverted = np.linalg.inv(A)
         return 0.5 * (inverted + inverted.T)
-    corner = A[:3, 3:]
-    upper = _inverse_of_half(A[:3, :3])
-    W = product(upper, corner)
-    lower = _inverse_of_half(A[3:, 3:] - product(corner.swapaxes(0, 1), W))
-    V = product(W, lower)
-    inverted = np.empty_like(A, order="C")
-    np.add(upper, product(V, W.swapaxes(0, 1)), out=inverted[:3, :3])
-    for i, j in ((1, 0), (2, 0), (2, 1)):
-        inverted[i, j] = inverted[j, i]
-    np.negative(V, out=inverted[:3, 3:])
-    inverted[3:, :3] = inverted[:3, 3:].swapaxes(0, 1)
-    inverted[3:, 3:] = lower
-    return inverted
-
-
-def _inverse_of_half(A: FloatArray) -> FloatArray:
-    """Inverse (3, 3, ...) of symmetric positive definite ``A = L D L^T``, as stable as that is."""
-    a, b, c = A[0]
+    A = A.copy()
+    pivots = []
     with np.errstate(divide="ignore", invalid="ignore"):
-        p = 1 / a
-        l10, l20 = b * p, c * p
-        d = A[1, 1] - l10 * b
-        e = A[1, 2] - l10 * c
-        q = 1 / d
-        l21 = e * q
-        f = A[2, 2] - l20 * c - l21 * e
-        r = 1 / f
-    smallest = min(float(pivot.min(initial=np.inf)) for pivot in (a, d, f))
+        for k in range(len(A)):
+            column = A[k].copy()
+            pivots.append(column[k])
+            row = column / column[k]
+            A -= column[:, None] * row
+            # Swept matrices stay symmetric; a sweep leaves minus the inverse of what it swept.
+            A[k] = A[:, k] = row
+            np.divide(-1, column[k], out=A[k, k])
+    smallest = np.min(pivots, initial=np.inf)
     if not smallest > 0:
         raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
-    # L^-1 = [[1, 0, 0], [-l10, 1, 0], [m, -l21, 1]].
-    m = l10 * l21 - l20
+    return np.negative(A, out=A)
+
+
+def inverse_of_three(A: FloatArray) -> FloatArray:
+    """Inverse (3, 3, ...) of symmetric positive definite matrices by elimination; as `inverse`."""
     inverted = np.empty_like(A, order="C")
-    mr, lr, lq = m * r, l21 * r, l10 * q
-    np.add(p, l10 * lq + m * mr, out=inverted[0, 0])
-    np.negative(lq + m * lr, out=inverted[0, 1])
-    inverted[0, 2] = mr
-    np.add(q, l21 * lr, out=inverted[1, 1])
-    np.negative(lr, out=inverted[1, 2])
-    inverted[2, 2] = r
-    for i, j in ((1, 0), (2, 0), (2, 1)):
-        inverted[i, j] = inverted[j, i]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        p = 1 / A[0, 0]
+        column = A[0, 1:] * p
+        rest = A[1:, 1:] - column[:, None] * A[0, 1:]
+        q = 1 / rest[0, 0]
+        ratio = rest[0, 1] * q
+        pivot = rest[1, 1] - ratio * rest[0, 1]
+        np.divide(1, pivot, out=inverted[2, 2])
+    smallest = min(float(d.min(initial=np.inf)) for d in (A[0, 0], rest[0, 0], pivot))
+    if not smallest > 0:
+        raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
+    off = ratio * inverted[2, 2]
+    np.add(q, ratio * off, out=inverted[1, 1])
+    inverted[1, 2] = inverted[2, 1] = np.negative(off, out=off)
+    below = column[0] * inverted[1:, 1]
+    below += column[1] * inverted[1:, 2]
+    column *= below
+    np.add(p, column[0], out=inverted[0, 0])
+    inverted[0, 0] += column[1]
+    inverted[0, 1:] = inverted[1:, 0] = np.negative(below, out=below)
     return inverted
 
 

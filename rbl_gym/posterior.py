@@ -1,15 +1,15 @@
 """The posterior Cramer-Rao bound as the environments carry it: `bounds` where speed counts.
 
-The recursion is that of `bounds.posterior_crb_step`, with the covariance in place of the
-information, ``P <- ((F P F^T + Q)^-1 + sum J^T J / var)^-1``: the inverse that the score needs is
-the one the next step starts from. Many worlds are taken by components, in blocks, worlds last;
-one world in few calls, with all that no action changes computed once for its episode.
-Nothing is checked here but that the matrices can be inverted.
+The recursion is that of `bounds.posterior_crb_step`. Many worlds are taken by components, in
+blocks, worlds last. One world is taken in few calls: all that no action changes is computed once
+for its episode, and the covariance is carried. Nothing is checked here but that the matrices can
+be inverted.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +17,20 @@ from scipy.linalg import lapack
 
 from rbl_gym import bounds, rotations
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.components import exp_and_left_jacobian, first, inverse, last, product
+from rbl_gym.components import (
+    exp_and_left_jacobian,
+    first,
+    inverse,
+    inverse_of_three,
+    last,
+    product,
+)
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
 
 _EYE = np.eye(6)
 # Worlds of a block: enough to outweigh the calls, few enough for the processor's cache.
-_BLOCK = 512
+_BLOCK = 1024
 _SINGULAR = "the information about the pose is singular or not finite"
 
 # --- one world ----------------------------------------------------------------------------------
@@ -72,7 +79,7 @@ class Course(NamedTuple):
 
     def score(self, epoch: int, P: FloatArray) -> float:
         """`bounds.score` of a pose covariance (6, 6) at an epoch."""
-        return bounds.root_of_trace(np.vdot(self.square[epoch], P))
+        return bounds.root_of_trace(float(np.vdot(self.square[epoch], P)))
 
 
 def course(
@@ -118,7 +125,7 @@ class Interval(NamedTuple):
 
 
 def step_many(
-    P: FloatArray,
+    J: FloatArray,
     interval: Interval | None,
     anchors: FloatArray,
     tags: tuple[tuple[float, ...], ...],
@@ -127,14 +134,14 @@ def step_many(
     noise: NoiseLaw,
     links: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """One step of the recursion for B worlds whose bodies have the same tags.
+    """`bounds.posterior_crb_step` of B worlds whose bodies have the same tags.
 
     Parameters
     ----------
-    P
-        Pose covariances (B, 6, 6) of the epoch before.
+    J
+        Information (B, 6, 6) of the epoch before.
     interval
-        From there to this epoch; None: P is of this epoch, before its ranges.
+        From there to this epoch; None: J is of this epoch, before its ranges.
     anchors, rotation, translation, links
         At this epoch, (B, M, 3), (B, 3, 3), (B, 3), (B, M, N); the pose is the true one.
     tags, noise
@@ -142,31 +149,30 @@ def step_many(
 
     Returns
     -------
-    The covariances (B, 6, 6) after the ranges, a view of memory that runs along the worlds, and
-    their `bounds.score` (B,).
+    The information (B, 6, 6) after the ranges, a view of memory that runs along the worlds, and
+    the `bounds.score` (B,) of its inverse.
 
     Raises
     ------
     ValueError
-        If a sum of information is singular or not finite.
+        If the information is singular or not finite.
     """
     maps = _maps(tags)
-    updated, trace = np.empty((6, 6, len(P))), np.empty(len(P))
-    for start in range(0, len(P), _BLOCK):
+    updated, trace = np.empty((6, 6, len(J))), np.empty(len(J))
+    for start in range(0, len(J), _BLOCK):
         rows = slice(start, start + _BLOCK)
-        predicted, Q = _block(P[rows], 2), _block(rotation[rows], 2)
-        if interval is not None:
-            turn = interval.dt * _block(interval.twist[rows, :3], 1)
-            predicted = _predict(predicted, turn, interval.dt * interval.process.std() ** 2)
+        new, Q = _block(J[rows], 2), _block(rotation[rows], 2)
         seen = _block(_transposed(anchors[rows]), 2) - _block(translation[rows], 1)[:, None]
         seen = np.einsum("ijb,imb->jmb", Q, seen)
         try:
-            information = inverse(predicted)
-            information += _information(maps, seen, Q, noise, _block(links[rows], 2))
-            new = inverse(information)
+            if interval is not None:
+                turn = interval.dt * _block(interval.twist[rows, :3], 1)
+                new = _predict(new, turn, math.sqrt(interval.dt) * interval.process.std())
+            new += _information(maps, seen, Q, noise, _block(_transposed(links[rows]), 2))
+            trace[rows] = _trace(maps, Q, inverse(new))
         except np.linalg.LinAlgError as error:
             raise ValueError(_SINGULAR) from error
-        updated[..., rows], trace[rows] = new, _trace(maps, Q, new)
+        updated[..., rows] = new
     return last(updated, 2), bounds.root_of_trace(trace)
 
 
@@ -174,19 +180,32 @@ def _block(array: FloatArray, trailing: int) -> FloatArray:
     return np.ascontiguousarray(first(array, trailing))
 
 
-def _predict(P: FloatArray, turn: FloatArray, variance: FloatArray) -> FloatArray:
-    """``F P F^T + Q`` (6, 6, B) after turns (3, B), with six variances of the interval's noise."""
+def _predict(J: FloatArray, turn: FloatArray, std: FloatArray) -> FloatArray:
+    """``(F J^-1 F^T + Q)^-1`` (6, 6, B) after turns (3, B), six deviations of the noise.
+
+    Never by way of J^-1: where little is known the two inverses would lose half the digits.
+    """
     step, jacobian = exp_and_left_jacobian(turn)
-    top = product(step, P[:3])
-    predicted = np.empty_like(P)
-    predicted[:3, :3] = _times_transposed(top[:, :3], step)
-    predicted[:3, :3] += _times_transposed(jacobian * variance[:3, None], jacobian)
-    predicted[:3, 3:] = top[:, 3:]
-    predicted[3:, :3] = top[:, 3:].swapaxes(0, 1)
-    predicted[3:, 3:] = P[3:, 3:]
-    for i in range(3, 6):
-        predicted[i, i] += variance[i]
-    return predicted
+    top = product(step, J[:3])
+    T = np.empty_like(J)
+    T[:3, :3] = _times_transposed(top[:, :3], step)
+    T[:3, 3:] = top[:, 3:]
+    T[3:, :3] = top[:, 3:].swapaxes(0, 1)
+    T[3:, 3:] = J[3:, 3:]
+    # (T^-1 + S S^T)^-1 = T - T S (I + S^T T S)^-1 S^T T, for the rotation, then the translation.
+    G = jacobian * std[:3, None]
+    TS = product(T[:, :3], G)
+    _lessen(T, TS, product(G.swapaxes(0, 1), TS[:3]))
+    TS = T[:, 3:] * std[3:, None]
+    _lessen(T, TS, std[3:, None, None] * TS[3:])
+    return T
+
+
+def _lessen(T: FloatArray, TS: FloatArray, inner: FloatArray) -> None:
+    """Take ``TS (I + inner)^-1 TS^T`` from T in place."""
+    for i in range(3):
+        inner[i, i] += 1.0
+    T -= _times_transposed(product(TS, inverse_of_three(inner)), TS)
 
 
 class _TagMaps(NamedTuple):
@@ -219,7 +238,7 @@ def _maps(tags: tuple[tuple[float, ...], ...]) -> _TagMaps:
 def _information(
     maps: _TagMaps, anchors: FloatArray, Q: FloatArray, noise: NoiseLaw, links: BoolArray
 ) -> FloatArray:
-    """Fisher information (6, 6, B) of the ranges, from the anchors in the body frame (3, M, B)."""
+    """Fisher information (6, 6, B) of the ranges, from anchors (3, M, B) in the body frame."""
     upper = _tag_information(maps.places, anchors, noise, links)
     blocks = maps.lift @ upper.reshape(maps.lift.shape[1], -1)
     # Both sides of all three blocks are turned to the world.
@@ -234,21 +253,23 @@ def _information(
 def _tag_information(
     places: FloatArray, anchors: FloatArray, noise: NoiseLaw, links: BoolArray
 ) -> FloatArray:
-    """Upper triangles (6, N, B) of the information of the ranges about each tag's place."""
-    d = places[:, None, :, None] - anchors[:, :, None]
+    """Upper triangles (6, N, B) of the information about each tag's place, links (N, M, B)."""
+    # Tags before anchors, so that each of these long loops runs over anchors and worlds.
+    d = places[:, :, None, None] - anchors[:, None]
     squared = d[0] * d[0]
     squared += d[1] * d[1]
     squared += d[2] * d[2]
-    variance = first(noise.variance(last(np.sqrt(squared), 2)), 2)
+    distance = _transposed(last(np.sqrt(squared), 2))
+    variance = first(_transposed(noise.variance(distance)), 2)
     # The gradients are d / distance: the square of that distance goes into the weight.
     with np.errstate(divide="ignore", invalid="ignore"):
         weight = links / (squared * variance)
-    if not squared.all():
+    if not squared.min() > 0:
         # Where an anchor stands on a tag the range has no gradient: that link tells nothing.
         weight = np.where(squared > 0, weight, 0.0)
-    upper = np.empty((6, *squared.shape[1:]))
+    upper = np.empty((6, len(squared), squared.shape[-1]))
     for i, rows in enumerate((slice(0, 3), slice(3, 5), slice(5, 6))):
-        np.einsum("mnb,jmnb->jnb", weight * d[i], d[i:], out=upper[rows])
+        np.einsum("nmb,jnmb->jnb", weight * d[i], d[i:], out=upper[rows])
     return upper
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, motion, ranging, rotations
+from rbl_gym import bounds, motion, posterior, ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.scenes import Scene
 
@@ -269,4 +269,40 @@ def posterior_information(
         predicted = bounds.predict_information(previous, at.twist, scene.dt, scene.process)
     return predicted + bounds.information_at(
         anchors, np.asarray(scene.tags), at.rotation, at.translation, scene.noise, links
+    )
+
+
+def posterior_step(
+    scene: Scene,
+    at: Epoch,
+    anchors: FloatArray,
+    links: BoolArray,
+    previous: FloatArray | None,
+    prior_covariance: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """`posterior_information` (B, 6, 6) of B worlds, fast, and the score (B,) of its inverse."""
+    interval = None
+    if previous is not None:
+        interval = posterior.Interval(at.twist, scene.dt, scene.process)
+    return posterior.step_many(
+        np.linalg.inv(prior_covariance) if previous is None else previous,
+        interval,
+        anchors,
+        scene.tags,
+        at.rotation,
+        at.translation,
+        scene.noise,
+        links,
+    )
+
+
+def posterior_course(scene: Scene, episode: Episode) -> posterior.Course:
+    """What the bound of one episode needs and no action changes."""
+    return posterior.course(
+        episode.rotation,
+        episode.positions,
+        episode.twists,
+        np.asarray(scene.tags),
+        scene.dt,
+        scene.process,
     )

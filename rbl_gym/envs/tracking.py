@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from rbl_gym import bounds, ranging, scenes, simulation
-from rbl_gym.checks import FloatArray, check_array, check_one_of
+from rbl_gym import posterior, ranging, scenes, simulation
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 
 REWARDS = ("bound", "none")
 
@@ -90,7 +91,6 @@ class TrackingEnv(gym.Env[Any, Any]):
         self.render_mode = render_mode
         self.observation_space = observation_space(self.scene)
         self.action_space = action_space(self.scene)
-        self._tags = np.asarray(self.scene.tags)
         self._episode: simulation.Episode | None = None
         self._epoch = 0
 
@@ -108,7 +108,9 @@ class TrackingEnv(gym.Env[Any, Any]):
             # No action can change what anchors that stand still will measure.
             at = simulation.whole(episode)
             self._measured = simulation.measure(self.scene, at, episode.anchors)
-        self._information: FloatArray | None = None
+        self._covariance = episode.prior_covariance
+        if self.reward_mode == "bound":
+            self._start_bound(episode)
         observation, info, _ = self._observe(episode)
         info["prior_rotation"] = episode.prior_rotation.copy()
         info["prior_translation"] = episode.prior_translation.copy()
@@ -147,17 +149,8 @@ class TrackingEnv(gym.Env[Any, Any]):
         }
         reward = 0.0
         if self.reward_mode == "bound":
-            self._information = simulation.posterior_information(
-                self.scene,
-                at,
-                self._anchors,
-                measured.links,
-                self._information,
-                episode.prior_covariance,
-            )
-            covariance = np.linalg.inv(self._information)
-            info["score_m"] = float(bounds.score(covariance, at.rotation, self._tags))
-            reward = -float(np.log(info["score_m"]))
+            info["score_m"] = self._carry_bound(measured.links)
+            reward = -math.log(info["score_m"])
         observation = {
             "ranges": measured.ranges,
             "links": measured.links.astype(np.int8),
@@ -165,6 +158,26 @@ class TrackingEnv(gym.Env[Any, Any]):
             "twist": at.twist.copy(),
         }
         return observation, info, reward
+
+    def _start_bound(self, episode: simulation.Episode) -> None:
+        """All of the bound that no action of the episode changes."""
+        self._course = simulation.posterior_course(self.scene, episode)
+        self._informations: FloatArray | None = None
+        if self._measured is not None:
+            self._informations = self._course.information(
+                slice(None), episode.anchors, self.scene.noise, self._measured.links
+            )
+
+    def _carry_bound(self, links: BoolArray) -> float:
+        """The posterior Cramer-Rao bound of this epoch, from that of the one before."""
+        k = self._epoch
+        if self._informations is None:
+            information = self._course.information(k, self._anchors, self.scene.noise, links)
+        else:
+            information = self._informations[k]
+        predicted = self._course.predict(k, self._covariance) if k else self._covariance
+        self._covariance = posterior.update(predicted, information)
+        return self._course.score(k, self._covariance)
 
 
 def check_action(action: ArrayLike, size: int) -> FloatArray:
