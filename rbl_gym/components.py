@@ -147,32 +147,6 @@ def inverse(A: FloatArray) -> FloatArray:
     return np.negative(A, out=A)
 
 
-def inverse_of_three(A: FloatArray) -> FloatArray:
-    """Inverse (3, 3, ...) of symmetric positive definite matrices by elimination; as `inverse`."""
-    inverted = np.empty_like(A, order="C")
-    with np.errstate(divide="ignore", invalid="ignore"):
-        p = 1 / A[0, 0]
-        column = A[0, 1:] * p
-        rest = A[1:, 1:] - column[:, None] * A[0, 1:]
-        q = 1 / rest[0, 0]
-        ratio = rest[0, 1] * q
-        pivot = rest[1, 1] - ratio * rest[0, 1]
-        np.divide(1, pivot, out=inverted[2, 2])
-    smallest = min(float(d.min(initial=np.inf)) for d in (A[0, 0], rest[0, 0], pivot))
-    if not smallest > 0:
-        raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
-    off = ratio * inverted[2, 2]
-    np.add(q, ratio * off, out=inverted[1, 1])
-    inverted[1, 2] = inverted[2, 1] = np.negative(off, out=off)
-    below = column[0] * inverted[1:, 1]
-    below += column[1] * inverted[1:, 2]
-    column *= below
-    np.add(p, column[0], out=inverted[0, 0])
-    inverted[0, 0] += column[1]
-    inverted[0, 1:] = inverted[1:, 0] = np.negative(below, out=below)
-    return inverted
-
-
 def _diagonal(A: FloatArray) -> FloatArray:
     """The diagonal (n, ...) of (n, n, ...) as a view where the memory allows it."""
     n = len(A)

@@ -9,7 +9,6 @@ be inverted.
 from __future__ import annotations
 
 import functools
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +20,6 @@ from rbl_gym.components import (
     exp_and_left_jacobian,
     first,
     inverse,
-    inverse_of_three,
     last,
     product,
 )
@@ -167,7 +165,11 @@ def step_many(
         try:
             if interval is not None:
                 turn = interval.dt * _block(interval.twist[rows, :3], 1)
-                new = _predict(new, turn, math.sqrt(interval.dt) * interval.process.std())
+                new = _predict(new, turn, interval.dt * interval.process.std() ** 2)
+                if new is None:
+                    twist = interval.twist[rows]
+                    new = bounds.predict_information(J[rows], twist, interval.dt, interval.process)
+                    new = _block(new, 2)
             new += _information(maps, seen, Q, noise, _block(_transposed(links[rows]), 2))
             trace[rows] = _trace(maps, Q, inverse(new))
         except np.linalg.LinAlgError as error:
@@ -180,32 +182,32 @@ def _block(array: FloatArray, trailing: int) -> FloatArray:
     return np.ascontiguousarray(first(array, trailing))
 
 
-def _predict(J: FloatArray, turn: FloatArray, std: FloatArray) -> FloatArray:
-    """``(F J^-1 F^T + Q)^-1`` (6, 6, B) after turns (3, B), six deviations of the noise.
+def _predict(J: FloatArray, turn: FloatArray, variance: FloatArray) -> FloatArray | None:
+    """``(F J^-1 F^T + Q)^-1`` (6, 6, B) after turns (3, B), six variances of the noise.
 
-    Never by way of J^-1: where little is known the two inverses would lose half the digits.
+    As ``(I + T Q)^-1 T``: where little is known, a way by J^-1 loses half the digits.
     """
     step, jacobian = exp_and_left_jacobian(turn)
     top = product(step, J[:3])
-    T = np.empty_like(J)
+    # [A | T] with T = F J F^T and A = I + T Q; A is brought to I.
+    both = np.empty((6, 12, J.shape[-1]))
+    A, T = both[:, :6], both[:, 6:]
     T[:3, :3] = _times_transposed(top[:, :3], step)
     T[:3, 3:] = top[:, 3:]
     T[3:, :3] = top[:, 3:].swapaxes(0, 1)
     T[3:, 3:] = J[3:, 3:]
-    # (T^-1 + S S^T)^-1 = T - T S (I + S^T T S)^-1 S^T T, for the rotation, then the translation.
-    G = jacobian * std[:3, None]
-    TS = product(T[:, :3], G)
-    _lessen(T, TS, product(G.swapaxes(0, 1), TS[:3]))
-    TS = T[:, 3:] * std[3:, None]
-    _lessen(T, TS, std[3:, None, None] * TS[3:])
-    return T
-
-
-def _lessen(T: FloatArray, TS: FloatArray, inner: FloatArray) -> None:
-    """Take ``TS (I + inner)^-1 TS^T`` from T in place."""
-    for i in range(3):
-        inner[i, i] += 1.0
-    T -= _times_transposed(product(TS, inverse_of_three(inner)), TS)
+    A[:, :3] = product(T[:, :3], _times_transposed(jacobian * variance[:3, None], jacobian))
+    np.multiply(T[:, 3:], variance[3:, None], out=A[:, 3:])
+    for i in range(6):
+        A[i, i] += 1.0
+    for k in range(6):
+        if not both[k, k].min() > 0.5:
+            # Pivots stay above 1 but for turned, uneven noise: then rows must be exchanged.
+            return None
+        both[k, k + 1 :] /= both[k, k]
+        for rows in (both[:k], both[k + 1 :]):
+            rows[:, k + 1 :] -= rows[:, k, None] * both[k, k + 1 :]
+    return bounds.symmetric(last(T, 2)).transpose(1, 2, 0)
 
 
 class _TagMaps(NamedTuple):
