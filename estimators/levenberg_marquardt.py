@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.components import exp, first, last, product, solve
+from rbl_gym.components import exp, first, last, product, solve
 
 
 class Linearization(NamedTuple):

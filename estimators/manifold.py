@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
-from rbl_gym.estimators.belief import PoseBelief
-from rbl_gym.estimators.components import (
+from rbl_gym.components import (
     first,
     inverse,
     last,
@@ -27,6 +26,7 @@ from rbl_gym.estimators.components import (
     product,
     trials_last,
 )
+from rbl_gym.estimators.belief import PoseBelief
 from rbl_gym.estimators.inputs import (
     check_covariance,
     check_epoch,

@@ -15,7 +15,7 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.components import cross, first, last, trials_last
+from rbl_gym.components import cross, first, last, trials_last
 from rbl_gym.estimators.levenberg_marquardt import Linearization
 
 # A loss takes squared whitened residuals to (their cost, the weight of each in least squares).

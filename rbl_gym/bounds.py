@@ -344,6 +344,12 @@ def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> Float
     square = moments.reshape((*moments.shape[:-2], 16)) @ _BY_MOMENTS
     square = square.reshape((*square.shape[:-1], 6, 6)) / turned.shape[-2]
     trace = np.einsum("...ab,...ab->...", square, covariance)
-    if not (trace >= 0).all():
-        raise ValueError(f"covariance must be positive and finite, got a trace of {trace.min()}")
+    return root_of_trace(trace)
+
+
+def root_of_trace(trace: FloatArray) -> FloatArray:
+    """The score (...) from its square, which is a trace; NaN and negative ones are refused."""
+    # True of NaN too.
+    if not np.min(trace) >= 0:
+        raise ValueError(f"covariance must be positive and finite, got a trace of {np.min(trace)}")
     return np.sqrt(trace)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, motion, ranging, rotations
+from rbl_gym import bounds, motion, posterior, ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.obstacles import in_sight
 from rbl_gym.scenes import Scene
@@ -263,6 +263,11 @@ def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
     return np.where(sight, 1.0, scene.blocked_information)
 
 
+def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> FloatArray:
+    """Share (..., M, N) of its information that each link has: none where it gave no range."""
+    return links * link_quality(scene, at, anchors)[..., None] if scene.obstacles else links
+
+
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:
     """Anchors after one step of the commanded velocities.
 
@@ -295,5 +300,46 @@ def posterior_information(
     else:
         predicted = bounds.predict_information(previous, at.twist, scene.dt, scene.process)
     return predicted + bounds.information_at(
-        anchors, np.asarray(scene.tags), at.rotation, at.translation, scene.noise, links
+        anchors,
+        np.asarray(scene.tags),
+        at.rotation,
+        at.translation,
+        scene.noise,
+        shares(scene, at, anchors, links),
+    )
+
+
+def posterior_step(
+    scene: Scene,
+    at: Epoch,
+    anchors: FloatArray,
+    links: BoolArray,
+    previous: FloatArray | None,
+    prior_covariance: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """`posterior_information` (B, 6, 6) of B worlds, fast, and the score (B,) of its inverse."""
+    interval = None
+    if previous is not None:
+        interval = posterior.Interval(at.twist, scene.dt, scene.process)
+    return posterior.step_many(
+        np.linalg.inv(prior_covariance) if previous is None else previous,
+        interval,
+        anchors,
+        scene.tags,
+        at.rotation,
+        at.translation,
+        scene.noise,
+        shares(scene, at, anchors, links),
+    )
+
+
+def posterior_course(scene: Scene, episode: Episode, positions: FloatArray) -> posterior.Course:
+    """What the bound of one episode needs and no action changes; tags' places (T + 1, N, 3)."""
+    return posterior.course(
+        episode.rotation,
+        positions,
+        episode.twists,
+        np.asarray(scene.tags),
+        scene.dt,
+        scene.process,
     )

@@ -133,7 +133,7 @@ def test_environments_own_reward_is_switched_off(monkeypatch):
     def refuse(*_: Any) -> None:
         raise AssertionError("the bound was computed")
 
-    monkeypatch.setattr(simulation, "posterior_information", refuse)
+    monkeypatch.setattr(simulation, "posterior_course", refuse)
     with pytest.raises(AssertionError, match="the bound"):
         raw(short("uwb_room"), reward="bound").reset(seed=0)
     assert len(rollout(wrapped(short("uwb_room")))) == 13

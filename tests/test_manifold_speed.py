@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, bounds, estimators, motion, ranging, rotations
-from rbl_gym.estimators import components, manifold
+from rbl_gym import bodies, bounds, components, estimators, motion, ranging, rotations
+from rbl_gym.estimators import manifold
 from rbl_gym.estimators.manifold import PoseState
 from rbl_gym.estimators.range_cost import RangeCost, huber, lift_map
 from tests.helpers import random_world, simulate

@@ -73,7 +73,7 @@ def test_wraps_what_make_vec_gives_and_its_own_reward_is_off(monkeypatch):
     def refuse(*_):
         raise AssertionError("the bound was computed")
 
-    monkeypatch.setattr(simulation, "posterior_information", refuse)
+    monkeypatch.setattr(simulation, "posterior_step", refuse)
     wrapped.reset(seed=1)
     _, reward, _, _, info = wrapped.step(np.zeros(4, int))
     np.testing.assert_allclose(reward, -np.log(info["score_m"]))

@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from rbl_gym import bounds, ranging, scenes, simulation
-from rbl_gym.checks import FloatArray, check_array, check_one_of
+from rbl_gym import posterior, ranging, scenes, simulation
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 
 REWARDS = ("bound", "none")
 
@@ -91,7 +91,6 @@ class TrackingEnv(gym.Env[Any, Any]):
         self.render_mode = render_mode
         self.observation_space = observation_space(self.scene)
         self.action_space = action_space(self.scene)
-        self._tags = np.asarray(self.scene.tags)
         self._episode: simulation.Episode | None = None
         self._epoch = 0
 
@@ -110,7 +109,9 @@ class TrackingEnv(gym.Env[Any, Any]):
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
             self._measured = simulation.measure(self.scene, at, episode.anchors, self._positions)
-        self._information: FloatArray | None = None
+        self._covariance = episode.prior_covariance
+        if self.reward_mode == "bound":
+            self._start_bound(episode)
         observation, info, _ = self._observe(episode)
         info["prior_rotation"] = episode.prior_rotation.copy()
         info["prior_translation"] = episode.prior_translation.copy()
@@ -126,7 +127,7 @@ class TrackingEnv(gym.Env[Any, Any]):
         if self.scene.anchor_speed_m_s > 0:
             velocities = check_action(action, 3 * self.scene.n_anchors)
             self._anchors = simulation.move_anchors(self.scene, self._anchors, velocities)
-        elif not self.action_space.contains(action):
+        elif not are_zeros(np.asarray(action), ()):
             raise ValueError(f"action must be 0 where the anchors are fixed, got {action!r:.80}")
         self._epoch += 1
         observation, info, reward = self._observe(self._episode)
@@ -149,17 +150,8 @@ class TrackingEnv(gym.Env[Any, Any]):
         }
         reward = 0.0
         if self.reward_mode == "bound":
-            self._information = simulation.posterior_information(
-                self.scene,
-                at,
-                self._anchors,
-                measured.links,
-                self._information,
-                episode.prior_covariance,
-            )
-            covariance = np.linalg.inv(self._information)
-            info["score_m"] = float(bounds.score(covariance, at.rotation, self._tags))
-            reward = -float(np.log(info["score_m"]))
+            info["score_m"] = self._carry_bound(at, measured.links)
+            reward = -math.log(info["score_m"])
         observation = {
             "ranges": measured.ranges,
             "links": measured.links.view(np.int8),
@@ -167,6 +159,30 @@ class TrackingEnv(gym.Env[Any, Any]):
             "twist": at.twist.copy(),
         }
         return observation, info, reward
+
+    def _start_bound(self, episode: simulation.Episode) -> None:
+        """All of the bound that no action of the episode changes."""
+        self._course = simulation.posterior_course(self.scene, episode, self._positions)
+        self._informations: FloatArray | None = None
+        if self._measured is not None:
+            shares = simulation.shares(
+                self.scene, self._whole, episode.anchors, self._measured.links
+            )
+            self._informations = self._course.information(
+                slice(None), episode.anchors, self.scene.noise, shares
+            )
+
+    def _carry_bound(self, at: simulation.Epoch, links: BoolArray) -> float:
+        """The posterior Cramer-Rao bound of this epoch, from that of the one before."""
+        k = self._epoch
+        if self._informations is None:
+            shares = simulation.shares(self.scene, at, self._anchors, links)
+            information = self._course.information(k, self._anchors, self.scene.noise, shares)
+        else:
+            information = self._informations[k]
+        predicted = self._course.predict(k, self._covariance) if k else self._covariance
+        self._covariance = posterior.update(predicted, information)
+        return self._course.score(k, self._covariance)
 
 
 def check_action(action: ArrayLike, size: int) -> FloatArray:

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from rbl_gym import bounds, scenes, simulation
+from rbl_gym import scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 from rbl_gym.envs.episodes import EpisodeStore, whole_rows
 from rbl_gym.envs.tracking import REWARDS, action_space, are_zeros, observation_space
@@ -74,7 +74,6 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = action_space(self.scene)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._tags = np.asarray(self.scene.tags)
         self._generators: list[np.random.Generator] = []
         self._episodes = EpisodeStore(self.scene, num_envs)
         # Worlds last in memory, as in the store.
@@ -243,8 +242,7 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         reward = np.zeros(self.num_envs)
         if self.reward_mode == "bound":
             self._carry_bound(at, observation["anchors"], measured.links, fresh, moved)
-            covariance = np.linalg.inv(self._information)
-            info["score_m"] = bounds.score(covariance, at.rotation, self._tags)
+            info["score_m"] = self._score.copy()
             reward = -np.log(info["score_m"])
         for key in list(info):
             info[f"_{key}"] = np.ones(self.num_envs, dtype=np.bool_)
@@ -258,18 +256,21 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         fresh: BoolArray,
         moved: BoolArray,
     ) -> None:
-        """The posterior Cramer-Rao information of the worlds that started or stepped."""
+        """The posterior Cramer-Rao bound of the worlds that started or stepped."""
         if moved.all():
-            self._information = simulation.posterior_information(
+            self._information, self._score = simulation.posterior_step(
                 self.scene, at, anchors, links, self._information, self._prior_covariance
             )
             return
         if fresh.all():
-            self._information = np.empty((self.num_envs, 6, 6))
+            self._information, self._score = (
+                np.empty((self.num_envs, 6, 6)),
+                np.empty(self.num_envs),
+            )
         for rows, started in ((fresh, True), (moved, False)):
             if rows.any():
                 part = simulation.Epoch(*(None if f is None else f[rows] for f in at))  # pyright: ignore[reportArgumentType]
-                self._information[rows] = simulation.posterior_information(
+                self._information[rows], self._score[rows] = simulation.posterior_step(
                     self.scene,
                     part,
                     anchors[rows],

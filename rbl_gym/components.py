@@ -54,6 +54,13 @@ def exp(w: FloatArray) -> FloatArray:
     return _series(w, a, b, 1.0 - b * squared)
 
 
+def exp_and_left_jacobian(w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`exp` and `rotations.left_jacobian` (3, 3, ...) of rotation vectors (3, ...), trials last."""
+    squared = np.einsum("i...,i...->...", w, w)
+    a, b, c = rotations.coefficients(squared)
+    return _series(w, a, b, 1.0 - b * squared), _series(w, b, c, 1.0 - c * squared)
+
+
 def log(Q: FloatArray) -> FloatArray:
     """Rotation vectors (3, ...) of rotation matrices (3, 3, ...); `rotations.log`."""
     return np.ascontiguousarray(first(rotations.log(last(Q, 2)), 1))
