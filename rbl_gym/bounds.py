@@ -347,9 +347,9 @@ def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> Float
     return root_of_trace(trace)
 
 
-def root_of_trace(trace: FloatArray) -> FloatArray:
+def root_of_trace(trace: ArrayLike) -> FloatArray:
     """The score (...) from its square, which is a trace; NaN and negative ones are refused."""
     # True of NaN too.
     if not np.min(trace) >= 0:
         raise ValueError(f"covariance must be positive and finite, got a trace of {np.min(trace)}")
-    return np.sqrt(trace)
+    return np.asarray(np.sqrt(trace))

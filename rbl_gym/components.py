@@ -6,13 +6,16 @@ estimators keep that shape and lay only the memory out the other way; here both 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray
 
 
-def first(array: FloatArray, trailing: int, batch: int = 0) -> FloatArray:
+def first(array: NDArray[Any], trailing: int, batch: int = 0) -> NDArray[Any]:
     """View (n, ..., batch) of (batch, n, ...): the `trailing` axes first, the batch axes last.
 
     Fewer batch axes than `batch` are filled up with axes of 1, so that views broadcast.

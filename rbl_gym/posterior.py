@@ -9,9 +9,10 @@ be inverted.
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from rbl_gym import bounds, rotations
@@ -77,7 +78,7 @@ class Course(NamedTuple):
 
     def score(self, epoch: int, P: FloatArray) -> float:
         """`bounds.score` of a pose covariance (6, 6) at an epoch."""
-        return bounds.root_of_trace(float(np.vdot(self.square[epoch], P)))
+        return float(bounds.root_of_trace(np.vdot(self.square[epoch], P)))
 
 
 def course(
@@ -101,13 +102,13 @@ def update(P: FloatArray, information: FloatArray) -> FloatArray:
     ValueError
         If the sum is singular or not finite.
     """
-    _, _, updated, flaw = lapack.dgesv(_EYE + P @ information, P)
+    _, _, updated, flaw = lapack.dgesv(_EYE + P @ information, P)  # pyright: ignore[reportAttributeAccessIssue]
     if flaw:
         raise ValueError(_SINGULAR)
     return 0.5 * (updated + updated.T)
 
 
-def _transposed(matrix: FloatArray) -> FloatArray:
+def _transposed(matrix: NDArray[Any]) -> NDArray[Any]:
     return matrix.swapaxes(-1, -2)
 
 
@@ -178,7 +179,7 @@ def step_many(
     return last(updated, 2), bounds.root_of_trace(trace)
 
 
-def _block(array: FloatArray, trailing: int) -> FloatArray:
+def _block(array: NDArray[Any], trailing: int) -> NDArray[Any]:
     return np.ascontiguousarray(first(array, trailing))
 
 
