@@ -104,7 +104,7 @@ class TrackingEnv(gym.Env[Any, Any]):
         self._epoch = 0
         self._anchors = episode.anchors.copy()
         self._whole = at = simulation.whole(episode)
-        self._positions = ranging.tag_positions(at.rotation, at.translation, self._tags)
+        self._positions = ranging.tag_positions(at.rotation, at.translation, self.scene.tags)
         self._measured: ranging.Measurement | None = None
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
