@@ -37,7 +37,11 @@ class StatisticEpoch(NamedTuple):
 
     def information(self) -> tuple[FloatArray, FloatArray]:
         """Information matrix (..., 12, 12) and vector (..., 12), those of the statistic."""
-        matrix, vector = information_of_moments(self.G, self.B, extended(self.tags))
+        G, B = (
+            np.moveaxis(array, (-2, -1), (0, 1)).reshape(*array.shape[-2:], -1)
+            for array in (self.G, self.B)
+        )
+        matrix, vector = information_of_moments(G, B, extended(self.tags))
         return (
             matrix.reshape(*self.G.shape[:-2], 12, 12),
             vector.reshape(*self.B.shape[:-2], 12),

@@ -122,7 +122,9 @@ def solve(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:
 
 
 def inverse(A: FloatArray) -> FloatArray:
-    """Inverse (n, n, ...) of symmetric positive definite matrices, bordered row by row.
+    """Inverse (n, n, ...) of symmetric positive definite matrices, ``L^-T D^-1 L^-1``.
+
+    The factors are inverted, not blocks of A: those lose a vague prior's digits.
 
     Raises
     ------
@@ -132,22 +134,29 @@ def inverse(A: FloatArray) -> FloatArray:
     if A.ndim == 2:
         inverted = np.linalg.inv(A)
         return 0.5 * (inverted + inverted.T)
-    X = np.empty_like(A)
-    pivots = [A[0, 0]]
+    n = len(A)
+    U = A.copy()
+    # Rows of D^-1/2 L^-1.
+    rows = np.zeros_like(U)
+    pivots = []
     with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(1, A[0, 0], out=X[0, 0])
-        for k in range(1, len(A)):
-            row = A[k, :k]
-            left = _combined(row, X[:k, :k])
-            pivots.append(A[k, k] - np.einsum("i...,i...->...", row, left))
-            scaled = left / pivots[k]
-            X[:k, :k] += left[:, None] * scaled
-            X[k, :k] = X[:k, k] = np.negative(scaled, out=scaled)
-            np.divide(1, pivots[k], out=X[k, k])
-    smallest = np.min(pivots, initial=np.inf)
+        for k in range(n):
+            pivots.append(U[k, k].min(initial=np.inf))
+            scale = 1 / np.sqrt(U[k, k])
+            U[k, k:] *= scale
+            for i in range(k + 1, n):
+                U[i, i:] -= U[k, i] * U[k, i:]
+            rows[k, k] = scale
+            if k:
+                np.multiply(_combined(U[:k, k], rows[:k, :k]), -scale, out=rows[k, :k])
+    smallest = min(pivots, default=np.inf)
     if not smallest > 0:
         raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
-    return X
+    for i in range(n):
+        # Columns of the factor are zero above their diagonal.
+        np.einsum("k...,kj...->j...", rows[i:, i], rows[i:, : i + 1], out=U[i, : i + 1])
+        U[:i, i] = U[i, :i]
+    return U
 
 
 def _combined(weights: FloatArray, rows: FloatArray) -> FloatArray:

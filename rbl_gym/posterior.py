@@ -95,17 +95,23 @@ def course(
 
 
 def update(P: FloatArray, information: FloatArray) -> FloatArray:
-    """Covariance ``(P^-1 + information)^-1`` (6, 6) in one solution, ``(I + P information)^-1 P``.
+    """Covariance ``(P^-1 + information)^-1`` (6, 6), as ``L (I + L^T information L)^-1 L^T``.
+
+    With ``P = L L^T``: symmetric all the way, which keeps the digits where the prior is vague.
 
     Raises
     ------
     ValueError
-        If the sum is singular or not finite.
+        If a matrix is not positive definite or not finite.
     """
-    _, _, updated, flaw = lapack.dgesv(_EYE + P @ information, P)  # pyright: ignore[reportAttributeAccessIssue]
+    lower, flaw = lapack.dpotrf(P, lower=1, clean=1)
+    if not flaw:
+        root, flaw = lapack.dpotrf(_EYE + lower.T @ information @ lower, lower=1)
+    if not flaw:
+        half, flaw = lapack.dtrtrs(root, lower.T, lower=1)
     if flaw:
         raise ValueError(_SINGULAR)
-    return 0.5 * (updated + updated.T)
+    return half.T @ half
 
 
 def _transposed(matrix: NDArray[Any]) -> NDArray[Any]:

@@ -333,11 +333,11 @@ def posterior_step(
     )
 
 
-def posterior_course(scene: Scene, episode: Episode, positions: FloatArray) -> posterior.Course:
-    """What the bound of one episode needs and no action changes; tags' places (T + 1, N, 3)."""
+def posterior_course(scene: Scene, episode: Episode) -> posterior.Course:
+    """What the bound of one episode needs and no action changes."""
     return posterior.course(
         episode.rotation,
-        positions,
+        ranging.tag_positions(episode.rotation, episode.translation, scene.tags),
         episode.twists,
         np.asarray(scene.tags),
         scene.dt,

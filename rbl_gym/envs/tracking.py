@@ -162,7 +162,7 @@ class TrackingEnv(gym.Env[Any, Any]):
 
     def _start_bound(self, episode: simulation.Episode) -> None:
         """All of the bound that no action of the episode changes."""
-        self._course = simulation.posterior_course(self.scene, episode, self._positions)
+        self._course = simulation.posterior_course(self.scene, episode)
         self._informations: FloatArray | None = None
         if self._measured is not None:
             shares = simulation.shares(
