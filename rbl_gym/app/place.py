@@ -22,7 +22,7 @@ _N_POSES, _N_POSES_OBSTACLES = 64, 160
 _MANY_POSES = 1000
 # First standard deviations of CMA-ES, in units of half the legal space: near the start, and far.
 _SIGMAS = (0.1, 0.4)
-_GENERATIONS = 120
+_GENERATIONS = 80
 # Random layouts whose median stands for "at random".
 _RANDOM_DRAWS = 25
 # Turns of the body over which the accuracy at a place is averaged.
