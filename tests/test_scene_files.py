@@ -139,7 +139,7 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
     assert points.shape == (200, 3)
     assert not scene_files.inside(points, box).any()
     assert ((points >= low) & (points <= high)).all()
-    np.testing.assert_allclose(points.mean(axis=0), [3, 1, 1], atol=0.02)
+    np.testing.assert_allclose(points.mean(axis=0), [3, 1, 1], atol=0.05)
 
 
 @pytest.mark.parametrize(

@@ -97,10 +97,10 @@ def scene(placed: Placed) -> go.Figure:
         "sees %{customdata[0]:.0%} of the region<extra></extra>",
     )  # fmt: skip
     shown.update_layout(
-        height=680, margin={"l": 0, "r": 0, "t": 30, "b": 0},
+        height=720, margin={"l": 0, "r": 0, "t": 40, "b": 30},
         scene={"aspectmode": "data", "xaxis_title": "x (m)", "yaxis_title": "y (m)",
-               "zaxis_title": "z (m)", "camera": {"eye": {"x": -0.9, "y": -1.3, "z": 1.1}}},
-        legend={"orientation": "h", "y": 1.02},
+               "zaxis_title": "z (m)", "camera": {"eye": {"x": -0.9, "y": -1.8, "z": 1.3}}},
+        legend={"orientation": "h", "x": 0.25, "y": 1.0},
         updatemenus=[_buttons(len(shown.data) - 2)],
         sliders=[_slider(maps, middle)] if len(maps) > 1 else [],
     )  # fmt: skip
@@ -110,7 +110,7 @@ def scene(placed: Placed) -> go.Figure:
 def _buttons(others: int) -> dict[str, Any]:
     rest = [True] * others
     return {
-        "type": "buttons", "direction": "right", "x": 0.0, "y": 1.0, "xanchor": "left",
+        "type": "buttons", "direction": "right", "x": 0.0, "y": 1.02, "xanchor": "left",
         "yanchor": "top",
         "buttons": [
             {"label": label, "method": "restyle", "args": [{"visible": [*which, *rest]}]}
@@ -133,7 +133,7 @@ def _slider(maps: list[Map], active: int) -> dict[str, Any]:
         for level in maps
     ]  # fmt: skip
     return {
-        "active": active, "steps": steps, "len": 0.6, "x": 0.2, "y": 0.02,
+        "active": active, "steps": steps, "len": 0.6, "x": 0.2, "y": 0.06,
         "currentvalue": {"prefix": "height of the map z = ", "suffix": " m"},
     }  # fmt: skip
 
