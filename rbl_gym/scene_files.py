@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbl_gym import bodies, placement, scenes
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of
@@ -62,7 +63,7 @@ class Problem(NamedTuple):
 def problem(
     scene: str,
     n_anchors: int | None = None,
-    region: tuple[FloatArray, FloatArray] | None = None,
+    region: tuple[ArrayLike, ArrayLike] | None = None,
     racks: int = 0,
     seed: int = 0,
 ) -> Problem:
@@ -109,7 +110,7 @@ def load(path: str) -> dict[str, Any]:
 def of_mapping(
     tables: Mapping[str, Any],
     n_anchors: int | None = None,
-    region: tuple[FloatArray, FloatArray] | None = None,
+    region: tuple[ArrayLike, ArrayLike] | None = None,
     name: str = "file",
 ) -> Problem:
     """The problem that the tables of a file describe; arguments as for `problem`."""
@@ -193,7 +194,7 @@ def _checked(
     n_anchors: int,
     obstacles: FloatArray,
     blocked_information: float,
-    region: tuple[FloatArray, FloatArray] | None,
+    region: tuple[ArrayLike, ArrayLike] | None,
 ) -> Problem:
     """The problem, whose scene has the work region as its volume, if it can be solved at all."""
     volume = scene.volume

@@ -6,6 +6,7 @@ import copy
 import json
 import math
 import tomllib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def changed(path: str, value: object) -> dict:
     """GOOD with one entry changed, or taken out for None."""
     tables = copy.deepcopy(GOOD)
     *parents, key = path.split(".")
-    node = tables
+    node: Any = tables
     for parent in parents:
         node = node[int(parent)] if isinstance(node, list) else node.setdefault(parent, {})
     if value is None:

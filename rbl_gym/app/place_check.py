@@ -56,7 +56,7 @@ def run(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[s
     scene = problem.task.scene
     prior = scene.prior_covariance
     with_prior = np.linalg.inv(drawn.information + np.linalg.inv(prior))
-    laws = {"iterated EKF": (drawn.told, False)}
+    laws: dict[str, tuple[ranging.NoiseLaw, bool]] = {"iterated EKF": (drawn.told, False)}
     if len(problem.context.racks):
         laws["iterated EKF, not told"] = (scene.noise, True)
     result = {}

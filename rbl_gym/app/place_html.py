@@ -96,12 +96,13 @@ def scene(placed: Placed) -> go.Figure:
         hovertemplate="anchor %{text}<br>x %{x:.3f}, y %{y:.3f}, z %{z:.3f} m<br>"
         "sees %{customdata[0]:.0%} of the region<extra></extra>",
     )  # fmt: skip
+    others = sum(1 for _ in shown.select_traces()) - 2
     shown.update_layout(
         height=720, margin={"l": 0, "r": 0, "t": 40, "b": 30},
         scene={"aspectmode": "data", "xaxis_title": "x (m)", "yaxis_title": "y (m)",
                "zaxis_title": "z (m)", "camera": {"eye": {"x": -0.9, "y": -1.8, "z": 1.3}}},
         legend={"orientation": "h", "x": 0.25, "y": 1.0},
-        updatemenus=[_buttons(len(shown.data) - 2)],
+        updatemenus=[_buttons(others)],
         sliders=[_slider(maps, middle)] if len(maps) > 1 else [],
     )  # fmt: skip
     return shown
