@@ -1,9 +1,10 @@
-"""The command line: rbl-gym demo, replay, reproduce."""
+"""The command line: rbl-gym demo, place, replay, reproduce."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import importlib.util
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -36,6 +37,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"rbl-gym {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     _add_demo(commands)
+    _add_place(commands)
     _add_replay(commands)
     _add_reproduce(commands)
     return parser
@@ -51,6 +53,29 @@ def _add_demo(commands: Any) -> None:
     demo.add_argument("--plot", default="out/demo.png", metavar="F", help="default out/demo.png")
     _add_json(demo)
     demo.set_defaults(run=_demo)
+
+
+def _add_place(commands: Any) -> None:
+    place = commands.add_parser(
+        "place",
+        help="where anchors go, and how good the pose will be",
+        description="Design a layout of anchors, predict the accuracy, compare with the usual "
+        "layouts, check with real filters. See docs/placement.md for the file format.",
+    )
+    place.add_argument("--scene", required=True, metavar="NAME|F",
+                       help="a named scene, or a file .toml or .json")  # fmt: skip
+    place.add_argument("--anchors", type=_numbers, metavar="N|A..B",
+                       help="how many; A..B: accuracy against the number")  # fmt: skip
+    place.add_argument("--racks", type=_natural, default=0, metavar="K",
+                       help="random boxes that block sight in a named room, default 0")  # fmt: skip
+    place.add_argument("--region", type=_region, metavar="x0,y0,z0,x1,y1,z1",
+                       help="work region, metres; write --region=-1,... for a minus")  # fmt: skip
+    place.add_argument("--trials", type=_positive, default=500, help="of the check, default 500")
+    place.add_argument("--seed", type=_natural, default=0, help="of all randomness, default 0")
+    place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
+    place.add_argument("--html", metavar="F", help="3-D page with the tables, self-contained")
+    _add_json(place)
+    place.set_defaults(run=_place)
 
 
 def _add_reproduce(commands: Any) -> None:
@@ -174,6 +199,46 @@ def _reproduce(options: argparse.Namespace) -> int:
     return 0
 
 
+def _place(options: argparse.Namespace) -> int:
+    _require("cmaes", "placement")
+    if options.html:
+        _require("plotly", "viz")
+    from rbl_gym import scene_files
+    from rbl_gym.app import place
+
+    numbers = options.anchors
+    problem = scene_files.problem(
+        options.scene, numbers[-1] if numbers else None, options.region, options.racks, options.seed
+    )
+    numbers = numbers or range(problem.task.n_anchors, problem.task.n_anchors + 1)
+    scene_files.check_n_anchors(numbers[0])
+    with progress("placing", place.work_units(numbers)) as advance:
+        placed = place.run(problem, numbers, options.seed, options.trials, advance)
+    if options.plot:
+        from rbl_gym.app import figures, place_figures
+
+        figures.save(place_figures.figure(placed), options.plot)
+    if options.html:
+        from rbl_gym.app import place_html
+
+        place_html.write(placed, options.html)
+    if write_json(placed.result, options.json):
+        from rbl_gym.app import place_report
+
+        place_report.print_place(placed.result)
+        for label, path in (("picture", options.plot), ("page", options.html)):
+            if path:
+                print(f"{label}: {path}")
+    return 0
+
+
+def _require(module: str, extra: str) -> None:
+    """Say which extra is missing before the work begins."""
+    if importlib.util.find_spec(module) is None:
+        raise MissingExtraError(f"this command needs the extra {extra}: pip install "
+                                f"'rbl-gym[{extra}]'")  # fmt: skip
+
+
 def _replay(options: argparse.Namespace) -> int:
     from rbl_gym import recordings
     from rbl_gym.app import replay
@@ -241,6 +306,26 @@ def _positive(text: str) -> int:
     if value == 0:
         raise argparse.ArgumentTypeError("must be at least 1, got 0")
     return value
+
+
+def _numbers(text: str) -> range:
+    """N or A..B as a range."""
+    first, dots, last = text.partition("..")
+    numbers = range(_positive(first), _positive(last if dots else first) + 1)
+    if not numbers:
+        raise argparse.ArgumentTypeError(f"must rise from A to B, got {text!r}")
+    return numbers
+
+
+def _region(text: str) -> tuple[list[float], list[float]]:
+    """Six numbers as two corners."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != 6:
+        raise argparse.ArgumentTypeError(f"must be six numbers x0,y0,z0,x1,y1,z1, got {text!r}")
+    return numbers[:3], numbers[3:]
 
 
 def _natural(text: str) -> int:

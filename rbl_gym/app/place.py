@@ -1,0 +1,408 @@
+"""Where do my anchors go, and how good will the pose be? Design, prediction, comparison."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds, layout_search, layouts, obstacles, placement, scene_files
+from rbl_gym.app import place_check
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement import Context, PlacementTask
+from rbl_gym.scene_files import Problem
+
+# Poses over which layouts are scored while searching: racks make the score rough.
+_N_POSES, _N_POSES_OBSTACLES = 64, 160
+# Poses over which the criteria of the result are averaged.
+_MANY_POSES = 1000
+# First standard deviations of CMA-ES, in units of half the legal space: near the start, and far.
+_SIGMAS = (0.1, 0.4)
+_GENERATIONS = 80
+# Random layouts whose median stands for "at random".
+_RANDOM_DRAWS = 25
+# Turns of the body over which the accuracy at a place is averaged.
+_TURNS = 8
+# Places over which the accuracy is averaged; those along the axes where the worst is sought,
+# edges included; those along the longer side of a map, and at least along the other.
+_SAMPLE, _GRID, _MAP, _LEAST_MAP = 600, (13, 13, 5), 56, 20
+# Heights at which a map is drawn in 3-D.
+_LEVELS = 5
+# Links that are worked on at a time, so that the temporaries stay in cache.
+_BLOCK = 40_000
+
+
+@dataclass(frozen=True)
+class FreeTask(PlacementTask):
+    """A task scored over poses outside of the obstacles `free_of` (K, 6), as tuples."""
+
+    free_of: tuple[tuple[float, ...], ...] = ()
+
+    @functools.cached_property
+    def poses(self) -> tuple[FloatArray, FloatArray]:
+        """Rotations (P, 3, 3) and offsets (P, 3), spread evenly over what is free."""
+        low, high = self.scene.volume.bounds()
+        boxes = np.array(self.free_of).reshape(-1, 6)
+        places = scene_files.free_points(low, high, boxes, self.n_poses)
+        # Few places may be free: they are then taken in turns.
+        places = np.resize(places, (self.n_poses, 3))
+        half = 0.5 * (high - low)
+        offsets = (places - 0.5 * (low + high)) / np.where(half > 0, half, 1.0)
+        return PlacementTask(self.scene, self.n_anchors, n_poses=self.n_poses).poses[0], offsets
+
+
+def free_task(problem: Problem, n_poses: int) -> FreeTask:
+    """The problem's task over so many free poses."""
+    return FreeTask(
+        problem.task.scene,
+        problem.task.n_anchors,
+        n_poses=n_poses,
+        blocked_information=problem.task.blocked_information,
+        free_of=tuple(map(tuple, problem.context.racks.tolist())),
+    )
+
+
+class Design(NamedTuple):
+    """A layout (M, 3), how it was found, and what the searches reached: name -> layout."""
+
+    anchors: FloatArray
+    method: str
+    searched: dict[str, FloatArray]
+
+
+class Accuracy(NamedTuple):
+    """Predicted standard deviations at places (L, 3): position (m), rotation (rad), b (m).
+
+    Root mean squares over turns of the body, each (L,); position and rotation are of all three
+    axes together.
+    """
+
+    places: FloatArray
+    position: FloatArray
+    rotation: FloatArray
+    score: FloatArray
+
+
+# --- design ----------------------------------------------------------------------------------
+
+
+def design(
+    problem: Problem,
+    seed: int,
+    advance: Callable[[], None] = lambda: None,
+    smaller: FloatArray | None = None,
+) -> Design:
+    """The best layout of a problem: greedy with swaps, then CMA-ES from it and from the ring.
+
+    Parameters
+    ----------
+    problem, seed
+        What is placed, and the seed of candidates and searches.
+    advance
+        Called after each of the `SEARCH_STEPS` steps.
+    smaller
+        A good layout (M - 1, 3) of one anchor fewer: with the best candidate added, it is one
+        more start.
+    """
+    context = problem.context
+    task = free_task(problem, _N_POSES_OBSTACLES if len(context.racks) else _N_POSES)
+    rng = np.random.default_rng([seed, task.n_anchors])
+    candidates = free_candidates(problem, rng, max(200, 4 * task.n_anchors))
+    greedy = layout_search.greedy(task, context, rng, candidates, swaps=True)
+    searched = {"greedy with swaps": greedy}
+    starts = {"greedy": greedy, "ring": layouts.ring(task, context, rng)}
+    if smaller is not None:
+        added = np.concatenate(
+            [np.broadcast_to(smaller, (len(candidates), *smaller.shape)), candidates[:, None]],
+            axis=-2,
+        )
+        scores = placement.score(task, _repeated(context, len(added)), added)
+        starts["one fewer"] = searched["one added"] = added[scores.argmin()]
+    advance()
+    for sigma in _SIGMAS:
+        found = layout_search.cma_es(
+            task, _repeated(context, len(starts)), rng, _GENERATIONS, sigma=sigma,
+            start=np.array(list(starts.values())),
+        )  # fmt: skip
+        for name, anchors in zip(starts, found, strict=True):
+            searched[f"CMA-ES from {name}, step {sigma:g}"] = anchors
+        advance()
+    # Nobody mounts to less than a millimetre.
+    region = task.scene.anchor_region
+    searched = {name: region.project(np.round(x, 3)) for name, x in searched.items()}
+    searched |= usual(task, context, rng)
+    legal = {
+        name: anchors for name, anchors in searched.items()
+        if not scene_files.inside(anchors, context.racks).any()
+    }  # fmt: skip
+    # Judged over more places than those that the search has seen.
+    places = free_sample(problem)
+    scores = {name: rms(accuracy(problem, x, places).score) for name, x in legal.items()}
+    best = min(scores, key=scores.__getitem__)
+    return Design(_in_order(legal[best], context.centre), best, searched)
+
+
+SEARCH_STEPS = 1 + len(_SIGMAS)
+
+
+def free_candidates(problem: Problem, rng: np.random.Generator, count: int) -> FloatArray:
+    """Legal places (count, 3) outside of the obstacles, uniform.
+
+    Raises
+    ------
+    ValueError
+        If hardly any place is free.
+    """
+    drawn = problem.task.scene.anchor_region.draw(rng.random((20 * count, 3)))
+    free = drawn[~scene_files.inside(drawn, problem.context.racks)]
+    if len(free) < problem.task.n_anchors:
+        raise ValueError("anchors have no legal place: obstacles cover all of them")
+    return free[:count]
+
+
+def _in_order(anchors: FloatArray, centre: FloatArray) -> FloatArray:
+    """Anchors counted around the region, counter-clockwise from the x axis."""
+    away = anchors - centre
+    return anchors[np.argsort(np.arctan2(away[:, 1], away[:, 0]) % (2 * np.pi), kind="stable")]
+
+
+def _repeated(context: Context, count: int) -> Context:
+    return Context(*(np.broadcast_to(field, (count, *field.shape)) for field in context))
+
+
+# --- prediction ------------------------------------------------------------------------------
+
+
+def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray) -> Accuracy:
+    """What the Cramer-Rao bound of one epoch of ranges promises at places (L, 3)."""
+    task = problem.task
+    tags = np.asarray(task.scene.tags)
+    turns = task.poses[0][:_TURNS]
+    rows = []
+    size = max(1, _BLOCK // (len(turns) * len(anchors) * len(tags)))
+    for begin in range(0, len(places), size):
+        part = places[begin : begin + size]
+        sight = obstacles.in_sight(anchors, part, problem.context.racks)
+        weight = np.where(sight, 1.0, task.blocked_information)[:, None, :, None]
+        information = bounds.information_at(
+            anchors, tags, turns, part[:, None], task.scene.noise, weight
+        )
+        covariance = np.linalg.inv(information + task.prior_information)
+        variance = np.einsum("...ii->...i", covariance)
+        b = bounds.score(covariance, turns, tags)
+        squares = variance[..., 3:].sum(-1), variance[..., :3].sum(-1), b**2
+        rows.append([np.sqrt(square.mean(axis=-1)) for square in squares])
+    return Accuracy(places, *(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+def free_sample(problem: Problem) -> FloatArray:
+    """Places (L, 3) spread evenly over the work region, obstacles left out."""
+    return scene_files.free_points(*problem.corners(), problem.context.racks, _SAMPLE)
+
+
+def free_grid(problem: Problem) -> FloatArray:
+    """A grid of places (L, 3) over the work region, its edges included, obstacles left out."""
+    low, high = problem.corners()
+    axes = [np.linspace(a, b, n if b > a else 1) for a, b, n in zip(low, high, _GRID, strict=True)]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return places[~scene_files.inside(places, problem.context.racks)]
+
+
+class Map(NamedTuple):
+    """Accuracy on a plane of the region: edges of its axes, values (rows, columns), NaN: blocked.
+
+    `across` and `up` are the axes (0, 1, 2) of columns and rows, `at` the third coordinate.
+    """
+
+    columns: FloatArray
+    rows: FloatArray
+    position: FloatArray
+    rotation: FloatArray
+    across: int
+    up: int
+    at: float
+
+
+def accuracy_map(problem: Problem, anchors: FloatArray, up: int = 1, share: float = 0.5) -> Map:
+    """The map over x and y (`up` 1) or x and z (2), at a share of the third axis's extent."""
+    low, high = problem.corners()
+    third = 3 - up
+    at = float(low[third] + share * (high - low)[third])
+    extent = max(float((high - low)[[0, up]].max()), 1e-9)
+    centres = []
+    for axis in (0, up):
+        least = _LEAST_MAP if high[axis] > low[axis] else 1
+        count = max(least, round(_MAP * (high - low)[axis] / extent))
+        share_of = (np.arange(count) + 0.5) / count
+        centres.append(low[axis] + share_of * (high - low)[axis])
+    places = np.empty((len(centres[1]), len(centres[0]), 3))
+    places[..., 0], places[..., up], places[..., third] = centres[0], centres[1][:, None], at
+    found = accuracy(problem, anchors, places.reshape(-1, 3))
+    blocked = scene_files.inside(found.places, problem.context.racks)
+    values = [
+        np.where(blocked, np.nan, value).reshape(places.shape[:2])
+        for value in (found.position, np.rad2deg(found.rotation))
+    ]
+    return Map(*centres, *values, across=0, up=up, at=at)
+
+
+def level_maps(problem: Problem, anchors: FloatArray) -> list[Map]:
+    """Maps over x and y at heights from the bottom of the region to its top."""
+    low, high = problem.corners()
+    shares = np.linspace(0, 1, _LEVELS) if high[2] > low[2] else [0.5]
+    return [accuracy_map(problem, anchors, share=float(share)) for share in shares]
+
+
+# --- results ---------------------------------------------------------------------------------
+
+
+class Placed(NamedTuple):
+    """What a run found: the problem with its last number of anchors, its design, the figures."""
+
+    problem: Problem
+    design: Design
+    result: dict[str, Any]
+
+
+def work_units(numbers: range) -> int:
+    """How often `run` advances."""
+    return len(numbers) * SEARCH_STEPS + 1
+
+
+def run(
+    problem: Problem,
+    numbers: range,
+    seed: int,
+    trials: int,
+    advance: Callable[[], None] = lambda: None,
+) -> Placed:
+    """Design, predict, compare and check; figures as plain numbers.
+
+    Parameters
+    ----------
+    problem
+        What is placed.
+    numbers
+        Numbers of anchors; all but the last appear only in the table over the number.
+    seed, trials
+        Of all randomness, and bodies of the Monte-Carlo check.
+    advance
+        Called after every step of the work.
+    """
+    rows, best, found = [], None, None
+    for number in numbers:
+        problem = scene_files.with_anchors(problem, number)
+        found = design(problem, seed, advance, best)
+        best = found.anchors
+        rows.append({"n_anchors": number, **_summary(problem, best)})
+    assert found is not None
+    low, high = problem.corners()
+    scene, task = problem.task.scene, free_task(problem, _MANY_POSES)
+    seen = placement.sight_fractions(task, problem.context, found.anchors)
+    boxes = problem.context.racks
+    result = {
+        "scene": problem.name,
+        "seed": seed,
+        "n_anchors": problem.task.n_anchors,
+        "region": {"low_m": low.tolist(), "high_m": high.tolist()},
+        "obstacles": [
+            {"low_m": (box[:3] - box[3:]).tolist(), "high_m": (box[:3] + box[3:]).tolist()}
+            for box in boxes
+        ],
+        "tags_m": [list(tag) for tag in scene.tags],
+        "method": found.method,
+        "anchors": [
+            {**dict(zip(("x_m", "y_m", "z_m"), anchor, strict=True)), "sees": float(share)}
+            for anchor, share in zip(found.anchors.tolist(), seen, strict=True)
+        ],
+        "coplanar": _is_flat(found.anchors),
+        "predicted": prediction(problem, found.anchors),
+        "criteria": _criteria(task, problem.context, found.anchors),
+        "layouts": comparison(problem, found, seed),
+        "check": place_check.run(problem, found.anchors, trials, seed),
+    }
+    if len(numbers) > 1:
+        result["against_number"] = rows
+    advance()
+    return Placed(problem, found, result)
+
+
+def prediction(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
+    """Median, 95th percentile and worst place of position, rotation and b over the region."""
+    sample = free_sample(problem)
+    found = accuracy(problem, anchors, np.concatenate([sample, free_grid(problem)]))
+    result: dict[str, Any] = {"places": len(found.places)}
+    for name, values in (
+        ("position_m", found.position),
+        ("rotation_deg", np.rad2deg(found.rotation)),
+        ("score_m", found.score),
+    ):
+        worst = int(values.argmax())
+        inner = values[: len(sample)]
+        result[name] = {
+            "rms": rms(inner),
+            "median": float(np.median(inner)),
+            "p95": float(np.quantile(inner, 0.95)),
+            "worst": float(values[worst]),
+            "worst_at_m": found.places[worst].tolist(),
+        }
+    return result
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _summary(problem: Problem, anchors: FloatArray) -> dict[str, float]:
+    """A prediction's row in a table of layouts."""
+    found = prediction(problem, anchors)
+    row = {"score_m": found["score_m"]["rms"]}
+    for name in ("position_m", "rotation_deg"):
+        row |= {f"{name.replace('_', f'_{what}_')}": found[name][what]
+                for what in ("median", "p95", "worst")}  # fmt: skip
+    return row
+
+
+def usual(task: PlacementTask, context: Context, rng: np.random.Generator) -> dict[str, FloatArray]:
+    """The usual layouts; `random` is the median of many draws."""
+    found = {
+        name: layout(task, context, rng)
+        for name, layout in layouts.LAYOUTS.items()
+        if name != "random"
+    }
+    many = layouts.random(task, _repeated(context, _RANDOM_DRAWS), rng)
+    order = np.argsort(placement.score(task, _repeated(context, _RANDOM_DRAWS), many))
+    return found | {"random": many[order[_RANDOM_DRAWS // 2]]}
+
+
+def comparison(problem: Problem, found: Design, seed: int) -> dict[str, dict[str, Any]]:
+    """The design and the usual layouts, each a row of figures."""
+    task = free_task(problem, _N_POSES)
+    drawn = usual(task, problem.context, np.random.default_rng([seed, 2]))
+    rows = {"designed": found.anchors, "greedy with swaps": found.searched["greedy with swaps"]}
+    table = {name: _summary(problem, anchors) for name, anchors in (rows | drawn).items()}
+    least = table["designed"]["score_m"]
+    return {
+        name: {**row, "ratio": row["score_m"] / least}
+        for name, row in sorted(table.items(), key=lambda item: item[1]["score_m"])
+    }
+
+
+def _criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> dict[str, Any]:
+    """The criteria as numbers; None where there is none (conditioning of coplanar anchors)."""
+    values = placement.criteria(task, context, anchors)._asdict()
+    numbers = {name: float(value) for name, value in values.items()}
+    if _is_flat(anchors):
+        numbers["conditioning"] = math.inf
+    return {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+
+
+def _is_flat(anchors: FloatArray) -> bool:
+    """Whether the anchors lie in one plane, as three always do."""
+    spread = np.linalg.svd(anchors - anchors.mean(axis=0), compute_uv=False)
+    return bool(len(anchors) < 4 or spread[2] < 1e-6 * spread[0])

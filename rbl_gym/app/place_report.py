@@ -1,0 +1,139 @@
+"""Tables of a placement on the terminal, by rich, and the same as HTML's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from rich.console import Console
+from rich.table import Table
+
+
+class Rows(NamedTuple):
+    """A table as texts; the first column is text, the others are figures."""
+
+    title: str
+    headings: list[str]
+    rows: list[list[str]]
+
+
+def tables(result: dict[str, Any]) -> Iterator[Rows]:
+    """All tables of a result, in the order in which they answer."""
+    yield _anchors(result)
+    yield _prediction(result)
+    yield _layouts(result["layouts"])
+    yield _check(result["check"])
+    if "against_number" in result:
+        yield _numbers(result["against_number"])
+
+
+def notes(result: dict[str, Any]) -> list[str]:
+    """What the tables mean, and what to be warned of; one sentence or two each."""
+    criteria, check = result["criteria"], result["check"]
+    conditioning = criteria["conditioning"]
+    found = [
+        "Predicted: Cramer-Rao bound of one epoch of ranges, one sigma of all three axes together, "
+        "averaged over turns of the body; b is the root mean square tag error.",
+        f"Criteria: position {criteria['position_m']:.4g} m, rotation "
+        f"{57.29577951308232 * criteria['rotation_rad']:.3g} deg, D-optimal "
+        f"{criteria['d_optimal_m']:.4g} m, E-optimal {criteria['e_optimal_m']:.4g} m, conditioning "
+        + ("infinite (coplanar)." if conditioning is None else f"{conditioning:.3g}."),
+        f"Check: {check['trials']} bodies at random poses in the region; the EKF starts from a "
+        f"prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m around "
+        "the truth. NEES of an honest filter: 6. Lost: further off than once in a million; RMSE "
+        "and NEES are of the others.",
+    ]
+    if result["coplanar"]:
+        found.append(
+            "These anchors lie in one plane: the mirror image behind it can fit the ranges as "
+            "well, so a filter must know the side; the linear filters (KF family) lose rank here."
+        )
+    if result["obstacles"]:
+        found.append(
+            "'Told': the radio reports which links are blocked, and the filter weighs them less."
+        )
+    return found
+
+
+def print_place(result: dict[str, Any]) -> None:
+    """Every table, and the notes."""
+    terminal = Console().is_terminal
+    console = Console(width=None if terminal else 130, highlight=False)
+    for rows in tables(result):
+        table = Table(title=rows.title, title_justify="left")
+        for index, heading in enumerate(rows.headings):
+            table.add_column(heading, justify="right" if index else "left")
+        for row in rows.rows:
+            table.add_row(*row)
+        console.print(table)
+    for note in notes(result):
+        console.print(note, markup=False)
+
+
+def _anchors(result: dict[str, Any]) -> Rows:
+    rows = [
+        [str(index + 1), *(f"{anchor[key]:.3f}" for key in ("x_m", "y_m", "z_m")),
+         f"{100 * anchor['sees']:.0f} %"]
+        for index, anchor in enumerate(result["anchors"])
+    ]  # fmt: skip
+    title = f"{result['scene']}: {result['n_anchors']} anchors ({result['method']})"
+    return Rows(title, ["anchor", "x (m)", "y (m)", "z (m)", "sees of region"], rows)
+
+
+def _prediction(result: dict[str, Any]) -> Rows:
+    rows = []
+    for key, label in (
+        ("position_m", "position (m)"), ("rotation_deg", "orientation (deg)"), ("score_m", "b (m)")
+    ):  # fmt: skip
+        figures = result["predicted"][key]
+        where = "(" + ", ".join(f"{x:.3g}" for x in figures["worst_at_m"]) + ")"
+        rows.append(
+            [label, *(f"{figures[what]:.4g}" for what in ("rms", "median", "p95", "worst")), where]
+        )
+    headings = ["one sigma", "RMS", "median", "p95", "worst place", "which (m)"]
+    return Rows("predicted over the region", headings, rows)
+
+
+_FIGURES = (
+    ("b (m)", "score_m", ".4g"),
+    ("position (m)", "position_median_m", ".4g"),
+    ("p95", "position_p95_m", ".4g"),
+    ("worst", "position_worst_m", ".4g"),
+    ("orientation (deg)", "rotation_median_deg", ".3g"),
+    ("p95", "rotation_p95_deg", ".3g"),
+    ("worst", "rotation_worst_deg", ".3g"),
+)
+
+
+def _layouts(layouts: dict[str, dict[str, float]]) -> Rows:
+    rows = [
+        [name, *(format(row[key], form) for _, key, form in _FIGURES), f"{row['ratio']:.3f}"]
+        for name, row in layouts.items()
+    ]
+    headings = ["layout", *(heading for heading, _, _ in _FIGURES), "b / designed"]
+    return Rows("the usual layouts, predicted", headings, rows)
+
+
+def _check(check: dict[str, Any]) -> Rows:
+    rows = []
+    for name, figures in check["filters"].items():
+        row = [name]
+        for quantity, unit, form in (("position", "m", ".4g"), ("rotation", "deg", ".3g")):
+            for key in (f"{quantity}_rmse_{unit}", f"{quantity}_predicted_{unit}"):
+                row.append(format(figures[key], form) if key in figures else "-")
+            ratio = f"{quantity}_ratio"
+            row.append(f"{figures[ratio]:.3f}" if ratio in figures else "-")
+        nees = f"{figures['nees']:.2f}" if "nees" in figures else "-"
+        rows.append([*row, nees, f"{100 * figures['lost']:.1f} %"])
+    headings = ["filter", "position RMSE (m)", "predicted", "ratio", "rotation RMSE (deg)",
+                "predicted", "ratio", "NEES (6)", "lost"]  # fmt: skip
+    return Rows(f"checked by Monte Carlo, {check['trials']} trials", headings, rows)
+
+
+def _numbers(numbers: list[dict[str, float]]) -> Rows:
+    rows = [
+        [str(row["n_anchors"]), *(format(row[key], form) for _, key, form in _FIGURES)]
+        for row in numbers
+    ]
+    headings = ["anchors", *(heading for heading, _, _ in _FIGURES)]
+    return Rows("against the number of anchors", headings, rows)

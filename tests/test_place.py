@@ -1,0 +1,279 @@
+"""rbl-gym place: designs, predictions, the check by real filters, what is written and printed."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+
+from rbl_gym import bounds, placement, scene_files
+from rbl_gym.app import place, place_check, place_figures, place_html, place_report
+from rbl_gym.app.cli import main
+from tests.test_scene_files import GOOD
+
+N_TRIALS = 60
+
+
+@pytest.fixture(autouse=True)
+def short_searches(monkeypatch):
+    monkeypatch.setattr(place, "_GENERATIONS", 8)
+    monkeypatch.setattr(place, "_MAP", 12)
+
+
+@pytest.fixture(scope="module")
+def with_rack():
+    return scene_files.of_mapping(GOOD, name="small")
+
+
+@pytest.fixture(scope="module")
+def placed(with_rack):
+    before = place._GENERATIONS
+    place._GENERATIONS = 8
+    found = place.run(with_rack, range(4, 6), 1, N_TRIALS)
+    place._GENERATIONS = before
+    return found
+
+
+# --- results -----------------------------------------------------------------------------------
+
+
+def test_the_design_is_legal_and_no_usual_layout_is_better(placed):
+    problem, design, result = placed
+    task = problem.task
+    assert design.anchors.shape == (5, 3)
+    assert placement.is_legal(task, design.anchors).all()
+    assert not scene_files.inside(design.anchors, problem.context.racks).any()
+    assert list(result["layouts"]) == sorted(
+        result["layouts"], key=lambda name: result["layouts"][name]["score_m"]
+    )
+    assert set(result["layouts"]) == {"designed", "greedy with swaps", "corners", "grid",
+                                      "perimeter", "ring", "random"}  # fmt: skip
+    assert min(row["ratio"] for row in result["layouts"].values()) == 1
+    assert result["layouts"]["random"]["ratio"] > 1.1
+
+
+@pytest.mark.parametrize("scene", ["auv_buoys", "satellite", "icassp2013"])
+def test_every_kind_of_legal_space(scene):
+    problem = scene_files.problem(scene, 4)
+    found = place.design(problem, 0)
+    assert placement.is_legal(problem.task, found.anchors, 1e-3).all()
+    assert place_figures.figure(place.run(problem, range(4, 5), 0, 20)) is not None
+
+
+def test_a_plane_and_a_line_are_regions_too():
+    for high in ([7, 5, 1], [7, 1, 1]):
+        problem = scene_files.problem("uwb_room", 4, ([1, 1, 1], high))
+        found = place.run(problem, range(4, 5), 0, 20)
+        assert place_figures.figure(found) is not None
+        assert found.result["predicted"]["position_m"]["worst"] < 1
+
+
+def test_more_anchors_are_better(placed):
+    rows = placed.result["against_number"]
+    assert [row["n_anchors"] for row in rows] == [4, 5]
+    assert rows[1]["score_m"] < rows[0]["score_m"]
+    assert rows[1]["score_m"] == placed.result["predicted"]["score_m"]["rms"]
+
+
+def test_predictions_are_the_bound_at_each_place(placed):
+    problem, design, _ = placed
+    task, scene = problem.task, problem.task.scene
+    places = np.array([[2.0, 2.0, 1.0], [6.5, 4.5, 0.5], [3.5, 4.0, 1.0]])
+    found = place.accuracy(problem, design.anchors, places)
+    for index, spot in enumerate(places):
+        squares = []
+        for turn in task.poses[0][: place._TURNS]:
+            sight = placement.obstacles.in_sight(design.anchors, spot[None], problem.context.racks)
+            information = task.prior_information
+            for seen, share in ((sight[0], 1.0), (~sight[0], task.blocked_information)):
+                mask = np.repeat(seen[:, None], len(scene.tags), axis=1)
+                information = information + share * bounds.range_information(
+                    design.anchors, np.array(scene.tags), turn, spot, scene.noise, mask
+                )
+            P = np.linalg.inv(information)
+            squares.append([np.trace(P[3:, 3:]), np.trace(P[:3, :3])])
+        expected = np.sqrt(np.mean(squares, axis=0))
+        np.testing.assert_allclose([found.position[index], found.rotation[index]], expected)
+
+
+def test_the_search_scores_over_free_poses(with_rack):
+    task = place.free_task(with_rack, 50)
+    places = placement.positions(task, with_rack.context)
+    assert places.shape == (50, 3)
+    assert not scene_files.inside(places, with_rack.context.racks).any()
+    low, high = with_rack.corners()
+    assert ((places >= low) & (places <= high)).all()
+
+
+def test_maps_leave_obstacles_out_and_agree_with_predictions(placed):
+    problem, design, _ = placed
+    plan = place.accuracy_map(problem, design.anchors)
+    assert plan.at == 1.0
+    spot = [plan.columns[0], plan.rows[-1], plan.at]
+    found = place.accuracy(problem, design.anchors, np.array([spot]))
+    assert plan.position[-1, 0] == pytest.approx(found.position[0])
+    assert plan.rotation[-1, 0] == pytest.approx(np.rad2deg(found.rotation[0]))
+    column, row = (np.abs(axis - x).argmin() for axis, x in ((plan.columns, 3.5), (plan.rows, 2.5)))
+    assert np.isnan(plan.position[row, column])
+    assert np.isfinite(plan.position).mean() > 0.8
+
+
+# --- the check ---------------------------------------------------------------------------------
+
+
+def test_filters_reach_what_is_predicted():
+    problem = scene_files.problem("uwb_room")
+    anchors = np.array([[8, 6, 3], [5, 8, 0.3], [2, 6, 3], [2, 2, 3], [5, 0, 0.3], [8, 2, 3.0]])
+    filters = place_check.run(problem, anchors, 3000, 0)["filters"]
+    assert list(filters) == ["iterated EKF", "locate, from nothing"]
+    for figures in filters.values():
+        assert figures["lost"] < 0.001
+        assert figures["position_ratio"] == pytest.approx(1, abs=0.04)
+        assert figures["rotation_ratio"] == pytest.approx(1, abs=0.04)
+        assert figures["nees"] == pytest.approx(6, abs=0.3)
+
+
+def test_blocked_links_are_noisier_by_what_is_left_of_their_information(with_rack):
+    anchors = np.array([[0, 0, 1], [8, 6, 1], [0, 6, 2.5], [8, 0, 2.5], [4, 3, 3.0]])
+    drawn = place_check.simulate(with_rack, anchors, 2000, np.random.default_rng(0))
+    tags = np.array(with_rack.task.scene.tags)
+    positions = drawn.translation[:, None] + tags @ np.swapaxes(drawn.rotation, -1, -2)
+    error = drawn.ranges - np.linalg.norm(positions[:, None] - anchors[:, None], axis=-1)
+    blocked = drawn.told.std_m > 0.5
+    assert 0.02 < blocked.mean() < 0.5
+    assert error[~blocked].std() == pytest.approx(0.1, rel=0.03)
+    # A range is never negative, which cuts a little of the noise.
+    assert error[blocked].std() == pytest.approx(1.0, rel=0.06)
+
+
+def test_a_filter_that_is_not_told_does_worse(with_rack, placed):
+    filters = place_check.run(with_rack, placed.design.anchors, 1000, 0)["filters"]
+    told, untold = filters["iterated EKF"], filters["iterated EKF, not told"]
+    assert told["nees"] == pytest.approx(6, abs=0.6)
+    assert untold["position_ratio"] > told["position_ratio"]
+
+
+def test_links_without_information_are_not_measured(with_rack):
+    tables = {**GOOD, "noise": {"floor_m": 0.1, "blocked_information": 0}}
+    problem = scene_files.of_mapping(tables)
+    anchors = np.array([[0, 0, 1], [8, 6, 1], [0, 6, 2.5], [8, 0, 2.5], [4, 3, 3.0]])
+    drawn = place_check.simulate(problem, anchors, 200, np.random.default_rng(0))
+    assert not drawn.links.all()
+    figures = place_check.run(problem, anchors, 300, 0)["filters"]["iterated EKF"]
+    assert figures["position_ratio"] == pytest.approx(1, abs=0.15)
+
+
+# --- the command -------------------------------------------------------------------------------
+
+COMMAND = ["place", "--scene", "uwb_room", "--anchors", "4", "--trials", "20", "--seed", "5"]
+
+
+def test_the_command_writes_a_table_a_picture_a_page_and_figures(tmp_path, capsys):
+    files = {end: tmp_path / "new" / f"x.{end}" for end in ("png", "html", "json")}
+    options = ["--plot", str(files["png"]), "--html", str(files["html"]), "--json",
+               str(files["json"])]  # fmt: skip
+    assert main([*COMMAND, *options]) == 0
+    shown = capsys.readouterr().out
+    for text in ("uwb_room: 4 anchors", "predicted over the region", "perimeter", "iterated EKF"):
+        assert text in shown
+    assert files["png"].stat().st_size > 50_000
+    result = json.loads(files["json"].read_text())
+    assert main([*COMMAND, "--json"]) == 0
+    assert capsys.readouterr().out == files["json"].read_text()
+    assert result["n_anchors"] == len(result["anchors"]) == 4
+    assert main([*COMMAND[:-1], "6", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["anchors"] != result["anchors"]
+
+
+def test_the_figures_have_these_names(placed):
+    result = json.loads(json.dumps(placed.result, allow_nan=False))
+    assert set(result) == {
+        "scene", "seed", "n_anchors", "region", "obstacles", "tags_m", "method", "anchors",
+        "coplanar", "predicted", "criteria", "layouts", "check", "against_number",
+    }  # fmt: skip
+    assert set(result["anchors"][0]) == {"x_m", "y_m", "z_m", "sees"}
+    for name in ("position_m", "rotation_deg", "score_m"):
+        figures = result["predicted"][name]
+        assert set(figures) == {"rms", "median", "p95", "worst", "worst_at_m"}
+        assert figures["median"] <= figures["p95"] <= figures["worst"]
+    assert set(result["criteria"]) == set(placement.Criteria._fields)
+    assert set(result["check"]) == {"trials", "prior_rotation_deg", "prior_position_m", "filters"}
+    assert set(result["check"]["filters"]["iterated EKF"]) == {
+        "lost", "nees", "position_rmse_m", "position_predicted_m", "position_ratio",
+        "rotation_rmse_deg", "rotation_predicted_deg", "rotation_ratio",
+    }  # fmt: skip
+    assert result["obstacles"] == [{"low_m": [3, 2, 0], "high_m": [4, 3, 2.5]}]
+
+
+def test_the_page_needs_no_network_and_is_the_same_for_the_same_result(placed, tmp_path):
+    for name in ("a.html", "b.html"):
+        place_html.write(placed, str(tmp_path / name))
+    page = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert page == (tmp_path / "b.html").read_text(encoding="utf-8")
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)\s*=", page[:5000])
+    assert not re.search(r"<script[^>]+src\s*=\s*[\"']?https?:", page)
+    for text in ("against the number of anchors", "checked by Monte Carlo", "obstacles"):
+        assert text in page
+    assert "Plotly.newPlot" in page
+    for rows in place_report.tables(placed.result):
+        assert all(len(row) == len(rows.headings) for row in rows.rows)
+
+
+def test_the_picture_is_the_same_for_the_same_result(placed, tmp_path):
+    for name in ("a.png", "b.png"):
+        place_figures.figure(placed).savefig(tmp_path / name, dpi=60)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_coplanar_anchors_are_warned_of():
+    problem = scene_files.problem("auv_buoys", 3)
+    result = place.run(problem, range(3, 4), 0, 20).result
+    assert result["coplanar"]
+    assert result["criteria"]["conditioning"] is None
+    assert any("mirror image" in note for note in place_report.notes(result))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--anchors", "2"], "the number of anchors must be 3 to 64, got 2"),
+        (["--anchors", "2..4"], "the number of anchors must be 3 to 64, got 2"),
+        (["--region", "0,0,0,20,1,1"], "region must lie inside the room"),
+        (["--racks", "9"], "racks must be a finite number in [0, 2]"),
+        (["--scene", "nowhere"], "scene must be one of"),
+        (["--scene", "nowhere.toml"], "nowhere.toml"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_with_status_2(options, message, capsys):
+    assert main([*COMMAND, *options]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1
+    assert error[0].startswith("rbl-gym place: ")
+    assert message in error[0]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--anchors", "x"], ["--anchors", "6..4"], ["--anchors", "3.."], ["--region", "1,2"],
+     ["--region", "a,b,c,d,e,f"], ["--trials", "0"]],
+)  # fmt: skip
+def test_what_cannot_be_read_is_a_usage_error(options, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main([*COMMAND, *options])
+    assert "must" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "extra"), [("cmaes", [], "placement"), ("plotly", ["--html", "x"], "viz")]
+)
+def test_a_missing_extra_is_named(module, options, extra, monkeypatch, capsys):
+    find = __import__("importlib.util").util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: None if name == module else find(name)
+    )
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    assert main([*COMMAND, *options]) == 2
+    assert f"pip install 'rbl-gym[{extra}]'" in capsys.readouterr().err
