@@ -76,3 +76,13 @@ def share_by_hand(scene, anchor: np.ndarray, point: np.ndarray) -> float:
         if (np.abs(along - box[:3]) <= box[3:]).all(axis=1).any():
             return scene.blocked_information
     return 1.0
+
+
+def law_by_hand(scene, anchors: np.ndarray, rotation: np.ndarray, translation: np.ndarray):
+    """The scene's noise law at a pose, link by link where obstacles change it."""
+    if not scene.obstacles:
+        return scene.noise
+    places = np.array(scene.tags) @ rotation.T + translation
+    distances = np.linalg.norm(places - anchors[:, None], axis=-1)
+    share = np.array([share_by_hand(scene, anchor, translation) for anchor in anchors])
+    return ranging.LinkNoise(np.sqrt(scene.noise.variance(distances) / share[:, None]))

@@ -36,7 +36,8 @@ def test_steps_of_many_worlds_and_of_one_equal_the_plain_recursion(name, links):
         plain = bounds.score(np.linalg.inv(want), at.rotation, scene.tags)
         np.testing.assert_allclose(score, plain, rtol=1e-9)
         P = course.predict(k, P) if k else P
-        P = posterior.update(P, course.information(k, alone.anchors, scene.noise, seen[2]))
+        shares = simulation.shares(scene, at, episode.anchors, seen)
+        P = posterior.update(P, course.information(k, alone.anchors, scene.noise, shares[2]))
         np.testing.assert_allclose(course.score(k, P), plain[2], rtol=1e-9)
 
 

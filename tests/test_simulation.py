@@ -14,7 +14,7 @@ from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box
 from rbl_gym.scenes import SCENES, Scene
 from rbl_gym.simulation import Episode
-from tests.helpers import share_by_hand
+from tests.helpers import law_by_hand, share_by_hand
 
 NAMES = list(SCENES)
 MOVABLE = [name for name, scene in SCENES.items() if scene.anchor_speed_m_s > 0]
@@ -590,13 +590,14 @@ def test_posterior_information_equals_a_naive_recursion_and_that_of_bounds(name)
         J = simulation.posterior_information(
             scene, simulation.epoch_of(episode, k), anchors, links, J, episode.prior_covariance
         )
+        law = law_by_hand(scene, anchors, *pose)
         if stepped is None:
             stepped = np.linalg.inv(episode.prior_covariance) + bounds.range_information(
-                anchors, scene.tags, *pose, scene.noise, links
+                anchors, scene.tags, *pose, law, links
             )
         else:
             stepped = bounds.posterior_crb_step(
-                stepped, anchors, scene.tags, *pose, scene.noise,
+                stepped, anchors, scene.tags, *pose, law,
                 twist, scene.dt, scene.process, links,
             )  # fmt: skip
         np.testing.assert_allclose(J, stepped, rtol=1e-12, atol=1e-12 * np.abs(J).max())

@@ -25,7 +25,7 @@ import rbl_gym
 from rbl_gym import bounds
 from rbl_gym.envs.tracking import TrackingEnv, observation_space
 from rbl_gym.scenes import SCENES
-from tests.helpers import assert_same, share_by_hand
+from tests.helpers import assert_same, law_by_hand, share_by_hand
 
 ROOT = Path(__file__).resolve().parent.parent
 ID = "rbl_gym:RBL/Tracking-v0"
@@ -339,13 +339,14 @@ def test_reward_is_minus_log_of_the_posterior_bound_along_the_truth(name, links)
     J = None
     for k, (seen, reward, *_, info) in enumerate(rollout(env, 12)):
         pose = info["rotation"], info["translation"]
+        law = law_by_hand(scene, seen["anchors"], *pose)
         if J is None:
             J = np.linalg.inv(info["prior_covariance"]) + bounds.range_information(
-                seen["anchors"], tags, *pose, scene.noise, seen["links"]
+                seen["anchors"], tags, *pose, law, seen["links"]
             )
         else:
             J = bounds.posterior_crb_step(
-                J, seen["anchors"], tags, *pose, scene.noise,
+                J, seen["anchors"], tags, *pose, law,
                 seen["twist"], scene.dt, scene.process, seen["links"],
             )  # fmt: skip
         b = score_by_hand(np.linalg.inv(J), info["rotation"], tags)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import importlib.util
-import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 from rbl_gym import __version__
+from rbl_gym.app import learning
+from rbl_gym.app.terminal import (
+    MissingExtraError,
+    add_json,
+    natural,
+    positive,
+    progress,
+    require,
+    write_json,
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,10 +32,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 2
 
 
-class MissingExtraError(Exception):
-    """A library is missing that one of the extras installs."""
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="rbl-gym", description="Localization of rigid bodies by radio."
@@ -38,6 +40,9 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     _add_demo(commands)
     _add_place(commands)
+    learning.add_train(commands)
+    learning.add_evaluate(commands)
+    learning.add_transfer(commands)
     _add_replay(commands)
     _add_reproduce(commands)
     return parser
@@ -51,7 +56,7 @@ def _add_demo(commands: Any) -> None:
     )
     _add_trials(demo)
     demo.add_argument("--plot", default="out/demo.png", metavar="F", help="default out/demo.png")
-    _add_json(demo)
+    add_json(demo)
     demo.set_defaults(run=_demo)
 
 
@@ -66,15 +71,15 @@ def _add_place(commands: Any) -> None:
                        help="a named scene, or a file .toml or .json")  # fmt: skip
     place.add_argument("--anchors", type=_numbers, metavar="N|A..B",
                        help="how many; A..B: accuracy against the number")  # fmt: skip
-    place.add_argument("--racks", type=_natural, default=0, metavar="K",
+    place.add_argument("--racks", type=natural, default=0, metavar="K",
                        help="random boxes that block sight in a named room, default 0")  # fmt: skip
     place.add_argument("--region", type=_region, metavar="x0,y0,z0,x1,y1,z1",
                        help="work region, metres; write --region=-1,... for a minus")  # fmt: skip
-    place.add_argument("--trials", type=_positive, default=500, help="of the check, default 500")
-    place.add_argument("--seed", type=_natural, default=0, help="of all randomness, default 0")
+    place.add_argument("--trials", type=positive, default=500, help="of the check, default 500")
+    place.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
     place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
     place.add_argument("--html", metavar="F", help="3-D page with the tables, self-contained")
-    _add_json(place)
+    add_json(place)
     place.set_defaults(run=_place)
 
 
@@ -90,13 +95,13 @@ def _add_reproduce(commands: Any) -> None:
     _add_trials(reproduce)
     reproduce.add_argument("--plot", metavar="F", help="default out/EXPERIMENT.png")
     reproduce.add_argument("--csv", metavar="F", help="every figure as a row")
-    _add_json(reproduce)
+    add_json(reproduce)
     reproduce.set_defaults(run=_reproduce)
 
 
 def _add_trials(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--trials", type=_positive, default=1000, help="default 1000")
-    parser.add_argument("--seed", type=_natural, default=0, help="of all randomness, default 0")
+    parser.add_argument("--trials", type=positive, default=1000, help="default 1000")
+    parser.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
 
 
 def _add_replay(commands: Any) -> None:
@@ -152,14 +157,8 @@ def _add_replay(commands: Any) -> None:
     )
     replay.add_argument("--no-robust", action="store_true", help="squares in place of Huber's loss")
     replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")
-    _add_json(replay)
+    add_json(replay)
     replay.set_defaults(run=_replay)  # fmt: skip
-
-
-def _add_json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", nargs="?", const="-", metavar="F",
-                        help="write the figures as JSON to F; without F, to standard output "
-                        "in place of the table")  # fmt: skip
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -200,9 +199,9 @@ def _reproduce(options: argparse.Namespace) -> int:
 
 
 def _place(options: argparse.Namespace) -> int:
-    _require("cmaes", "placement")
+    require("cmaes", "placement")
     if options.html:
-        _require("plotly", "viz")
+        require("plotly", "viz")
     from rbl_gym import scene_files
     from rbl_gym.app import place
 
@@ -230,13 +229,6 @@ def _place(options: argparse.Namespace) -> int:
             if path:
                 print(f"{label}: {path}")
     return 0
-
-
-def _require(module: str, extra: str) -> None:
-    """Say which extra is missing before the work begins."""
-    if importlib.util.find_spec(module) is None:
-        raise MissingExtraError(f"this command needs the extra {extra}: pip install "
-                                f"'rbl-gym[{extra}]'")  # fmt: skip
 
 
 def _replay(options: argparse.Namespace) -> int:
@@ -272,46 +264,10 @@ def _replay(options: argparse.Namespace) -> int:
     return 0
 
 
-@contextlib.contextmanager
-def progress(label: str, total: int) -> Iterator[Callable[[], None]]:
-    """A progress bar on standard error; yields the function that advances it."""
-    try:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-    except ImportError as error:
-        raise MissingExtraError(
-            "this command needs the extra cli: pip install 'rbl-gym[cli]'"
-        ) from error
-    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task(label, total=total)
-        yield lambda: bar.advance(task)
-
-
-def write_json(result: dict[str, Any], target: str | None) -> bool:
-    """Write figures where asked; returns whether standard output is free for a table."""
-    if target is None:
-        return True
-    text = json.dumps(result, indent=1, allow_nan=False) + "\n"
-    if target == "-":
-        sys.stdout.write(text)
-        return False
-    Path(target).parent.mkdir(parents=True, exist_ok=True)
-    Path(target).write_text(text, encoding="utf-8")
-    return True
-
-
-def _positive(text: str) -> int:
-    value = _natural(text)
-    if value == 0:
-        raise argparse.ArgumentTypeError("must be at least 1, got 0")
-    return value
-
-
 def _numbers(text: str) -> range:
     """N or A..B as a range."""
     first, dots, last = text.partition("..")
-    numbers = range(_positive(first), _positive(last if dots else first) + 1)
+    numbers = range(positive(first), positive(last if dots else first) + 1)
     if not numbers:
         raise argparse.ArgumentTypeError(f"must rise from A to B, got {text!r}")
     return numbers
@@ -326,13 +282,3 @@ def _region(text: str) -> tuple[list[float], list[float]]:
     if len(numbers) != 6:
         raise argparse.ArgumentTypeError(f"must be six numbers x0,y0,z0,x1,y1,z1, got {text!r}")
     return numbers[:3], numbers[3:]
-
-
-def _natural(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"must be a whole number, not negative, got {text!r}")
-    return value

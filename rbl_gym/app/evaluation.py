@@ -18,6 +18,7 @@ from rbl_gym import layout_search, layouts, placement
 from rbl_gym.app.policies import Policy
 from rbl_gym.app.rl_tasks import RlTask
 from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.wrappers import controllers
 
 # Seeds of held-out worlds lie beyond those that a training reaches.
@@ -75,25 +76,8 @@ def evaluate(
     known = references(task)
     names = [check_one_of("reference", name, known) for name in names]
     names = [name for name in known if name in {*names, known[0], known[-1]}]
-    losses: dict[str, FloatArray] = {}
-    is_placement = task.env_id == "RBL/AnchorPlacement-v0"
-    for name in names:
-        rng = np.random.default_rng([seed, known.index(name)])
-        if is_placement:
-            losses[name] = _placement_reference(task, name, worlds, seed, rng)
-        else:
-            controller = _controllers(task)[name]
-            losses[name] = _rollout(
-                task, lambda env, _, c=controller, r=rng: c(env, r), worlds, seed
-            )
-        advance()
-    for label, policy in policies.items():
-        losses[label] = _rollout(task, lambda _, seen, p=policy: p(seen), worlds, seed)
-        advance()
-        if is_placement and task.arguments.get("mode") != "mounts":
-            rng = np.random.default_rng([seed, len(known)])
-            losses[f"{label} + cma-es"] = _refined(task, policy, worlds, seed, rng)
-            advance()
+    play = _placement_losses if task.env_id == "RBL/AnchorPlacement-v0" else _loop_losses
+    losses = play(task, policies, names, worlds, seed, advance)
     rng = np.random.default_rng([seed, len(known) + 1])
     resamples = rng.integers(worlds, size=(_RESAMPLES, worlds))
     return {
@@ -134,6 +118,26 @@ def _figures(
 # --- tasks played step by step ----------------------------------------------------------------
 
 
+def _loop_losses(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> dict[str, FloatArray]:
+    losses = {}
+    for name in names:
+        rng = np.random.default_rng([seed, references(task).index(name)])
+        controller = _controllers(task)[name]
+        losses[name] = _rollout(task, lambda env, _, c=controller, r=rng: c(env, r), worlds, seed)
+        advance()
+    for label, policy in policies.items():
+        losses[label] = _rollout(task, lambda _, seen, p=policy: p(seen), worlds, seed)
+        advance()
+    return losses
+
+
 def _rollout(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> FloatArray:
@@ -142,18 +146,33 @@ def _rollout(
     observation, _ = env.reset(seed=HELD_OUT_SEED + seed)
     total, steps = np.zeros(worlds), 0
     done = np.zeros(worlds, dtype=np.bool_)
-    info: dict[str, Any] = {}
     while not done.all():
-        observation, reward, terminated, truncated, info = env.step(act(env, observation))
+        observation, reward, terminated, truncated, _ = env.step(act(env, observation))
         total += reward
         steps += 1
         done = terminated | truncated
-    if task.env_id == "RBL/AnchorPlacement-v0":
-        return np.log(info["score_m"])
     return -total / steps
 
 
 # --- placement --------------------------------------------------------------------------------
+
+
+def _placement_losses(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> dict[str, FloatArray]:
+    problem, contexts, found = layouts_of(task, policies, names, worlds, seed, advance)
+    if task.arguments.get("mode") != "mounts":
+        env = _problems(task, worlds, seed)
+        for label in policies:
+            rng = np.random.default_rng([seed, len(references(task))])
+            found[f"{label} + cma-es"] = _refined(task, env, found[label], rng)
+            advance()
+    return {name: _loss_of(problem, contexts, anchors) for name, anchors in found.items()}
 
 
 def _problems(task: RlTask, worlds: int, seed: int) -> Any:
@@ -163,54 +182,67 @@ def _problems(task: RlTask, worlds: int, seed: int) -> Any:
     return env
 
 
-def _placement_reference(
-    task: RlTask, name: str, worlds: int, seed: int, rng: np.random.Generator
-) -> FloatArray:
+def layouts_of(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> tuple[PlacementTask, Context, dict[str, FloatArray]]:
+    """The problem, held-out contexts, and layouts (C, M, 3) of references and policies.
+
+    The random ones are (C, 8, M, 3).
+    """
     env = _problems(task, worlds, seed)
+    found = {}
+    for name in names:
+        rng = np.random.default_rng([seed, references(task).index(name)])
+        found[name] = _reference_layout(task, env, name, rng)
+        advance()
+    for label, policy in policies.items():
+        found[label] = _policy_layout(task, policy, worlds, seed)
+        advance()
+    return env.task, env.contexts, found
+
+
+def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generator) -> FloatArray:
     problem, contexts = env.task, env.contexts
+    worlds = len(contexts.centre)
     if task.arguments.get("mode") == "mounts":
         candidates = placement.mounts(problem)
         if name == "random":
-            return _mean_of_tries(
-                problem, contexts,
-                candidates[_choices(rng, worlds, len(candidates), problem.n_anchors)],
-            )  # fmt: skip
-        found = layout_search.greedy(
+            draws = rng.random((worlds, _RANDOM_TRIES, len(candidates)))
+            return candidates[draws.argsort(axis=-1)[..., : problem.n_anchors]]
+        return layout_search.greedy(
             problem, contexts, rng, candidates=candidates, swaps=name == "greedy-swaps"
         )
-    elif name == "random":
+    if name == "random":
         shape = (worlds, _RANDOM_TRIES, problem.n_anchors, 3)
-        return _mean_of_tries(
-            problem, contexts, problem.scene.anchor_region.draw(rng.random(shape))
-        )
-    else:
-        found = {**layouts.LAYOUTS, **layout_search.SEARCHES}[name](problem, contexts, rng)
-    return np.log(placement.score(problem, contexts, found))
+        return problem.scene.anchor_region.draw(rng.random(shape))
+    return {**layouts.LAYOUTS, **layout_search.SEARCHES}[name](problem, contexts, rng)
 
 
-def _choices(rng: np.random.Generator, worlds: int, n: int, k: int) -> np.ndarray:
-    """Random sets (worlds, tries, k) of n without repetition."""
-    return rng.random((worlds, _RANDOM_TRIES, n)).argsort(axis=-1)[..., :k]
-
-
-def _mean_of_tries(problem: Any, contexts: Any, anchors: FloatArray) -> FloatArray:
-    scores = placement.score(problem, layout_search.expand(contexts), anchors)
-    return np.log(scores).mean(axis=-1)
-
-
-def _refined(
-    task: RlTask, policy: Policy, worlds: int, seed: int, rng: np.random.Generator
-) -> FloatArray:
-    """A policy's layouts after a tenth of the generations that CMA-ES alone takes."""
-    env = _problems(task, worlds, seed)
-    problem, contexts = env.task, env.contexts
-    observation, _ = env.reset(seed=HELD_OUT_SEED + seed)
-    info: dict[str, Any] = {}
+def _policy_layout(task: RlTask, policy: Policy, worlds: int, seed: int) -> FloatArray:
+    env = task.make(worlds, "Disabled")
+    observation, info = env.reset(seed=HELD_OUT_SEED + seed)
     done = np.zeros(worlds, dtype=np.bool_)
     while not done.all():
         observation, _, done, _, info = env.step(policy(observation))
-    found = layout_search.cma_es(
-        problem, contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
-        start=info["anchors"],
+    return info["anchors"]
+
+
+def _loss_of(problem: PlacementTask, contexts: Context, anchors: FloatArray) -> FloatArray:
+    """Log scores (C,) of layouts, of several the mean."""
+    if anchors.ndim == 4:
+        scores = placement.score(problem, layout_search.expand(contexts), anchors)
+        return np.log(scores).mean(axis=-1)
+    return np.log(placement.score(problem, contexts, anchors))
+
+
+def _refined(task: RlTask, env: Any, anchors: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Layouts after a tenth of the generations that CMA-ES alone takes."""
+    return layout_search.cma_es(
+        env.task, env.contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
+        start=anchors,
     )  # fmt: skip
-    return np.log(placement.score(problem, contexts, found))

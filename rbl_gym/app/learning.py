@@ -1,4 +1,4 @@
-"""The commands rbl-gym train and rbl-gym evaluate."""
+"""The commands rbl-gym train, evaluate and transfer."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rbl_gym.app.terminal import (
     natural,
     positive,
     progress,
+    require,
     write_json,
 )
 
@@ -48,6 +49,26 @@ def add_evaluate(commands: Any) -> None:
     evaluate.add_argument("--seed", type=natural, default=0, help="which worlds, default 0")
     add_json(evaluate)
     evaluate.set_defaults(run=_evaluate)
+
+
+def add_transfer(commands: Any) -> None:
+    """The parser of ``rbl-gym transfer``."""
+    transfer = commands.add_parser(
+        "transfer",
+        help="layouts rolled through real filters",
+        description="Track moving bodies among anchors placed by policies and references: does "
+        "what is good by the bound track well?",
+    )
+    placements = [name for name, task in TASKS.items() if task.env_id == "RBL/AnchorPlacement-v0"]
+    transfer.add_argument("task", choices=sorted(placements))
+    transfer.add_argument("--policy", action="append", default=[], metavar="F",
+                          help="of rbl-gym train; may be given again")  # fmt: skip
+    transfer.add_argument("--worlds", type=positive, default=48, help="default 48")
+    transfer.add_argument("--repeats", type=positive, default=16,
+                          help="bodies in each world, default 16")  # fmt: skip
+    transfer.add_argument("--seed", type=natural, default=0, help="which worlds, default 0")
+    add_json(transfer)
+    transfer.set_defaults(run=_transfer)
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -89,4 +110,27 @@ def _evaluate(options: argparse.Namespace) -> int:
         from rbl_gym.app import reports
 
         reports.print_evaluation(result)
+    return 0
+
+
+def _transfer(options: argparse.Namespace) -> int:
+    require("cmaes", "placement")
+    from rbl_gym.app import evaluation, policies, transfer
+
+    task = rl_task(options.task)
+    loaded = {Path(path).stem: policies.load(path) for path in options.policy}
+    filters = transfer.filters(task)
+    units = (len(filters) + 1) * (len(transfer.REFERENCES) + len(loaded))
+    with progress(options.task, units) as advance:
+        problem, contexts, layouts = evaluation.layouts_of(
+            task, loaded, transfer.REFERENCES, options.worlds, options.seed, advance
+        )
+        result = transfer.run(
+            problem, contexts, layouts, filters, options.repeats, options.seed, advance
+        )
+    result |= {"task": options.task, "worlds": options.worlds, "seed": options.seed}
+    if write_json(result, options.json):
+        from rbl_gym.app import reports
+
+        reports.print_transfer(result)
     return 0

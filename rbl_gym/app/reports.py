@@ -121,3 +121,18 @@ def print_evaluation(result: dict[str, Any]) -> None:
                       f"{row['score_m']:.4f}", f"{row['normalised']:.3f}", interval)  # fmt: skip
     console.print(table)
     console.print(f"normalised: 0 is random, 1 is {result['best_reference']}")
+
+
+def print_transfer(result: dict[str, Any]) -> None:
+    """One table for each filter: score and real error, and how they go together."""
+    console = _console()
+    for name, rows in result["filters"].items():
+        table = Table(title=f"{result['task']}, {name}, {result['worlds']} worlds, "
+                      f"{result['repeats']} bodies in each")  # fmt: skip
+        table.add_column("layouts")
+        for heading in ("score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"):
+            table.add_column(heading, justify="right")
+        for label, row in rows.items():
+            table.add_row(label, f"{row['score_m']:.4f}", f"{row['tag_rmse_m']:.4f}",
+                          f"{row['correlation']:.3f}")  # fmt: skip
+        console.print(table)

@@ -14,6 +14,7 @@ import numpy as np
 
 from rbl_gym import estimators, layout_search, metrics, motion, obstacles, placement, ranging
 from rbl_gym import rotations as rot
+from rbl_gym.app.rl_tasks import RlTask
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement import Context, PlacementTask
 
@@ -26,6 +27,16 @@ FILTERS = {
     "iekf, reflections": ("iekf", {"iterations": 4, "robust": True}, True),
     "uc-kf": ("uc-kf", {}, False),
 }
+
+
+# Layouts besides those of policies.
+REFERENCES = ["random", "ring", "greedy-swaps", "cma-es"]
+
+
+def filters(task: RlTask) -> list[str]:
+    """Filters that can track in the task's scene: UC-KF needs anchors that are not coplanar."""
+    low, high = placement.task(task.arguments["scene"]).scene.anchor_region.bounds()
+    return [name for name in FILTERS if name != "uc-kf" or (high > low).all()]
 
 
 class Bodies(NamedTuple):

@@ -1,0 +1,78 @@
+"""What the commands share: progress bars, JSON, arguments, extras that are missing."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+
+class MissingExtraError(Exception):
+    """A library is missing that one of the extras installs."""
+
+
+def require(module: str, extra: str) -> None:
+    """Say which extra is missing before the work begins."""
+    if importlib.util.find_spec(module) is None:
+        raise MissingExtraError(f"this command needs the extra {extra}: pip install "
+                                f"'rbl-gym[{extra}]'")  # fmt: skip
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """The option --json."""
+    parser.add_argument("--json", nargs="?", const="-", metavar="F",
+                        help="write the figures as JSON to F; without F, to standard output "
+                        "in place of the table")  # fmt: skip
+
+
+@contextlib.contextmanager
+def progress(label: str, total: int) -> Iterator[Callable[..., None]]:
+    """A progress bar on standard error; yields the function that advances it (by 1)."""
+    try:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+    except ImportError as error:
+        raise MissingExtraError(
+            "this command needs the extra cli: pip install 'rbl-gym[cli]'"
+        ) from error
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(label, total=total)
+        yield lambda steps=1: bar.advance(task, steps)
+
+
+def write_json(result: dict[str, Any], target: str | None) -> bool:
+    """Write figures where asked; returns whether standard output is free for a table."""
+    if target is None:
+        return True
+    text = json.dumps(result, indent=1, allow_nan=False) + "\n"
+    if target == "-":
+        sys.stdout.write(text)
+        return False
+    Path(target).parent.mkdir(parents=True, exist_ok=True)
+    Path(target).write_text(text, encoding="utf-8")
+    return True
+
+
+def positive(text: str) -> int:
+    """A whole number above zero, for argparse."""
+    value = natural(text)
+    if value == 0:
+        raise argparse.ArgumentTypeError("must be at least 1, got 0")
+    return value
+
+
+def natural(text: str) -> int:
+    """A whole number, not negative, for argparse."""
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"must be a whole number, not negative, got {text!r}")
+    return value
