@@ -23,6 +23,8 @@ from rbl_gym.wrappers import controllers
 
 # Seeds of held-out worlds lie beyond those that a training reaches.
 HELD_OUT_SEED = 1_000_000_000
+# The reference that is one layout for all contexts, and the contexts it is optimised over.
+_ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
 # Random layouts of each context; and generations of CMA-ES that refine a policy's proposal.
 _RANDOM_TRIES = 8
 REFINE_GENERATIONS = 12
@@ -35,7 +37,7 @@ def references(task: RlTask) -> list[str]:
     if task.env_id == "RBL/AnchorPlacement-v0":
         if task.arguments.get("mode") == "mounts":
             return ["random", "greedy", "greedy-swaps"]
-        return [*layouts.LAYOUTS, *layout_search.SEARCHES]
+        return [*layouts.LAYOUTS, _ONE_LAYOUT, *layout_search.SEARCHES]
     return list(_controllers(task))
 
 
@@ -220,6 +222,10 @@ def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generato
     if name == "random":
         shape = (worlds, _RANDOM_TRIES, problem.n_anchors, 3)
         return problem.scene.anchor_region.draw(rng.random(shape))
+    if name == _ONE_LAYOUT:
+        training = placement.draw_contexts(problem, rng, (_TRAINING_CONTEXTS,))
+        one = layout_search.shared_layout(problem, training, rng)
+        return np.broadcast_to(one, (worlds, *one.shape))
     return {**layouts.LAYOUTS, **layout_search.SEARCHES}[name](problem, contexts, rng)
 
 

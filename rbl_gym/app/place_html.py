@@ -99,8 +99,9 @@ def scene(placed: Placed) -> go.Figure:
     others = sum(1 for _ in shown.select_traces()) - 2
     shown.update_layout(
         height=720, margin={"l": 0, "r": 0, "t": 40, "b": 30},
-        scene={"domain": {"y": [0.1, 1.0]}, "aspectmode": "data", "xaxis_title": "x (m)", "yaxis_title": "y (m)",
-               "zaxis_title": "z (m)", "camera": {"eye": {"x": -0.9, "y": -1.8, "z": 1.3}}},
+        scene={"domain": {"y": [0.1, 1.0]}, "aspectmode": "data", "xaxis_title": "x (m)",
+               "yaxis_title": "y (m)", "zaxis_title": "z (m)",
+               "camera": {"eye": {"x": -0.9, "y": -1.8, "z": 1.3}}},
         legend={"orientation": "h", "x": 0.25, "y": 1.0},
         updatemenus=[_buttons(others)],
         sliders=[_slider(maps, middle)] if len(maps) > 1 else [],
