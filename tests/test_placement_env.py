@@ -171,45 +171,67 @@ def test_rewards_are_the_score_of_the_anchors_in_info(kind):
             assert (info["score_m"] > 0) is terminated
 
 
+def turned(env, info, mirror):
+    """Signs by which the region is brought towards +x and +y."""
+    scene = env.unwrapped._batch.task.scene
+    low, high = scene.volume.bounds()
+    # Legal places that do not lie evenly about the volume are no mirror's.
+    mirror &= np.array_equal(sum(scene.anchor_region.bounds())[:2], (low + high)[:2])
+    sign = np.where(info["region"][:3] < 0.5 * (low + high), -1, 1) if mirror else np.ones(3)
+    return sign * [1, 1, 0] + [0, 0, 1]
+
+
+@pytest.mark.parametrize("mirror", [True, False])
 @pytest.mark.parametrize("kind", ["auv", "satellite", "room with racks"])
-def test_sequential_places_each_action_by_the_region(kind):
-    env = AnchorPlacementEnv(**WORLDS[kind])
+@pytest.mark.parametrize("seed", [6, 7, 8])
+def test_sequential_places_each_action_by_the_region(kind, mirror, seed):
+    env = AnchorPlacementEnv(**WORLDS[kind], mirror=mirror)
     task = env.unwrapped._batch.task
-    steps, actions = episode(env, 6)
+    steps, actions = episode(env, seed)
     for k, step in enumerate(steps):
-        placed = task.scene.anchor_region.place(np.array(actions[:k], float).reshape(-1, 3))
+        shown = np.array(actions[:k], float).reshape(-1, 3) * turned(env, step[4], mirror)
+        placed = task.scene.anchor_region.place(shown)
         np.testing.assert_allclose(step[4]["anchors"][:k], placed)
         assert not step[4]["anchors"][k:].any()  # zeros where no anchor stands yet
 
 
+@pytest.mark.parametrize("mirror", [True, False])
+@pytest.mark.parametrize("seed", [6, 7, 8])
 @every_world
-def test_observations_by_hand(kind):
-    env = AnchorPlacementEnv(**WORLDS[kind])
+def test_observations_by_hand(kind, mirror, seed):
+    env = AnchorPlacementEnv(**WORLDS[kind], mirror=mirror)
     task, mode = env.unwrapped._batch.task, WORLDS[kind].get("mode", "sequential")
     low, high = (np.array(corner) for corner in (task.scene.volume.low, task.scene.volume.high))
     m = task.n_anchors
-    steps, actions = episode(env, 7)
+    steps, actions = episode(env, seed)
     for k, (observation, _, _, _, info) in enumerate(steps):
         assert observation.dtype == np.float32
         assert env.observation_space.contains(observation)
+        sign = turned(env, info, mirror)
+        floor, top = task.scene.anchor_region.bounds()
+        middle = 0.5 * (floor + top) * [1, 1, 0]
         centre, half, racks = context_of(info)
+        centre = middle + sign * (centre - middle)
+        racks = np.array([[*(middle + sign * (r[:3] - middle)), *r[3:]] for r in racks])
+        if mirror:
+            racks = sorted(racks, key=lambda rack: -rack[0])
         parts = [2 * (centre - low) / (high - low) - 1, 4 * half / (high - low) - 1]
         for rack in racks:
-            floor, top = task.scene.anchor_region.bounds()
             parts += [2 * (rack[:3] - floor) / (top - floor) - 1, 2 * rack[3:] / (top - floor)]
         if mode == "sequential":
             done = np.zeros((m, 3))
             done[:k] = np.array(actions[:k]).reshape(-1, 3)
             parts.append(done.ravel())
         if mode == "mounts":
-            mounts = placement.mounts(task)
+            # Mount k of the observation is the one that the mirror takes mount k to.
+            mounts = middle + sign * (placement.mounts(task) - middle)
             parts.append(placement.sight_fractions(task, context_of(info), mounts))
             taken = np.zeros(57)
             taken[np.array(actions[:k], int)] = 1
             parts.append(taken)
             np.testing.assert_array_equal(info["action_mask"], 1 - taken)
             assert info["action_mask"].dtype == np.int8
-            np.testing.assert_array_equal(info["anchors"][:k], mounts[np.array(actions[:k], int)])
+            np.testing.assert_allclose(info["anchors"][:k], mounts[np.array(actions[:k], int)])
         if mode != "one-shot":
             parts.append(np.arange(m) == k)
         wanted = np.clip(np.concatenate(parts), -1, 1)
@@ -217,7 +239,7 @@ def test_observations_by_hand(kind):
 
 
 def test_actions_beyond_the_box_are_cut():
-    env = AnchorPlacementEnv(n_anchors=1)
+    env = AnchorPlacementEnv(n_anchors=1, mirror=False)
     env.reset(seed=1)
     observation, _, _, _, info = env.step(np.array([3.0, -9, 0.5]))
     np.testing.assert_allclose(info["anchors"], [[200, -200, 0]])
@@ -238,7 +260,7 @@ def test_one_shot_equals_sequential():
 
 
 def test_a_mount_twice_adds_a_second_anchor_there():
-    env = AnchorPlacementEnv("uwb_room", "mounts", n_anchors=2)
+    env = AnchorPlacementEnv("uwb_room", "mounts", n_anchors=2, mirror=False)
     task = env.unwrapped._batch.task
     _, info = env.reset(seed=8)
     first = env.step(20)

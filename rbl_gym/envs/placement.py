@@ -14,7 +14,10 @@ from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.placement import Context
+from rbl_gym.regions import Region
 
+# Signs by which a problem may be mirrored: neither, x, y, both.
+_MIRRORS = ((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1))
 MODES = ("sequential", "one-shot", "mounts")
 # Score from which the shaped reward of the mounts counts, metres.
 _EMPTY_SCORE_M = 3.0
@@ -34,11 +37,13 @@ class AnchorPlacementVectorEnv(BatchEnv):
         mode: str = "sequential",
         racks: int = 0,
         n_anchors: int | None = None,
+        mirror: bool = True,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         self.task = placement.task(scene, n_anchors, racks)
+        self.mirror = bool(mirror) and is_symmetric(self.task)
         self.mode = check_one_of("mode", mode, MODES)
         self.single_action_space = self._action_space()
         size = observation_size(self.task, self.mode)
@@ -49,12 +54,15 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self._placements = steps
         uniforms = np.zeros((num_envs, placement.context_uniforms(self.task)))
         self._contexts = placement.build_contexts(self.task, uniforms)
+        # Signs of the axes by which each problem is shown mirrored.
+        self._signs = np.ones((num_envs, 3))
         self._features = context_features(self.task, self._contexts)
         self._actions = np.zeros((num_envs, self.task.n_anchors, 3))
         self._anchors = np.zeros((num_envs, self.task.n_anchors, 3))
         self._score_m = np.zeros(num_envs)
         if self.mode == "mounts":
             self._mounts = placement.mounts(self.task)
+            self._mirrored = mirrored_mounts(self.task, self._mounts)
             self._taken = np.zeros((num_envs, len(self._mounts)), dtype=np.bool_)
             self._sight = np.zeros((num_envs, len(self._mounts)))
             self._information = np.zeros((num_envs, self.task.n_poses, 6, 6))
@@ -77,7 +85,11 @@ class AnchorPlacementVectorEnv(BatchEnv):
         fresh = placement.build_contexts(self.task, uniforms)
         for held, new in zip(self._contexts, fresh, strict=True):
             held[chosen] = new
-        self._features[chosen] = context_features(self.task, fresh)
+        shown = fresh
+        if self.mirror:
+            self._signs[chosen] = signs_of(self.task, fresh)
+            shown = mirrored_context(self.task, fresh, self._signs[chosen])
+        self._features[chosen] = context_features(self.task, shown)
         self._actions[chosen] = 0.0
         self._anchors[chosen] = 0.0
         self._score_m[chosen] = 0.0
@@ -98,7 +110,8 @@ class AnchorPlacementVectorEnv(BatchEnv):
         # One-shot: all anchors of a world; else the next one.
         new = (rows,) if self.mode == "one-shot" else (rows, step)
         self._actions[new] = np.clip(actions[rows], -1, 1).reshape(self._actions[new].shape)
-        self._anchors[new] = self.task.scene.anchor_region.place(self._actions[new])
+        signs = self._signs[rows, None] if self.mode == "one-shot" else self._signs[rows]
+        self._anchors[new] = self.task.scene.anchor_region.place(signs * self._actions[new])
         reward = np.zeros(self.num_envs)
         if complete.any():
             problems = Context(*(field[complete] for field in self._contexts))
@@ -110,7 +123,8 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self, actions: np.ndarray, rows: np.ndarray, step: np.ndarray, complete: BoolArray
     ) -> FloatArray:
         """Anchors on mounts; the reward is the drop of the log score."""
-        chosen = actions[rows].astype(int)
+        # Action k is that of the k-th mount in the observation.
+        chosen = self._shown()[rows, actions[rows].astype(int)]
         anchors = self._mounts[chosen]
         self._anchors[rows, step] = anchors
         self._taken[rows, chosen] = True
@@ -123,12 +137,18 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self._score_m[complete] = np.exp(log_score[complete])
         return reward
 
+    def _shown(self) -> np.ndarray:
+        """Which mount (B, 57) stands at each place of the observation."""
+        which = (self._signs[:, :2] < 0) @ np.array([1, 2])
+        return self._mirrored[which]
+
     def _observe(self) -> np.ndarray:
         parts = [self._features]
         if self.mode == "sequential":
             parts.append(self._actions.reshape(self.num_envs, -1))
         if self.mode == "mounts":
-            parts += [self._sight, self._taken]
+            shown = self._shown()
+            parts += [np.take_along_axis(a, shown, axis=-1) for a in (self._sight, self._taken)]
         if self.mode != "one-shot":
             parts.append(self._epochs[:, None] == np.arange(self.task.n_anchors))
         return np.concatenate(parts, axis=-1, dtype=np.float32)
@@ -142,7 +162,8 @@ class AnchorPlacementVectorEnv(BatchEnv):
             "racks": contexts.racks.copy(),
         }
         if self.mode == "mounts":
-            info["action_mask"] = (~self._taken).astype(np.int8)
+            free = ~np.take_along_axis(self._taken, self._shown(), axis=-1)
+            info["action_mask"] = free.astype(np.int8)
         return info
 
 
@@ -166,7 +187,10 @@ class AnchorPlacementEnv(ScalarEnv):
     ``Box(-1, 1, (n,), float32)``, in order: the region's centre and size, scaled to the volume
     (6); of each rack its place and half size, scaled to the room (6 each); sequential: the
     actions so far (3 M); mounts: the share of the poses that each mount sees, and whether it
-    is taken (57 + 57); except in one-shot the one-hot number of the next anchor (M).
+    is taken (57 + 57); except in one-shot the one-hot number of the next anchor (M). Where the
+    legal space and the volume have one centre, problems are shown mirrored in x and y, so that
+    the region lies towards +x and +y, racks in the order of x, and actions are mirrored back;
+    ``mirror=False`` shows them as they are.
 
     ## Reward
     ``-log score`` with the last anchor, 0 before. ``"mounts"``: the drop of the log score with
@@ -199,9 +223,12 @@ class AnchorPlacementEnv(ScalarEnv):
         mode: str = "sequential",
         racks: int = 0,
         n_anchors: int | None = None,
+        mirror: bool = True,
         render_mode: str | None = None,
     ) -> None:
-        self._configure(render_mode, scene=scene, mode=mode, racks=racks, n_anchors=n_anchors)
+        self._configure(
+            render_mode, scene=scene, mode=mode, racks=racks, n_anchors=n_anchors, mirror=mirror
+        )
 
 
 def observation_size(task: placement.PlacementTask, mode: str) -> int:
@@ -211,6 +238,39 @@ def observation_size(task: placement.PlacementTask, mode: str) -> int:
         return size
     middle = 3 * task.n_anchors if mode == "sequential" else 2 * len(placement.mounts(task))
     return size + middle + task.n_anchors
+
+
+def is_symmetric(task: placement.PlacementTask) -> bool:
+    """Whether legal space and volume have one centre in x and y: problems may be mirrored."""
+    centres = [_centre(region)[:2] for region in (task.scene.volume, task.scene.anchor_region)]
+    return bool(np.allclose(*centres, atol=1e-9))
+
+
+def _centre(region: Region) -> FloatArray:
+    return np.mean(region.bounds(), axis=0)
+
+
+def signs_of(task: placement.PlacementTask, context: Context) -> FloatArray:
+    """Signs (..., 3) of the axes that bring the region's centre towards +x and +y."""
+    off = context.centre - _centre(task.scene.volume)
+    return np.where((off < 0) & np.array([True, True, False]), -1.0, 1.0)
+
+
+def mirrored_context(task: placement.PlacementTask, context: Context, signs: FloatArray) -> Context:
+    """The problem mirrored by signs (..., 3), its racks in the order of falling x."""
+    middle = _centre(task.scene.anchor_region) * [1, 1, 0]
+    racks = context.racks.copy()
+    racks[..., :3] = middle + signs[..., None, :] * (racks[..., :3] - middle)
+    order = np.argsort(-racks[..., 0], axis=-1)
+    racks = np.take_along_axis(racks, order[..., None], axis=-2)
+    return Context(middle + signs * (context.centre - middle), context.half, racks)
+
+
+def mirrored_mounts(task: placement.PlacementTask, mounts: FloatArray) -> np.ndarray:
+    """Indices (4, 57) of the mounts mirrored in neither, x, y, both."""
+    middle = _centre(task.scene.anchor_region) * [1, 1, 0]
+    moved = middle + np.array(_MIRRORS)[:, None] * (mounts - middle)
+    return np.abs(moved[:, :, None] - mounts).sum(axis=-1).argmin(axis=-1)
 
 
 def context_features(task: placement.PlacementTask, context: Context) -> FloatArray:
