@@ -143,7 +143,7 @@ def test_a_state_with_cross_terms_takes_the_general_path(name, tags, where, monk
             covariance[:, np.arange(3), np.arange(3)] *= 1.5
         return state._replace(covariance=covariance)
 
-    calls = count_calls(monkeypatch, engines, "batched_update")
+    calls = count_calls(monkeypatch, engines, "dense_update")
     fast = track(name, TAGS[tags], (12,), edit=edit)
     structured = where == "anisotropic" and tags == "aligned"
     # Information wears the cross terms off; the fast path may come back.
@@ -157,23 +157,24 @@ def test_a_state_with_cross_terms_takes_the_general_path(name, tags, where, monk
 def test_the_intended_path_is_taken(name, tags, monkeypatch):
     four = count_calls(monkeypatch, engines, "filter_update")
     common = count_calls(monkeypatch, engines, "shared_update")
+    dense = count_calls(monkeypatch, engines, "dense_update")
     general = count_calls(monkeypatch, engines, "batched_update")
     columns = count_calls(monkeypatch, kalman, "column_fit")
 
     def taken(tags, batch, **case):
-        for calls in (four, common, general, columns):
+        for calls in (four, common, dense, general, columns):
             calls.clear()
         track(name, tags, batch, steps=3, **case)
-        return len(four), len(common), len(general), len(columns)
+        return len(four), len(common), len(dense), len(general), len(columns)
 
     newton = 3 * (name == "uc-kf")
-    assert taken(TAGS[tags], (12,)) == (3, 0, 0, newton)
-    assert taken(TAGS[tags], (12,), fixed=True) == (3, 0, 0, newton)
-    assert taken(TAGS[tags], (12,), fixed=True, common_twist=True) == (0, 3, 0, newton)
-    assert taken(TAGS["uncentred"], (12,)) == (0, 0, 3, 0)
-    assert taken(TAGS["uncentred"], (12,), fixed=True, common_twist=True) == (0, 3, 0, 0)
-    assert taken(TAGS[tags], ()) == (0, 0, 0, 0)
-    assert taken(TAGS[tags], (12,), lost=(0, 1, 2)) == (0, 0, 3, 0)
+    assert taken(TAGS[tags], (12,)) == (3, 0, 0, 0, newton)
+    assert taken(TAGS[tags], (12,), fixed=True) == (3, 0, 0, 0, newton)
+    assert taken(TAGS[tags], (12,), fixed=True, common_twist=True) == (0, 3, 0, 0, newton)
+    assert taken(TAGS["uncentred"], (12,)) == (0, 0, 3, 0, 0)
+    assert taken(TAGS["uncentred"], (12,), fixed=True, common_twist=True) == (0, 3, 0, 0, 0)
+    assert taken(TAGS[tags], ()) == (0, 0, 0, 0, 0)
+    assert taken(TAGS[tags], (12,), lost=(0, 1, 2)) == (0, 0, 0, 3, 0)
 
 
 def test_a_shared_covariance_stays_shared_and_one_reset_trial_ends_it():
