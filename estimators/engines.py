@@ -282,7 +282,9 @@ def epoch_moments(
 
 
 def _as_batch(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:
-    return np.broadcast_to(array, (*batch, *array.shape[array.ndim - core :]))
+    shape = (*batch, *array.shape[array.ndim - core :])
+    # Only the array itself is known for what it was made of.
+    return array if array.shape == shape else np.broadcast_to(array, shape)
 
 
 def _flat(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rbl_gym import bodies, estimators, motion, ranging, rotations
-from rbl_gym.estimators import engines, kalman, unitary
-from rbl_gym.estimators.four_filters import inverse, join, principal_frame, split
+from rbl_gym.estimators import engines, four_filters, kalman, unitary
+from rbl_gym.estimators.four_filters import inverse, join, principal_frame, remembered, split
 from rbl_gym.estimators.least_squares import procrustes, vec
 from rbl_gym.estimators.shared_covariance import shared
 from rbl_gym.estimators.squared_range import extended, moments, paper_matrices, statistic
@@ -235,6 +235,32 @@ def test_split_and_join_are_inverses_and_the_covariance_is_the_users(tags):
     spoilt = covariance.copy()
     spoilt[4, 1, 7] += 1e-6
     assert split(frame, spoilt) is None
+
+
+def test_only_the_whole_joined_covariance_is_remembered(monkeypatch):
+    frame = principal_frame(TAGS["turned"])
+    assert frame is not None
+    blocks = np.einsum("ij,kb->ijkb", np.eye(3), np.linspace(1, 2, 32).reshape(4, 8))
+    for batch in ((8,), (2, 4)):
+        covariance = join(frame, blocks, batch)
+        assert split(frame, covariance) is blocks
+        with pytest.raises(ValueError, match="read-only"):
+            covariance[0, 0, 0] = 1.0
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            covariance.flags.writeable = True
+        assert type(covariance) is np.ndarray
+        others = (
+            covariance[::-1], covariance[:4], covariance[..., :9, :9], covariance.copy(),
+            covariance.swapaxes(-1, -2), np.where(True, covariance, 0.0), covariance + 0.0,
+            covariance.base[::-1], pickle.loads(pickle.dumps(covariance)),
+            np.broadcast_to(covariance, (3, *covariance.shape)),
+        )  # fmt: skip
+        assert not any(remembered(frame, np.asarray(other)) is not None for other in others)
+        assert remembered(frame._replace(aligned=True), covariance) is None
+    calls = count_calls(monkeypatch, four_filters, "_within")
+    track("kf", TAGS["turned"], (12,))
+    # Of the prior alone.
+    assert len(calls) == 1
 
 
 def test_tags_off_their_centroid_have_no_frame():
