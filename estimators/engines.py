@@ -57,8 +57,8 @@ class Prediction(NamedTuple):
 class Epoch(NamedTuple):
     """One epoch: ranges (..., M, N), anchors, tags, weights and links (None: all).
 
-    Ranges that are not `checked` are finite and positive only after `check_ranges`: where the
-    weights are fixed, nobody has read them before the engine.
+    Ranges of all links have yet to pass `check_ranges`: the engine looks at them where it
+    reads them anyway.
     """
 
     ranges: FloatArray
@@ -66,17 +66,12 @@ class Epoch(NamedTuple):
     tags: FloatArray
     weights: FloatArray
     links: BoolArray | None
-    checked: bool = True
 
     def statistic(self) -> Statistic:
         """The statistic of `squared_range`, of checked ranges."""
-        self.check()
-        return statistic(*self[:5])
-
-    def check(self) -> None:
-        """Look at the ranges, if nobody has."""
-        if not self.checked:
-            check_ranges(self.ranges, self.links)
+        if self.links is None:
+            check_ranges(self.ranges)
+        return statistic(*self)
 
 
 class Batched:
@@ -273,12 +268,11 @@ def epoch_moments(
     epoch: Epoch, tags: FloatArray, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """`moments` of a batch, trials last: G (3, 3, B) and B (3, 4, B) for extended tags (N, 4)."""
-    epoch.check()
     anchors, weights = (
         array[None] if array.ndim == 2 else _flat(array, 2, batch)
         for array in (epoch.anchors, epoch.weights)
     )
-    return moments(_flat(epoch.ranges, 2, batch), anchors, tags, weights)
+    return moments(_flat(epoch.ranges, 2, batch), anchors, tags, weights, unchecked=epoch.ranges)
 
 
 def _as_batch(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:
