@@ -274,8 +274,14 @@ class KalmanFamily:
         largest = _largest_of_three(variance[..., 9:])
         # The first and last anchor bound the extent from below, and mostly settle it.
         apart = _largest_of_three(np.abs(anchors[..., 0, :] - anchors[..., -1, :]))
-        if not (vague_rotation | (largest > apart**2)).any():
+        doubted = vague_rotation | (largest > apart**2)
+        if not doubted.any():
             return
+        if anchors.ndim > 2:
+            anchors, largest, vague_rotation = (
+                np.broadcast_to(array, (*doubted.shape, *array.shape[array.ndim - core :]))[doubted]
+                for array, core in ((anchors, 2), (largest, 0), (vague_rotation, 0))
+            )
         vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
         if not vague.any():
             return

@@ -52,9 +52,7 @@ def update(
     anchors, tags, weights
         (M, 3), (N, 3), (M, 1) or (M, N): the same for all trials.
     """
-    model = _model(
-        len(anchors), len(tags), anchors.tobytes(), tags.tobytes(), weights.tobytes()
-    )
+    model = _model(len(anchors), len(tags), anchors.tobytes(), tags.tobytes(), weights.tobytes())
     P = symmetric(np.linalg.solve(np.eye(12) + P @ model.matrix, P))
     *of_tags, slope = model.slopes
     rows = ranges.reshape(-1, anchors.shape[0] * tags.shape[0])
