@@ -132,7 +132,8 @@ def join(frame: Frame, blocks: FloatArray, batch: tuple[int, ...]) -> FloatArray
         last[9:, 9:] = blocks[:, :, 3]
     last.flags.writeable = False
     # An owner of an owner: the base of a view is the first array behind it of another type.
-    owner = np.moveaxis(last.view(_Owner).reshape(12, 12, *batch), (0, 1), (-2, -1))
+    moved = np.moveaxis(last.view(_Owner).reshape(12, 12, *batch), (0, 1), (-2, -1))
+    owner = moved.view(_Owner)
     owner.frame, owner.blocks = frame, blocks
     return owner.view(np.ndarray)
 
