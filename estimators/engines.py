@@ -13,6 +13,9 @@ import numpy as np
 
 from rbl_gym.bounds import symmetric
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.dense_filter import centred_frame
+from rbl_gym.estimators.dense_filter import predict as dense_predict
+from rbl_gym.estimators.dense_filter import update as dense_update
 from rbl_gym.estimators.four_filters import Frame, join, join_mean, split, split_mean
 from rbl_gym.estimators.four_filters import predict as filter_predict
 from rbl_gym.estimators.four_filters import update as filter_update
@@ -22,9 +25,7 @@ from rbl_gym.estimators.shared_covariance import update as shared_update
 from rbl_gym.estimators.squared_range import (
     Statistic,
     compressed,
-    extended,
     information,
-    information_of_moments,
     moments,
     statistic,
 )
@@ -45,7 +46,7 @@ class Prediction(NamedTuple):
     shift
         (..., 3), metres.
     noise
-        Variances (12,) that are added.
+        Variances (12,) that are added, one for all entries of Q.
     """
 
     step: FloatArray
@@ -56,8 +57,8 @@ class Prediction(NamedTuple):
 class Epoch(NamedTuple):
     """One epoch: ranges (..., M, N), anchors, tags, weights and links (None: all).
 
-    Ranges that are not `checked` are finite and positive only after `check_ranges`: where the
-    weights are fixed, nobody has read them before the engine.
+    Ranges of all links have yet to pass `check_ranges`: the engine looks at them where it
+    reads them anyway.
     """
 
     ranges: FloatArray
@@ -65,17 +66,12 @@ class Epoch(NamedTuple):
     tags: FloatArray
     weights: FloatArray
     links: BoolArray | None
-    checked: bool = True
 
     def statistic(self) -> Statistic:
         """The statistic of `squared_range`, of checked ranges."""
-        self.check()
-        return statistic(*self[:5])
-
-    def check(self) -> None:
-        """Look at the ranges, if nobody has."""
-        if not self.checked:
-            check_ranges(self.ranges, self.links)
+        if self.links is None:
+            check_ranges(self.ranges)
+        return statistic(*self)
 
 
 class Batched:
@@ -96,9 +92,11 @@ class Batched:
         batch = np.broadcast_shapes(mean.shape[:-1], step.shape[:-2])
         if math.prod(batch) < FEW_TRIALS:
             return plain_predict(mean, P, motion)
-        if frame is None:
-            return batched_predict(mean, P, motion, batch)
-        return predict_trials_last(mean, P if common is None else common, motion, batch)
+        old = _as_batch(P, 2, batch) if common is None else common
+        blocks = None if frame is None else split(frame, old)
+        if frame is None or blocks is None:
+            return predict_trials_last(mean, old, motion, batch)
+        return four_filters_predict(frame, mean, blocks, motion, batch)
 
     @staticmethod
     def update(
@@ -111,18 +109,22 @@ class Batched:
             mean.shape[:-1], epoch.ranges.shape[:-2], epoch.anchors.shape[:-2],
             epoch.weights.shape[:-2], () if epoch.links is None else epoch.links.shape[:-2],
         )  # fmt: skip
-        if math.prod(batch) >= FEW_TRIALS and epoch.links is None:
+        if math.prod(batch) < FEW_TRIALS:
+            return plain_update(mean, P, epoch.statistic())
+        if epoch.links is None:
             common = shared(P)
             if common is not None and epoch.anchors.ndim == 2 and epoch.weights.ndim == 2:
                 mean, common = shared_update(mean, common, *epoch[:4])
                 return mean, spread_out(common, mean.shape[:-1])
-            if frame is not None and epoch.weights.shape[-1] == 1:
-                posterior = four_filters_update(frame, mean, P, epoch, batch)
+            if epoch.weights.shape[-1] == 1 and epoch.tags.ndim == 2:
+                posterior = None
+                if frame is not None:
+                    posterior = four_filters_update(frame, mean, P, epoch, batch)
+                if posterior is None:
+                    posterior = update_trials_last(mean, P, epoch, batch)
                 if posterior is not None:
                     return posterior
-        if math.prod(batch) >= FEW_TRIALS:
-            return batched_update(mean, P, epoch, batch)
-        return plain_update(mean, P, epoch.statistic())
+        return batched_update(mean, P, epoch, batch)
 
 
 def plain_predict(
@@ -158,59 +160,82 @@ def correct(
     return mean + (posterior @ innovation)[..., 0]
 
 
+def four_filters_predict(
+    frame: Frame,
+    mean: FloatArray,
+    blocks: FloatArray,
+    motion: Prediction,
+    batch: tuple[int, ...],
+) -> tuple[FloatArray, FloatArray]:
+    """`plain_predict` of many trials by `four_filters`."""
+    x, blocks = filter_predict(
+        split_mean(frame, _as_batch(mean, 1, batch)),
+        blocks,
+        np.ascontiguousarray(_trials_last(motion.step, 2, batch)),
+        _trials_last(motion.shift, 1, batch),
+        motion.noise.reshape(4, 3).T[..., None],
+    )
+    return join_mean(frame, x, batch), join(frame, blocks, batch)
+
+
+def four_filters_update(
+    frame: Frame, mean: FloatArray, P: FloatArray, epoch: Epoch, batch: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray] | None:
+    """Mean and covariance by `four_filters`, None where the state has not that structure."""
+    common = shared(P)
+    blocks = split(frame, _as_batch(P, 2, batch) if common is None else common)
+    if blocks is None:
+        return None
+    G, B = epoch_moments(epoch, frame.tags, batch)
+    posterior = filter_update(frame, split_mean(frame, _as_batch(mean, 1, batch)), blocks, G, B)
+    if posterior is None:
+        return None
+    return join_mean(frame, posterior[0], batch), join(frame, posterior[1], batch)
+
+
 def predict_trials_last(
     mean: FloatArray, P: FloatArray, motion: Prediction, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """`plain_predict` of many trials by `four_filters.predict`."""
+    """`plain_predict` of many trials by `dense_filter`."""
     step, shift, noise = motion
-    mean, P = filter_predict(
+    mean, P = dense_predict(
         _trials_last(mean, 1, batch),
         _trials_last(P, 2, batch),
         np.ascontiguousarray(_trials_last(step, 2, batch)),
         _trials_last(shift, 1, batch),
         noise,
     )
-    mean, P = mean.reshape(12, *batch), P.reshape(12, 12, *batch)
-    return np.moveaxis(mean, 0, -1), np.moveaxis(P, (0, 1), (-2, -1))
+    return _trials_first(mean, P, batch)
 
 
-def batched_predict(
-    mean: FloatArray, P: FloatArray, motion: Prediction, batch: tuple[int, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """`plain_predict` of many trials, a block of them at a time."""
-    means, covariances = np.empty((*batch, 12)), np.empty((*batch, 12, 12))
-    flat = [_flat(mean, 1, batch), _flat(P, 2, batch), _flat(motion.step, 2, batch)]
-    shift = _flat(motion.shift, 1, batch)
-    new_mean, new_P = means.reshape(-1, 12), covariances.reshape(-1, 12, 12)
-    for part in _blocks(len(shift)):
-        x, old, step = (array[part] for array in flat)
-        here = Prediction(step, shift[part], motion.noise)
-        new_mean[part], new_P[part] = plain_predict(x, old, here)
-    return means, covariances
+def update_trials_last(
+    mean: FloatArray, P: FloatArray, epoch: Epoch, batch: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray] | None:
+    """`plain_update` of common weights by `dense_filter`, None where it finds P singular."""
+    tags = centred_frame(epoch.tags)
+    G, B = epoch_moments(epoch, tags.frame.tags, batch)
+    posterior = dense_update(
+        tags,
+        _trials_last(_as_batch(mean, 1, batch), 1, batch),
+        _trials_last(_as_batch(P, 2, batch), 2, batch),
+        G,
+        B,
+    )
+    return None if posterior is None else _trials_first(*posterior, batch)
 
 
 def batched_update(
     mean: FloatArray, P: FloatArray, epoch: Epoch, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """`plain_update` of many trials, a block of them at a time."""
-    if epoch.links is not None or epoch.weights.shape[-1] != 1 or epoch.tags.ndim != 2:
-        told = information(epoch.statistic())
-    else:
-        tags = extended(epoch.tags)
-        told = None
-        G, B = epoch_moments(epoch, tags, batch)
+    told = information(epoch.statistic())
+    matrices, vectors = _flat(told[0], 2, batch), _flat(told[1], 1, batch)
     means, covariances = np.empty((*batch, 12)), np.empty((*batch, 12, 12))
     new_mean, new_P = means.reshape(-1, 12), covariances.reshape(-1, 12, 12)
     mean, P = _flat(mean, 1, batch), _flat(P, 2, batch)
-    if told is not None:
-        matrices, vectors = _flat(told[0], 2, batch), _flat(told[1], 1, batch)
     for part in _blocks(len(mean)):
-        if told is None:
-            matrix, vector = information_of_moments(G[..., part], B[..., part], tags)
-        else:
-            matrix, vector = matrices[part], vectors[part]
-        new_P[part] = posterior = posterior_covariance(P[part], matrix)
-        new_mean[part] = correct(mean[part], posterior, matrix, vector)
+        new_P[part] = posterior = posterior_covariance(P[part], matrices[part])
+        new_mean[part] = correct(mean[part], posterior, matrices[part], vectors[part])
     return means, covariances
 
 
@@ -243,31 +268,17 @@ def epoch_moments(
     epoch: Epoch, tags: FloatArray, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray]:
     """`moments` of a batch, trials last: G (3, 3, B) and B (3, 4, B) for extended tags (N, 4)."""
-    epoch.check()
     anchors, weights = (
         array[None] if array.ndim == 2 else _flat(array, 2, batch)
         for array in (epoch.anchors, epoch.weights)
     )
-    return moments(_flat(epoch.ranges, 2, batch), anchors, tags, weights)
-
-
-def four_filters_update(
-    frame: Frame, mean: FloatArray, P: FloatArray, epoch: Epoch, batch: tuple[int, ...]
-) -> tuple[FloatArray, FloatArray] | None:
-    """Mean and covariance by `four_filters`, None where the state has not that structure."""
-    common = shared(P)
-    blocks = split(frame, _as_batch(P, 2, batch) if common is None else common)
-    if blocks is None:
-        return None
-    G, B = epoch_moments(epoch, frame.tags, batch)
-    posterior = filter_update(frame, split_mean(frame, _as_batch(mean, 1, batch)), blocks, G, B)
-    if posterior is None:
-        return None
-    return join_mean(frame, posterior[0], batch), join(frame, posterior[1], batch)
+    return moments(_flat(epoch.ranges, 2, batch), anchors, tags, weights, unchecked=epoch.ranges)
 
 
 def _as_batch(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:
-    return np.broadcast_to(array, (*batch, *array.shape[array.ndim - core :]))
+    shape = (*batch, *array.shape[array.ndim - core :])
+    # Only the array itself is known for what it was made of.
+    return array if array.shape == shape else np.broadcast_to(array, shape)
 
 
 def _flat(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatArray:
@@ -283,6 +294,14 @@ def _trials_last(array: FloatArray, core: int, batch: tuple[int, ...]) -> FloatA
     axes = tuple(range(len(batch)))
     view = np.moveaxis(view, axes, tuple(a + core for a in axes))
     return view.reshape(*view.shape[:core], -1)
+
+
+def _trials_first(
+    mean: FloatArray, P: FloatArray, batch: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Mean (..., 12) and covariance (..., 12, 12) of (12, B) and (12, 12, B), not copied."""
+    mean, P = mean.reshape(12, *batch), P.reshape(12, 12, *batch)
+    return np.moveaxis(mean, 0, -1), np.moveaxis(P, (0, 1), (-2, -1))
 
 
 def _blocks(n_trials: int) -> Iterator[slice]:

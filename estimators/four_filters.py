@@ -6,7 +6,8 @@ With V the principal axes of the tag layout, ``C^T C = V diag(lambda) V^T``, and
 
 Inside, the trials are the last axis: the four blocks of the covariance are (3, 3, 4, B), the
 state is (3, 4, B). The covariances that come out are the usual (..., 12, 12), laid out in
-memory with the trials last, so that the next step reads them as they are.
+memory with the trials last. They are read-only, and their memory's owner remembers the blocks,
+so that the next step need not look for them.
 """
 
 from __future__ import annotations
@@ -47,6 +48,11 @@ def principal_frame(tags: FloatArray) -> Frame | None:
     """Frame of tags (N, 3), None where they are not centred."""
     if tags.ndim != 2 or (np.abs(tags.sum(axis=0)) > 1e-12 * np.abs(tags).max(initial=0.0)).any():
         return None
+    return frame_of_centred(tags)
+
+
+def frame_of_centred(tags: FloatArray) -> Frame:
+    """Frame of tags (N, 3) about their centroid."""
     gram = tags.T @ tags
     values, axes = np.diagonal(gram), np.eye(3)
     aligned = bool(np.abs(gram - np.diag(values)).max() <= 1e-14 * values.max())
@@ -61,8 +67,36 @@ def principal_frame(tags: FloatArray) -> Frame | None:
 # --- between the state's arrays and the four filters -----------------------------------------
 
 
+class _Owner(np.ndarray):
+    """The memory of a covariance (12, 12, ...) that was joined, and what it was joined from."""
+
+    frame: Frame | None
+    blocks: FloatArray | None
+
+    def __array_finalize__(self, source: object) -> None:
+        # A part of the memory is not what the blocks say.
+        self.frame = self.blocks = None
+
+
+def remembered(frame: Frame, covariance: FloatArray) -> FloatArray | None:
+    """Blocks (3, 3, 4, B) that `join` made this whole covariance of; None of any other array."""
+    owner = covariance.base
+    # Of a slice or a copy the base is another array.
+    if (
+        isinstance(owner, _Owner)
+        and owner.frame is frame
+        and covariance.shape == owner.shape
+        and covariance.strides == owner.strides
+    ):
+        return owner.blocks
+    return None
+
+
 def split(frame: Frame, covariance: FloatArray) -> FloatArray | None:
     """Blocks (3, 3, 4, B) of a covariance (..., 12, 12), None where it is not block-diagonal."""
+    blocks = remembered(frame, covariance)
+    if blocks is not None:
+        return blocks
     last = np.moveaxis(covariance, (-2, -1), (0, 1)).reshape(12, 12, -1)
     cross = [last[:9, 9:]]
     if frame.aligned:
@@ -86,7 +120,7 @@ def split(frame: Frame, covariance: FloatArray) -> FloatArray | None:
 
 
 def join(frame: Frame, blocks: FloatArray, batch: tuple[int, ...]) -> FloatArray:
-    """Covariance (..., 12, 12) of blocks (3, 3, 4, B), its memory with the trials last."""
+    """Covariance (..., 12, 12) of blocks (3, 3, 4, B), read-only, trials last in memory."""
     n_trials = blocks.shape[-1]
     last = np.zeros((12, 12, n_trials))
     if frame.aligned:
@@ -96,7 +130,12 @@ def join(frame: Frame, blocks: FloatArray, batch: tuple[int, ...]) -> FloatArray
         rotation = (_mix(frame) @ turned).reshape(3, 3, 3, 3, n_trials)
         last.reshape(4, 3, 4, 3, n_trials)[:3, :, :3] = rotation.swapaxes(1, 2)
         last[9:, 9:] = blocks[:, :, 3]
-    return np.moveaxis(last.reshape(12, 12, *batch), (0, 1), (-2, -1))
+    last.flags.writeable = False
+    # An owner of an owner: the base of a view is the first array behind it of another type.
+    moved = np.moveaxis(last.view(_Owner).reshape(12, 12, *batch), (0, 1), (-2, -1))
+    owner = moved.view(_Owner)
+    owner.frame, owner.blocks = frame, blocks
+    return owner.view(np.ndarray)
 
 
 def _diagonal_blocks(last: FloatArray) -> FloatArray:
@@ -156,46 +195,30 @@ def _allowed(covariance: FloatArray) -> FloatArray:
 
 
 def predict(
-    mean: FloatArray, P: FloatArray, step: FloatArray, shift: FloatArray, noise: FloatArray
+    x: FloatArray, blocks: FloatArray, step: FloatArray, shift: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance after ``x <- F x + [0; shift]``, ``P <- F P F^T + Q``, trials last.
-
-    No frame is needed: a 3 x 3 block across that is zero stays zero, and costs no more than
-    a look.
+    """State (3, 4, B) and blocks (3, 3, 4, B) after a step of time.
 
     Parameters
     ----------
-    mean, P
-        (12, B) and (12, 12, B), or B = 1 where common.
+    x, blocks
+        The state, and the blocks or (3, 3, 4, 1) where common.
     step, shift
-        Rotation R (3, 3, B) of ``F = blkdiag(R, R, R, I)``, and (3, B).
+        Rotation R (3, 3, B or 1) of the three columns, and shift (3, B or 1) of the translation.
     noise
-        Diagonal (12,) of Q.
+        Variances (3, 4, 1) that are added, one for all entries of the rotation.
     """
-    n_trials = max(mean.shape[-1], P.shape[-1], step.shape[-1])
-    new = np.zeros((4, 3, 4, 3, n_trials))
-    old = P.reshape(4, 3, 4, 3, -1)
-    for k in range(4):
-        for m in range(k, 4):
-            block = old[k, :, m]
-            if k != m and _is_zero(block):
-                continue
-            if k < 3:
-                block = np.einsum("ijb,jkb->ikb", step, block)
-            if m < 3:
-                block = np.einsum("ijb,kjb->ikb", block, step)
-            new[k, :, m] = block
-            if k != m:
-                new[m, :, k] = block.swapaxes(0, 1)
-    diagonal = _diagonal_blocks(new)
+    moved = np.empty((3, 4, max(x.shape[-1], step.shape[-1])))
+    np.einsum("ijb,jkb->ikb", step, x[:, :3], out=moved[:, :3])
+    np.add(x[:, 3], shift, out=moved[:, 3])
+    new = np.empty((3, 3, 4, moved.shape[-1] if step.shape[-1] > 1 else blocks.shape[-1]))
+    half = np.einsum("ijb,jlkb->ilkb", step, blocks[:, :, :3])
+    np.einsum("ijkb,ljb->ilkb", half, step, out=new[:, :, :3])
+    new[:, :, 3] = blocks[:, :, 3]
     for i in range(3):
-        diagonal[i, i] += noise.reshape(4, 3)[:, i, None]
-        diagonal[i, :i] = diagonal[:i, i]
-    x = mean.reshape(4, 3, -1)
-    moved = np.empty((4, 3, n_trials))
-    np.einsum("ijb,kjb->kib", step, x[:3], out=moved[:3])
-    np.add(x[3], shift, out=moved[3])
-    return moved.reshape(12, -1), new.reshape(12, 12, -1)
+        new[i, i] += noise[i]
+        new[i, :i] = new[:i, i]
+    return moved, new
 
 
 def update(
@@ -213,8 +236,12 @@ def update(
     new = inverse(precision + frame.share * G[:, :, None])
     if new is None:
         return None
-    innovation = B - frame.share * np.einsum("ijb,jkb->ikb", G, x)
-    return x + np.einsum("ijkb,jkb->ikb", new, innovation), new
+    innovation = np.einsum("ijb,jkb->ikb", G, x)
+    innovation *= frame.share
+    np.subtract(B, innovation, out=innovation)
+    moved = np.einsum("ijkb,jkb->ikb", new, innovation)
+    moved += x
+    return moved, new
 
 
 def inverse(blocks: FloatArray) -> FloatArray | None:

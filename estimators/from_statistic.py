@@ -112,7 +112,8 @@ def _four_filters(
     frame: Frame, mean: FloatArray, P: FloatArray, epoch: StatisticEpoch, batch: tuple[int, ...]
 ) -> tuple[FloatArray, FloatArray] | None:
     """The update by `four_filters`, None where the state has not that structure."""
-    P = P if P.ndim == 2 else np.broadcast_to(P, (*batch, 12, 12))
+    if P.ndim > 2 and P.shape[:-2] != batch:
+        P = np.broadcast_to(P, (*batch, 12, 12))
     blocks = four_filters.split(frame, P)
     if blocks is None:
         return None

@@ -39,6 +39,7 @@ from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
     check_covariance,
     check_epoch,
+    check_ranges,
     check_variance,
 )
 from rbl_gym.estimators.least_squares import unvec, vec
@@ -173,11 +174,17 @@ class KalmanFamily:
             cannot determine the 12 states and the state is too vague to stand in (the
             message names the rank).
         """
-        fixed = self.weights is not None
-        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=not fixed)
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=False)
         self._check_determined(state, anchors)
         if self.weights is None:
-            weights = 1 / check_variance(self.noise.squared_range_variance(ranges, mask), mask)
+            with np.errstate(invalid="ignore"):
+                variance = self.noise.squared_range_variance(ranges, mask)
+            try:
+                weights = 1 / check_variance(variance, mask)
+            except ValueError:
+                # A range that is no range may be what stands behind a variance that is none.
+                check_ranges(ranges, mask)
+                raise
         else:
             weights = np.asarray(self.weights, dtype=np.float64)
             weights = weights[..., None] if weights.ndim == 1 else weights
@@ -186,9 +193,7 @@ class KalmanFamily:
                 len(self.tags),
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
-        epoch = Epoch(
-            ranges, anchors, self.tags, weights, mask, checked=not fixed or mask is not None
-        )
+        epoch = Epoch(ranges, anchors, self.tags, weights, mask)
         mean, covariance = ENGINES[self.engine].update(
             state.mean, state.covariance, epoch, self._frame
         )
@@ -269,8 +274,14 @@ class KalmanFamily:
         largest = _largest_of_three(variance[..., 9:])
         # The first and last anchor bound the extent from below, and mostly settle it.
         apart = _largest_of_three(np.abs(anchors[..., 0, :] - anchors[..., -1, :]))
-        if not (vague_rotation | (largest > apart**2)).any():
+        doubted = vague_rotation | (largest > apart**2)
+        if not doubted.any():
             return
+        if anchors.ndim > 2:
+            anchors, largest, vague_rotation = (
+                np.broadcast_to(array, (*doubted.shape, *array.shape[array.ndim - core :]))[doubted]
+                for array, core in ((anchors, 2), (largest, 0), (vague_rotation, 0))
+            )
         vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
         if not vague.any():
             return

@@ -7,6 +7,9 @@ A covariance is known to be shared by its memory: no leading axes, or leading st
 
 from __future__ import annotations
 
+import functools
+from typing import NamedTuple
+
 import numpy as np
 
 from rbl_gym.bounds import symmetric
@@ -17,6 +20,9 @@ from rbl_gym.estimators.squared_range import (
     squares_times,
     statistic,
 )
+
+# From here on it pays to sum over the tags before the anchors.
+_MANY_TAGS = 12
 
 
 def shared(covariance: FloatArray) -> FloatArray | None:
@@ -46,18 +52,48 @@ def update(
     anchors, tags, weights
         (M, 3), (N, 3), (M, 1) or (M, N): the same for all trials.
     """
-    # The information vector is linear in the squared ranges; this is its constant part.
-    matrix, constant = information(statistic(np.zeros(ranges.shape[-2:]), anchors, tags, weights))
-    P = symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
+    model = _model(len(anchors), len(tags), anchors.tobytes(), tags.tobytes(), weights.tobytes())
+    P = symmetric(np.linalg.solve(np.eye(12) + P @ model.matrix, P))
+    *of_tags, slope = model.slopes
+    rows = ranges.reshape(-1, anchors.shape[0] * tags.shape[0])
+    told = squares_times(rows, [*of_tags, slope @ P], unchecked=ranges)
+    kept = mean @ (np.eye(12) - model.matrix @ P)
+    kept += model.constant @ P
+    told = told.reshape(*ranges.shape[:-2], 12)
+    if kept.shape == told.shape:
+        return np.add(kept, told, out=kept), P
+    return kept + told, P
+
+
+class _Model(NamedTuple):
+    """What an epoch tells, by its geometry: the matrix, and the vector of the squared ranges.
+
+    The vector is the constant and the slopes' product with the squares, see `squares_times`.
+    """
+
+    matrix: FloatArray
+    constant: FloatArray
+    slopes: list[FloatArray]
+
+
+@functools.lru_cache(maxsize=16)
+def _model(n_anchors: int, n_tags: int, *memory: bytes) -> _Model:
+    """The model of the memory of anchors, tags and weights: the same for epochs on end."""
+    numbers = (np.frombuffer(part) for part in memory)
+    anchors, tags, weights = (
+        part.reshape(shape)
+        for part, shape in zip(numbers, ((-1, 3), (-1, 3), (n_anchors, -1)), strict=True)
+    )
+    stat = statistic(np.zeros((n_anchors, n_tags)), anchors, tags, weights)
     mass = weights.sum(axis=0)
     centre = (weights / np.where(mass > 0, mass, 1.0)).T @ anchors
-    spread = weights[..., None] * (anchors[:, None] - centre)
-    slope = -2 * (extended(tags)[:, :, None] * spread[:, :, None]).reshape(-1, 12)
-    batch = np.broadcast_shapes(mean.shape[:-1], ranges.shape[:-2])
-    moved = squares_times(ranges.reshape(-1, len(slope)), slope @ P, unchecked=ranges)
-    moved = moved.reshape(*ranges.shape[:-2], 12)
-    kept = mean @ (np.eye(12) - matrix @ P) + constant @ P
-    return np.broadcast_to(kept, (*batch, 12)) + moved, P
+    spread = -2 * weights[..., None] * (anchors[:, None] - centre)
+    of_tags = extended(tags)
+    if stat.is_common and n_tags >= _MANY_TAGS:
+        slopes = [of_tags, np.einsum("kl,mi->mkli", np.eye(4), spread[:, 0]).reshape(-1, 12)]
+    else:
+        slopes = [(of_tags[:, :, None] * spread[:, :, None]).reshape(-1, 12)]
+    return _Model(*information(stat), slopes)
 
 
 def spread_out(covariance: FloatArray, batch: tuple[int, ...]) -> FloatArray:

@@ -12,6 +12,7 @@ No matrix larger than 12 x 12 is ever made, whatever the number of anchors and t
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,6 @@ import numpy as np
 from rbl_gym.bounds import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.inputs import (
-    are_positive,
     check_ranges,
     matrix_rank,
     spanned_dimensions,
@@ -91,7 +91,11 @@ def statistic(
 
 
 def moments(
-    ranges: FloatArray, anchors: FloatArray, tags: FloatArray, weights: FloatArray
+    ranges: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    weights: FloatArray,
+    unchecked: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """G and ``B = sum_n b_n c_n^T`` of common weights, without the b of each tag; trials last.
 
@@ -101,6 +105,8 @@ def moments(
         (B, M, N), (B or 1, M, 3) and (B or 1, M, 1).
     tags
         Extended tags (N, 4), in any frame.
+    unchecked
+        As of `squares_times`.
 
     Returns
     -------
@@ -116,7 +122,7 @@ def moments(
         here = ranges[part]
         w = np.ascontiguousarray((weights[part] if len(weights) > 1 else weights)[..., 0].T)
         sums, spread, squared = np.split(columns[..., : len(here)], (4, 7))
-        product = squares_times(here.reshape(-1, n_tags), tags)
+        product = squares_times(here.reshape(-1, n_tags), [tags], unchecked)
         sums[:] = product.reshape(-1, n_anchors, 4).T
         spread[:] = (anchors[part] if len(anchors) > 1 else anchors).T
         total = w.sum(axis=0)
@@ -133,22 +139,30 @@ def moments(
 
 
 def squares_times(
-    ranges: FloatArray, matrix: FloatArray, unchecked: FloatArray | None = None
+    ranges: FloatArray, matrices: list[FloatArray], unchecked: FloatArray | None = None
 ) -> FloatArray:
     """``(r * r) @ matrix`` for ranges (K, n) and a matrix (n, p), a few rows at a time.
 
-    `unchecked` is the array that the ranges are rows of, if it has yet to pass `check_ranges`:
-    each part is looked at while it is in the cache.
+    Of two matrices (n / q, s) and (q s, p) the first is for each of q parts of a row, and the
+    second for what comes of them. `unchecked` is the array that the ranges are rows of, if it
+    has yet to pass `check_ranges`: each part is looked at while it is in the cache. A range
+    that is not finite shows in the product, which is smaller.
     """
-    product = np.empty((len(ranges), matrix.shape[1]))
+    *first, last = matrices
+    product = np.empty((len(ranges), last.shape[1]))
     size = max(1, _CHUNK // ranges.shape[1])
     squares = np.empty((min(size, len(ranges)), ranges.shape[1]))
-    for begin in range(0, len(ranges), size):
-        part = ranges[begin : begin + size]
-        if unchecked is not None and not are_positive(part):
+    with np.errstate(invalid="ignore"):
+        for begin in range(0, len(ranges), size):
+            part = ranges[begin : begin + size]
+            if unchecked is not None and not part.min() > 0:
+                check_ranges(unchecked)
+            here = np.multiply(part, part, out=squares[: len(part)])
+            for matrix in first:
+                here = here.reshape(-1, len(matrix)) @ matrix
+            np.matmul(here.reshape(len(part), -1), last, out=product[begin : begin + size])
+        if unchecked is not None and not math.isfinite(np.vdot(product, product)):
             check_ranges(unchecked)
-        here = np.multiply(part, part, out=squares[: len(part)])
-        np.matmul(here, matrix, out=product[begin : begin + size])
     return product
 
 

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from rbl_gym import bodies, estimators, motion, ranging, rotations
-from rbl_gym.estimators import engines, kalman, unitary
-from rbl_gym.estimators.four_filters import inverse, join, principal_frame, split
+from rbl_gym.estimators import dense_filter, engines, four_filters, kalman, unitary
+from rbl_gym.estimators.four_filters import inverse, join, principal_frame, remembered, split
 from rbl_gym.estimators.least_squares import procrustes, vec
 from rbl_gym.estimators.shared_covariance import shared
-from rbl_gym.estimators.squared_range import extended, moments, paper_matrices, statistic
+from rbl_gym.estimators.squared_range import (
+    extended,
+    information,
+    moments,
+    paper_matrices,
+    statistic,
+)
 from tests.helpers import simulate
 
 FAMILY = ["kf", "uc-kf", "et-kf", "kf-ortho"]
@@ -143,7 +149,7 @@ def test_a_state_with_cross_terms_takes_the_general_path(name, tags, where, monk
             covariance[:, np.arange(3), np.arange(3)] *= 1.5
         return state._replace(covariance=covariance)
 
-    calls = count_calls(monkeypatch, engines, "batched_update")
+    calls = count_calls(monkeypatch, engines, "dense_update")
     fast = track(name, TAGS[tags], (12,), edit=edit)
     structured = where == "anisotropic" and tags == "aligned"
     # Information wears the cross terms off; the fast path may come back.
@@ -157,23 +163,24 @@ def test_a_state_with_cross_terms_takes_the_general_path(name, tags, where, monk
 def test_the_intended_path_is_taken(name, tags, monkeypatch):
     four = count_calls(monkeypatch, engines, "filter_update")
     common = count_calls(monkeypatch, engines, "shared_update")
+    dense = count_calls(monkeypatch, engines, "dense_update")
     general = count_calls(monkeypatch, engines, "batched_update")
     columns = count_calls(monkeypatch, kalman, "column_fit")
 
     def taken(tags, batch, **case):
-        for calls in (four, common, general, columns):
+        for calls in (four, common, dense, general, columns):
             calls.clear()
         track(name, tags, batch, steps=3, **case)
-        return len(four), len(common), len(general), len(columns)
+        return len(four), len(common), len(dense), len(general), len(columns)
 
     newton = 3 * (name == "uc-kf")
-    assert taken(TAGS[tags], (12,)) == (3, 0, 0, newton)
-    assert taken(TAGS[tags], (12,), fixed=True) == (3, 0, 0, newton)
-    assert taken(TAGS[tags], (12,), fixed=True, common_twist=True) == (0, 3, 0, newton)
-    assert taken(TAGS["uncentred"], (12,)) == (0, 0, 3, 0)
-    assert taken(TAGS["uncentred"], (12,), fixed=True, common_twist=True) == (0, 3, 0, 0)
-    assert taken(TAGS[tags], ()) == (0, 0, 0, 0)
-    assert taken(TAGS[tags], (12,), lost=(0, 1, 2)) == (0, 0, 3, 0)
+    assert taken(TAGS[tags], (12,)) == (3, 0, 0, 0, newton)
+    assert taken(TAGS[tags], (12,), fixed=True) == (3, 0, 0, 0, newton)
+    assert taken(TAGS[tags], (12,), fixed=True, common_twist=True) == (0, 3, 0, 0, newton)
+    assert taken(TAGS["uncentred"], (12,)) == (0, 0, 3, 0, 0)
+    assert taken(TAGS["uncentred"], (12,), fixed=True, common_twist=True) == (0, 3, 0, 0, 0)
+    assert taken(TAGS[tags], ()) == (0, 0, 0, 0, 0)
+    assert taken(TAGS[tags], (12,), lost=(0, 1, 2)) == (0, 0, 0, 3, 0)
 
 
 def test_a_shared_covariance_stays_shared_and_one_reset_trial_ends_it():
@@ -234,6 +241,32 @@ def test_split_and_join_are_inverses_and_the_covariance_is_the_users(tags):
     spoilt = covariance.copy()
     spoilt[4, 1, 7] += 1e-6
     assert split(frame, spoilt) is None
+
+
+def test_only_the_whole_joined_covariance_is_remembered(monkeypatch):
+    frame = principal_frame(TAGS["turned"])
+    assert frame is not None
+    blocks = np.einsum("ij,kb->ijkb", np.eye(3), np.linspace(1, 2, 32).reshape(4, 8))
+    for batch in ((8,), (2, 4)):
+        covariance = join(frame, blocks, batch)
+        assert split(frame, covariance) is blocks
+        with pytest.raises(ValueError, match="read-only"):
+            covariance[0, 0, 0] = 1.0
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            covariance.flags.writeable = True
+        assert type(covariance) is np.ndarray
+        others = (
+            covariance[::-1], covariance[:4], covariance[..., :9, :9], covariance.copy(),
+            covariance.swapaxes(-1, -2), np.where(True, covariance, 0.0), covariance + 0.0,
+            covariance.base[::-1], pickle.loads(pickle.dumps(covariance)),
+            np.broadcast_to(covariance, (3, *covariance.shape)),
+        )  # fmt: skip
+        assert not any(remembered(frame, np.asarray(other)) is not None for other in others)
+        assert remembered(frame._replace(aligned=True), covariance) is None
+    calls = count_calls(monkeypatch, four_filters, "_within")
+    track("kf", TAGS["turned"], (12,))
+    # Of the prior alone.
+    assert len(calls) == 1
 
 
 def test_tags_off_their_centroid_have_no_frame():
@@ -307,6 +340,86 @@ def test_no_path_lets_a_bad_range_through(weights, centred, value, message, monk
     single = kalman.KalmanState(*(array[0] for array in state))
     with pytest.raises(ValueError, match="ranges must be"):
         filter.update(single, ranges[9], anchors)
+
+
+@pytest.mark.parametrize("tags", TAGS)
+@pytest.mark.parametrize("scale", [1.0, 1e4, 1e8])
+def test_the_dense_filter_keeps_the_digits_of_a_vague_prior(tags, scale):
+    rng = np.random.default_rng(8)
+    tags, anchors = TAGS[tags], shell(rng, (9, 7))
+    ranges, weights = rng.uniform(12, 18, (9, 7, len(tags))), np.ones((9, 7, 1))
+    root = rng.standard_normal((9, 12, 12))
+    prior = scale * (root @ root.swapaxes(-1, -2) + np.eye(12))
+    mean = rng.standard_normal((9, 12))
+    matrix, vector = information(statistic(ranges, anchors, tags, weights))
+    want = exact_posterior(prior, matrix)
+    centred = dense_filter.centred_frame(tags)
+    G, B = moments(ranges, anchors, centred.frame.tags, weights)
+    # The arguments stay what they are.
+    arguments = mean.T.copy(), prior.transpose(1, 2, 0).copy()
+    got = dense_filter.update(centred, *arguments, G, B)
+    assert got is not None
+    np.testing.assert_array_equal(arguments[0], mean.T)
+    np.testing.assert_array_equal(arguments[1], prior.transpose(1, 2, 0))
+    covariance = got[1].transpose(2, 0, 1)
+    np.testing.assert_array_equal(covariance, covariance.swapaxes(-1, -2))
+    np.testing.assert_allclose(covariance, want, rtol=1e-6, atol=1e-8 * np.abs(want).max())
+    np.testing.assert_allclose(
+        got[0].T,
+        engines.correct(mean, want, matrix, vector),
+        rtol=1e-6,
+        atol=1e-8 * np.sqrt(scale),
+    )
+
+
+def exact_posterior(P, matrix):
+    """``(I + P G)^-1 P`` by elimination in long doubles."""
+    result = []
+    for prior, told in zip(np.longdouble(P), np.longdouble(matrix), strict=True):
+        rows = np.concatenate([np.eye(12) + prior @ told, prior], axis=1)
+        for i in range(12):
+            best = i + np.argmax(np.abs(rows[i:, i]))
+            rows[[i, best]] = rows[[best, i]]
+            rows[i] /= rows[i, i]
+            others = np.arange(12) != i
+            rows[others] -= rows[others, i, None] * rows[i]
+        result.append(rows[:, 12:])
+    return np.array(result, dtype=np.float64)
+
+
+def test_the_dense_filter_leaves_a_singular_block_to_the_general_form(monkeypatch):
+    def edit(state):
+        covariance = state.covariance.copy()
+        covariance[2, 10] = covariance[2, :, 10] = 0
+        return state._replace(covariance=covariance)
+
+    still = motion.ProcessNoise(0.0, 0.0)
+    calls = count_calls(monkeypatch, engines, "batched_update")
+    fast = track("kf", TAGS["aligned"], (12,), edit=edit, process=still, steps=2)
+    assert calls
+    plain(monkeypatch)
+    assert_equal(fast, track("kf", TAGS["aligned"], (12,), edit=edit, process=still, steps=2))
+
+
+def test_the_model_kept_for_shared_epochs_is_that_of_the_anchors_now():
+    """Written to in place, the anchors are new ones; many tags and few take other products."""
+    rng = np.random.default_rng(9)
+    for n_tags in (4, 20):
+        tags = rng.uniform(-0.5, 0.5, (n_tags, 3))
+        weights = rng.uniform(1, 2, 7)
+        filter = estimators.make("kf", tags=tags, noise=NOISE, process=PROCESS, weights=weights)
+        state = filter.initial(np.eye(3), np.zeros((12, 3)), PRIOR)
+        anchors = np.empty((7, 3))
+        for _ in range(2):
+            anchors[:] = shell(rng, (7,))
+            ranges = rng.uniform(12, 18, (12, 7, n_tags))
+            got = filter.update(state, ranges, anchors)
+            assert shared(got.covariance) is not None
+            want = engines.plain_update(
+                state.mean, state.covariance, statistic(ranges, anchors, tags, weights[:, None])
+            )
+            np.testing.assert_allclose(got.mean, want[0], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(got.covariance, want[1], rtol=1e-9, atol=1e-12)
 
 
 def test_moments_in_parts_are_those_of_the_statistic(monkeypatch):
