@@ -20,6 +20,9 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.four_filters import Frame, frame_of_centred, inverse
 
+# Variance that the rotation may bring to the centroid, over that of the translation.
+_FAR = 1e6
+
 
 class CentredFrame(NamedTuple):
     """The principal axes of any tag layout (N, 3) about its centroid (3,)."""
@@ -69,12 +72,19 @@ def predict(
 def update(
     tags: CentredFrame, mean: FloatArray, P: FloatArray, G: FloatArray, B: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Mean (12, B) and covariance (12, 12, B) after an epoch; None where a block is singular.
+    """Mean (12, B) and covariance (12, 12, B) after an epoch.
 
-    The epoch is G (3, 3, B) and B (3, 4, B) of `squared_range.moments`, of the tags of the
-    frame, trials last.
+    None where a block is singular, or where the way to the centroid and back would cost digits:
+    a rotation that is vague beside the translation, tags far from their origin. The epoch is
+    G (3, 3, B) and B (3, 4, B) of `squared_range.moments`, of the tags of the frame, trials
+    last.
     """
     x = mean.reshape(4, 3, -1).copy()
+    if tags.centre.any():
+        variance = np.einsum("iib->ib", P)
+        reach = (tags.centre**2).sum() * variance[:9].max(axis=0)
+        if (reach > _FAR * variance[9:].min(axis=0)).any():
+            return None
     blocks = _Blocks(P.reshape(4, 3, 4, 3, -1).copy())
     _move(blocks, x, tags.centre)
     if not tags.frame.aligned:

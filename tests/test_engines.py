@@ -430,3 +430,22 @@ def test_moments_in_parts_are_those_of_the_statistic(monkeypatch):
     monkeypatch.setattr("rbl_gym.estimators.squared_range._COLUMNS", 7 * 4)
     for got, expected in zip(moments(ranges, anchors, extended(tags), weights), want, strict=True):
         np.testing.assert_allclose(np.moveaxis(got, -1, 0), expected, rtol=1e-7)
+
+
+def test_vague_rotation_of_tags_far_from_their_origin_keeps_its_digits():
+    """By way of the centroid some 1e-2 of the covariance would be lost."""
+    rng = np.random.default_rng(3)
+    tags = rng.uniform(-0.5, 0.5, (5, 3)) + [30.0, 0, 0]
+    anchors = 40 * rng.standard_normal((80, 6, 3))
+    ranges = ranging.simulate(anchors, tags, np.eye(3), np.zeros(3), NOISE, rng).ranges
+    kf = estimators.make("kf", tags=tags, noise=NOISE, process=motion.ProcessNoise(0.1, 0.1))
+    P = np.diag([1e8] * 9 + [1.0] * 3)
+    mean = np.tile(np.append(np.eye(3).ravel(), np.zeros(3)), (80, 1))
+    state = kf.update(kalman.KalmanState(mean, np.tile(P, (80, 1, 1))), ranges, anchors)
+    alone = [
+        kf.update(kalman.KalmanState(mean[k], P), ranges[k], anchors[k]).covariance
+        for k in range(5)
+    ]
+    scale = np.sqrt(np.diagonal(np.array(alone), axis1=1, axis2=2))
+    scale = scale[:, :, None] * scale[:, None]
+    np.testing.assert_allclose(state.covariance[:5] / scale, np.array(alone) / scale, atol=1e-3)
