@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 
 from rbl_gym import layout_search, layouts, placement
-from rbl_gym.app.policies import Policy
-from rbl_gym.app.rl_tasks import RlTask
+from rbl_gym.app.policies import Policy, check_fit
+from rbl_gym.app.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.wrappers import controllers
 
-# Seeds of held-out worlds lie beyond those that a training reaches.
-HELD_OUT_SEED = 1_000_000_000
 # Random layouts of each context; and generations of CMA-ES that refine a policy's proposal.
 _RANDOM_TRIES = 8
 REFINE_GENERATIONS = 12
@@ -71,7 +69,7 @@ def evaluate(
     Raises
     ------
     ValueError
-        On an unknown reference.
+        On an unknown reference, or a policy that does not fit the task.
     """
     known = references(task)
     names = [check_one_of("reference", name, known) for name in names]
@@ -115,6 +113,21 @@ def _figures(
     }
 
 
+def _check_policies(task: RlTask, policies: dict[str, Policy]) -> None:
+    """Before hours of references: a ValueError on a policy that cannot be played or told apart."""
+    envs = task.make(1)
+    for label, policy in policies.items():
+        if label in references(task):
+            raise ValueError(f"policy {label!r} has the name of a reference: rename its file")
+        check_fit(policy, label, envs)
+
+
+def _held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str, Any]]:
+    """An environment at the start of its held-out episodes, its observation and info."""
+    env = task.make(worlds, "Disabled")
+    return env, *env.reset(seed=HELD_OUT_SEED + SEED_STRIDE * seed)
+
+
 # --- tasks played step by step ----------------------------------------------------------------
 
 
@@ -126,6 +139,7 @@ def _loop_losses(
     seed: int,
     advance: Callable[[], None],
 ) -> dict[str, FloatArray]:
+    _check_policies(task, policies)
     losses = {}
     for name in names:
         rng = np.random.default_rng([seed, references(task).index(name)])
@@ -142,8 +156,7 @@ def _rollout(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> FloatArray:
     """Losses (worlds,) of one episode of each world."""
-    env = task.make(worlds, "Disabled")
-    observation, _ = env.reset(seed=HELD_OUT_SEED + seed)
+    env, observation, _ = _held_out(task, worlds, seed)
     total, steps = np.zeros(worlds), 0
     done = np.zeros(worlds, dtype=np.bool_)
     while not done.all():
@@ -167,19 +180,11 @@ def _placement_losses(
 ) -> dict[str, FloatArray]:
     problem, contexts, found = layouts_of(task, policies, names, worlds, seed, advance)
     if task.arguments.get("mode") != "mounts":
-        env = _problems(task, worlds, seed)
         for label in policies:
             rng = np.random.default_rng([seed, len(references(task))])
-            found[f"{label} + cma-es"] = _refined(task, env, found[label], rng)
+            found[f"{label} + cma-es"] = _refined(problem, contexts, found[label], rng)
             advance()
     return {name: _loss_of(problem, contexts, anchors) for name, anchors in found.items()}
-
-
-def _problems(task: RlTask, worlds: int, seed: int) -> Any:
-    """An environment at the start of its held-out problems."""
-    env = task.make(worlds, "Disabled")
-    env.reset(seed=HELD_OUT_SEED + seed)
-    return env
 
 
 def layouts_of(
@@ -194,7 +199,8 @@ def layouts_of(
 
     The random ones are (C, 8, M, 3).
     """
-    env = _problems(task, worlds, seed)
+    _check_policies(task, policies)
+    env, _, _ = _held_out(task, worlds, seed)
     found = {}
     for name in names:
         rng = np.random.default_rng([seed, references(task).index(name)])
@@ -224,8 +230,7 @@ def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generato
 
 
 def _policy_layout(task: RlTask, policy: Policy, worlds: int, seed: int) -> FloatArray:
-    env = task.make(worlds, "Disabled")
-    observation, info = env.reset(seed=HELD_OUT_SEED + seed)
+    env, observation, info = _held_out(task, worlds, seed)
     done = np.zeros(worlds, dtype=np.bool_)
     while not done.all():
         observation, _, done, _, info = env.step(policy(observation))
@@ -240,9 +245,11 @@ def _loss_of(problem: PlacementTask, contexts: Context, anchors: FloatArray) -> 
     return np.log(placement.score(problem, contexts, anchors))
 
 
-def _refined(task: RlTask, env: Any, anchors: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _refined(
+    problem: PlacementTask, contexts: Context, anchors: FloatArray, rng: np.random.Generator
+) -> FloatArray:
     """Layouts after a tenth of the generations that CMA-ES alone takes."""
     return layout_search.cma_es(
-        env.task, env.contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
+        problem, contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
         start=anchors,
     )  # fmt: skip

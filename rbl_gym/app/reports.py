@@ -133,6 +133,7 @@ def print_transfer(result: dict[str, Any]) -> None:
         for heading in ("score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"):
             table.add_column(heading, justify="right")
         for label, row in rows.items():
+            alike = row["correlation"]
             table.add_row(label, f"{row['score_m']:.4f}", f"{row['tag_rmse_m']:.4f}",
-                          f"{row['correlation']:.3f}")  # fmt: skip
+                          "-" if alike is None else f"{alike:.3f}")  # fmt: skip
         console.print(table)
