@@ -78,14 +78,19 @@ def evaluate(
     losses = play(task, policies, names, worlds, seed, advance)
     rng = np.random.default_rng([seed, len(known) + 1])
     resamples = rng.integers(worlds, size=(_RESAMPLES, worlds))
+    methods: dict[str, dict[str, Any]] = {
+        name: _figures(loss, losses["random"], losses[known[-1]], resamples)
+        for name, loss in losses.items()
+    }
+    for figures in methods.values():
+        # With a price in it, a loss is no longer the logarithm of metres.
+        priced = task.arguments.get("mode") == "priced"
+        figures["score_m"] = None if priced else math.exp(figures["loss"])
     return {
         "worlds": worlds,
         "seed": seed,
         "best_reference": known[-1],
-        "methods": {
-            name: _figures(loss, losses["random"], losses[known[-1]], resamples)
-            for name, loss in losses.items()
-        },
+        "methods": methods,
     }
 
 
@@ -99,14 +104,13 @@ def work_units(task: RlTask, names: list[str], n_policies: int) -> int:
 def _figures(
     loss: FloatArray, random: FloatArray, best: FloatArray, resamples: np.ndarray
 ) -> dict[str, float]:
-    """Mean loss, its score in metres, the normalised value with a paired bootstrap interval."""
+    """Mean loss, and the normalised value with a paired bootstrap interval."""
     means = [array[resamples].mean(axis=-1) for array in (random, loss, best)]
     normalised = (means[0] - means[1]) / (means[0] - means[2])
     low, high = np.quantile(normalised, [0.025, 0.975])
     return {
         "loss": float(loss.mean()),
         "loss_std_error": float(loss.std(ddof=1) / math.sqrt(len(loss))) if len(loss) > 1 else 0.0,
-        "score_m": float(np.exp(loss.mean())),
         "normalised": float((random.mean() - loss.mean()) / (random.mean() - best.mean())),
         "normalised_low": float(low),
         "normalised_high": float(high),

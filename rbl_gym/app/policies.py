@@ -76,7 +76,8 @@ def load(path: str | Path) -> Policy:
         If the file is no policy.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # numpy leaves a file open that is no archive.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             meta = json.loads(str(file[_META]))
             n_layers = sum(name.startswith("weight_") for name in file.files)
             weights = tuple(file[f"weight_{k}"].astype(float) for k in range(n_layers))

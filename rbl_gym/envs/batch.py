@@ -78,7 +78,9 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         raise NotImplementedError
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Step the worlds of the mask, at least one; rewards, whether terminated, of all worlds."""
+        """Step the worlds of the mask; rewards, and whether they terminated, of all worlds.
+
+        At least one moves."""
         raise NotImplementedError
 
     def _observe(self) -> Observation:
