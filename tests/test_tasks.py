@@ -434,6 +434,17 @@ def test_top_k_takes_the_highest_and_on_ties_the_lower_numbers(k):
             assert scores[world][chosen[world] == 1].min() > scores[world][chosen[world] == 0].max()
 
 
+def test_binary_choices_may_come_as_floats():
+    """As stable-baselines3 hands them on."""
+    results = []
+    for dtype in (np.int8, np.float32, np.bool_):
+        env = AnchorSelectionVectorEnv(2, "priced")
+        env.reset(seed=1)
+        results.append(env.step((np.arange(24).reshape(2, 12) % 3 == 0).astype(dtype)))
+    assert_same(results[1], results[0])
+    assert_same(results[2], results[0])
+
+
 def test_each_anchor_costs_its_price():
     rewards = {}
     for price in (0.0, 0.05, 0.3):
@@ -588,8 +599,10 @@ def test_bad_vector_arguments_are_named(kind, arguments, message):
         ("priced", np.full(12, 2), "actions must lie in"),
         ("priced", np.full(12, 256), "actions must lie in"),
         ("priced", np.full(12, -255), "actions must lie in"),
-        ("priced", np.ones(12), "actions must be integers"),
-        ("priced", np.ones(11, int), r"actions must be integers of shape \(1, 12\)"),
+        ("priced", np.full(12, 0.5), "actions must lie in"),
+        ("priced", np.full(12, 1e300), "actions must lie in"),
+        ("priced", np.full(12, math.nan), "actions must be finite"),
+        ("priced", np.ones(11, int), r"actions must be numbers of shape \(1, 12\)"),
     ],
 )
 def test_bad_actions_are_named_and_change_nothing(kind, action, message):

@@ -171,22 +171,23 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         space = self.single_action_space
         array = np.asarray(actions)
         shape = (self.num_envs, *(space.shape or ()))
-        is_box = isinstance(space, gym.spaces.Box)
-        if array.shape != shape or array.dtype.kind not in ("fiub" if is_box else "iub"):
-            kind = "numbers" if is_box else "integers"
+        # Learners hand on binary choices as floating-point zeros and ones.
+        whole = isinstance(space, gym.spaces.Discrete)
+        if array.shape != shape or array.dtype.kind not in ("iub" if whole else "fiub"):
+            kind = "integers" if whole else "numbers"
             raise ValueError(
                 f"actions must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
             )
-        if is_box:
-            array = array.astype(np.float64)
-            if not np.isfinite(array).all():
-                raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
-        else:
-            # A narrow type would wrap large numbers round into the space.
-            narrow = array.astype(self.action_space.dtype)
-            if (narrow != array).any() or not self.action_space.contains(narrow):
-                raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
-        return array
+        if not np.isfinite(array).all():
+            raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
+        if isinstance(space, gym.spaces.Box):
+            return array.astype(np.float64)
+        dtype = self.action_space.dtype
+        # Binary before the cast: a narrow type would wrap large numbers round into the space.
+        legal = self.action_space.contains(array.astype(dtype)) if whole else np.isin(array, (0, 1))
+        if not np.all(legal):
+            raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
+        return array.astype(dtype)
 
     def _reset_mask(self, options: dict[str, Any] | None) -> BoolArray:
         if options is None or "reset_mask" not in options:
