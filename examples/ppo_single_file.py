@@ -7,6 +7,7 @@ meets the references on held-out problems (which takes the extra placement).
 
 Measured, seed 0, 299,008 steps, 46 s of processor time on one core: normalised 1.000 (95 %: .996 to
 1.005) on 64 held-out problems, 0 being random layouts and 1 CMA-ES for each problem by itself.
+Seed 1: .997 (.983 to 1.016) on 12.
 """
 
 import argparse

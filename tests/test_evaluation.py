@@ -86,18 +86,15 @@ def test_a_layouts_loss_is_its_log_score(name):
 def test_a_placement_policy_is_played_as_in_the_scalar_environment_and_refining_helps():
     pytest.importorskip("cmaes", reason="needs the extra placement")
     task, policy = rl_task("auv_buoys"), random_policy(sizes=(22, 8, 3))
-    result = evaluate(task, {"mine": policy}, worlds=2)
+    result = evaluate(task, {"mine": policy}, worlds=1)
     assert list(result["methods"]) == ["random", "cma-es", "mine", "mine + cma-es"]
-    losses = []
-    for i in range(2):
-        env, over, reward = AnchorPlacementEnv(), False, 0.0
-        observation, _ = env.reset(seed=HELD_OUT_SEED + i)
-        while not over:
-            observation, reward, over, _, _ = env.step(policy(observation))
-        losses.append(-reward)
+    env, over, reward = AnchorPlacementEnv(), False, 0.0
+    observation, _ = env.reset(seed=HELD_OUT_SEED)
+    while not over:
+        observation, reward, over, _, _ = env.step(policy(observation))
     figures = result["methods"]
-    np.testing.assert_allclose(figures["mine"]["loss"], np.mean(losses), rtol=1e-6)
-    np.testing.assert_allclose(figures["mine"]["score_m"], np.exp(np.mean(losses)), rtol=1e-6)
+    np.testing.assert_allclose(figures["mine"]["loss"], -reward, rtol=1e-6)
+    np.testing.assert_allclose(figures["mine"]["score_m"], np.exp(-reward), rtol=1e-6)
     assert figures["cma-es"]["loss"] < figures["mine + cma-es"]["loss"] < figures["mine"]["loss"]
 
 
