@@ -441,11 +441,10 @@ def test_vague_rotation_of_tags_far_from_their_origin_keeps_its_digits():
     kf = estimators.make("kf", tags=tags, noise=NOISE, process=motion.ProcessNoise(0.1, 0.1))
     P = np.diag([1e8] * 9 + [1.0] * 3)
     mean = np.tile(np.append(np.eye(3).ravel(), np.zeros(3)), (80, 1))
-    state = kf.update(kalman.KalmanState(mean, np.tile(P, (80, 1, 1))), ranges, anchors)
-    alone = [
-        kf.update(kalman.KalmanState(mean[k], P), ranges[k], anchors[k]).covariance
-        for k in range(5)
-    ]
+    prior = kf.initial(np.eye(3), np.zeros(3), P)
+    wide = prior._replace(mean=mean, covariance=np.tile(P, (80, 1, 1)))
+    state = kf.update(wide, ranges, anchors)
+    alone = [kf.update(prior, ranges[k], anchors[k]).covariance for k in range(5)]
     scale = np.sqrt(np.diagonal(np.array(alone), axis1=1, axis2=2))
     scale = scale[:, :, None] * scale[:, None]
     np.testing.assert_allclose(state.covariance[:5] / scale, np.array(alone) / scale, atol=1e-3)

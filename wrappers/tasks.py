@@ -137,9 +137,20 @@ class FilterLoop(BatchEnv):
         prior = np.sqrt(np.diagonal(self.scene.prior_covariance))
         return np.log(np.maximum(std, 1e-12) / prior) + 1.0
 
+    def _velocity(self) -> FloatArray:
+        """Commanded velocities (B, 3) over the speed."""
+        speed = max(self.scene.speed_m_s, float(np.abs(self.scene.twist[3:]).max()), 1e-3)
+        return self.twist[:, 3:] / speed
+
     def _columns(self) -> FloatArray:
         """The first two columns (B, 6) of the estimated rotation."""
         return np.swapaxes(self.state.rotation, -1, -2)[:, :2].reshape(-1, 6)
+
+
+def _world(scene: Any, **defaults: Any) -> scenes.Scene:
+    """The scene; `defaults` stand where it says nothing of its own."""
+    changes = {"name": scene} if isinstance(scene, str) else scene
+    return scenes.get({**defaults, **changes} if isinstance(changes, Mapping) else changes)
 
 
 def _flat(parts: list[FloatArray]) -> np.ndarray:
@@ -163,11 +174,12 @@ class MobileAnchorsVectorEnv(FilterLoop):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
-        changes = {"name": scene} if isinstance(scene, str) else dict(scene)
-        world = scenes.get({**level, **changes})
+        world = _world(scene, **level)
         if world.anchor_speed_m_s <= 0:
             raise ValueError("scene must have anchors that move, got anchor_speed_m_s = 0")
-        self.sort_craft = bool(sort_craft)
+        if not isinstance(sort_craft, bool):
+            raise ValueError(f"sort_craft must be True or False, got {sort_craft!r}")
+        self.sort_craft = sort_craft
         size = 15 + 3 * world.n_anchors
         self.single_action_space = spaces.Box(-1.0, 1.0, (2 * world.n_anchors,), np.float32)
         self.single_observation_space = spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32)
@@ -206,8 +218,8 @@ class MobileAnchorsVectorEnv(FilterLoop):
         depth = self.state.translation[:, 2:]
         distance = np.sqrt((gap**2).sum(axis=-1) + depth**2)
         return _flat([
-            depth / 50, self.twist[:, 3:5] / self.scene.speed_m_s, self._log_std(),
-            self._columns(), gap.reshape(self.num_envs, -1) / 100, np.log(distance / 100),
+            depth / 50, self._velocity()[:, :2], self._log_std(), self._columns(),
+            gap.reshape(self.num_envs, -1) / 100, np.log(np.maximum(distance, 1e-6) / 100),
         ])  # fmt: skip
 
 
@@ -282,8 +294,7 @@ class AnchorSelectionVectorEnv(FilterLoop):
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        changes = {"name": scene} if isinstance(scene, str) else dict(scene)
-        world = scenes.get({"steps": 50, **changes})
+        world = _world(scene, steps=50)
         self.mode = check_one_of("mode", mode, SELECTIONS)
         if isinstance(k, bool) or not isinstance(k, int) or not 1 <= k <= world.n_anchors:
             raise ValueError(f"k must be an int from 1 to {world.n_anchors}, got {k!r}")
@@ -328,9 +339,10 @@ class AnchorSelectionVectorEnv(FilterLoop):
 
     def _observe(self) -> np.ndarray:
         low, high = self.scene.volume.bounds()
-        place = (self.state.translation - 0.5 * (low + high)) / (0.5 * (high - low))
-        velocity = self.twist[:, 3:] / max(self.scene.speed_m_s, 1e-9)
-        return _flat([place, velocity, self._log_std(), self._columns()])
+        # In a volume without height, deviations count by what the prior leaves open.
+        half = np.maximum(0.5 * (high - low), self.scene.initial_translation_m)
+        place = (self.state.translation - 0.5 * (low + high)) / half
+        return _flat([place, self._velocity(), self._log_std(), self._columns()])
 
     def _inform(self) -> dict[str, np.ndarray]:
         return {**super()._inform(), "chosen": self._chosen.astype(np.int8)}

@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 
 from rbl_gym import layout_search, layouts, placement
-from rbl_gym.app.policies import Policy
-from rbl_gym.app.rl_tasks import RlTask
+from rbl_gym.app.policies import Policy, check_fit
+from rbl_gym.app.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.wrappers import controllers
 
-# Seeds of held-out worlds lie beyond those that a training reaches.
-HELD_OUT_SEED = 1_000_000_000
 # The reference that is one layout for all contexts, and the contexts it is optimised over.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
 # Random layouts of each context; and generations of CMA-ES that refine a policy's proposal.
@@ -73,7 +71,7 @@ def evaluate(
     Raises
     ------
     ValueError
-        On an unknown reference.
+        On an unknown reference, or a policy that does not fit the task.
     """
     known = references(task)
     names = [check_one_of("reference", name, known) for name in names]
@@ -82,14 +80,19 @@ def evaluate(
     losses = play(task, policies, names, worlds, seed, advance)
     rng = np.random.default_rng([seed, len(known) + 1])
     resamples = rng.integers(worlds, size=(_RESAMPLES, worlds))
+    methods: dict[str, dict[str, Any]] = {
+        name: _figures(loss, losses["random"], losses[known[-1]], resamples)
+        for name, loss in losses.items()
+    }
+    for figures in methods.values():
+        # With a price in it, a loss is no longer the logarithm of metres.
+        priced = task.arguments.get("mode") == "priced"
+        figures["score_m"] = None if priced else math.exp(figures["loss"])
     return {
         "worlds": worlds,
         "seed": seed,
         "best_reference": known[-1],
-        "methods": {
-            name: _figures(loss, losses["random"], losses[known[-1]], resamples)
-            for name, loss in losses.items()
-        },
+        "methods": methods,
     }
 
 
@@ -103,18 +106,32 @@ def work_units(task: RlTask, names: list[str], n_policies: int) -> int:
 def _figures(
     loss: FloatArray, random: FloatArray, best: FloatArray, resamples: np.ndarray
 ) -> dict[str, float]:
-    """Mean loss, its score in metres, the normalised value with a paired bootstrap interval."""
+    """Mean loss, and the normalised value with a paired bootstrap interval."""
     means = [array[resamples].mean(axis=-1) for array in (random, loss, best)]
     normalised = (means[0] - means[1]) / (means[0] - means[2])
     low, high = np.quantile(normalised, [0.025, 0.975])
     return {
         "loss": float(loss.mean()),
         "loss_std_error": float(loss.std(ddof=1) / math.sqrt(len(loss))) if len(loss) > 1 else 0.0,
-        "score_m": float(np.exp(loss.mean())),
         "normalised": float((random.mean() - loss.mean()) / (random.mean() - best.mean())),
         "normalised_low": float(low),
         "normalised_high": float(high),
     }
+
+
+def _check_policies(task: RlTask, policies: dict[str, Policy]) -> None:
+    """Before hours of references: a ValueError on a policy that cannot be played or told apart."""
+    envs = task.make(1)
+    for label, policy in policies.items():
+        if label in references(task):
+            raise ValueError(f"policy {label!r} has the name of a reference: rename its file")
+        check_fit(policy, label, envs)
+
+
+def _held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str, Any]]:
+    """An environment at the start of its held-out episodes, its observation and info."""
+    env = task.make(worlds, "Disabled")
+    return env, *env.reset(seed=HELD_OUT_SEED + SEED_STRIDE * seed)
 
 
 # --- tasks played step by step ----------------------------------------------------------------
@@ -128,6 +145,7 @@ def _loop_losses(
     seed: int,
     advance: Callable[[], None],
 ) -> dict[str, FloatArray]:
+    _check_policies(task, policies)
     losses = {}
     for name in names:
         rng = np.random.default_rng([seed, references(task).index(name)])
@@ -144,8 +162,7 @@ def _rollout(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> FloatArray:
     """Losses (worlds,) of one episode of each world."""
-    env = task.make(worlds, "Disabled")
-    observation, _ = env.reset(seed=HELD_OUT_SEED + seed)
+    env, observation, _ = _held_out(task, worlds, seed)
     total, steps = np.zeros(worlds), 0
     done = np.zeros(worlds, dtype=np.bool_)
     while not done.all():
@@ -169,19 +186,11 @@ def _placement_losses(
 ) -> dict[str, FloatArray]:
     problem, contexts, found = layouts_of(task, policies, names, worlds, seed, advance)
     if task.arguments.get("mode") != "mounts":
-        env = _problems(task, worlds, seed)
         for label in policies:
             rng = np.random.default_rng([seed, len(references(task))])
-            found[f"{label} + cma-es"] = _refined(task, env, found[label], rng)
+            found[f"{label} + cma-es"] = _refined(problem, contexts, found[label], rng)
             advance()
     return {name: _loss_of(problem, contexts, anchors) for name, anchors in found.items()}
-
-
-def _problems(task: RlTask, worlds: int, seed: int) -> Any:
-    """An environment at the start of its held-out problems."""
-    env = task.make(worlds, "Disabled")
-    env.reset(seed=HELD_OUT_SEED + seed)
-    return env
 
 
 def layouts_of(
@@ -196,7 +205,8 @@ def layouts_of(
 
     The random ones are (C, 8, M, 3).
     """
-    env = _problems(task, worlds, seed)
+    _check_policies(task, policies)
+    env, _, _ = _held_out(task, worlds, seed)
     found = {}
     for name in names:
         rng = np.random.default_rng([seed, references(task).index(name)])
@@ -230,8 +240,7 @@ def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generato
 
 
 def _policy_layout(task: RlTask, policy: Policy, worlds: int, seed: int) -> FloatArray:
-    env = task.make(worlds, "Disabled")
-    observation, info = env.reset(seed=HELD_OUT_SEED + seed)
+    env, observation, info = _held_out(task, worlds, seed)
     done = np.zeros(worlds, dtype=np.bool_)
     while not done.all():
         observation, _, done, _, info = env.step(policy(observation))
@@ -246,9 +255,11 @@ def _loss_of(problem: PlacementTask, contexts: Context, anchors: FloatArray) -> 
     return np.log(placement.score(problem, contexts, anchors))
 
 
-def _refined(task: RlTask, env: Any, anchors: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _refined(
+    problem: PlacementTask, contexts: Context, anchors: FloatArray, rng: np.random.Generator
+) -> FloatArray:
     """Layouts after a tenth of the generations that CMA-ES alone takes."""
     return layout_search.cma_es(
-        env.task, env.contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
+        problem, contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
         start=anchors,
     )  # fmt: skip

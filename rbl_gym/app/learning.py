@@ -94,10 +94,10 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from rbl_gym.app import evaluation, policies
+    from rbl_gym.app import evaluation
 
     task = rl_task(options.task)
-    loaded = {Path(path).stem: policies.load(path) for path in options.policy}
+    loaded = _policies(options.policy)
     names = options.references.split(",") if options.references else evaluation.references(task)
     units = evaluation.work_units(task, names, len(loaded))
     try:
@@ -115,15 +115,16 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _transfer(options: argparse.Namespace) -> int:
     require("cmaes", "placement")
-    from rbl_gym.app import evaluation, policies, transfer
+    from rbl_gym.app import evaluation, transfer
 
     task = rl_task(options.task)
-    loaded = {Path(path).stem: policies.load(path) for path in options.policy}
+    loaded = _policies(options.policy)
     filters = transfer.filters(task)
-    units = (len(filters) + 1) * (len(transfer.REFERENCES) + len(loaded))
+    references = transfer.references(task)
+    units = (len(filters) + 1) * (len(references) + len(loaded))
     with progress(options.task, units) as advance:
         problem, contexts, layouts = evaluation.layouts_of(
-            task, loaded, transfer.REFERENCES, options.worlds, options.seed, advance
+            task, loaded, references, options.worlds, options.seed, advance
         )
         result = transfer.run(
             problem, contexts, layouts, filters, options.repeats, options.seed, advance
@@ -134,3 +135,16 @@ def _transfer(options: argparse.Namespace) -> int:
 
         reports.print_transfer(result)
     return 0
+
+
+def _policies(paths: list[str]) -> dict[str, Any]:
+    """Policies by the names of their files, or a ValueError where two share one."""
+    from rbl_gym.app import policies
+
+    loaded: dict[str, Any] = {}
+    for path in paths:
+        label = Path(path).stem
+        if label in loaded:
+            raise ValueError(f"--policy: two files are named {label!r}: rename {path}")
+        loaded[label] = policies.load(path)
+    return loaded

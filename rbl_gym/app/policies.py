@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, check_array, check_finite, check_one_of
 
 _META = "meta"
+KINDS = ("box", "discrete", "multi-binary")
 
 
 class Policy(NamedTuple):
@@ -60,7 +64,7 @@ def save(policy: Policy, path: str | Path) -> None:
     arrays[_META] = np.array(json.dumps({"kind": policy.kind, **policy.meta}))
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+        np.savez_compressed(file, **arrays)
 
 
 def load(path: str | Path) -> Policy:
@@ -72,11 +76,51 @@ def load(path: str | Path) -> Policy:
         If the file is no policy.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # numpy leaves a file open that is no archive.
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
             meta = json.loads(str(file[_META]))
             n_layers = sum(name.startswith("weight_") for name in file.files)
             weights = tuple(file[f"weight_{k}"].astype(float) for k in range(n_layers))
             biases = tuple(file[f"bias_{k}"].astype(float) for k in range(n_layers))
-    except (KeyError, ValueError, EOFError) as error:
+        policy = Policy(weights, biases, check_one_of("kind", meta.pop("kind"), KINDS), meta)
+        _check_layers(policy)
+    except _BROKEN as error:
         raise ValueError(f"{path} is no policy of rbl-gym: {error}") from error
-    return Policy(weights, biases, str(meta.pop("kind", "box")), meta)
+    return policy
+
+
+# What reading a file raises that holds something else, or half of it.
+_BROKEN = (
+    AttributeError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+
+
+def _check_layers(policy: Policy) -> None:
+    """A ValueError unless the layers are finite and fit together."""
+    if not policy.weights:
+        raise ValueError("it has no layers")
+    n_in = policy.weights[0].shape[-1]
+    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        check_finite(f"bias_{k}", check_array(f"bias_{k}", bias, ("n_out",)))
+        check_finite(f"weight_{k}", check_array(f"weight_{k}", weight, (len(bias), n_in)))
+        n_in = len(bias)
+
+
+def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
+    """Of which kind a policy for an action space is, and how many outputs it has."""
+    if isinstance(space, gym.spaces.Discrete):
+        return "discrete", int(space.n)
+    kind = "multi-binary" if isinstance(space, gym.spaces.MultiBinary) else "box"
+    return kind, int(np.prod(space.shape or ()))
+
+
+def check_fit(policy: Policy, label: str, envs: Any) -> None:
+    """A ValueError unless a policy reads and acts as a vector environment asks for."""
+    n_in, n_out = envs.single_observation_space.shape[0], len(policy.biases[-1])
+    wanted = (n_in, *kind_and_outputs(envs.single_action_space))
+    got = (policy.weights[0].shape[1], policy.kind, n_out)
+    if got != wanted:
+        raise ValueError(
+            f"policy {label!r} does not fit: it was trained on {policy.meta.get('task')!r} and "
+            f"has (observation, kind, outputs) = {got}, the task's are {wanted}"
+        )

@@ -113,12 +113,13 @@ def print_evaluation(result: dict[str, Any]) -> None:
     console = _console()
     table = Table(title=f"{result['task']}, {result['worlds']} held-out worlds")
     table.add_column("policy")
-    for heading in ("mean log b", "score (m)", "normalised", "95 %"):
+    for heading in ("loss", "score b (m)", "normalised", "95 %"):
         table.add_column(heading, justify="right")
     for name, row in sorted(result["methods"].items(), key=lambda item: item[1]["loss"]):
         interval = f"{row['normalised_low']:.3f} to {row['normalised_high']:.3f}"
         table.add_row(name, f"{row['loss']:.4f} +- {row['loss_std_error']:.4f}",
-                      f"{row['score_m']:.4f}", f"{row['normalised']:.3f}", interval)  # fmt: skip
+                      "-" if row["score_m"] is None else f"{row['score_m']:.4f}",
+                      f"{row['normalised']:.3f}", interval)  # fmt: skip
     console.print(table)
     console.print(f"normalised: 0 is random, 1 is {result['best_reference']}")
 
@@ -133,6 +134,7 @@ def print_transfer(result: dict[str, Any]) -> None:
         for heading in ("score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"):
             table.add_column(heading, justify="right")
         for label, row in rows.items():
+            alike = row["correlation"]
             table.add_row(label, f"{row['score_m']:.4f}", f"{row['tag_rmse_m']:.4f}",
-                          f"{row['correlation']:.3f}")  # fmt: skip
+                          "-" if alike is None else f"{alike:.3f}")  # fmt: skip
         console.print(table)

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 
 from rbl_gym.checks import check_one_of
+
+# Worlds of a training, or of an evaluation, have the seeds from SEED_STRIDE times its own seed on;
+# those of evaluations begin beyond all of trainings.
+SEED_STRIDE = 1_000_000
+HELD_OUT_SEED = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,6 @@ class RlTask:
     learning_rate: float = 1e-3
     hidden: tuple[int, ...] = (128, 128)
     log_std_init: float = -0.5
-    options: dict[str, Any] = field(default_factory=dict)
 
     def make(self, num_envs: int, autoreset_mode: str = "SameStep") -> Any:
         """The vector environment."""

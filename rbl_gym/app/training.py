@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from rbl_gym.app.policies import Policy
-from rbl_gym.app.rl_tasks import RlTask
+from rbl_gym.app.policies import Policy, kind_and_outputs
+from rbl_gym.app.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 
 
 def train(
@@ -24,9 +25,14 @@ def train(
 
     Raises
     ------
+    ValueError
+        On a seed whose worlds are held out for evaluations.
     ModuleNotFoundError
         Without stable-baselines3 (extra ``rl``).
     """
+    if seed * SEED_STRIDE >= HELD_OUT_SEED:
+        raise ValueError(f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the "
+                         "worlds of larger ones are held out for evaluations")  # fmt: skip
     import torch
     from stable_baselines3 import PPO
 
@@ -35,21 +41,26 @@ def train(
     # Small networks: threads cost more than they give, and vary the sums.
     torch.set_num_threads(1)
     envs = _Timed(Sb3VecEnv(task.make(task.num_envs)))
-    envs.venv.seed(seed * 1_000_000)
-    model = PPO(
-        "MlpPolicy",
-        envs.venv,
-        n_steps=task.rollout,
-        batch_size=task.batch_size,
-        n_epochs=task.epochs,
-        gamma=task.gamma,
-        gae_lambda=task.gae_lambda,
-        learning_rate=lambda remaining: task.learning_rate * remaining,
-        policy_kwargs={"net_arch": list(task.hidden), **_log_std(task)},
-        seed=seed,
-        device="cpu",
-        **task.options,
-    )
+    continuous = kind_and_outputs(envs.venv.action_space)[0] == "box"
+    log_std = {"log_std_init": task.log_std_init} if continuous else {}
+    with warnings.catch_warnings():
+        # The last batch of a rollout may be a smaller one.
+        warnings.filterwarnings("ignore", "You have specified a mini-batch size")
+        model = PPO(
+            "MlpPolicy",
+            envs.venv,
+            n_steps=task.rollout,
+            batch_size=task.batch_size,
+            n_epochs=task.epochs,
+            gamma=task.gamma,
+            gae_lambda=task.gae_lambda,
+            learning_rate=lambda remaining: task.learning_rate * remaining,
+            policy_kwargs={"net_arch": list(task.hidden), **log_std},
+            seed=seed,
+            device="cpu",
+        )
+    # After PPO has seeded the worlds itself, with seeds that neighbouring trainings share.
+    envs.venv.seed(seed * SEED_STRIDE)
     curve = _Curve(advance)
     begin, cpu = time.perf_counter(), time.process_time()
     model.learn(steps, callback=curve.callback())
@@ -69,13 +80,6 @@ def train(
         "command": f"rbl-gym train {name} --steps {steps} --seed {seed}",
     }
     return _policy(model, meta), figures
-
-
-def _log_std(task: RlTask) -> dict[str, float]:
-    import gymnasium as gym
-
-    continuous = isinstance(task.make(1).single_action_space, gym.spaces.Box)
-    return {"log_std_init": task.log_std_init} if continuous else {}
 
 
 class _Timed:
@@ -127,15 +131,13 @@ class _Curve:
 
 def _policy(model: Any, meta: dict[str, Any]) -> Policy:
     """The policy network of a PPO model as arrays."""
-    import gymnasium as gym
     import torch
 
     layers = [m for m in model.policy.mlp_extractor.policy_net if isinstance(m, torch.nn.Linear)]
     layers.append(model.policy.action_net)
-    kinds = {gym.spaces.Discrete: "discrete", gym.spaces.MultiBinary: "multi-binary"}
     return Policy(
         tuple(layer.weight.detach().numpy().astype(float) for layer in layers),
         tuple(layer.bias.detach().numpy().astype(float) for layer in layers),
-        kinds.get(type(model.action_space), "box"),
+        kind_and_outputs(model.action_space)[0],
         meta,
     )

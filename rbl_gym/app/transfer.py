@@ -14,6 +14,7 @@ import numpy as np
 
 from rbl_gym import estimators, layout_search, metrics, motion, obstacles, placement, ranging
 from rbl_gym import rotations as rot
+from rbl_gym.app import evaluation
 from rbl_gym.app.rl_tasks import RlTask
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement import Context, PlacementTask
@@ -29,8 +30,10 @@ FILTERS = {
 }
 
 
-# Layouts besides those of policies.
-REFERENCES = ["random", "ring", "greedy-swaps", "cma-es"]
+def references(task: RlTask) -> list[str]:
+    """Layouts besides those of policies, as far as the task knows them."""
+    known = evaluation.references(task)
+    return [name for name in ("random", "ring", "greedy-swaps", "cma-es") if name in known]
 
 
 def filters(task: RlTask) -> list[str]:
@@ -62,7 +65,7 @@ def run(
     """Scores and filter errors of layouts (C, M, 3) or (C, L, M, 3) of contexts (C,).
 
     Every layout meets the same bodies. Returns, for each filter and label, the mean logarithms of
-    score and error, and over the layouts labelled ``random`` their correlation.
+    score and error, and their correlation over the layouts (None of fewer than three).
     """
     bodies = _bodies(task, contexts, repeats, np.random.default_rng([seed, 2]))
     scores = {
@@ -87,13 +90,15 @@ def run(
             rows[label] = {
                 "score_m": float(np.exp(np.log(score).mean())),
                 "tag_rmse_m": float(np.exp(np.log(errors).mean())),
-                "correlation": float(
-                    np.corrcoef(np.log(score).ravel(), np.log(errors).ravel())[0, 1]
-                ),
+                "correlation": _correlation(np.log(score).ravel(), np.log(errors).ravel()),
             }
             advance()
         result["filters"][name] = rows
     return result
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> float | None:
+    return float(np.corrcoef(first, second)[0, 1]) if len(first) > 2 else None
 
 
 def _bodies(

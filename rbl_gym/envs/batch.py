@@ -51,8 +51,12 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(f"num_envs must be a positive int, got {num_envs!r}")
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, got {render_mode!r}")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}")
+        if max_episode_steps is not None and (
+            isinstance(max_episode_steps, bool)
+            or not isinstance(max_episode_steps, int)
+            or max_episode_steps < 1
+        ):
+            raise ValueError(f"max_episode_steps must be a positive int, got {max_episode_steps!r}")
         modes = [mode.value for mode in AutoresetMode]
         if not isinstance(autoreset_mode, AutoresetMode):
             autoreset_mode = AutoresetMode(check_one_of("autoreset_mode", autoreset_mode, modes))
@@ -62,7 +66,7 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         self.metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._mode = autoreset_mode
+        self.autoreset_mode = autoreset_mode
         self._generators: list[np.random.Generator] = []
         self._done = np.zeros(num_envs, dtype=np.bool_)
         self._epochs = np.zeros(num_envs, dtype=np.int64)
@@ -74,7 +78,9 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         raise NotImplementedError
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Step the worlds of the mask; rewards and whether they terminated, of all worlds."""
+        """Step the worlds of the mask; rewards, and whether they terminated, of all worlds.
+
+        At least one moves."""
         raise NotImplementedError
 
     def _observe(self) -> Observation:
@@ -115,19 +121,21 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             raise gym.error.ResetNeeded("call reset() before step()")
         checked = self._checked(actions)
         ended = self._done.copy()
-        if ended.any() and self._mode is AutoresetMode.DISABLED:
+        if ended.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
                 "episodes are over: reset (some of many: options['reset_mask'])"
             )
         moving = ~ended
         self._epochs[moving] += 1
-        reward, terminated = self._advance(checked, moving)
-        reward, terminated = np.where(moving, reward, 0.0), terminated & moving
+        reward, terminated = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=np.bool_)
+        if moving.any():
+            advanced, over = self._advance(checked, moving)
+            reward, terminated = np.where(moving, advanced, 0.0), over & moving
         truncated = moving & ~terminated & (self._epochs >= self.steps_limit)
         self._done = terminated | truncated
         if ended.any():
             self._begin(ended)
-        if self._mode is not AutoresetMode.SAME_STEP or not self._done.any():
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP or not self._done.any():
             return self._observe(), reward, terminated, truncated, self._masked_info()
         last = self._done.copy()
         final = {
@@ -163,19 +171,23 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         space = self.single_action_space
         array = np.asarray(actions)
         shape = (self.num_envs, *(space.shape or ()))
-        is_box = isinstance(space, gym.spaces.Box)
-        if array.shape != shape or array.dtype.kind not in ("fiub" if is_box else "iub"):
-            kind = "numbers" if is_box else "integers"
+        # Learners hand on binary choices as floating-point zeros and ones.
+        whole = isinstance(space, gym.spaces.Discrete)
+        if array.shape != shape or array.dtype.kind not in ("iub" if whole else "fiub"):
+            kind = "integers" if whole else "numbers"
             raise ValueError(
                 f"actions must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
             )
-        if is_box:
-            array = array.astype(np.float64)
-            if not np.isfinite(array).all():
-                raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
-        elif not self.action_space.contains(array.astype(self.action_space.dtype)):
+        if not np.isfinite(array).all():
+            raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
+        if isinstance(space, gym.spaces.Box):
+            return array.astype(np.float64)
+        dtype = self.action_space.dtype
+        # Binary before the cast: a narrow type would wrap large numbers round into the space.
+        legal = self.action_space.contains(array.astype(dtype)) if whole else np.isin(array, (0, 1))
+        if not np.all(legal):
             raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
-        return array
+        return array.astype(dtype)
 
     def _reset_mask(self, options: dict[str, Any] | None) -> BoolArray:
         if options is None or "reset_mask" not in options:

@@ -101,8 +101,6 @@ class AnchorPlacementVectorEnv(BatchEnv):
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         rows = np.flatnonzero(moving)
-        if not len(rows):
-            return np.zeros(self.num_envs), moving
         step = self._epochs[rows] - 1
         complete = np.asarray(moving & (self._epochs == self._placements))
         if self.mode == "mounts":

@@ -1,0 +1,48 @@
+"""PPO of stable-baselines3 learns where four buoys go, and meets the usual layouts.
+
+    python examples/train_ppo.py          (pip install 'rbl-gym[rl,placement]')
+
+`rbl-gym train auv_buoys` does the same for longer; this is what it comes down to. Measured: 0.136 m
+after 100,000 steps, where random layouts have 0.42 m and CMA-ES for each problem 0.105 m; 42 s of
+processor time, searches included.
+"""
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+
+from rbl_gym import layout_search, layouts, placement
+from rbl_gym.wrappers.sb3 import Sb3VecEnv
+
+STEPS, HELD_OUT = 100_000, 64
+ID = "rbl_gym:RBL/AnchorPlacement-v0"
+
+torch.set_num_threads(1)  # small networks: more threads cost more than they give
+envs = Sb3VecEnv(gym.make_vec(ID, num_envs=64, scene="auv_buoys", autoreset_mode="SameStep"))
+model = PPO("MlpPolicy", envs, n_steps=16, batch_size=512, gamma=1.0, gae_lambda=1.0,
+            learning_rate=lambda remaining: 1e-3 * remaining,
+            policy_kwargs={"net_arch": [128, 128], "log_std_init": -0.5}, seed=0)  # fmt: skip
+model.learn(STEPS)
+
+# Problems that the training did not see: the policy places one anchor after the other.
+problems = gym.make_vec(ID, num_envs=HELD_OUT, scene="auv_buoys", autoreset_mode="Disabled")
+observation, info = problems.reset(seed=1_000_000_000)
+done = np.zeros(HELD_OUT, dtype=bool)
+while not done.all():
+    action, _ = model.predict(observation, deterministic=True)
+    observation, reward, done, _, info = problems.step(action)
+
+task, contexts = problems.unwrapped.task, problems.unwrapped.contexts
+rng = np.random.default_rng(0)
+found = {
+    "random": layouts.random(task, contexts, rng),
+    "corners": layouts.corners(task, contexts, rng),
+    "ring": layouts.ring(task, contexts, rng),
+    "greedy": layout_search.greedy(task, contexts, rng),
+    f"PPO, {STEPS:,} steps": info["anchors"],
+    "CMA-ES per problem": layout_search.cma_es(task, contexts, rng),
+}
+for name, anchors in found.items():
+    log_score = np.log(placement.score(task, contexts, anchors)).mean()
+    print(f"{name:20s} accuracy (geometric mean) {np.exp(log_score):.4f} m")

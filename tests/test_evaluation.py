@@ -1,0 +1,307 @@
+"""Evaluation and transfer: losses by hand, held-out worlds, intervals, the command line."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rbl_gym import estimators, layouts, placement, ranging
+from rbl_gym.app import evaluation, policies, training, transfer
+from rbl_gym.app.cli import main
+from rbl_gym.app.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
+from rbl_gym.envs.placement import AnchorPlacementEnv
+from rbl_gym.placement import Context
+from rbl_gym.wrappers.tasks import AnchorSelectionEnv, MobileAnchorsEnv
+from tests.test_policies import random_policy
+
+SHORT: dict[str, tuple[RlTask, type, tuple[int, ...], str]] = {
+    "mobile": (
+        RlTask("RBL/MobileAnchors-v0", {"scene": {"name": "auv_craft", "steps": 4}}, 1, 1),
+        MobileAnchorsEnv, (24, 8, 6), "box",
+    ),
+    "selection": (
+        RlTask("RBL/AnchorSelection-v0", {"k": 2, "scene": {"name": "hall", "steps": 5}}, 1, 1),
+        AnchorSelectionEnv, (18, 8, 12), "box",
+    ),
+    "priced": (
+        RlTask("RBL/AnchorSelection-v0",
+               {"mode": "priced", "price": 0.2, "scene": {"name": "hall", "steps": 5}}, 1, 1),
+        AnchorSelectionEnv, (18, 8, 12), "multi-binary",
+    ),
+}  # fmt: skip
+MOUNTS = RlTask(
+    "RBL/AnchorPlacement-v0",
+    {"scene": "uwb_room", "racks": 1, "mode": "mounts", "n_anchors": 3}, 1, 1,
+)  # fmt: skip
+
+
+def silent() -> None:
+    pass
+
+
+def evaluate(task, played=None, names=(), worlds=3, seed=0) -> dict[str, Any]:
+    return evaluation.evaluate(task, played or {}, list(names), worlds, seed, silent)
+
+
+# --- losses by hand ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", SHORT)
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_policys_loss_is_minus_its_mean_reward_in_scalar_worlds(kind, seed):
+    task, scalar, sizes, policy_kind = SHORT[kind]
+    policy = random_policy(policy_kind, sizes)
+    got = evaluation._loop_losses(task, {"mine": policy}, [], 3, seed, silent)["mine"]
+    for i in range(3):
+        env, rewards, over = scalar(**task.arguments), [], False
+        observation, _ = env.reset(seed=HELD_OUT_SEED + SEED_STRIDE * seed + i)
+        while not over:
+            observation, reward, _, over, _ = env.step(policy(observation))
+            rewards.append(reward)
+        np.testing.assert_allclose(got[i], -np.mean(rewards), rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["ring", "corners", "random"])
+def test_a_layouts_loss_is_its_log_score(name):
+    task = rl_task("auv_buoys")
+    problem, contexts, found = evaluation.layouts_of(task, {}, [name], 3, 1, silent)
+    losses = evaluation._loss_of(problem, contexts, found[name])
+    for i in range(3):
+        env = AnchorPlacementEnv()
+        _, info = env.reset(seed=HELD_OUT_SEED + SEED_STRIDE + i)
+        context = Context(info["region"][:3], info["region"][3:], np.zeros((0, 6)))
+        if name == "random":
+            assert found[name].shape == (3, 8, 4, 3)
+            tries = found[name][i]
+        else:
+            tries = layouts.LAYOUTS[name](problem, context, np.random.default_rng(0))[None]
+        scores = [math.log(placement.score(problem, context, one)) for one in tries]
+        np.testing.assert_allclose(losses[i], np.mean(scores), rtol=1e-9)
+
+
+def test_a_placement_policy_is_played_as_in_the_scalar_environment_and_refining_helps():
+    pytest.importorskip("cmaes", reason="needs the extra placement")
+    task, policy = rl_task("auv_buoys"), random_policy(sizes=(22, 8, 3))
+    result = evaluate(task, {"mine": policy}, worlds=1)
+    assert list(result["methods"]) == ["random", "cma-es", "mine", "mine + cma-es"]
+    env, over, reward = AnchorPlacementEnv(), False, 0.0
+    observation, _ = env.reset(seed=HELD_OUT_SEED)
+    while not over:
+        observation, reward, over, _, _ = env.step(policy(observation))
+    figures = result["methods"]
+    np.testing.assert_allclose(figures["mine"]["loss"], -reward, rtol=1e-6)
+    np.testing.assert_allclose(figures["mine"]["score_m"], np.exp(-reward), rtol=1e-6)
+    assert figures["cma-es"]["loss"] < figures["mine + cma-es"]["loss"] < figures["mine"]["loss"]
+
+
+def test_normalised_by_hand_and_intervals_hold_the_mean():
+    for task in (SHORT["selection"][0], SHORT["mobile"][0], MOUNTS):
+        result = evaluate(task, names=evaluation.references(task), worlds=6)
+        figures = result["methods"]
+        best = evaluation.references(task)[-1]
+        assert result["best_reference"] == best
+        assert list(figures) == evaluation.references(task)
+        low, high = figures["random"]["loss"], figures[best]["loss"]
+        for row in figures.values():
+            wanted = (low - row["loss"]) / (low - high)
+            np.testing.assert_allclose(row["normalised"], wanted, atol=1e-12)
+            assert row["normalised_low"] <= wanted + 1e-12
+            assert row["normalised_high"] >= wanted - 1e-12
+            assert row["score_m"] == pytest.approx(math.exp(row["loss"]))
+        for name, value in (("random", 0), (best, 1)):
+            assert figures[name]["normalised_low"] == pytest.approx(value)
+            assert figures[name]["normalised_high"] == pytest.approx(value)
+
+
+def test_intervals_are_paired():
+    """What is common to all methods in a world does not widen them."""
+    rng = np.random.default_rng(1)
+    common, own = 5 * rng.standard_normal(40), 0.01 * rng.standard_normal(40)
+    resamples = rng.integers(40, size=(500, 40))
+    row = evaluation._figures(common + 0.5 + own, common + 1, common, resamples)
+    assert row["normalised"] == pytest.approx(0.5, abs=0.01)
+    assert row["normalised_high"] - row["normalised_low"] < 0.02
+    assert row["loss_std_error"] == pytest.approx(5 / math.sqrt(40), rel=0.3)
+
+
+def test_a_priced_loss_is_no_score():
+    task, _, sizes, kind = SHORT["priced"]
+    result = evaluate(task, {"mine": random_policy(kind, sizes)})
+    assert {row["score_m"] for row in result["methods"].values()} == {None}
+
+
+# --- seeds ------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_figures_whatever_else_is_asked():
+    task, _, sizes, kind = SHORT["selection"]
+    alone = evaluate(task)
+    beside = evaluate(task, {"mine": random_policy(kind, sizes)}, ["nearest", "greedy-blind"])
+    assert evaluate(task) == alone
+    for name, row in alone["methods"].items():
+        assert beside["methods"][name] == row
+    assert evaluate(task, seed=1)["methods"]["random"] != alone["methods"]["random"]
+
+
+def test_evaluations_and_trainings_never_share_worlds():
+    assert max(task.num_envs for task in TASKS.values()) <= SEED_STRIDE
+    with pytest.raises(ValueError, match="seed must be below 1000, got 1000"):
+        training.train("auv_buoys", rl_task("auv_buoys"), 64, 1000, lambda _: None)
+    first, second = (
+        evaluation._held_out(rl_task("auv_buoys"), 50, seed)[0].contexts.centre for seed in (0, 1)
+    )
+    assert not {tuple(row) for row in first} & {tuple(row) for row in second}
+
+
+# --- what is refused before the work begins ---------------------------------------------------
+
+
+@pytest.mark.parametrize("task", [SHORT["mobile"][0], MOUNTS])
+def test_wrong_references_and_policies_are_named(task):
+    with pytest.raises(ValueError, match="reference must be one of 'random'.*got 'best'"):  # noqa: RUF043
+        evaluate(task, names=["best"])
+    with pytest.raises(ValueError, match="policy 'mine' does not fit: it was trained on"):
+        evaluate(task, {"mine": random_policy()})
+    with pytest.raises(ValueError, match="policy 'random' has the name of a reference"):
+        evaluate(task, {"random": random_policy()})
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_tasks_and_their_references(name):
+    task = rl_task(name)
+    envs = task.make(1)
+    known = evaluation.references(task)
+    assert known[0] == "random"
+    assert len(known) >= 3
+    assert envs.single_observation_space.shape[0] < 256
+    calls = []
+    evaluation.work_units(task, ["random"], 2)
+    if name == "selection":
+        small = SHORT["selection"][0]
+        played = {"mine": random_policy("box", SHORT["selection"][2])}
+        evaluation.evaluate(small, played, ["nearest"], 2, 0, lambda: calls.append(1))
+        assert len(calls) == evaluation.work_units(small, ["nearest"], 1)
+    with pytest.raises(ValueError, match="task must be one of 'auv_buoys'"):
+        rl_task("buoys")
+
+
+# --- transfer ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["uwb_room", "auv_buoys"])
+def test_filter_errors_by_hand(name):
+    task = rl_task(name)
+    problem, contexts, found = evaluation.layouts_of(task, {}, ["ring"], 2, 3, silent)
+    bodies = transfer._bodies(problem, contexts, 1, np.random.default_rng(4))
+    got = transfer._tag_rmse(problem, contexts, found["ring"], bodies, "iekf", 1)
+    scene, tags = problem.scene, np.array(problem.scene.tags)
+    for i in range(2):
+        total, anchors = 0.0, found["ring"][i]
+        for k in range(41):
+            Q, t = bodies.rotation[k, i], bodies.translation[k, i]
+            distance = np.linalg.norm(tags @ Q.T + t - anchors[:, None], axis=-1)
+            share = np.ones((len(anchors), 1))
+            for rack in contexts.racks[i]:
+                along = anchors[:, None] + np.linspace(0, 1, 4001)[:, None] * (t - anchors[:, None])
+                blocked = (np.abs(along - rack[:3]) <= rack[3:]).all(axis=-1).any(axis=-1)
+                share[blocked] = problem.blocked_information
+            std = np.sqrt(scene.noise.variance(distance) / share)
+            ranges = np.maximum(distance + std * bodies.normals[k, i], 1e-3)
+            law = ranging.LinkNoise(np.sqrt(scene.noise.variance(ranges) / share))
+            filt: Any = estimators.make(
+                "iekf", tags=tags, noise=law, process=scene.process, iterations=2
+            )
+            if k == 0:
+                state = filt.initial(bodies.prior[0][i], bodies.prior[1][i], scene.prior_covariance)
+            else:
+                state = filt.predict(state, bodies.twists[k - 1, i], scene.dt)
+            state = filt.update(state, ranges, anchors)
+            if k > 10:
+                gap = tags @ (state.rotation - Q).T + state.translation - t
+                total += (gap**2).sum() / len(tags) / 30
+        np.testing.assert_allclose(got[i], math.sqrt(total), rtol=1e-6)
+
+
+def test_filters_and_references_by_task():
+    assert transfer.filters(rl_task("auv_buoys")) == ["iekf", "iekf, reflections"]
+    assert transfer.filters(rl_task("mounts")) == ["iekf", "iekf, reflections", "uc-kf"]
+    assert transfer.references(rl_task("mounts")) == ["random", "greedy-swaps"]
+    assert transfer.references(rl_task("satellite"))[-1] == "cma-es"
+
+
+def test_correlations_need_three():
+    assert transfer._correlation(np.array([1.0]), np.array([2.0])) is None
+    values = np.array([1.0, 2.0, 4.0])
+    assert transfer._correlation(values, 3 - 2 * values) == pytest.approx(-1)
+
+
+# --- the command line -------------------------------------------------------------------------
+
+
+def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
+    path = tmp_path / "mine.npz"
+    policies.save(random_policy(sizes=(18, 4, 12), task="selection"), path)
+    arguments = ["evaluate", "selection", "--worlds", "2", "--references", "nearest",
+                 "--policy", str(path)]  # fmt: skip
+    assert main([*arguments, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert list(result["methods"]) == ["random", "nearest", "greedy-with-map", "mine"]
+    assert (result["task"], result["worlds"], result["seed"]) == ("selection", 2, 0)
+    figures = tmp_path / "new" / "figures.json"
+    assert main([*arguments, "--json", str(figures)]) == 0
+    table = capsys.readouterr().out
+    assert json.loads(figures.read_text()) == result
+    for word in (*result["methods"], "normalised: 0 is random, 1 is greedy-with-map"):
+        assert word in table
+    assert main(["evaluate", "selection-priced", "--worlds", "1", "--references", "random"]) == 0
+    assert "greedy-with-map" in capsys.readouterr().out
+
+
+def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(transfer, "_STEPS", 14)
+    path = tmp_path / "mine.npz"
+    sizes = (TASKS["mounts"].make(1).single_observation_space.shape[0], 4, 57)
+    policies.save(random_policy("discrete", sizes, task="mounts"), path)
+    arguments = ["transfer", "mounts", "--worlds", "1", "--repeats", "1", "--policy", str(path)]
+    assert main([*arguments, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert list(result["filters"]) == ["iekf", "iekf, reflections", "uc-kf"]
+    for rows in result["filters"].values():
+        assert list(rows) == ["random", "greedy-swaps", "mine"]
+        assert rows["mine"]["correlation"] is None
+        assert abs(rows["random"]["correlation"]) <= 1
+        assert rows["greedy-swaps"]["score_m"] < rows["random"]["score_m"]
+        assert all(row["tag_rmse_m"] > 0 for row in rows.values())
+    assert main(arguments) == 0
+    assert "correlation" in capsys.readouterr().out
+
+
+def test_errors_are_one_line(tmp_path, capsys):
+    good, same = tmp_path / "mine.npz", tmp_path / "other" / "mine.npz"
+    for path in (good, same):
+        policies.save(random_policy(sizes=(18, 4, 12), task="selection"), path)
+    broken = tmp_path / "broken.npz"
+    broken.write_text("nothing")
+    for arguments, message in (
+        (["evaluate", "selection", "--references", "best"], "reference must be one of 'random'"),
+        (["evaluate", "selection", "--references", "random,"], "got ''"),
+        (["evaluate", "auv_buoys", "--policy", str(good)], "policy 'mine' does not fit"),
+        (["evaluate", "selection", "--policy", str(good), "--policy", str(same)],
+         "two files are named 'mine'"),
+        (["evaluate", "selection", "--policy", str(broken)], "is no policy of rbl-gym"),
+        (["evaluate", "selection", "--policy", str(tmp_path / "no.npz")], "No such file"),
+        (["transfer", "mounts", "--policy", str(good)], "policy 'mine' does not fit"),
+        (["train", "selection", "--seed", "1000"], "seed must be below 1000"),
+    ):  # fmt: skip
+        assert main(arguments) == 2
+        error = capsys.readouterr().err.strip().splitlines()[-1]
+        assert error.startswith("rbl-gym ")
+        assert message in error
+    for arguments in (["evaluate", "selection", "--worlds", "0"], ["train", "chess"],
+                      ["transfer", "selection"]):  # fmt: skip
+        with pytest.raises(SystemExit):
+            main(arguments)

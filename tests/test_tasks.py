@@ -1,0 +1,619 @@
+"""Mobile anchors and anchor selection: Gymnasium's contract, beliefs and observations by hand."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import seeding
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from rbl_gym import bounds, estimators, motion, scenes, simulation
+from rbl_gym.ranging import LinkNoise
+from rbl_gym.wrappers import controllers
+from rbl_gym.wrappers.tasks import (
+    AnchorSelectionEnv,
+    AnchorSelectionVectorEnv,
+    MobileAnchorsEnv,
+    MobileAnchorsVectorEnv,
+)
+from tests.helpers import assert_same, share_by_hand
+
+MOBILE, SELECTION = "rbl_gym:RBL/MobileAnchors-v0", "rbl_gym:RBL/AnchorSelection-v0"
+LOSSY = {"drop_probability": 0.2}
+WORLDS: dict[str, tuple[str, dict[str, Any]]] = {
+    "easy": (MOBILE, {}),
+    "hard": (MOBILE, {"difficulty": "hard"}),
+    "by number": (MOBILE, {"sort_craft": False}),
+    "lossy": (MOBILE, {"scene": {"name": "auv_craft", "links": LOSSY, "n_anchors": 4}}),
+    "top 3": (SELECTION, {}),
+    "top 1": (SELECTION, {"k": 1}),
+    "priced": (SELECTION, {"mode": "priced"}),
+    "priced, lossy": (SELECTION, {"mode": "priced", "scene": {"name": "hall", "links": LOSSY}}),
+}
+every_world = pytest.mark.parametrize("kind", WORLDS)
+CLASSES = {
+    MOBILE: (MobileAnchorsEnv, MobileAnchorsVectorEnv),
+    SELECTION: (AnchorSelectionEnv, AnchorSelectionVectorEnv),
+}
+
+
+def short(kind: str, steps: int = 4) -> tuple[type, type, dict[str, Any]]:
+    """Scalar class, vector class, and arguments with short episodes."""
+    env_id, arguments = WORLDS[kind]
+    scene = arguments.get("scene", {"name": "auv_craft" if env_id == MOBILE else "hall"})
+    return *CLASSES[env_id], {**arguments, "scene": {**scene, "steps": steps}}
+
+
+def actions_of(env, rng):
+    if isinstance(env.single_action_space, gym.spaces.MultiBinary):
+        return rng.integers(0, 2, env.action_space.shape).astype(np.int8)
+    return rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+
+
+def close(got, want):
+    """Equal at the precision that a filter's rounding leaves."""
+    assert_same(got, want, rtol=2e-5, atol=2e-6)
+
+
+def run(env, n, seed=0):
+    """Everything that n steps of a vector environment return."""
+    rng = np.random.default_rng(seed)
+    return [env.reset(seed=seed), *(env.step(actions_of(env, rng)) for _ in range(n))]
+
+
+# --- Gymnasium --------------------------------------------------------------------------------
+
+
+@every_world
+def test_gymnasiums_checker_has_no_complaint(kind):
+    env_id, arguments = WORLDS[kind]
+    check_env(gym.make(env_id, **arguments).unwrapped)
+
+
+@every_world
+def test_specs_round_trip(kind):
+    env_id, arguments = WORLDS[kind]
+    env = gym.make(env_id, **arguments)
+    assert env.spec is not None
+    text = env.spec.to_json()
+    again = gym.make(EnvSpec.from_json(text))
+    assert again.spec is not None
+    assert json.loads(again.spec.to_json()) == json.loads(text)
+    action = env.action_space.sample()
+    assert_same(again.reset(seed=2), env.reset(seed=2))
+    assert_same(again.step(action), env.step(action))
+
+
+@every_world
+@pytest.mark.parametrize("twin_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
+                         ids=["copy", "pickle"])  # fmt: skip
+def test_twins_in_mid_episode_go_on_alike(kind, twin_of):
+    _, vector, arguments = short(kind)
+    env = vector(3, **arguments)
+    run(env, 2)
+    twin, rng = twin_of(env), np.random.default_rng(1)
+    for _ in range(8):
+        actions = actions_of(env, rng)
+        assert_same(twin.step(actions), env.step(actions))
+
+
+def spoil(value):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        value[...] = 1
+    elif not isinstance(value, str):
+        for item in value if isinstance(value, list | tuple | np.ndarray) else []:
+            spoil(item)
+
+
+@every_world
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared(kind, mode):
+    _, vector, arguments = short(kind)
+    last = []
+    for spoiled in (False, True):
+        env, rng = vector(3, **arguments, autoreset_mode=mode), np.random.default_rng(2)
+        results: list[Any] = [env.reset(seed=9)]
+        for _ in range(11):
+            if spoiled:
+                spoil(results[-1])
+            results.append(env.step(actions_of(env, rng)))
+        last.append(results[-1])
+    assert last[0][0].tobytes() == last[1][0].tobytes()
+    assert last[0][1].tobytes() == last[1][1].tobytes()
+    assert_same(last[0], last[1])
+
+
+@every_world
+def test_seeds_decide_and_episodes_differ(kind):
+    scalar, _, arguments = short(kind)
+    env = scalar(**arguments)
+    first, _ = env.reset(seed=4)
+    np.testing.assert_array_equal(env.reset(seed=4)[0], first)
+    assert (env.reset()[0] != first).any()
+    assert (env.reset(seed=5)[0] != first).any()
+
+
+@every_world
+def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
+    env_id, arguments = WORLDS[kind]
+    env = gym.make(env_id, **arguments).unwrapped
+    env.action_space.seed(1)
+    env.reset(seed=1)
+    for k in range(1, (100 if env_id == MOBILE else 50) + 1):
+        observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
+        assert env.observation_space.contains(observation)
+        assert math.isfinite(reward)
+        assert info["epoch"] == k
+        assert terminated is False
+        assert truncated is (k == (100 if env_id == MOBILE else 50))
+    with pytest.raises(ResetNeeded):
+        env.step(env.action_space.sample())
+
+
+# --- vector against scalar --------------------------------------------------------------------
+
+
+def vectors(kind, mode, n=3):
+    scalar, vector, arguments = short(kind)
+    peer = SyncVectorEnv([lambda: scalar(**arguments)] * n, autoreset_mode=mode)
+    return vector(n, **arguments, autoreset_mode=mode), peer
+
+
+@every_world
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_equals_scalar_environments(kind, mode):
+    native, peer = vectors(kind, mode)
+    rng = np.random.default_rng(1)
+    close(native.reset(seed=[5, 3, 8]), peer.reset(seed=[5, 3, 8]))
+    ends = 0
+    for _ in range(12):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got, want, strict=True):
+            close(a, b)
+        assert native.observation_space.contains(got[0])
+        ends += got[3].all()
+    assert ends >= 2
+
+
+@every_world
+def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(kind):
+    native, peer = vectors(kind, AutoresetMode.DISABLED)
+    rng = np.random.default_rng(3)
+    close(native.reset(seed=7), peer.reset(seed=7))
+    for step in range(1, 13):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got, want, strict=True):
+            close(a, b)
+        mask = got[3].copy()
+        if step == 2:
+            mask[1] = True  # in mid-episode: from here on the clocks differ
+        if mask.any():
+            got = native.reset(options={"reset_mask": mask.copy()})
+            want = peer.reset(options={"reset_mask": mask.copy()})
+            close(got[0], want[0])
+            close(got[1]["score_m"][mask], want[1]["score_m"][mask])
+
+
+@every_world
+def test_next_step_mixes_resets_and_steps(kind):
+    """Worlds whose clocks differ: one begins anew while the others go on."""
+    native, peer = vectors(kind, AutoresetMode.NEXT_STEP)
+    rng = np.random.default_rng(4)
+    native.reset(seed=1)
+    peer.reset(seed=1)
+    actions = actions_of(native, rng)
+    native.step(actions)
+    peer.step(actions)
+    native._begin(np.array([False, True, False]))
+    peer.envs[1].reset()
+    for step in range(12):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got[1:4], want[1:4], strict=True):
+            close(a, b)
+        close(got[0], want[0])
+        assert got[3].any() == (step % 5 in (2, 3))
+
+
+@every_world
+def test_a_shorter_limit_truncates(kind):
+    env_id, arguments = WORLDS[kind]
+    envs = gym.make_vec(env_id, num_envs=2, max_episode_steps=3, **arguments)
+    assert [step[3].all() for step in run(envs, 4)[1:]] == [False, False, True, False]
+
+
+# --- the belief by a separate filter ----------------------------------------------------------
+
+
+def score_by_hand(state, tags) -> float:
+    """b = sqrt(mean_n tr(J_n P J_n^T)), J_n = [-[Q c_n]x, I]."""
+    total = 0.0
+    for x, y, z in tags @ state.rotation.T:
+        J = np.hstack([-np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(3)])
+        total += np.trace(J @ state.covariance @ J.T)
+    return math.sqrt(total / len(tags))
+
+
+class Replay:
+    """One world by the scene's episode, plain distances, and a filter of its own."""
+
+    def __init__(self, scene, seed: int) -> None:
+        self.scene, self.tags = scene, np.array(scene.tags)
+        self.episode = simulation.draw_episode(scene, seeding.np_random(seed)[0])
+        self.anchors = np.array(self.episode.anchors)
+        self.state: Any = self.filter().initial(
+            self.episode.prior_rotation,
+            self.episode.prior_translation,
+            self.episode.prior_covariance,
+        )
+        self.shares: list[float] = []
+
+    def filter(self, noise=None) -> Any:
+        return estimators.make(
+            "iekf", tags=self.tags, noise=noise or self.scene.noise, process=self.scene.process,
+            iterations=2,
+        )  # fmt: skip
+
+    def predict(self, k: int) -> None:
+        self.state = self.filter().predict(self.state, self.episode.twists[k], self.scene.dt)
+
+    def update(self, k: int, chosen=None, told: bool = True) -> None:
+        place = self.episode.translation[k]
+        tags = self.tags @ self.episode.rotation[k].T + place
+        distance = np.linalg.norm(tags - self.anchors[:, None], axis=-1)
+        share = np.array([[share_by_hand(self.scene, a, place)] for a in self.anchors])
+        self.shares += list(share[chosen if chosen is not None else slice(None), 0])
+        std = np.sqrt(self.scene.noise.variance(distance) / share)
+        ranges = distance + std * self.episode.normals[k]
+        law = LinkNoise(np.sqrt(self.scene.noise.variance(ranges) / (share if told else 1.0)))
+        links = None
+        if chosen is not None:
+            links = np.zeros(ranges.shape, bool)
+            links[chosen] = True
+        noise = law if self.scene.obstacles else None
+        self.state = self.filter(noise).update(self.state, ranges, self.anchors, links)
+
+    def log_std(self):
+        prior = [self.scene.initial_rotation_rad] * 3 + [self.scene.initial_translation_m] * 3
+        return np.log(np.sqrt(np.diag(self.state.covariance)) / prior) + 1
+
+    def common(self):
+        """What both tasks observe: log standard deviations, two columns of the rotation."""
+        return [*self.log_std(), *self.state.rotation[:, 0], *self.state.rotation[:, 1]]
+
+
+@pytest.mark.parametrize("difficulty", ["easy", "hard"])
+@pytest.mark.parametrize("seed", [3, 11])
+def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
+    env = MobileAnchorsEnv(difficulty)
+    scene = env.unwrapped._batch.scene
+    m, speed = (3, 4.0) if difficulty == "easy" else (2, 2.0)
+    assert (scene.n_anchors, scene.anchor_speed_m_s, scene.dt, scene.steps) == (m, speed, 2, 100)
+    twin, rng = Replay(scene, seed), np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    np.testing.assert_allclose(twin.anchors[:, 2], 0)
+    twin.update(0)
+    for k in range(1, 31):
+        gap = twin.anchors - twin.state.translation
+        order = sorted(range(m), key=lambda i: math.atan2(gap[i, 1], gap[i, 0]))
+        wanted = [
+            twin.state.translation[2] / 50, *twin.episode.twists[k - 1][3:5] / 1.5, *twin.common(),
+            *gap[order][:, :2].ravel() / 100, *np.log(np.linalg.norm(gap[order], axis=1) / 100),
+        ]  # fmt: skip
+        np.testing.assert_allclose(observation, wanted, atol=2e-5)
+        np.testing.assert_allclose(info["score_m"], score_by_hand(twin.state, twin.tags), rtol=1e-6)
+        action = rng.uniform(-1.5, 1.5, 2 * m)
+        for j, i in enumerate(order):
+            step = action[2 * j : 2 * j + 2]
+            twin.anchors[i, :2] += 2.0 * speed * step / max(1.0, np.linalg.norm(step))
+        observation, reward, _, _, info = env.step(action)
+        np.testing.assert_allclose(env.unwrapped._batch.anchors[0], twin.anchors, atol=1e-9)
+        twin.predict(k)
+        twin.update(k)
+        np.testing.assert_allclose(
+            reward, -math.log(score_by_hand(twin.state, twin.tags)), rtol=1e-6
+        )
+        error = twin.state.translation - twin.episode.translation[k]
+        np.testing.assert_allclose(info["position_error_m"], np.linalg.norm(error), rtol=1e-6)
+        assert info["rotation_error_rad"] < 0.6
+
+
+@pytest.mark.parametrize("mode", ["top-k", "priced"])
+@pytest.mark.parametrize("seed", [1, 5])
+def test_selection_rewards_and_observations_by_a_separate_filter(mode, seed):
+    env = AnchorSelectionEnv(mode, price=0.07)
+    scene = env.unwrapped._batch.scene
+    assert scene.blocked_information == 0.02
+    twin, rng = Replay(scene, seed), np.random.default_rng(seed)
+    observation, info = env.reset(seed=seed)
+    assert not info["chosen"].any()
+    for k in range(1, 31):
+        wanted = [
+            *(twin.state.translation - [0, 0, 1.75]) / [17, 8, 1.25],
+            *twin.episode.twists[k - 1][3:] / 2, *twin.common(),
+        ]  # fmt: skip
+        np.testing.assert_allclose(observation, wanted, atol=2e-5)
+        if mode == "top-k":
+            action = rng.uniform(-1, 1, 12)
+            chosen = np.argsort(action)[-3:]
+        else:
+            action = (rng.random(12) < 0.3).astype(np.int8)
+            chosen = np.flatnonzero(action)
+        observation, reward, _, _, info = env.step(action)
+        np.testing.assert_array_equal(np.flatnonzero(info["chosen"]), np.sort(chosen))
+        twin.predict(k)
+        if len(chosen):
+            twin.update(k, chosen)
+        wanted_reward = -math.log(score_by_hand(twin.state, twin.tags))
+        wanted_reward -= 0.07 * len(chosen) * (mode == "priced")
+        np.testing.assert_allclose(reward, wanted_reward, rtol=1e-6)
+    assert set(twin.shares) == {0.02, 1.0}
+
+
+def test_a_blocked_link_carries_two_percent_and_the_filter_is_told():
+    env = AnchorSelectionEnv(k=1)
+    scene = env.unwrapped._batch.scene
+    for seed in range(20):
+        probe = Replay(scene, seed)
+        shares = [share_by_hand(scene, a, probe.episode.translation[1]) for a in probe.anchors]
+        if 0.02 in shares:
+            break
+    env.reset(seed=seed)
+    blocked = shares.index(0.02)
+    env.step(np.eye(12)[blocked])
+    got = env.unwrapped._batch.state.covariance[0]
+    beliefs = []
+    for told in (True, False):
+        twin = Replay(scene, seed)
+        twin.predict(1)
+        twin.update(1, [blocked], told)
+        beliefs.append(twin.state.covariance)
+    np.testing.assert_allclose(got, beliefs[0], rtol=1e-6, atol=1e-12)
+    assert np.trace(beliefs[0]) > 1.05 * np.trace(beliefs[1])
+    # In information: the gain of the link is a fiftieth of what it would be in sight.
+    before = Replay(scene, seed)
+    before.predict(1)
+    gain = [np.trace(np.linalg.inv(p) - np.linalg.inv(before.state.covariance)) for p in beliefs]
+    assert gain[0] / gain[1] == pytest.approx(0.02, rel=0.1)  # the linearisation points differ
+
+
+def test_without_anchors_the_belief_is_the_prediction():
+    env = AnchorSelectionVectorEnv(4, "priced")
+    env.reset(seed=2)
+    before = env.state
+    _, reward, _, _, info = env.step(np.zeros((4, 12), np.int8))
+    pose = motion.propagate(before.rotation, before.translation, env.twist, 0.2)
+    covariance = bounds.predict_covariance(before.covariance, env.twist, 0.2, env.scene.process)
+    np.testing.assert_allclose(env.state.rotation, pose[0], atol=1e-12)
+    np.testing.assert_allclose(env.state.translation, pose[1], atol=1e-12)
+    np.testing.assert_allclose(env.state.covariance, covariance, rtol=1e-9, atol=1e-12)
+    score = bounds.score(covariance, pose[0], np.array(env.scene.tags))
+    np.testing.assert_allclose(reward, -np.log(score))
+    assert not info["chosen"].any()
+    # Beside worlds that measure, too.
+    mixed = np.zeros((4, 12), np.int8)
+    mixed[[1, 3]] = 1
+    before = env.state
+    env.step(mixed)
+    alone = bounds.predict_covariance(before.covariance, env.twist, 0.2, env.scene.process)
+    np.testing.assert_allclose(env.state.covariance[[0, 2]], alone[[0, 2]], rtol=1e-9, atol=1e-12)
+    traces = np.trace(env.state.covariance - alone, axis1=1, axis2=2)
+    assert (traces[[1, 3]] < 0).all()
+
+
+# --- actions ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [1, 3, 12])
+def test_top_k_takes_the_highest_and_on_ties_the_lower_numbers(k):
+    env = AnchorSelectionVectorEnv(3, k=k)
+    env.reset(seed=1)
+    scores = np.random.default_rng(1).uniform(-1, 1, (3, 12))
+    scores[1] = 0.5
+    scores[2] *= 100
+    chosen = env.step(scores)[4]["chosen"]
+    assert (chosen.sum(axis=1) == k).all()
+    np.testing.assert_array_equal(chosen[1], np.arange(12) < k)
+    for world in (0, 2):
+        if k < 12:
+            assert scores[world][chosen[world] == 1].min() > scores[world][chosen[world] == 0].max()
+
+
+def test_binary_choices_may_come_as_floats():
+    """As stable-baselines3 hands them on."""
+    results = []
+    for dtype in (np.int8, np.float32, np.bool_):
+        env = AnchorSelectionVectorEnv(2, "priced")
+        env.reset(seed=1)
+        results.append(env.step((np.arange(24).reshape(2, 12) % 3 == 0).astype(dtype)))
+    assert_same(results[1], results[0])
+    assert_same(results[2], results[0])
+
+
+def test_each_anchor_costs_its_price():
+    rewards = {}
+    for price in (0.0, 0.05, 0.3):
+        env = AnchorSelectionVectorEnv(3, "priced", price=price)
+        env.reset(seed=1)
+        actions = np.zeros((3, 12), np.int8)
+        actions[1, :4], actions[2] = 1, 1
+        rewards[price] = env.step(actions)[1]
+    for price in (0.05, 0.3):
+        lost = price * np.array([0, 4, 12])
+        np.testing.assert_allclose(rewards[0.0] - rewards[price], lost, atol=1e-12)
+
+
+def test_craft_numbers_change_nothing_when_sorted():
+    turn = np.array([2, 0, 3, 1])
+    scene = {"name": "auv_craft", "n_anchors": 4}
+    for sort in (True, False):
+        env, peer = (MobileAnchorsVectorEnv(8, scene=scene, sort_craft=sort) for _ in range(2))
+        env.reset(seed=3)
+        peer.reset(seed=3)
+        peer.anchors = env.anchors[:, turn].copy()
+        peer._sort()
+        assert np.array_equal(env._observe(), peer._observe()) is sort
+        actions = np.random.default_rng(0).uniform(-1, 1, (8, 8))
+        env.step(actions)
+        peer.step(actions)
+        assert np.allclose(peer.anchors, env.anchors[:, turn], atol=1e-9) is sort
+
+
+def test_craft_move_at_their_limit_at_most_and_stay_on_the_water():
+    env = MobileAnchorsVectorEnv(16, "hard")
+    env.reset(seed=1)
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        before = env.anchors.copy()
+        actions = rng.uniform(-2, 2, (16, 4))
+        wanted = np.linalg.norm(actions.reshape(16, 2, 2), axis=-1).clip(max=1)
+        order = env.order.copy()
+        env.step(actions)
+        moved = np.linalg.norm(env.anchors - before, axis=-1)
+        np.testing.assert_allclose(
+            np.take_along_axis(moved, order, axis=1), 2.0 * 2.0 * wanted, rtol=1e-9
+        )
+        assert not env.anchors[..., 2].any()
+
+
+# --- consistency ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["easy", "hard", "selection"])
+def test_nees_is_six(kind):
+    """Means over worlds of a chi-square of 6 degrees; at epochs far apart about independent."""
+    if kind == "selection":
+        env: Any = AnchorSelectionVectorEnv(512, autoreset_mode="Disabled")
+        policy = controllers.greedy_blind
+    else:
+        env = MobileAnchorsVectorEnv(512, kind, autoreset_mode="Disabled")
+        policy = controllers.orbit
+    rng = np.random.default_rng(1)
+    env.reset(seed=1)
+    values = np.array([env.step(policy(env, rng))[4]["nees"] for _ in range(25)])
+    if kind == "hard":
+        # Two craft leave a direction so weak that the belief is curved there: the tail is long,
+        # with ever so many iterations. What is typical is still near a chi-square's 5.35.
+        assert 5.0 < np.median(values[5:]) < 6.2
+        return
+    means = values.mean(axis=1)
+    one = math.sqrt(12 / 512)
+    # Mean over epochs: of the errors' memory, a fifth of the epochs count as independent.
+    assert abs(np.mean(means[5:]) - 6) < 4 * one / math.sqrt(4), means
+    assert np.abs(means[5:] - 6).max() < 5 * one, means
+
+
+# --- scenes of one's own, bad arguments -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "scene"),
+    [
+        (MobileAnchorsVectorEnv, {"name": "auv_craft", "speed_m_s": 0.0}),
+        (MobileAnchorsVectorEnv, {"name": "auv_craft", "n_anchors": 1}),
+        (MobileAnchorsVectorEnv, "satellite"),
+        (AnchorSelectionVectorEnv, "camsap2013"),
+        (AnchorSelectionVectorEnv, "auv_buoys"),
+        (AnchorSelectionVectorEnv,
+         {"name": "hall", "volume": {"low": [-17, -8, 1], "high": [17, 8, 1]}}),
+        (AnchorSelectionVectorEnv, scenes.get("uwb_room")),
+    ],
+)  # fmt: skip
+def test_other_scenes_give_finite_observations(kind, scene):
+    env = kind(4, scene=scene, max_episode_steps=4)
+    for step in run(env, 9):
+        assert np.isfinite(step[0]).all()
+        assert env.observation_space.contains(step[0])
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        (0, {"difficulty": "x"}, "difficulty must be one of 'easy', 'hard', got 'x'"),
+        (0, {"difficulty": ["easy"]}, "difficulty must be one of"),
+        (0, {"scene": "mars"}, "scene must be one of"),
+        (0, {"scene": 3}, "scene must be a name or a dict"),
+        (0, {"scene": ["auv_craft"]}, "scene must be a name or a dict"),
+        (0, {"scene": {"steps": 3}}, "scene must be a name or a dict"),
+        (0, {"scene": {"name": "auv_craft", "anchor_speed_m_s": 0}}, "scene must have anchors"),
+        (0, {"scene": {"name": "auv_craft", "colour": 1}}, "scene has no field 'colour'"),
+        (0, {"sort_craft": "no"}, "sort_craft must be True or False, got 'no'"),
+        (0, {"render_mode": "human"}, "render_mode must be None"),
+        (1, {"mode": "all"}, "mode must be one of 'top-k', 'priced', got 'all'"),
+        (1, {"k": 0}, "k must be an int from 1 to 12, got 0"),
+        (1, {"k": 13}, "k must be an int from 1 to 12, got 13"),
+        (1, {"k": 2.0}, "k must be an int from 1 to 12, got 2.0"),
+        (1, {"k": True}, "k must be an int from 1 to 12, got True"),
+        (1, {"price": -0.1}, "price must be a finite number"),
+        (1, {"price": math.nan}, "price must be a finite number"),
+        (1, {"price": "cheap"}, "price must be a number, got 'cheap'"),
+        (1, {"scene": None}, "scene must be a name or a dict"),
+        (1, {"render_mode": "rgb_array"}, "render_mode must be None"),
+    ],
+)  # fmt: skip
+def test_bad_arguments_are_named(kind, arguments, message):
+    for cls in list(CLASSES.values())[kind]:
+        with pytest.raises(ValueError, match=message):
+            cls(**arguments)
+
+
+@pytest.mark.parametrize("kind", [MobileAnchorsVectorEnv, AnchorSelectionVectorEnv])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be a positive int, got 0"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be a positive int, got 0"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps must be a positive int, got 2.5"),
+        ({"max_episode_steps": "ten"}, "max_episode_steps must be a positive int, got 'ten'"),
+        ({"autoreset_mode": "Never"}, "autoreset_mode must be one of 'NextStep'"),
+    ],
+)
+def test_bad_vector_arguments_are_named(kind, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**{"num_envs": 2, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("kind", "action", "message"),
+    [
+        ("easy", np.zeros(4), r"actions must be numbers of shape \(1, 6\)"),
+        ("easy", [0, 0, math.nan, 0, 0, 0], "actions must be finite, got nan"),
+        ("easy", [math.inf, 0, 0, 0, 0, 0], "actions must be finite, got inf"),
+        ("top 3", "all", "actions must be numbers"),
+        ("top 3", np.full(12, math.nan), "actions must be finite"),
+        ("priced", np.full(12, 2), "actions must lie in"),
+        ("priced", np.full(12, 256), "actions must lie in"),
+        ("priced", np.full(12, -255), "actions must lie in"),
+        ("priced", np.full(12, 0.5), "actions must lie in"),
+        ("priced", np.full(12, 1e300), "actions must lie in"),
+        ("priced", np.full(12, math.nan), "actions must be finite"),
+        ("priced", np.ones(11, int), r"actions must be numbers of shape \(1, 12\)"),
+    ],
+)
+def test_bad_actions_are_named_and_change_nothing(kind, action, message):
+    scalar, _, arguments = short(kind)
+    env, peer = scalar(**arguments), scalar(**arguments)
+    with pytest.raises(ResetNeeded):
+        env.step(env.action_space.sample())
+    env.reset(seed=1)
+    peer.reset(seed=1)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    env.action_space.seed(1)
+    good = env.action_space.sample()
+    assert_same(env.step(good), peer.step(good))
