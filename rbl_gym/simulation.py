@@ -235,17 +235,22 @@ def whole(episode: Episode) -> Epoch:
 
 
 def measure(
-    scene: Scene, at: Epoch, anchors: FloatArray, positions: FloatArray | None = None
+    scene: Scene,
+    at: Epoch,
+    anchors: FloatArray,
+    positions: FloatArray | None = None,
+    quality: FloatArray | None = None,
 ) -> ranging.Measurement:
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
 
-    `positions`: those of the tags (..., N, 3), where they are known already.
+    `positions` of the tags (..., N, 3) and `quality` (`link_quality`): where known already.
     """
     if positions is None:
         positions = ranging.tag_positions(at.rotation, at.translation, scene.tags)
     normals = at.normals
     if scene.obstacles:
-        normals = normals / np.sqrt(link_quality(scene, at, anchors))[..., None]
+        quality = link_quality(scene, at, anchors) if quality is None else quality
+        normals = normals / np.sqrt(quality)[..., None]
     distances = ranging.distances(anchors, positions)
     measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
     clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
@@ -266,6 +271,17 @@ def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
 def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> FloatArray:
     """Share (..., M, N) of its information that each link has: none where it gave no range."""
     return links * link_quality(scene, at, anchors)[..., None] if scene.obstacles else links
+
+
+def perceived_noise(
+    scene: Scene, ranges: FloatArray, links: BoolArray, quality: FloatArray
+) -> ranging.LinkNoise:
+    """The noise of an epoch to a receiver that learns how good a link is with its range.
+
+    `quality` (..., M) is that of `link_quality`, `ranges` and `links` are (..., M, N).
+    """
+    variance = scene.noise.variance(np.where(links, ranges, 1.0), links)
+    return ranging.LinkNoise(np.sqrt(variance / quality[..., None]))
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:

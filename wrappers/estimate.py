@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from rbl_gym import bounds, estimators, metrics, scenes
+from rbl_gym import bounds, estimators, metrics, scenes, simulation
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 
@@ -23,8 +24,9 @@ _FLAT_LIMIT = 10.0
 class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Turns measurements into a pose belief, and the belief into the reward.
 
-    Wraps an environment whose observation has `ranges`, `links`, `anchors` and `twist` and
-    whose unwrapped form has a `scene` (`RBL/Tracking-v0`). The environment's own reward is
+    Wraps an environment whose observation has `ranges`, `links`, `anchors`, `twist` and, in
+    scenes with obstacles, `quality`, and whose unwrapped form has a `scene`
+    (`RBL/Tracking-v0`). The environment's own reward is
     switched off. For vector environments: `VectorEstimatePose`.
 
     Parameters
@@ -103,9 +105,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._observation(observation, belief), reward, terminated, truncated, info
 
     def _update(self, observation: dict[str, np.ndarray]) -> PoseBelief:
-        self._state = self._filter.update(
-            self._state, observation["ranges"], observation["anchors"], observation["links"]
-        )
+        self._state = update(self._filter, self._state, observation, self._scene)
         return self._filter.belief(self._state)
 
     def _judge(self, belief: PoseBelief, info: dict[str, Any]) -> None:
@@ -136,6 +136,33 @@ def make_filter(scene: scenes.Scene, name: str, options: Mapping[str, Any] | Non
         noise=scene.noise,
         process=scene.process,
         **(options or {}),
+    )
+
+
+def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What a filter reads of an observation."""
+    keys = "ranges", "links", "quality", "anchors", "twist"
+    return {key: observation[key] for key in keys if key in observation}
+
+
+def update(
+    filter: Filter, state: Any, observation: Mapping[str, np.ndarray], scene: scenes.Scene
+) -> Any:
+    """The filter's state after the measurements of an epoch, with their `quality` if it is told.
+
+    A filter learns of the quality by its noise law, if it is a dataclass with a field `noise`.
+    """
+    ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
+    if "quality" in observation and _has_noise(filter):
+        seen = links.astype(np.bool_, copy=False)
+        noise = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
+        filter = dataclasses.replace(filter, noise=noise)  # pyright: ignore[reportArgumentType]
+    return filter.update(state, ranges, anchors, links)
+
+
+def _has_noise(filter: Filter) -> bool:
+    return dataclasses.is_dataclass(filter) and any(
+        field.name == "noise" for field in dataclasses.fields(filter)
     )
 
 

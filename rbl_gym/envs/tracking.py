@@ -40,6 +40,7 @@ class TrackingEnv(gym.Env[Any, Any]):
     | `links` | (M, N) | int8 | 1 where a range was measured |
     | `anchors` | (M, 3) | float64 | places of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
+    | `quality` | (M,) | float64 | share of a link's information that an anchor's sight of the body leaves: 1 in sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
 
     ## Reward
     ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square
@@ -106,9 +107,14 @@ class TrackingEnv(gym.Env[Any, Any]):
         self._whole = at = simulation.whole(episode)
         self._positions = ranging.tag_positions(at.rotation, at.translation, self.scene.tags)
         self._measured: ranging.Measurement | None = None
+        self._quality: FloatArray | None = None
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
-            self._measured = simulation.measure(self.scene, at, episode.anchors, self._positions)
+            if self.scene.obstacles:
+                self._quality = simulation.link_quality(self.scene, at, episode.anchors)
+            self._measured = simulation.measure(
+                self.scene, at, episode.anchors, self._positions, self._quality
+            )
         self._covariance = episode.prior_covariance
         if self.reward_mode == "bound":
             self._start_bound(episode)
@@ -138,8 +144,13 @@ class TrackingEnv(gym.Env[Any, Any]):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any], float]:
         k = self._epoch
         at = simulation.Epoch(*(f if f is None else f[k] for f in self._whole))  # pyright: ignore[reportArgumentType]
+        quality = None if self._quality is None else self._quality[k].copy()
         if self._measured is None:
-            measured = simulation.measure(self.scene, at, self._anchors, self._positions[k])
+            if self.scene.obstacles:
+                quality = simulation.link_quality(self.scene, at, self._anchors)
+            measured = simulation.measure(
+                self.scene, at, self._anchors, self._positions[k], quality
+            )
         else:
             measured = ranging.Measurement(*(field[k].copy() for field in self._measured))
         info: dict[str, Any] = {
@@ -158,6 +169,8 @@ class TrackingEnv(gym.Env[Any, Any]):
             "anchors": self._anchors.copy(),
             "twist": at.twist.copy(),
         }
+        if quality is not None:
+            observation["quality"] = quality
         return observation, info, reward
 
     def _start_bound(self, episode: simulation.Episode) -> None:
@@ -216,17 +229,16 @@ def observation_space(scene: scenes.Scene) -> spaces.Dict:
     # Ten standard deviations of the drawn turn rate; an orbit of 1 m is the tightest.
     twist[:3] = np.maximum(twist[:3], max(10 * scene.spin_rad_s, np.pi / scene.dt, scene.speed_m_s))
     twist[3:] = np.maximum(twist[3:], scene.speed_m_s) + 1e-9
-    return spaces.Dict(
-        {
-            "ranges": spaces.Box(0.0, scene.range_limit_m, links, np.float64),
-            "links": spaces.MultiBinary(links),
-            "anchors": spaces.Box(
-                np.tile(low, (scene.n_anchors, 1)), np.tile(high, (scene.n_anchors, 1)),
-                dtype=np.float64,
-            ),
-            "twist": spaces.Box(-twist, twist, dtype=np.float64),
-        }
-    )  # fmt: skip
+    low, high = np.tile(low, (scene.n_anchors, 1)), np.tile(high, (scene.n_anchors, 1))
+    keys: dict[str, spaces.Space[Any]] = {
+        "ranges": spaces.Box(0.0, scene.range_limit_m, links, np.float64),
+        "links": spaces.MultiBinary(links),
+        "anchors": spaces.Box(low, high, dtype=np.float64),
+        "twist": spaces.Box(-twist, twist, dtype=np.float64),
+    }
+    if scene.obstacles:
+        keys["quality"] = spaces.Box(0.0, 1.0, (scene.n_anchors,), np.float64)
+    return spaces.Dict(keys)
 
 
 def action_space(scene: scenes.Scene) -> spaces.Space[Any]:

@@ -221,7 +221,10 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         """
         with whole_rows():
             stored = self._episodes.at(self._epochs)
-            measured = simulation.measure(self.scene, stored, self._anchors)
+            quality = None
+            if self.scene.obstacles:
+                quality = simulation.link_quality(self.scene, stored, self._anchors)
+            measured = simulation.measure(self.scene, stored, self._anchors, quality=quality)
         at = stored._replace(
             rotation=stored.rotation.copy(),
             translation=stored.translation.copy(),
@@ -233,6 +236,8 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
             "anchors": self._anchors.copy(),
             "twist": at.twist,
         }
+        if quality is not None:
+            observation["quality"] = np.ascontiguousarray(quality)
         info: dict[str, Any] = {
             "rotation": at.rotation,
             "translation": at.translation,
