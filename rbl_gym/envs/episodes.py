@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from rbl_gym import simulation
 from rbl_gym.checks import FloatArray
+from rbl_gym.components import whole_rows
 from rbl_gym.scenes import Scene
 
 # Worlds that are drawn and built together: what they need on the way fits the cache.
 _BLOCK = 256
-
-
-@contextlib.contextmanager
-def whole_rows() -> Iterator[None]:
-    """Let numpy compute on rows of worlds where they are.
-
-    It copies operands into its buffer (8192 numbers) when their rows are shorter and do not
-    join up, which takes longer than the arithmetic.
-    """
-    before = np.setbufsize(256)
-    try:
-        yield
-    finally:
-        np.setbufsize(before)
 
 
 class EpisodeStore:

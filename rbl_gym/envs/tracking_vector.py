@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
-from rbl_gym.envs.episodes import EpisodeStore, whole_rows
+from rbl_gym.components import whole_rows
+from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import (
     REWARDS,
     action_space,
