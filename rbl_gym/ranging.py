@@ -267,7 +267,14 @@ def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
     """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
     positions, anchors = np.asarray(positions), np.asarray(anchors)
     positions, anchors = positions[..., None, :, :], anchors[..., :, None, :]
-    # Summed axis by axis: the same last bits in every memory order, and little memory.
+    # Summed axis by axis: the same last bits in every memory order.
+    if positions.ndim == anchors.ndim == 3:
+        gap = np.subtract(positions, anchors, dtype=np.float64)
+        gap *= gap
+        squared = gap[..., 0] + gap[..., 1]
+        squared += gap[..., 2]
+        return np.sqrt(squared, out=squared)
+    # Of many worlds the three axes at once would not stay in the cache.
     squared = np.subtract(positions[..., 0], anchors[..., 0], dtype=np.float64)
     squared *= squared
     gap = np.empty_like(squared)
