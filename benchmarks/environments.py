@@ -3,8 +3,9 @@
 Process time of one thread, medians over interleaved repeats:
 
 - the native vector environment against the time of generating its normals alone;
-- the vector environment against the scalar one, per environment step;
-- the scalar environment beside Gymnasium's CartPole;
+- the vector environment against the scalar one, whole episodes with their resets on both sides,
+  per epoch (an episode of T steps has T + 1, that of the reset among them);
+- the scalar environment beside Gymnasium's CartPole, steps alone, no resets on either side;
 - vector environment + iterated EKF + belief observation + reward, in steps per CPU second;
 - ``import rbl_gym`` against ``import gymnasium``.
 
@@ -44,12 +45,13 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--num-envs", type=int, default=1024)
     options = parser.parse_args()
-    jobs: dict[str, Callable[[], float]] = {"CartPole-v1 scalar": scalar_job(cart_pole())}
+    jobs: dict[str, Callable[[], float]] = {"CartPole-v1 steps": steps_job(cart_pole())}
     for scene in SCENES:
         jobs[f"{scene} normals alone"] = normals_job(scene, options.num_envs)
         for reward in ("none", "bound"):
             jobs[f"{scene} vector {reward}"] = vector_job(scene, reward, options.num_envs)
-            jobs[f"{scene} scalar {reward}"] = scalar_job(TrackingEnv(scene, reward))
+            jobs[f"{scene} scalar {reward}"] = scalar_job(scene, reward)
+        jobs[f"{scene} scalar steps"] = steps_job(TrackingEnv(scene, "none"))
         jobs[f"{scene} vector iekf"] = belief_job(scene, options.num_envs)
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(options.repeats):
@@ -61,7 +63,7 @@ def main() -> None:
         result["ratios"][scene] = {
             "vector to normals": micro[f"{scene} vector none"] / micro[f"{scene} normals alone"],
             "scalar to vector": micro[f"{scene} scalar none"] / micro[f"{scene} vector none"],
-            "scalar to CartPole": micro[f"{scene} scalar none"] / micro["CartPole-v1 scalar"],
+            "scalar to CartPole": micro[f"{scene} scalar steps"] / micro["CartPole-v1 steps"],
             "env + iekf steps per CPU second": 1e6 / micro[f"{scene} vector iekf"],
         }
     result["import_seconds"] = import_times(options.repeats)
@@ -123,9 +125,30 @@ def whole_episode(envs: Any, steps: int, num_envs: int) -> Callable[[], float]:
     return lambda: timed(work, steps * num_envs)
 
 
-def scalar_job(env: gym.Env[Any, Any], steps: int = 400) -> Callable[[], float]:
+def zero_action(env: gym.Env[Any, Any]) -> Any:
+    space = env.action_space
+    return np.zeros(space.shape, space.dtype) if space.shape else 0
+
+
+def scalar_job(scene: str, reward: str, epochs: int = 400) -> Callable[[], float]:
+    """Whole episodes with their resets, of one world."""
+    env = TrackingEnv(scene, reward)
+    steps, action = env.scene.steps, zero_action(env)
+    episodes = -(-epochs // (steps + 1))
+    env.reset(seed=0)
+
+    def work() -> None:
+        for _ in range(episodes):
+            env.reset()
+            for _ in range(steps):
+                env.step(action)
+
+    return lambda: timed(work, episodes * (steps + 1))
+
+
+def steps_job(env: gym.Env[Any, Any], steps: int = 400) -> Callable[[], float]:
     """Steps alone, resets left out."""
-    action: Any = np.zeros(env.action_space.shape) if env.action_space.shape else 0
+    action = zero_action(env)
 
     def job() -> float:
         total, done = 0.0, 0

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import bounds, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.components import (
+    exp_and_left_jacobian,
     first,
     inverse,
     last,
@@ -25,6 +26,7 @@ from rbl_gym.components import (
     log,
     product,
     trials_last,
+    whole_rows,
 )
 from rbl_gym.estimators.belief import PoseBelief
 from rbl_gym.estimators.inputs import (
@@ -120,6 +122,8 @@ class IteratedEkf:
         """State after `dt` seconds of the twist (..., 6), ``P <- F P F^T + Q``."""
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
+        if state.translation.ndim > 1 or twist.ndim > 1:
+            return _predict_many(state, twist, dt, self.process)
         rotation, translation = propagate(state.rotation, state.translation, twist, dt)
         covariance = bounds.predict_covariance(state.covariance, twist, dt, self.process)
         return PoseState(rotation, translation, covariance)
@@ -164,6 +168,7 @@ class IteratedEkf:
         joined = (np.concatenate(fields) for fields in zip(*parts, strict=True))
         return PoseState(*(a.reshape((*batch, *a.shape[1:])) for a in joined))
 
+    @whole_rows()
     def _update(
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
     ) -> PoseState:
@@ -187,6 +192,32 @@ class IteratedEkf:
         """The state as a belief (copies)."""
         rotation = state.rotation.copy()
         return PoseBelief(rotation, state.translation.copy(), state.covariance.copy(), rotation)
+
+
+@whole_rows()
+def _predict_many(
+    state: PoseState, twist: FloatArray, dt: float, process: ProcessNoise
+) -> PoseState:
+    """`IteratedEkf.predict` by components: exp(w) and its left Jacobian from one series."""
+    batch = np.broadcast_shapes(state.translation.shape[:-1], twist.shape[:-1])
+    ndim = len(batch)
+    twist = first(trials_last(twist, 1), 1, ndim)
+    turn, jacobian = exp_and_left_jacobian(twist[:3] * dt)
+    P = first(trials_last(state.covariance, 2), 2, ndim)
+    variance = dt * process.std() ** 2
+    top = product(turn, P[:3])
+    covariance = np.empty((6, 6, *batch))
+    covariance[:3, :3] = product(top[:, :3], turn.swapaxes(0, 1))
+    spread = jacobian * variance[:3].reshape((3, *[1] * ndim))
+    covariance[:3, :3] += product(spread, jacobian.swapaxes(0, 1))
+    covariance[:3, 3:] = top[:, 3:]
+    covariance[3:, :3] = top[:, 3:].swapaxes(0, 1)
+    covariance[3:, 3:] = P[3:, 3:]
+    for i in range(3, 6):
+        covariance[i, i] += variance[i]
+    rotation = product(turn, first(trials_last(state.rotation, 2), 2, ndim))
+    translation = first(state.translation, 1, ndim) + twist[3:] * dt
+    return PoseState(last(rotation, 2), last(translation, 1), last(covariance, 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,8 @@ estimators keep that shape and lay only the memory out the other way; here both 
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,20 @@ from numpy.typing import NDArray
 
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray
+
+
+@contextlib.contextmanager
+def whole_rows() -> Iterator[None]:
+    """Let numpy compute on rows of trials where they are.
+
+    It copies operands into its buffer (8192 numbers) when their rows are shorter and do not
+    join up, which takes longer than the arithmetic.
+    """
+    before = np.setbufsize(256)
+    try:
+        yield
+    finally:
+        np.setbufsize(before)
 
 
 def first(array: NDArray[Any], trailing: int, batch: int = 0) -> NDArray[Any]:
@@ -135,28 +151,28 @@ def inverse(A: FloatArray) -> FloatArray:
         inverted = np.linalg.inv(A)
         return 0.5 * (inverted + inverted.T)
     n = len(A)
-    U = A.copy()
-    # Rows of D^-1/2 L^-1.
-    rows = np.zeros_like(U)
-    pivots = []
-    with np.errstate(divide="ignore", invalid="ignore"):
+    # [A, I], of which elimination makes [D^1/2 L^T, D^-1/2 L^-1].
+    U = np.empty((n, 2 * n, *A.shape[2:]))
+    U[:, :n], U[:, n:] = A, 0.0
+    pivots, products = np.empty_like(U[:, 0]), np.empty_like(U[1:, :n])
+    with whole_rows(), np.errstate(divide="ignore", invalid="ignore"):
         for k in range(n):
-            pivots.append(U[k, k].min(initial=np.inf))
-            scale = 1 / np.sqrt(U[k, k])
-            U[k, k:] *= scale
-            for i in range(k + 1, n):
-                U[i, i:] -= U[k, i] * U[k, i:]
-            rows[k, k] = scale
-            if k:
-                np.multiply(_combined(U[:k, k], rows[:k, :k]), -scale, out=rows[k, :k])
-    smallest = min(pivots, default=np.inf)
+            U[k, n + k] = 1.0
+            pivots[k] = U[k, k]
+            # What changes: below row k the columns after k, up to where I has begun to fill.
+            row = U[k, k + 1 : n + k + 1]
+            row *= 1 / np.sqrt(pivots[k])
+            below = np.multiply(U[k, k + 1 : n, None], row, out=products[k:])
+            U[k + 1 :, k + 1 : n + k + 1] -= below
+    smallest = pivots.min(initial=np.inf)
     if not smallest > 0:
         raise np.linalg.LinAlgError(f"matrix must be positive definite, got a pivot {smallest:g}")
+    rows, inverted = U[:, n:], np.empty_like(U[:, :n])
     for i in range(n):
         # Columns of the factor are zero above their diagonal.
-        np.einsum("k...,kj...->j...", rows[i:, i], rows[i:, : i + 1], out=U[i, : i + 1])
-        U[:i, i] = U[i, :i]
-    return U
+        np.einsum("k...,kj...->j...", rows[i:, i], rows[i:, : i + 1], out=inverted[i, : i + 1])
+        inverted[:i, i] = inverted[i, :i]
+    return inverted
 
 
 def _combined(weights: FloatArray, rows: FloatArray) -> FloatArray:

@@ -100,7 +100,8 @@ class RangeNoise:
             std *= std
             std += self.floor_m**2
             np.sqrt(std, out=std)
-        ranges = std * normals
+        fits = isinstance(std, np.ndarray) and std.shape == distances.shape == np.shape(normals)
+        ranges = np.multiply(std, normals, out=std if fits else None)
         ranges += distances
         return np.maximum(ranges, 0.0, out=ranges)
 
@@ -265,11 +266,22 @@ def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) 
 def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
     """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
     positions, anchors = np.asarray(positions), np.asarray(anchors)
+    positions, anchors = positions[..., None, :, :], anchors[..., :, None, :]
     # Summed axis by axis: the same last bits in every memory order.
-    gap = np.subtract(positions[..., None, :, :], anchors[..., :, None, :], dtype=np.float64)
-    gap *= gap
-    squared = gap[..., 0] + gap[..., 1]
-    squared += gap[..., 2]
+    if positions.ndim == anchors.ndim == 3:
+        gap = np.subtract(positions, anchors, dtype=np.float64)
+        gap *= gap
+        squared = gap[..., 0] + gap[..., 1]
+        squared += gap[..., 2]
+        return np.sqrt(squared, out=squared)
+    # Of many worlds the three axes at once would not stay in the cache.
+    squared = np.subtract(positions[..., 0], anchors[..., 0], dtype=np.float64)
+    squared *= squared
+    gap = np.empty_like(squared)
+    for axis in (1, 2):
+        np.subtract(positions[..., axis], anchors[..., axis], out=gap)
+        gap *= gap
+        squared += gap
     return np.sqrt(squared, out=squared)
 
 

@@ -15,8 +15,12 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array
 
-# Below this squared angle the Taylor series is exact to rounding; above it the closed form is.
+# Above this squared angle the closed forms are exact enough.
 _SMALL_SQUARED_ANGLE = 1e-4
+# Up to this squared angle the Taylor series below are exact to rounding, and take less time.
+_SERIES_SQUARED_ANGLE = 0.25
+# Of sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2, the highest power first.
+_SERIES = [[(-1) ** n / math.factorial(2 * n + k) for n in range(6, -1, -1)] for k in (1, 2, 3)]
 # Fewer matrices than this are decomposed: an iteration in array calls takes longer.
 _SMALL_BATCH = 32
 # Determinant at unit norm (at most 0.19) above which the polar iteration is exact to 1e-13.
@@ -47,7 +51,9 @@ def vee(W: ArrayLike) -> FloatArray:
 
 def coefficients(squared: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 as functions (...) of x^2 (...)."""
-    small = np.asarray(squared < _SMALL_SQUARED_ANGLE)
+    small = np.asarray(squared < _SERIES_SQUARED_ANGLE)
+    if small.all():
+        return _taylor(squared)
     any_small = small.any()
     safe = np.where(small, 1.0, squared) if any_small else squared
     x = np.sqrt(safe)
@@ -62,11 +68,14 @@ def coefficients(squared: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 def _taylor(s: Any) -> tuple[Any, Any, Any]:
     """`coefficients` of a small x^2, an array or a float."""
-    return (
-        1 + s * (-1 / 6 + s * (1 / 120 - s / 5040)),
-        0.5 + s * (-1 / 24 + s * (1 / 720 - s / 40320)),
-        1 / 6 + s * (-1 / 120 + s * (1 / 5040 - s / 362880)),
-    )
+    sums = []
+    for highest, *rest in _SERIES:
+        total = highest * s
+        for term in rest[:-1]:
+            total += term
+            total *= s
+        sums.append(total + rest[-1])
+    return sums[0], sums[1], sums[2]
 
 
 def inverse_coefficient(squared: FloatArray) -> FloatArray:

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, motion, posterior, ranging, rotations
+from rbl_gym import bounds, motion, posterior, ranging, rotations, statistic
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.obstacles import in_sight
 from rbl_gym.scenes import Scene
+from rbl_gym.statistic import EpochStatistic
 
 
 class Draws(NamedTuple):
@@ -35,8 +36,8 @@ class Episode(NamedTuple):
         Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
         unless the prior is older than it.
     normals, uniforms
-        Random numbers of the ranges (..., T + 1, M, N), of the links (..., T + 1, 2, M, N) or
-        None where the scene's links need none.
+        Random numbers of the ranges (..., T + 1, M, N), or (..., T + 1, 3, 4) of the statistic
+        in their place; of the links (..., T + 1, 2, M, N) or None where they need none.
     prior_rotation, prior_translation, prior_covariance
         Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
     anchors
@@ -70,18 +71,23 @@ _START_NORMALS = 4 + 3 + 6
 _HOLD = 10
 
 
-def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Draws:
-    """The random numbers of an episode: one call for normals, one for uniforms."""
+def draw(
+    scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = (), statistic: bool = False
+) -> Draws:
+    """The random numbers of an episode: one call for normals, one for uniforms.
+
+    `statistic`: of one whose epochs are measured by `measure_statistic`, 12 normals each.
+    """
     return Draws(
-        rng.standard_normal((*batch, sum(_normal_sizes(scene)))),
+        rng.standard_normal((*batch, sum(_normal_sizes(scene, statistic)))),
         rng.random((*batch, sum(_uniform_sizes(scene)))),
     )
 
 
-def empty_draws(scene: Scene, count: int) -> Draws:
+def empty_draws(scene: Scene, count: int, statistic: bool = False) -> Draws:
     """Room for the random numbers of `count` episodes, (count, n) and (count, m)."""
     return Draws(
-        np.empty((count, sum(_normal_sizes(scene)))),
+        np.empty((count, sum(_normal_sizes(scene, statistic)))),
         np.empty((count, sum(_uniform_sizes(scene)))),
     )
 
@@ -93,23 +99,27 @@ def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.
         generator.random(out=draws.uniforms[row])
 
 
-def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
+def of_ranges(
+    scene: Scene, draws: Draws, statistic: bool = False
+) -> tuple[FloatArray, FloatArray | None]:
     """Views of the draws: `normals` and `uniforms` of an `Episode`."""
     batch, shape = draws.normals.shape[:-1], (scene.n_anchors, len(scene.tags))
-    normals = _split(draws.normals, _normal_sizes(scene))[2]
-    normals = normals.reshape((*batch, scene.steps + 1, *shape))
+    normals = _split(draws.normals, _normal_sizes(scene, statistic))[2]
+    normals = normals.reshape((*batch, scene.steps + 1, *((3, 4) if statistic else shape)))
     if not scene.links.is_random:
         return normals, None
     uniforms = _split(draws.uniforms, _uniform_sizes(scene))[3]
     return normals, uniforms.reshape((*batch, scene.steps + 1, 2, *shape))
 
 
-def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:
+def draw_episode(
+    scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = (), statistic: bool = False
+) -> Episode:
     """An episode of a scene, or a batch of independent ones.
 
     Anchors that the scene leaves open are drawn anew for every episode of the batch.
     """
-    return build_episode(scene, draw(scene, rng, batch))
+    return build_episode(scene, draw(scene, rng, batch, statistic), statistic)
 
 
 def _steps(scene: Scene) -> int:
@@ -121,10 +131,11 @@ def _links(scene: Scene) -> int:
     return scene.n_anchors * len(scene.tags)
 
 
-def _normal_sizes(scene: Scene) -> tuple[int, int, int, int]:
+def _normal_sizes(scene: Scene, statistic: bool) -> tuple[int, int, int, int]:
     """Normals of the start, the process, the ranges, the random twists."""
     held = -(-_steps(scene) // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
-    return _START_NORMALS, 6 * _steps(scene), (scene.steps + 1) * _links(scene), held
+    epoch = 12 if statistic else _links(scene)
+    return _START_NORMALS, 6 * _steps(scene), (scene.steps + 1) * epoch, held
 
 
 def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
@@ -142,10 +153,10 @@ def _n_points(scene: Scene) -> int:
     return 8 + int(np.ceil(16 * scene.speed_m_s * scene.dt * _steps(scene) / extent))
 
 
-def build_episode(scene: Scene, draws: Draws) -> Episode:
+def build_episode(scene: Scene, draws: Draws, statistic: bool = False) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, _, held = _split(draws.normals, _normal_sizes(scene))
+    start, process, _, held = _split(draws.normals, _normal_sizes(scene, statistic))
     places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = _steps(scene)
@@ -176,7 +187,8 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     else:
         anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
     covariance = np.broadcast_to(covariance, (*batch, 6, 6))
-    return Episode(*path, twists, *of_ranges(scene, draws), *prior, covariance, anchors)
+    random = of_ranges(scene, draws, statistic)
+    return Episode(*path, twists, *random, *prior, covariance, anchors)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
@@ -235,17 +247,22 @@ def whole(episode: Episode) -> Epoch:
 
 
 def measure(
-    scene: Scene, at: Epoch, anchors: FloatArray, positions: FloatArray | None = None
+    scene: Scene,
+    at: Epoch,
+    anchors: FloatArray,
+    positions: FloatArray | None = None,
+    quality: FloatArray | None = None,
 ) -> ranging.Measurement:
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
 
-    `positions`: those of the tags (..., N, 3), where they are known already.
+    `positions` of the tags (..., N, 3) and `quality` (`link_quality`): where known already.
     """
     if positions is None:
         positions = ranging.tag_positions(at.rotation, at.translation, scene.tags)
     normals = at.normals
     if scene.obstacles:
-        normals = normals / np.sqrt(link_quality(scene, at, anchors))[..., None]
+        quality = link_quality(scene, at, anchors) if quality is None else quality
+        normals = normals / np.sqrt(quality)[..., None]
     distances = ranging.distances(anchors, positions)
     measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
     clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
@@ -254,6 +271,26 @@ def measure(
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     links &= ranges > 0
     return ranging.Measurement(ranges, links, nlos)
+
+
+def check_has_statistic(scene: Scene) -> None:
+    """A ValueError where G and B are not all there is to know of an epoch of the scene."""
+    links, noise = scene.links, scene.noise
+    if not isinstance(noise, ranging.SquaredRangeNoise):
+        raise ValueError(f"scene must have a SquaredRangeNoise for its statistic, got {noise!r}")
+    if links.is_random or links.reach_m is not None or scene.obstacles:
+        raise ValueError(
+            "scene must have links that never fail, no reach_m and no obstacles for its "
+            f"statistic, got {links!r}, {len(scene.obstacles)} obstacles"
+        )
+
+
+def measure_statistic(scene: Scene, at: Epoch, anchors: FloatArray) -> EpochStatistic:
+    """What an epoch's ranges would tell a linear filter, G (..., 3, 3) and B (..., 3, 4)."""
+    G, B = statistic.measure_statistic(
+        anchors, np.asarray(scene.tags), at.rotation, at.translation, scene.noise, at.normals
+    )
+    return EpochStatistic(np.ascontiguousarray(G), np.ascontiguousarray(B))
 
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
@@ -266,6 +303,17 @@ def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
 def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> FloatArray:
     """Share (..., M, N) of its information that each link has: none where it gave no range."""
     return links * link_quality(scene, at, anchors)[..., None] if scene.obstacles else links
+
+
+def perceived_noise(
+    scene: Scene, ranges: FloatArray, links: BoolArray, quality: FloatArray
+) -> ranging.LinkNoise:
+    """The noise of an epoch to a receiver that learns how good a link is with its range.
+
+    `quality` (..., M) is that of `link_quality`, `ranges` and `links` are (..., M, N).
+    """
+    variance = scene.noise.variance(np.where(links, ranges, 1.0), links)
+    return ranging.LinkNoise(np.sqrt(variance / quality[..., None]))
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:

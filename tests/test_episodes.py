@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from rbl_gym import scenes, simulation
-from rbl_gym.envs.episodes import EpisodeStore, whole_rows
+from rbl_gym.components import whole_rows
+from rbl_gym.envs.episodes import EpisodeStore
 
 LOSSY = {"drop_probability": 0.2, "nlos_probability": 0.1}
 

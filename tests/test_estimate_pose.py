@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pickle
 from typing import Any
@@ -15,8 +16,10 @@ from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics, Time
 from scipy.spatial.transform import Rotation
 
 from rbl_gym import estimators, simulation
+from rbl_gym.ranging import LinkNoise
 from rbl_gym.scenes import SCENES
 from rbl_gym.wrappers import EstimatePose
+from rbl_gym.wrappers.estimate import update
 from tests.helpers import assert_same
 
 ID = "rbl_gym:RBL/Tracking-v0"
@@ -69,6 +72,7 @@ def tag_spread_by_hand(P: np.ndarray, rotation: np.ndarray, tags: np.ndarray) ->
     [
         *((name, "iekf", {}) for name in NAMES),
         ("uwb_room", "iekf", {"robust": True, "iterations": 2}),
+        ("hall", "kf", {}),
         ("uwb_room", "uc-kf", {"coupled": True}),
         ("satellite", "et-kf", {"threshold": 0.01}),
         ("drone_yard", "kf", {"engine": "filterpy", "sigma_q_scale": 0.8}),
@@ -95,6 +99,10 @@ def test_wrapped_rollout_equals_driving_the_filter_by_hand(name, filter, options
             state = hand.initial(*prior)
         else:
             state = hand.predict(state, seen["twist"], world.scene.dt)
+        if "quality" in seen:
+            variance = world.scene.noise.variance(seen["ranges"])
+            noise = LinkNoise(np.sqrt(variance / seen["quality"][:, None]))
+            hand = dataclasses.replace(hand, noise=noise)  # pyright: ignore[reportArgumentType]
         state = hand.update(state, seen["ranges"], seen["anchors"], seen["links"])
         belief = hand.belief(state)
         b = tag_spread_by_hand(belief.covariance, belief.rotation, tags)
@@ -173,6 +181,18 @@ def test_kalman_family_tracks(filter, name, reward):
         turn = result[0]["belief_rotation"]
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(turn) > 0
+
+
+def test_filter_without_a_noise_field_is_updated_as_it_is():
+    """A third party's filter need not know of the quality."""
+
+    class Stranger:
+        def update(self, state, ranges, anchors, links=None):
+            return "updated"
+
+    seen = raw("hall").reset(seed=1)[0]
+    stranger: Any = Stranger()
+    assert update(stranger, None, seen, SCENES["hall"]) == "updated"
 
 
 def test_iekf_believes_itself_at_the_bound():

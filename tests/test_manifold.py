@@ -8,7 +8,7 @@ import pytest
 from rbl_gym import bodies, bounds, estimators, metrics, motion, ranging, rotations
 from rbl_gym.estimators.belief import inverse
 from rbl_gym.estimators.levenberg_marquardt import minimize_pose
-from rbl_gym.estimators.manifold import MapProblem, PoseState
+from rbl_gym.estimators.manifold import IteratedEkf, MapProblem, PoseState
 from rbl_gym.estimators.range_cost import RangeCost, huber
 from tests.helpers import load, random_world, simulate
 
@@ -237,6 +237,30 @@ def test_a_vague_prior_and_a_geometry_without_a_pose_raise(anchors, tags, messag
         filter.update(vague, ranges, anchors)
     tight = filter.initial(np.eye(3), [1, 2, 3], np.diag([0.01] * 3 + [0.1] * 3))
     assert np.isfinite(filter.update(tight, ranges, anchors).translation).all()
+
+
+@pytest.mark.parametrize("batch", [(1,), (40,), (2, 3)])
+@pytest.mark.parametrize("shared", [(), ("state",), ("twist",)], ids=str)
+def test_prediction_of_a_batch_is_that_of_each_body(batch, shared):
+    rng = np.random.default_rng(8)
+    process = motion.ProcessNoise((0.01, 0.2, 0.03), (0.1, 0.4, 0.2))
+    filter = IteratedEkf(random_world(rng, 4, 5)[1], ranging.RangeNoise(0.1), process)
+    of = {key: () if key in shared else batch for key in ("state", "twist")}
+    A = rng.normal(size=(*of["state"], 6, 6))
+    state = filter.initial(
+        rotations.random(rng, of["state"]), rng.normal(size=(*of["state"], 3)),
+        A @ np.swapaxes(A, -1, -2) + np.eye(6),
+    )  # fmt: skip
+    twist = rng.normal(size=(*of["twist"], 6)) * 10.0 ** rng.uniform(-6, 0.5, (*of["twist"], 1))
+    got = filter.predict(state, twist, 0.5)
+    everything = PoseState(*(
+        np.broadcast_to(field, (*batch, *field.shape[len(of["state"]):])) for field in state
+    ))  # fmt: skip
+    twists = np.broadcast_to(twist, (*batch, 6))
+    for k in np.ndindex(batch):
+        want = filter.predict(PoseState(*(field[k] for field in everything)), twists[k], 0.5)
+        for a, b in zip(got, want, strict=True):
+            np.testing.assert_allclose(a[k], b, rtol=1e-12, atol=1e-13)
 
 
 def test_prediction_turns_the_covariance_with_the_body():

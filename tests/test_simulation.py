@@ -566,7 +566,8 @@ def information_by_hand(
         arm = episode.rotation[k] @ np.array(scene.tags[n])
         unit = (arm + episode.translation[k] - anchors[m]) / distances[m, n]
         gradient = np.concatenate([np.cross(arm, unit), unit])
-        total += np.outer(gradient, gradient) / variance_by_hand(scene, distances[m], n)
+        share = share_by_hand(scene, anchors[m], episode.translation[k])
+        total += share * np.outer(gradient, gradient) / variance_by_hand(scene, distances[m], n)
     return total
 
 

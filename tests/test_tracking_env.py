@@ -318,6 +318,24 @@ def test_ranges_are_those_of_the_true_pose_to_the_anchors_seen(name):
             assert abs(error) < 6 * (variance[0, n] / share) ** 0.5
 
 
+@pytest.mark.parametrize("speed", [0.0, 3.0])
+def test_quality_is_that_of_the_sight_from_each_anchor(speed):
+    scene = short("hall", 8, anchor_speed_m_s=speed)
+    told = []
+    for result in rollout(gym.make(ID, scene=scene), 4):
+        seen, place = result[0], result[-1]["translation"]
+        want = [share_by_hand(SCENES["hall"], anchor, place) for anchor in seen["anchors"]]
+        np.testing.assert_array_equal(seen["quality"], want)
+        told += want
+    assert set(told) == {1.0, SCENES["hall"].blocked_information}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_quality_is_observed_only_among_obstacles(name):
+    env = gym.make(ID, scene=name)
+    assert ("quality" in env.reset(seed=0)[0]) == bool(SCENES[name].obstacles)
+
+
 # --- reward -----------------------------------------------------------------------------------
 
 

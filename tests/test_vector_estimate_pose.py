@@ -33,6 +33,7 @@ def pair(scene, mode, filter="iekf", n=3, **arguments):
         ("uwb_room", "kf-ortho", {"observation": "flat"}),
         ("camsap2013", "et-kf", {}),
         ("satellite", "iekf", {"options": {"robust": True}, "observation": "flat"}),
+        ("hall", "iekf", {}),
     ],
 )
 def test_equals_scalar_wrapped_environments(mode, name, filter, arguments):

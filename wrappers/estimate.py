@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from rbl_gym import bounds, estimators, metrics, scenes
+from rbl_gym import bounds, estimators, metrics, scenes, simulation
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 
@@ -23,8 +24,9 @@ _FLAT_LIMIT = 10.0
 class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Turns measurements into a pose belief, and the belief into the reward.
 
-    Wraps an environment whose observation has `ranges`, `links`, `anchors` and `twist` and
-    whose unwrapped form has a `scene` (`RBL/Tracking-v0`). The environment's own reward is
+    Wraps an environment whose observation has `ranges` and `links` (in scenes with obstacles
+    `quality`) or `G` and `B`, besides `anchors` and `twist`, and whose unwrapped form has a
+    `scene` (`RBL/Tracking-v0`). The environment's own reward is
     switched off. For vector environments: `VectorEstimatePose`.
 
     Parameters
@@ -78,7 +80,9 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._tags = np.asarray(self._scene.tags)
         self._filter = make_filter(self._scene, filter, options)
         self._state: Any = None
-        self.observation_space = observation_space(self._kind, env.observation_space, self._scene)
+        self.observation_space = observation_space(
+            self._kind, env.observation_space, self._scene, self._filter
+        )
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -103,9 +107,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._observation(observation, belief), reward, terminated, truncated, info
 
     def _update(self, observation: dict[str, np.ndarray]) -> PoseBelief:
-        self._state = self._filter.update(
-            self._state, observation["ranges"], observation["anchors"], observation["links"]
-        )
+        self._state = update(self._filter, self._state, observation, self._scene)
         return self._filter.belief(self._state)
 
     def _judge(self, belief: PoseBelief, info: dict[str, Any]) -> None:
@@ -139,6 +141,36 @@ def make_filter(scene: scenes.Scene, name: str, options: Mapping[str, Any] | Non
     )
 
 
+def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What a filter reads of an observation."""
+    keys = "ranges", "links", "quality", "G", "B", "anchors", "twist"
+    return {key: observation[key] for key in keys if key in observation}
+
+
+def update(
+    filter: Filter, state: Any, observation: Mapping[str, np.ndarray], scene: scenes.Scene
+) -> Any:
+    """The filter's state after the measurements of an epoch, with their `quality` if it is told.
+
+    A filter learns of the quality by its noise law, if it is a dataclass with a field `noise`.
+    """
+    if "G" in observation:
+        statistical: Any = filter
+        return statistical.update_statistic(state, observation["G"], observation["B"])
+    ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
+    if "quality" in observation and _has_noise(filter):
+        seen = links.astype(np.bool_, copy=False)
+        noise = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
+        filter = dataclasses.replace(filter, noise=noise)  # pyright: ignore[reportArgumentType]
+    return filter.update(state, ranges, anchors, links)
+
+
+def _has_noise(filter: Filter) -> bool:
+    return dataclasses.is_dataclass(filter) and any(
+        field.name == "noise" for field in dataclasses.fields(filter)
+    )
+
+
 def judge(
     belief: PoseBelief, rotation: FloatArray, translation: FloatArray, tags: FloatArray
 ) -> dict[str, FloatArray]:
@@ -169,12 +201,18 @@ def present(
 
 
 def observation_space(
-    kind: str, inner: spaces.Space[Any], scene: scenes.Scene
+    kind: str, inner: spaces.Space[Any], scene: scenes.Scene, filter: Filter
 ) -> spaces.Space[Any]:
-    """The space of `present`, from that of one raw environment."""
-    needed = {"ranges", "links", "anchors", "twist"}
-    if not isinstance(inner, spaces.Dict) or not needed <= set(inner.keys()):
+    """The space of `present`, from that of one raw environment which the filter can read."""
+    keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
+    needed = {"G", "B"} if "G" in keys else {"ranges", "links"}
+    if not isinstance(inner, spaces.Dict) or not {*needed, "anchors", "twist"} <= keys:
         raise ValueError(f"env must observe ranges, links, anchors and twist, its space is {inner}")
+    if "G" in keys and not hasattr(filter, "update_statistic"):
+        raise ValueError(
+            "filter must have update_statistic where only the statistic is observed "
+            f"('kf' and its family do), got {type(filter).__name__}"
+        )
     if kind == "flat":
         size = 21 + 4 * scene.n_anchors
         return spaces.Box(-_FLAT_LIMIT, _FLAT_LIMIT, (size,), np.float32)

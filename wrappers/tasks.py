@@ -6,7 +6,6 @@ sees the belief, not the ranges, and is paid for how good the belief says it is.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,7 +19,7 @@ from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
-from rbl_gym.ranging import LinkNoise
+from rbl_gym.wrappers.estimate import update
 
 # An observation is of order one; what is far outside says no more than that.
 _LIMIT = 10.0
@@ -89,16 +88,16 @@ class FilterLoop(BatchEnv):
         """Update some worlds with their ranges; `chosen` (B, M): which anchors measure."""
         at = simulation.Epoch(*(None if field is None else field[rows] for field in self.at))  # pyright: ignore[reportArgumentType]
         anchors = self.anchors[rows]
-        measured = simulation.measure(self.scene, at, anchors)
-        links = measured.links if chosen is None else measured.links & chosen[rows, :, None]
-        filter = self.filter
+        quality = None
         if self.scene.obstacles:
-            # A receiver learns how good a link is with the range.
-            quality = simulation.link_quality(self.scene, at, anchors)[..., None]
-            std = np.sqrt(self.scene.noise.variance(measured.ranges) / quality)
-            filter = dataclasses.replace(filter, noise=LinkNoise(std))
+            quality = simulation.link_quality(self.scene, at, anchors)
+        measured = simulation.measure(self.scene, at, anchors, quality=quality)
+        links = measured.links if chosen is None else measured.links & chosen[rows, :, None]
+        epoch = {"ranges": measured.ranges, "links": links, "anchors": anchors}
+        if quality is not None:
+            epoch["quality"] = quality
         state = PoseState(*(field[rows] for field in self.state))
-        self._put(rows, filter.update(state, measured.ranges, anchors, links))
+        self._put(rows, update(self.filter, state, epoch, self.scene))
 
     def _put(self, rows: np.ndarray, state: PoseState) -> None:
         if len(rows) == self.num_envs:

@@ -17,12 +17,12 @@ from rbl_gym.wrappers.estimate import (
     REWARDS,
     judge,
     make_filter,
+    measured_of,
     observation_space,
     present,
     scene_of,
+    update,
 )
-
-_MEASURED = ("ranges", "links", "anchors", "twist")
 
 
 class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
@@ -62,7 +62,9 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         self._filter = make_filter(self._scene, filter, options)
         self._state: Any = None
         self._belief: PoseBelief | None = None
-        single = observation_space(self._kind, env.single_observation_space, self._scene)
+        single = observation_space(
+            self._kind, env.single_observation_space, self._scene, self._filter
+        )
         self.single_observation_space = single
         self.observation_space = batch_space(single, env.num_envs)
 
@@ -106,10 +108,10 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         last: BoolArray,
     ) -> None:
         """Predict and update the worlds that stepped, the ended ones with their final ranges."""
-        measured = {key: observation[key] for key in _MEASURED}
+        measured = measured_of(observation)
         if last.any():
             final = info["final_obs"][last]
-            for key in _MEASURED:
+            for key in measured:
                 measured[key] = measured[key].copy()
                 measured[key][last] = np.stack([one[key] for one in final])
         everywhere = bool(moved.all())
@@ -117,7 +119,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         if not everywhere:
             measured = {key: value[moved] for key, value in measured.items()}
         state = self._filter.predict(state, measured["twist"], self._scene.dt)
-        state = self._filter.update(state, *(measured[k] for k in ("ranges", "anchors", "links")))
+        state = update(self._filter, state, measured, self._scene)
         self._put(state, moved)
 
     def _start(
@@ -126,8 +128,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         """States of new episodes, from the priors in `info`, updated with their first ranges."""
         prior = [info[f"prior_{name}"][fresh] for name in ("rotation", "translation", "covariance")]
         state = self._filter.initial(*prior)
-        epoch = [observation[key][fresh] for key in ("ranges", "anchors", "links")]
-        self._put(self._filter.update(state, *epoch), fresh)
+        epoch = {key: value[fresh] for key, value in measured_of(observation).items()}
+        self._put(update(self._filter, state, epoch, self._scene), fresh)
 
     def _put(self, state: Any, where: BoolArray) -> None:
         """Take over the states of some worlds, and their beliefs."""

@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from rbl_gym import simulation
 from rbl_gym.checks import FloatArray
+from rbl_gym.components import whole_rows
 from rbl_gym.scenes import Scene
 
 # Worlds that are drawn and built together: what they need on the way fits the cache.
 _BLOCK = 256
-
-
-@contextlib.contextmanager
-def whole_rows() -> Iterator[None]:
-    """Let numpy compute on rows of worlds where they are.
-
-    It copies operands into its buffer (8192 numbers) when their rows are shorter and do not
-    join up, which takes longer than the arithmetic.
-    """
-    before = np.setbufsize(256)
-    try:
-        yield
-    finally:
-        np.setbufsize(before)
 
 
 class EpisodeStore:
@@ -36,10 +22,11 @@ class EpisodeStore:
     anew by every reset, not made anew: fresh memory is slow.
     """
 
-    def __init__(self, scene: Scene, num_envs: int) -> None:
+    def __init__(self, scene: Scene, num_envs: int, statistic: bool = False) -> None:
         self._scene = scene
+        self._statistic = statistic
         self._num_envs = num_envs
-        self._draws = simulation.empty_draws(scene, num_envs)
+        self._draws = simulation.empty_draws(scene, num_envs, statistic)
         self._timed: list[FloatArray] = []
 
     @property
@@ -61,11 +48,13 @@ class EpisodeStore:
             rows = _rows(block)
             draws = simulation.Draws(*(field[rows] for field in self._draws))
             with whole_rows():
-                episode = simulation.build_episode(self._scene, draws)
+                episode = simulation.build_episode(self._scene, draws, self._statistic)
                 self._write(rows, episode)
             starts.append(episode[len(simulation.Epoch._fields) :])
         # Views, taken anew because a pickled store comes back with copies of them.
-        self._normals, self._uniforms = simulation.of_ranges(self._scene, self._draws)
+        self._normals, self._uniforms = simulation.of_ranges(
+            self._scene, self._draws, self._statistic
+        )
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
             name: np.concatenate(parts)

@@ -15,6 +15,7 @@ from rbl_gym import posterior, ranging, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 
 REWARDS = ("bound", "none")
+OBSERVATIONS = ("ranges", "statistic")
 
 
 class TrackingEnv(gym.Env[Any, Any]):
@@ -40,10 +41,22 @@ class TrackingEnv(gym.Env[Any, Any]):
     | `links` | (M, N) | int8 | 1 where a range was measured |
     | `anchors` | (M, 3) | float64 | places of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
+    | `quality` | (M,) | float64 | share of a link's information that an anchor's sight of the body leaves: 1 in sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
+
+    ``observation="statistic"``: what a linear filter needs of the squared ranges, in place of
+    `ranges` and `links`; no range is drawn, only 12 normals per epoch, and the law of G and B
+    is the same (`rbl_gym.statistic`). For scenes with a `SquaredRangeNoise` whose links never
+    fail.
+
+    | key | shape | type | meaning |
+    |---|---|---|---|
+    | `G` | (3, 3) | float64 | information that the anchors give about a tag, 1/m^2 |
+    | `B` | (3, 4) | float64 | moments of the squared ranges with the tags' coordinates and 1 |
 
     ## Reward
     ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square
-    tag error in metres, at the true pose: how good any estimator could be with these anchors.
+    tag error in metres, at the true pose: how good any estimator could be with these anchors
+    and all of their ranges.
     ``reward="none"``: 0, for wrappers that compute their own.
 
     ## Starting state
@@ -52,8 +65,8 @@ class TrackingEnv(gym.Env[Any, Any]):
     `prior_covariance`), which refers to epoch 0 before its update.
 
     ## Info
-    `rotation`, `translation`: the true pose; `nlos`: which ranges came over a reflected path;
-    `epoch`; `score_m`: b (with ``reward="bound"``).
+    `rotation`, `translation`: the true pose; `nlos`: which ranges came over a reflected path
+    (where ranges are observed); `epoch`; `score_m`: b (with ``reward="bound"``).
 
     ## Episode end
     Never terminates; truncates after `scene.steps` steps.
@@ -70,7 +83,8 @@ class TrackingEnv(gym.Env[Any, Any]):
     )
     ```
     `scene`: a name of `rbl_gym.scenes.SCENES` or a dict of overrides, see
-    `rbl_gym.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
+    `rbl_gym.scenes.get`. `reward`: ``"bound"`` or ``"none"``. `observation`: ``"ranges"`` or
+    ``"statistic"``.
 
     ## Version history
     * v0: first version.
@@ -83,13 +97,15 @@ class TrackingEnv(gym.Env[Any, Any]):
         scene: str | Mapping[str, Any] = "uwb_room",
         reward: str = "bound",
         render_mode: str | None = None,
+        observation: str = "ranges",
     ) -> None:
         if render_mode is not None:
             raise ValueError(f"render_mode must be None, got {render_mode!r}")
         self.scene = scenes.get(scene)
         self.reward_mode = check_one_of("reward", reward, REWARDS)
         self.render_mode = render_mode
-        self.observation_space = observation_space(self.scene)
+        self.statistic = is_statistic(observation, self.scene)
+        self.observation_space = observation_space(self.scene, self.statistic)
         self.action_space = action_space(self.scene)
         self._episode: simulation.Episode | None = None
         self._epoch = 0
@@ -99,16 +115,18 @@ class TrackingEnv(gym.Env[Any, Any]):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start an episode; the measurements are those of epoch 0."""
         super().reset(seed=seed)
-        episode = simulation.draw_episode(self.scene, self.np_random)
+        episode = simulation.draw_episode(self.scene, self.np_random, statistic=self.statistic)
         self._episode = episode
         self._epoch = 0
         self._anchors = episode.anchors.copy()
         self._whole = at = simulation.whole(episode)
         self._positions = ranging.tag_positions(at.rotation, at.translation, self.scene.tags)
-        self._measured: ranging.Measurement | None = None
+        self._measured: dict[str, np.ndarray] | None = None
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
-            self._measured = simulation.measure(self.scene, at, episode.anchors, self._positions)
+            self._measured = measure(
+                self.scene, self.statistic, at, episode.anchors, self._positions
+            )
         self._covariance = episode.prior_covariance
         if self.reward_mode == "bound":
             self._start_bound(episode)
@@ -139,25 +157,22 @@ class TrackingEnv(gym.Env[Any, Any]):
         k = self._epoch
         at = simulation.Epoch(*(f if f is None else f[k] for f in self._whole))  # pyright: ignore[reportArgumentType]
         if self._measured is None:
-            measured = simulation.measure(self.scene, at, self._anchors, self._positions[k])
+            observation = measure(self.scene, self.statistic, at, self._anchors, self._positions[k])
         else:
-            measured = ranging.Measurement(*(field[k].copy() for field in self._measured))
+            observation = {key: field[k].copy() for key, field in self._measured.items()}
         info: dict[str, Any] = {
             "rotation": at.rotation.copy(),
             "translation": at.translation.copy(),
-            "nlos": measured.nlos,
             "epoch": k,
         }
+        if not self.statistic:
+            info["nlos"] = observation.pop("nlos")
         reward = 0.0
         if self.reward_mode == "bound":
-            info["score_m"] = self._carry_bound(at, measured.links)
+            info["score_m"] = self._carry_bound(at, links_of(observation, self.scene))
             reward = -math.log(info["score_m"])
-        observation = {
-            "ranges": measured.ranges,
-            "links": measured.links.view(np.int8),
-            "anchors": self._anchors.copy(),
-            "twist": at.twist.copy(),
-        }
+        observation["anchors"] = self._anchors.copy()
+        observation["twist"] = at.twist.copy()
         return observation, info, reward
 
     def _start_bound(self, episode: simulation.Episode) -> None:
@@ -165,9 +180,8 @@ class TrackingEnv(gym.Env[Any, Any]):
         self._course = simulation.posterior_course(self.scene, episode)
         self._informations: FloatArray | None = None
         if self._measured is not None:
-            shares = simulation.shares(
-                self.scene, self._whole, episode.anchors, self._measured.links
-            )
+            links = links_of(self._measured, self.scene, (self.scene.steps + 1,))
+            shares = simulation.shares(self.scene, self._whole, episode.anchors, links)
             self._informations = self._course.information(
                 slice(None), episode.anchors, self.scene.noise, shares
             )
@@ -183,6 +197,45 @@ class TrackingEnv(gym.Env[Any, Any]):
         predicted = self._course.predict(k, self._covariance) if k else self._covariance
         self._covariance = posterior.update(predicted, information)
         return self._course.score(k, self._covariance)
+
+
+def is_statistic(observation: str, scene: scenes.Scene) -> bool:
+    """Whether the statistic is to be observed, or a ValueError where the scene has none."""
+    if check_one_of("observation", observation, OBSERVATIONS) == "ranges":
+        return False
+    simulation.check_has_statistic(scene)
+    return True
+
+
+def measure(
+    scene: scenes.Scene,
+    statistic: bool,
+    at: simulation.Epoch,
+    anchors: FloatArray,
+    positions: FloatArray | None = None,
+) -> dict[str, np.ndarray]:
+    """What an epoch tells: G and B, or ranges and links with `nlos` and maybe `quality`."""
+    if statistic:
+        return simulation.measure_statistic(scene, at, anchors)._asdict()
+    quality = simulation.link_quality(scene, at, anchors) if scene.obstacles else None
+    measured = simulation.measure(scene, at, anchors, positions, quality)
+    told: dict[str, np.ndarray] = {
+        "ranges": measured.ranges,
+        "links": measured.links.view(np.int8),
+        "nlos": measured.nlos,
+    }
+    if quality is not None:
+        told["quality"] = np.ascontiguousarray(quality)
+    return told
+
+
+def links_of(
+    told: Mapping[str, np.ndarray], scene: scenes.Scene, batch: tuple[int, ...] = ()
+) -> BoolArray:
+    """Links (..., M, N) of what `measure` told: all of them where it is the statistic."""
+    if "links" in told:
+        return told["links"].view(np.bool_)
+    return np.ones((*batch, scene.n_anchors, len(scene.tags)), dtype=np.bool_)
 
 
 def check_action(action: ArrayLike, size: int) -> FloatArray:
@@ -203,7 +256,7 @@ def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
     return action.shape == shape and action.dtype.kind in "iub" and not action.any()
 
 
-def observation_space(scene: scenes.Scene) -> spaces.Dict:
+def observation_space(scene: scenes.Scene, statistic: bool = False) -> spaces.Dict:
     """Finite bounds of a scene's observations."""
     links = (scene.n_anchors, len(scene.tags))
     low, high = scene.anchor_region.bounds()
@@ -216,17 +269,35 @@ def observation_space(scene: scenes.Scene) -> spaces.Dict:
     # Ten standard deviations of the drawn turn rate; an orbit of 1 m is the tightest.
     twist[:3] = np.maximum(twist[:3], max(10 * scene.spin_rad_s, np.pi / scene.dt, scene.speed_m_s))
     twist[3:] = np.maximum(twist[3:], scene.speed_m_s) + 1e-9
-    return spaces.Dict(
-        {
-            "ranges": spaces.Box(0.0, scene.range_limit_m, links, np.float64),
-            "links": spaces.MultiBinary(links),
-            "anchors": spaces.Box(
-                np.tile(low, (scene.n_anchors, 1)), np.tile(high, (scene.n_anchors, 1)),
-                dtype=np.float64,
-            ),
-            "twist": spaces.Box(-twist, twist, dtype=np.float64),
-        }
-    )  # fmt: skip
+    low, high = np.tile(low, (scene.n_anchors, 1)), np.tile(high, (scene.n_anchors, 1))
+    keys: dict[str, spaces.Space[Any]] = {
+        "anchors": spaces.Box(low, high, dtype=np.float64),
+        "twist": spaces.Box(-twist, twist, dtype=np.float64),
+    }
+    if statistic:
+        G, B = _statistic_limits(scene)
+        keys["G"] = spaces.Box(-G, G, (3, 3), np.float64)
+        keys["B"] = spaces.Box(-B, B, (3, 4), np.float64)
+        return spaces.Dict(keys)
+    keys["ranges"] = spaces.Box(0.0, scene.range_limit_m, links, np.float64)
+    keys["links"] = spaces.MultiBinary(links)
+    if scene.obstacles:
+        keys["quality"] = spaces.Box(0.0, 1.0, (scene.n_anchors,), np.float64)
+    return spaces.Dict(keys)
+
+
+def _statistic_limits(scene: scenes.Scene) -> tuple[float, float]:
+    """Numbers that no entry of G or B exceeds.
+
+    ``tr G <= 4 sum_m |a_m - s_1|^2 / var_m = 4 M / sigma^2``; of ``G [Q t] S + L Z F^T``,
+    ``S = C_e C_e^T = F F^T``, the norms of the factors, with normals below 10.
+    """
+    assert isinstance(scene.noise, ranging.SquaredRangeNoise)
+    tags = np.asarray(scene.tags)
+    G = 4.0 * scene.n_anchors / scene.noise.sigma_m**2
+    S = float((tags**2).sum()) + len(tags)
+    place = float(np.abs(scene.volume.bounds()).max()) * math.sqrt(3) + scene.range_limit_m
+    return G, G * S * math.sqrt(3 + place**2) + math.sqrt(G * S) * 10 * math.sqrt(12)
 
 
 def action_space(scene: scenes.Scene) -> spaces.Space[Any]:

@@ -14,8 +14,17 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
-from rbl_gym.envs.episodes import EpisodeStore, whole_rows
-from rbl_gym.envs.tracking import REWARDS, action_space, are_zeros, observation_space
+from rbl_gym.components import whole_rows
+from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.envs.tracking import (
+    REWARDS,
+    action_space,
+    are_zeros,
+    is_statistic,
+    links_of,
+    measure,
+    observation_space,
+)
 
 
 class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
@@ -34,7 +43,7 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
     ----------
     num_envs
         How many.
-    scene, reward, render_mode
+    scene, reward, render_mode, observation
         As `TrackingEnv`.
     max_episode_steps
         Truncate after so many steps, if fewer than the scene's.
@@ -53,6 +62,7 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        observation: str = "ranges",
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive int, got {num_envs!r}")
@@ -70,12 +80,13 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         self.steps_limit = min(self.scene.steps, max_episode_steps or self.scene.steps)
         self.metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}
         self._mode = autoreset_mode
-        self.single_observation_space = observation_space(self.scene)
+        self.statistic = is_statistic(observation, self.scene)
+        self.single_observation_space = observation_space(self.scene, self.statistic)
         self.single_action_space = action_space(self.scene)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._generators: list[np.random.Generator] = []
-        self._episodes = EpisodeStore(self.scene, num_envs)
+        self._episodes = EpisodeStore(self.scene, num_envs, self.statistic)
         # Worlds last in memory, as in the store.
         self._anchors = np.empty((num_envs, self.scene.n_anchors, 3), order="F")
         self._prior_covariance = np.empty((num_envs, 6, 6))
@@ -221,27 +232,25 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         """
         with whole_rows():
             stored = self._episodes.at(self._epochs)
-            measured = simulation.measure(self.scene, stored, self._anchors)
+            observation = measure(self.scene, self.statistic, stored, self._anchors)
         at = stored._replace(
             rotation=stored.rotation.copy(),
             translation=stored.translation.copy(),
             twist=stored.twist.copy(),
         )
-        observation = {
-            "ranges": measured.ranges,
-            "links": measured.links.view(np.int8),
-            "anchors": self._anchors.copy(),
-            "twist": at.twist,
-        }
         info: dict[str, Any] = {
             "rotation": at.rotation,
             "translation": at.translation,
-            "nlos": measured.nlos,
             "epoch": self._epochs.copy(),
         }
+        if not self.statistic:
+            info["nlos"] = observation.pop("nlos")
+        observation["anchors"] = self._anchors.copy()
+        observation["twist"] = at.twist
         reward = np.zeros(self.num_envs)
         if self.reward_mode == "bound":
-            self._carry_bound(at, observation["anchors"], measured.links, fresh, moved)
+            links = links_of(observation, self.scene, (self.num_envs,))
+            self._carry_bound(at, observation["anchors"], links, fresh, moved)
             info["score_m"] = self._score.copy()
             reward = -np.log(info["score_m"])
         for key in list(info):
