@@ -99,7 +99,8 @@ def make(
     tags
         (N, 3), places on the body, metres, body frame.
     noise
-        Law of the ranges (`rbl_gym.ranging`).
+        Law of the ranges (`rbl_gym.ranging`); with ``measurement="doa"`` (of ``"iekf"``) that of
+        the angles (`rbl_gym.bearing.AngleNoise`).
     process
         Noise of the motion.
     **options
@@ -120,8 +121,9 @@ def make(
             )
         factory = found[0].load()
     tags = check_array("tags", tags, ("N", 3))
+    of_ranges = options.get("measurement", "ranges") == "ranges"
     for label, value, methods in (
-        ("noise", noise, ("variance", "squared_range_variance")),
+        ("noise", noise, ("variance", "squared_range_variance") if of_ranges else ("variance",)),
         ("process", process, ("covariance", "std")),
     ):
         if not all(callable(getattr(value, method, None)) for method in methods):

@@ -23,6 +23,9 @@ DISTANCE_WEIGHT = 10.0
 START_SHIFT = 1e-3
 STEP_TOLERANCE = 1e-8
 MAX_ITERATIONS = 50
+# Below this step, in units of length, the residuals' curvature counts too (Newton proper): noise
+# leaves residuals, and with them Gauss-Newton would go on converging linearly.
+_CURVED = 1e-2
 
 
 class Places(NamedTuple):
@@ -65,12 +68,15 @@ def newton_iteration(
     gap = body[:, pairs[:, 0]] - body[:, pairs[:, 1]]
     lengths = np.sqrt(np.einsum("ipb,ipb->pb", gap, gap))
     x = body + START_SHIFT
+    extent = lengths.max(axis=0)
     iterations = np.full(len(tags), MAX_ITERATIONS)
     active = np.arange(len(tags))
     converged = np.zeros(len(tags), bool)
-    now, goal, known = x, target, lengths
+    now, goal, known, size = x, target, lengths, np.full(len(tags), np.inf)
     for iteration in range(1, MAX_ITERATIONS + 1):
-        step = _newton_step(now, goal, known, pairs, weight)
+        step = _newton_step(
+            now, goal, known, pairs, weight, (size < _CURVED * extent).astype(float)
+        )
         now = now + step
         size = np.sqrt(np.einsum("ikb,ikb->b", step, step))
         done = size < STEP_TOLERANCE
@@ -81,7 +87,8 @@ def newton_iteration(
             iterations[active[stop]] = iteration
             converged[active[done]] = True
             keep = ~stop
-            active, now, goal, known = active[keep], now[..., keep], goal[..., keep], known[:, keep]
+            active, size, extent = active[keep], size[keep], extent[keep]
+            now, goal, known = now[..., keep], goal[..., keep], known[:, keep]
         if not len(active):
             break
     x[:, :, active] = now
@@ -89,21 +96,32 @@ def newton_iteration(
 
 
 def _newton_step(
-    x: FloatArray, angles: FloatArray, lengths: FloatArray, pairs: np.ndarray, weight: float
+    x: FloatArray,
+    angles: FloatArray,
+    lengths: FloatArray,
+    pairs: np.ndarray,
+    weight: float,
+    curved: FloatArray,
 ) -> FloatArray:
-    """One Gauss-Newton step (3, K, B) of the places (3, K, B)."""
+    """One step (3, K, B) of the places (3, K, B); `curved` (B,): 1 Newton, 0 Gauss-Newton."""
     n_tags, trials = x.shape[1:]
     found, J = bearing.linearize(x)
+    residual = found - angles
     A = np.zeros((n_tags, 3, n_tags, 3, trials))
-    at = range(n_tags)
-    A[at, :, at] = np.einsum("aikb,ajkb->kijb", J, J)
-    force = np.einsum("aikb,akb->kib", J, angles - found)
+    own = np.einsum("aikb,ajkb->kijb", J, J)
+    force = -np.einsum("aikb,akb->kib", J, residual)
     gap = x[:, pairs[:, 0]] - x[:, pairs[:, 1]]
     distance = np.sqrt(np.maximum(np.einsum("ipb,ipb->pb", gap, gap), 1e-200))
     along = gap * (weight / distance)
     pull = along * (weight * (lengths - distance))
+    bend = curved * (1 - lengths / distance)
+    if curved.any():
+        own += (curved * bearing.curvature(x, residual)).transpose(2, 0, 1, 3)
+    at = range(n_tags)
+    A[at, :, at] = own
     for p, (i, j) in enumerate(pairs):
-        block = along[:, None, p] * along[:, p]
+        block = ((1 - bend[p]) * along[:, None, p]) * along[:, p]
+        block[range(3), range(3)] += weight**2 * bend[p]
         A[i, :, i] += block
         A[j, :, j] += block
         A[i, :, j] -= block

@@ -145,7 +145,7 @@ def search(part: RangeCost, first: Solution, where: BoolArray) -> tuple[Solution
     best = cheapest(fine)
     # Where many poses are nearly as good the way along the valley is long.
     polished = minimize_pose(part, best.rotation[:, None], best.translation[:, None], 100)
-    return cheapest(polished), _rivals(part, fine)
+    return cheapest(polished), rivals(part, fine)
 
 
 def local_minima(part: RangeCost, first: Solution, where: BoolArray) -> Solution:
@@ -224,7 +224,7 @@ def cheapest(solutions: Solution) -> Solution:
     )
 
 
-def _rivals(part: RangeCost, solutions: Solution) -> Alternatives:
+def rivals(part: RangeCost, solutions: Solution) -> Alternatives:
     """Distinct minima that are about as cheap as the best."""
     size = len(solutions.at.cost)
     result = no_alternatives(size)

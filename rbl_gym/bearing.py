@@ -55,8 +55,7 @@ def angles(positions: ArrayLike, station: ArrayLike | None = None) -> FloatArray
 
     By atan2: accurate near 0 and pi too, where the arc cosine loses half of the digits.
     """
-    x = np.moveaxis(_relative(positions, station), -1, 0)
-    return np.stack([np.arctan2(across, along) for along, across in _along_and_across(x)], axis=-2)
+    return np.moveaxis(seen(np.moveaxis(_relative(positions, station), -1, 0)), 0, -2)
 
 
 def jacobian(positions: ArrayLike, station: ArrayLike | None = None) -> FloatArray:
@@ -66,6 +65,11 @@ def jacobian(positions: ArrayLike, station: ArrayLike | None = None) -> FloatArr
     """
     _, gradient = linearize(np.moveaxis(_relative(positions, station), -1, 0))
     return np.moveaxis(gradient, (0, 1), (-3, -1))
+
+
+def seen(x: FloatArray) -> FloatArray:
+    """Angles (2, ...) at places (3, ...), components first."""
+    return np.stack([np.arctan2(across, along) for along, across in _along_and_across(x)])
 
 
 def linearize(x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -82,6 +86,29 @@ def linearize(x: FloatArray) -> tuple[FloatArray, FloatArray]:
         np.multiply(x, along / np.where(scale > 0, scale, np.inf), out=gradient[row])
         gradient[row, k] = -across / np.where(squared > 0, squared, np.inf)
     return found, gradient
+
+
+def curvature(x: FloatArray, weights: FloatArray) -> FloatArray:
+    """Sum (3, 3, ...) of the angles' second derivatives at places (3, ...), weights (2, ...).
+
+    In the cylinder about the axis e, u the unit vector away from it, h along and a across: the
+    angle is ``atan2(a, h)``, and the circle about the axis adds ``h / (a |x|^2)`` across both.
+    """
+    squared = np.einsum("i...,i...->...", x, x)
+    total = np.zeros((3, *x.shape))
+    for k, (along, across), weight in zip(_AXES, _along_and_across(x), weights, strict=True):
+        safe = np.where(across > 0, across, np.inf)
+        u = x / safe
+        u[k] = 0.0
+        both = 2 * along * across / squared**2
+        mixed = (across**2 - along**2) / squared**2
+        around = along / (squared * safe)
+        total += (weight * -(both + around)) * u[:, None] * u
+        total[k] += weight * mixed * u
+        total[:, k] += weight * mixed * u
+        for i in range(3):
+            total[i, i] += weight * (both if i == k else around)
+    return total
 
 
 def _along_and_across(x: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
@@ -104,9 +131,9 @@ def directions(angles: FloatArray, sign: ArrayLike = 1.0) -> FloatArray:
 
 def information(positions: FloatArray, noise: AngleNoise) -> FloatArray:
     """Fisher information (..., N, 3, 3) of the angles about the place of each tag."""
-    J = jacobian(positions)
-    weight = 1 / noise.variance(J[..., 0])
-    return np.einsum("...kn,...kni,...knj->...nij", weight, J, J)
+    found, J = linearize(np.moveaxis(positions, -1, 0))
+    weight = 1 / noise.variance(found)
+    return np.moveaxis(np.einsum("k...,ki...,kj...->ij...", weight, J, J), (0, 1), (-2, -1))
 
 
 def simulate(

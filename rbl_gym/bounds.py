@@ -269,9 +269,16 @@ def doa_information(
     translation = check_array("translation", translation, (3,))
     if not isinstance(noise, bearing.AngleNoise):
         raise ValueError(f"noise must be a bearing.AngleNoise, got {noise!r:.80}")
-    positions = ranging.tag_positions(rotation, translation, tags)
     if station is not None:
-        positions = positions - check_array("station", station, (3,))[..., None, :]
+        translation = translation - check_array("station", station, (3,))
+    return doa_information_at(tags, rotation, translation, noise)
+
+
+def doa_information_at(
+    tags: FloatArray, rotation: FloatArray, translation: FloatArray, noise: bearing.AngleNoise
+) -> FloatArray:
+    """`doa_information` on arrays that are known to be good, seen from the origin."""
+    positions = ranging.tag_positions(rotation, translation, tags)
     return lift(tag_jacobian(rotation, tags), bearing.information(positions, noise))
 
 
