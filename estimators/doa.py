@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from rbl_gym.estimators.doa_newton import newton_iteration, unit_quaternion
 from rbl_gym.estimators.inputs import spanned_dimensions
 from rbl_gym.estimators.localization import Fit, PoseEstimate, covariance_of
 from rbl_gym.estimators.maximum_likelihood import Alternatives, no_alternatives
+from rbl_gym.estimators.swarm import ParticipatorySearch, ParticleSwarm, search_places
 
 HALF_SPACES: dict[str | None, float | None] = {"y>0": 1.0, "y<0": -1.0, None: None}
 # Trials of a block: their arrays, a start for each root, stay in the processor's cache.
@@ -112,7 +114,7 @@ def locate_doa(
         flat(angles, 2), 1 / noise.variance(flat(angles, 2)), flat(tags, 2),
         HALF_SPACES[half_space], distance_weight, rng or np.random.default_rng(0),
     )  # fmt: skip
-    size = _BLOCK if method == "ml" else 8 * _BLOCK
+    size = 8 * _BLOCK if method == "nia" else _BLOCK
     blocks = [
         _solve(METHODS[method], _rows(epoch, slice(start, start + size)))
         for start in range(0, len(epoch.angles), size)
@@ -196,4 +198,14 @@ def fit_of_places(epoch: DoaEpoch, positions: FloatArray, converged: np.ndarray)
     )
 
 
-METHODS: dict[str, Callable[[DoaEpoch], Fit]] = {"ml": _ml, "nia": _nia}
+def _searched(search: ParticleSwarm | ParticipatorySearch, epoch: DoaEpoch) -> Fit:
+    found = search_places(search, epoch.angles, epoch.tags, epoch.rng)
+    return fit_of_places(epoch, found.positions, found.converged)
+
+
+METHODS: dict[str, Callable[[DoaEpoch], Fit]] = {
+    "ml": _ml,
+    "nia": _nia,
+    "pso": partial(_searched, ParticleSwarm()),
+    "psa": partial(_searched, ParticipatorySearch()),
+}
