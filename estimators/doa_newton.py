@@ -22,7 +22,7 @@ DISTANCE_WEIGHT = 10.0
 # The start C has tags on the axes, where the angles have no derivative.
 START_SHIFT = 1e-3
 STEP_TOLERANCE = 1e-8
-MAX_ITERATIONS = 50
+MAX_ITERATIONS = 30
 # Below this step, in units of length, the residuals' curvature counts too (Newton proper): noise
 # leaves residuals, and with them Gauss-Newton would go on converging linearly.
 _CURVED = 1e-2

@@ -50,9 +50,7 @@ class ParticleSwarm:
         for _ in range(self.steps):
             leader = _at(best, best_cost.argmin(axis=-1))
             own, common = self.attraction * rng.random((2, *x.shape))
-            velocity = (
-                self.inertia * velocity + own * (best - x) + common * (leader[..., None] - x)
-            )
+            velocity = self.inertia * velocity + own * (best - x) + common * (leader[..., None] - x)
             x = np.clip(x + velocity, 0.0, 1.0)
             cost = objective(x)
             better = cost < best_cost
