@@ -23,8 +23,9 @@ from rbl_gym.estimators.maximum_likelihood import Alternatives, no_alternatives
 from rbl_gym.estimators.swarm import ParticipatorySearch, ParticleSwarm, search_places
 
 HALF_SPACES: dict[str | None, float | None] = {"y>0": 1.0, "y<0": -1.0, None: None}
-# Trials of a block: their arrays, a start for each root, stay in the processor's cache.
-_BLOCK = 64
+# Trials of a block, of Newton's iteration and of methods with many starts for each trial: their
+# arrays stay in the processor's cache.
+_BLOCK, _BLOCK_OF_STARTS = 1024, 64
 
 
 class DoaEpoch(NamedTuple):
@@ -114,7 +115,7 @@ def locate_doa(
         flat(angles, 2), 1 / noise.variance(flat(angles, 2)), flat(tags, 2),
         HALF_SPACES[half_space], distance_weight, rng or np.random.default_rng(0),
     )  # fmt: skip
-    size = 8 * _BLOCK if method == "nia" else _BLOCK
+    size = _BLOCK if method == "nia" else _BLOCK_OF_STARTS
     blocks = [
         _solve(METHODS[method], _rows(epoch, slice(start, start + size)))
         for start in range(0, len(epoch.angles), size)

@@ -13,16 +13,19 @@ import itertools
 import numpy as np
 
 from rbl_gym import bearing
-from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.checks import FloatArray
 from rbl_gym.components import cross, first, last
 from rbl_gym.estimators.doa_cost import DoaCost
 from rbl_gym.estimators.levenberg_marquardt import Solution, minimize_pose
-from rbl_gym.estimators.maximum_likelihood import Alternatives, cheapest, rivals
+from rbl_gym.estimators.maximum_likelihood import Alternatives, cheapest, merge, rivals
 
 # Triples of tags that starts are made from: those of largest area.
 _TRIPLES = 6
-# Starts that are refined, of a known half-space and of an unknown one.
-_REFINED, _REFINED_BOTH = 6, 10
+# Starts on each side of y = 0 that are refined, and those that are refined to the end: many
+# starts lead to one optimum.
+_REFINED, _FINALISTS = 6, 5
+# A cost so far above the best is not going to be the best.
+_HOPEFUL = 50.0
 
 
 def global_search(
@@ -37,22 +40,50 @@ def global_search(
     side
         Sign of y of the body, None: unknown.
     """
+    sides = (1.0, -1.0) if side is None else (side,)
     rotation, translation = starts(angles, tags, side)
     part = DoaCost(angles[:, None], weights[:, None], tags[:, None], np.zeros((1, 1, 3)))
     cost = _cost_of_angles(part, rotation, translation)
-    cost = np.where(_is_beyond(rotation, translation, tags, side), np.inf, cost)
-    count = min(_REFINED if side else _REFINED_BOTH, cost.shape[1])
-    keep = np.argpartition(cost, count - 1, axis=1)[:, :count]
-    refined = minimize_pose(
-        part,
+    chosen = _cheapest_of_sides(rotation, translation, cost, tags, sides, _REFINED)
+    coarse = minimize_pose(part, *chosen, iterations=6, tolerance=1e-2)
+    finalists = _cheapest_of_sides(*coarse[:2], coarse.at.cost, tags, sides, _FINALISTS)
+    refined = minimize_pose(part, *finalists, iterations=8)
+    cost = refined.at.cost
+    hopeful = cost < cost.min(axis=1, keepdims=True) + _HOPEFUL
+    slow = (hopeful & ~refined.converged).any(axis=1)
+    if slow.any():
+        rest = part.each(lambda array, _: array[slow] if len(array) == len(slow) else array)
+        more = minimize_pose(rest, refined.rotation[slow], refined.translation[slow], 60)
+        refined = merge(refined, more, slow)
+    if side is not None:
+        beyond = side * _height(refined.rotation, refined.translation, tags) <= 0
+        cost = np.where(beyond, np.inf, refined.at.cost)
+        refined = refined._replace(at=refined.at._replace(cost=cost))
+    return cheapest(refined), rivals(part, refined)
+
+
+def _cheapest_of_sides(
+    rotation: FloatArray,
+    translation: FloatArray,
+    cost: FloatArray,
+    tags: FloatArray,
+    sides: tuple[float, ...],
+    count: int,
+) -> tuple[FloatArray, FloatArray]:
+    """The `count` cheapest poses of every trial on each side of y = 0."""
+    height = _height(rotation, translation, tags)
+    count = min(count, cost.shape[1])
+    keep = np.concatenate(
+        [
+            np.argpartition(np.where(side * height > 0, cost, np.inf), count - 1)[:, :count]
+            for side in sides
+        ],
+        axis=1,
+    )
+    return (
         np.take_along_axis(rotation, keep[..., None, None], axis=1),
         np.take_along_axis(translation, keep[..., None], axis=1),
-        iterations=40,
     )
-    beyond = _is_beyond(refined.rotation, refined.translation, tags, side)
-    cost = np.where(beyond, np.inf, refined.at.cost)
-    refined = refined._replace(at=refined.at._replace(cost=cost))
-    return cheapest(refined), rivals(part, refined)
 
 
 def starts(
@@ -167,11 +198,6 @@ def _cost_of_angles(part: DoaCost, rotation: FloatArray, translation: FloatArray
     return 0.5 * np.einsum("an...,an...,an...->...", first(part.weights, 2, 2), residual, residual)
 
 
-def _is_beyond(
-    rotation: FloatArray, translation: FloatArray, tags: FloatArray, side: float | None
-) -> BoolArray:
-    """Whether the tags' centre of poses (B, S) is on the wrong side of y = 0."""
-    if side is None:
-        return np.zeros(translation.shape[:2], bool)
-    y = translation[..., 1] + np.einsum("bsj,bj->bs", rotation[..., 1, :], tags.mean(axis=1))
-    return side * y <= 0
+def _height(rotation: FloatArray, translation: FloatArray, tags: FloatArray) -> FloatArray:
+    """y of the tags' centre at poses (B, S)."""
+    return translation[..., 1] + np.einsum("bsj,bj->bs", rotation[..., 1, :], tags.mean(axis=1))

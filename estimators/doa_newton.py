@@ -107,29 +107,27 @@ def _newton_step(
     n_tags, trials = x.shape[1:]
     found, J = bearing.linearize(x)
     residual = found - angles
-    A = np.zeros((n_tags, 3, n_tags, 3, trials))
     own = np.einsum("aikb,ajkb->kijb", J, J)
-    force = -np.einsum("aikb,akb->kib", J, residual)
-    gap = x[:, pairs[:, 0]] - x[:, pairs[:, 1]]
-    distance = np.sqrt(np.maximum(np.einsum("ipb,ipb->pb", gap, gap), 1e-200))
-    along = gap * (weight / distance)
-    pull = along * (weight * (lengths - distance))
-    bend = curved * (1 - lengths / distance)
     if curved.any():
         own += (curved * bearing.curvature(x, residual)).transpose(2, 0, 1, 3)
-    at = range(n_tags)
-    A[at, :, at] = own
-    for p, (i, j) in enumerate(pairs):
-        block = ((1 - bend[p]) * along[:, None, p]) * along[:, p]
-        block[range(3), range(3)] += weight**2 * bend[p]
-        A[i, :, i] += block
-        A[j, :, j] += block
-        A[i, :, j] -= block
-        A[j, :, i] -= block
-        force[i] += pull[:, p]
-        force[j] -= pull[:, p]
+    gap = x[:, pairs[:, 0]] - x[:, pairs[:, 1]]
+    distance = np.sqrt(np.maximum(np.einsum("ipb,ipb->pb", gap, gap), 1e-200))
+    along = np.ascontiguousarray((gap * (weight / distance)).swapaxes(0, 1))
+    bend = curved * (1 - lengths / distance)
+    blocks = (along * (1 - bend)[:, None])[:, :, None] * along[:, None]
+    blocks[:, range(3), range(3)] += (weight**2 * bend)[:, None]
+    pull = along * (weight * (lengths - distance))[:, None]
+    # A pair pulls its two tags apart: +1 and -1 in its row of the incidence matrix.
+    E = np.zeros((len(pairs), n_tags))
+    E[range(len(pairs)), pairs[:, 0]], E[range(len(pairs)), pairs[:, 1]] = 1.0, -1.0
+    both = (E[:, :, None] * E[:, None]).reshape(len(pairs), -1)
+    A = (both.T @ blocks.reshape(len(pairs), -1)).reshape(n_tags, n_tags, 3, 3, trials)
+    A[range(n_tags), range(n_tags)] += own
+    force = (E.T @ pull.reshape(len(pairs), -1)).reshape(n_tags, 3, trials)
+    force -= np.einsum("aikb,akb->kib", J, residual)
     size = 3 * n_tags
-    step = solve(A.reshape(size, size, trials), force.reshape(size, trials), np.zeros(trials))
+    A = A.swapaxes(1, 2).reshape(size, size, trials)
+    step = solve(A, force.reshape(size, trials), np.zeros(trials))
     return step.reshape(n_tags, 3, trials).swapaxes(0, 1)
 
 
