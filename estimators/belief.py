@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbl_gym.bearing import AngleNoise
 from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
@@ -87,7 +88,12 @@ def names() -> list[str]:
 
 
 def make(
-    name: str, *, tags: ArrayLike, noise: NoiseLaw, process: ProcessNoise, **options: Any
+    name: str,
+    *,
+    tags: ArrayLike,
+    noise: NoiseLaw | AngleNoise,
+    process: ProcessNoise,
+    **options: Any,
 ) -> Filter:
     """A filter by its name.
 

@@ -125,7 +125,11 @@ def locate_doa(
     fields[1] = fields[1] + origin
     fields[7] = fields[7] + origin[:, None]
     fields = [field.reshape((*batch, *field.shape[1:])) for field in fields]
-    return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[0])
+    rotation, translation, covariance, cost, converged, rank, *others = fields
+    return PoseEstimate(
+        rotation, translation, covariance, cost, converged, rank, Alternatives._make(others),
+        matrix=rotation,
+    )  # fmt: skip
 
 
 def _rows(epoch: DoaEpoch, rows: slice) -> DoaEpoch:

@@ -131,8 +131,9 @@ class DoaEkf(IteratedEkf):
         loss = huber(HUBER) if self.robust else None
         data: DoaCost | SumCost = DoaCost(angles, weights, self.tags, station, loss)
         if of_ranges:
-            ranges = RangeCost(*of_ranges, self.tags, loss, lift=self._lift)
-            data = SumCost((data, ranges))
+            ranges, range_weights, anchors = of_ranges
+            cost = RangeCost(ranges, range_weights, anchors, self.tags, loss, lift=self._lift)
+            data = SumCost((data, cost))
         problem = map_problem(state, data)
         start = problem.prior.rotation, problem.prior.translation
         vague = is_vague(state.covariance)
@@ -153,7 +154,7 @@ def _best_of_angles(
 ) -> tuple[FloatArray, FloatArray]:
     """The best solve from the prior, the global solution of the angles, and its alternatives."""
     part = problem.take(batch, where)
-    data = part.data.parts[0] if isinstance(part.data, SumCost) else part.data
+    data: Any = part.data.parts[0] if isinstance(part.data, SumCost) else part.data
     best, others = global_search(data.angles, data.weights, data.tags, None)
     missing = np.isinf(others.cost)
     rotation = np.where(missing[..., None, None], best.rotation[:, None], others.rotation)

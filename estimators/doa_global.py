@@ -59,7 +59,7 @@ def global_search(
         beyond = side * _height(refined.rotation, refined.translation, tags) <= 0
         cost = np.where(beyond, np.inf, refined.at.cost)
         refined = refined._replace(at=refined.at._replace(cost=cost))
-    return cheapest(refined), rivals(part, refined)
+    return cheapest(refined), rivals(part.tags, refined)
 
 
 def _cheapest_of_sides(
@@ -146,7 +146,7 @@ def three_point_depths(rays: FloatArray, body: FloatArray) -> FloatArray:
         4 * (-p * (1 + p) * cos_b + 2 * s * cos_c**2 * cos_b - (1 - q) * cos_a * cos_c),
         (1 + p) ** 2 - 4 * s * cos_c**2,
     ]  # fmt: skip
-    v = np.maximum(_quartic_roots(np.array(coefficients)).real, 1e-3)
+    v = np.maximum(_quartic_roots(np.array(coefficients)), 1e-3)
     p, cos_a, cos_b, cos_c, b = (x[:, None] for x in (p, cos_a, cos_b, cos_c, b))
     lower = 2 * (cos_c - v * cos_a)
     lower = np.where(np.abs(lower) > 1e-9, lower, 1e-9)
@@ -155,15 +155,15 @@ def three_point_depths(rays: FloatArray, body: FloatArray) -> FloatArray:
     return np.stack([d, d * np.minimum(u, 1e3), d * np.minimum(v, 1e3)])
 
 
-def _quartic_roots(coefficients: FloatArray) -> np.ndarray:
-    """Complex roots (n, 4) of quartics with coefficients (5, n), highest power first."""
+def _quartic_roots(coefficients: FloatArray) -> FloatArray:
+    """Real parts (n, 4) of the roots of quartics with coefficients (5, n), highest power first."""
     leading = coefficients[0]
     floor = 1e-12 * np.abs(coefficients).max(axis=0) + 1e-300
     leading = np.where(np.abs(leading) > floor, leading, floor)
     companion = np.zeros((coefficients.shape[1], 4, 4))
     companion[:, 0] = -(coefficients[1:] / leading).T
     companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
-    return np.linalg.eigvals(companion)
+    return np.linalg.eigvals(companion).real
 
 
 def _align(places: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray]:

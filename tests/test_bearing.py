@@ -127,4 +127,4 @@ def test_bad_angles_are_refused(value, message):
     with pytest.raises(ValueError, match="std_rad must be"):
         bearing.AngleNoise(0.0)
     with pytest.raises(ValueError, match="noise must be a bearing"):
-        bounds.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], 0.1)
+        bounds.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], 0.1)  # pyright: ignore[reportArgumentType]

@@ -161,8 +161,8 @@ def test_the_handedness_of_the_body_tells_its_side_or_the_ambiguity_is_reported(
     turn = np.linalg.norm(rotations.error(found.rotation, rotation), axis=-1)
     right = (turn < 0.2) & (np.abs(found.translation - T).max(axis=-1) < 0.5)
     reported = np.isfinite(found.alternatives.cost[:, 0])
-    assert right.mean() > 0.97
-    assert (right | reported).mean() > 0.99
+    assert right.mean() > 0.985
+    assert (right | reported).mean() > 0.995
 
 
 @pytest.mark.parametrize("method", METHODS)

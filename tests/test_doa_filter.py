@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ RANGES = ranging.RangeNoise(0.1)
 PROCESS = motion.ProcessNoise(0.05, 0.3)
 
 
-def make(tags=TAGS, noise=NOISE, process=PROCESS, **options):
+def make(tags=TAGS, noise: Any = NOISE, process=PROCESS, **options) -> Any:
     return estimators.make(
         "iekf", tags=tags, noise=noise, process=process, measurement="doa", **options
     )
@@ -27,7 +29,7 @@ def tracked():
     env = BaseStationVectorEnv(trials, scene={"steps": 30}, reward="none")
     tags, process = np.array(env.scene.tags), env.scene.process
     law = {"tags": tags, "process": process}
-    filters = {
+    filters: dict[str, Any] = {
         "angles": make(noise=env.noise, **law),
         "both": make(noise=env.noise, range_noise=RANGES, **law),
         "ranges": estimators.make("iekf", noise=RANGES, **law),
