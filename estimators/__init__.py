@@ -7,6 +7,8 @@ change of name.
 from functools import partial
 
 from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
+from rbl_gym.estimators.doa import locate_doa
+from rbl_gym.estimators.doa_filter import DoaEkf, iterated_ekf
 from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
@@ -18,9 +20,10 @@ for _name, _constraint in {
     "kf-ortho": "always",
 }.items():
     register(_name, partial(KalmanFamily, constraint=_constraint))
-register("iekf", IteratedEkf)
+register("iekf", iterated_ekf)
 
 __all__ = [
+    "DoaEkf",
     "Filter",
     "IteratedEkf",
     "KalmanFamily",
@@ -29,6 +32,7 @@ __all__ = [
     "PoseEstimate",
     "PoseState",
     "locate",
+    "locate_doa",
     "make",
     "methods",
     "names",

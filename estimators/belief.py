@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbl_gym.bearing import AngleNoise
 from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
@@ -87,7 +88,12 @@ def names() -> list[str]:
 
 
 def make(
-    name: str, *, tags: ArrayLike, noise: NoiseLaw, process: ProcessNoise, **options: Any
+    name: str,
+    *,
+    tags: ArrayLike,
+    noise: NoiseLaw | AngleNoise,
+    process: ProcessNoise,
+    **options: Any,
 ) -> Filter:
     """A filter by its name.
 
@@ -99,7 +105,8 @@ def make(
     tags
         (N, 3), places on the body, metres, body frame.
     noise
-        Law of the ranges (`rbl_gym.ranging`).
+        Law of the ranges (`rbl_gym.ranging`); with ``measurement="doa"`` (of ``"iekf"``) that of
+        the angles (`rbl_gym.bearing.AngleNoise`).
     process
         Noise of the motion.
     **options
@@ -120,8 +127,9 @@ def make(
             )
         factory = found[0].load()
     tags = check_array("tags", tags, ("N", 3))
+    of_ranges = options.get("measurement", "ranges") == "ranges"
     for label, value, methods in (
-        ("noise", noise, ("variance", "squared_range_variance")),
+        ("noise", noise, ("variance", "squared_range_variance") if of_ranges else ("variance",)),
         ("process", process, ("covariance", "std")),
     ):
         if not all(callable(getattr(value, method, None)) for method in methods):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -154,19 +155,8 @@ class IteratedEkf:
         if mask is not None:
             weights = weights * mask
         epoch = (*state, ranges, weights, anchors)
-        batch = np.broadcast_shapes(
-            *(a.shape[: a.ndim - n] for a, n in zip(epoch, _TRAILING, strict=True))
-        )
         size = min(_BLOCK, 1 + _BLOCK_LINKS // math.prod(ranges.shape[-2:]))
-        if math.prod(batch) <= size:
-            return self._update(PoseState(*epoch[:3]), *epoch[3:])
-        flat = [_flatten(a, n, batch) for a, n in zip(epoch, _TRAILING, strict=True)]
-        parts = []
-        for start in range(0, math.prod(batch), size):
-            block = [a if len(a) == 1 else a[start : start + size] for a in flat]
-            parts.append(self._update(PoseState(*block[:3]), *block[3:]))
-        joined = (np.concatenate(fields) for fields in zip(*parts, strict=True))
-        return PoseState(*(a.reshape((*batch, *a.shape[1:])) for a in joined))
+        return update_in_blocks(self._update, epoch, _TRAILING, size)
 
     @whole_rows()
     def _update(
@@ -175,18 +165,14 @@ class IteratedEkf:
         """The update of one block of trials, links as weights (..., M, N)."""
         loss = huber(HUBER) if self.robust else None
         data = RangeCost(ranges, weights, anchors, self.tags, loss, lift=self._lift)
-        prior = PoseState(*(trials_last(a, n) for a, n in zip(state, _TRAILING[:3], strict=True)))
-        information = last(inverse(first(prior.covariance, 2)), 2)
-        problem = MapProblem(prior, information, data)
-        start = prior.rotation, prior.translation
-        vague = _is_vague(state.covariance)
+        problem = map_problem(state, data)
+        start = problem.prior.rotation, problem.prior.translation
+        vague = is_vague(state.covariance)
         if vague.any():
             _check_determined(anchors, self.tags)
-            start = global_start(problem, vague)
-        found = minimize_pose(problem, *start, iterations=self.iterations)
-        covariance = last(inverse(first(found.at.hessian, 2)), 2)
-        fields = found.rotation, found.translation, covariance
-        return PoseState(*(np.array(field, order="C") for field in fields))
+            batch = np.broadcast_shapes(vague.shape, ranges.shape[:-2], anchors.shape[:-2])
+            start = global_start(problem, vague, batch, _best_of_net)
+        return posterior(problem, *start, self.iterations)
 
     def belief(self, state: PoseState) -> PoseBelief:
         """The state as a belief (copies)."""
@@ -220,17 +206,58 @@ def _predict_many(
     return PoseState(last(rotation, 2), last(translation, 1), last(covariance, 2))
 
 
+def update_in_blocks(
+    update: Callable[..., PoseState],
+    epoch: Sequence[FloatArray],
+    trailing: Sequence[int],
+    size: int,
+) -> PoseState:
+    """`update` (state, arrays ...) over at most `size` trials at once.
+
+    `epoch`: the state's arrays and those of the measurements, each with so many `trailing` axes.
+    """
+    batch = np.broadcast_shapes(
+        *(a.shape[: a.ndim - n] for a, n in zip(epoch, trailing, strict=True))
+    )
+    if math.prod(batch) <= size:
+        return update(PoseState(*epoch[:3]), *epoch[3:])
+    flat = [_flatten(a, n, batch) for a, n in zip(epoch, trailing, strict=True)]
+    parts = []
+    for start in range(0, math.prod(batch), size):
+        block = [a if len(a) == 1 else a[start : start + size] for a in flat]
+        parts.append(update(PoseState(*block[:3]), *block[3:]))
+    joined = (np.concatenate(fields) for fields in zip(*parts, strict=True))
+    return PoseState(*(a.reshape((*batch, *a.shape[1:])) for a in joined))
+
+
+def map_problem(state: PoseState, data: Any) -> MapProblem:
+    """The problem of an update: a prior and the cost of what was measured."""
+    prior = PoseState(*(trials_last(a, n) for a, n in zip(state, _TRAILING[:3], strict=True)))
+    return MapProblem(prior, last(inverse(first(prior.covariance, 2)), 2), data)
+
+
+def posterior(
+    problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
+) -> PoseState:
+    """The most likely pose near a start, with the covariance there."""
+    found = minimize_pose(problem, rotation, translation, iterations=iterations)
+    covariance = last(inverse(first(found.at.hessian, 2)), 2)
+    fields = found.rotation, found.translation, covariance
+    return PoseState(*(np.array(field, order="C") for field in fields))
+
+
 @dataclass(frozen=True, eq=False)
 class MapProblem:
     """Maximum a posteriori pose of one epoch; arrays with leading batch axes.
 
-    Cost: that of the ranges plus half the prior's Mahalanobis distance, residual
+    `data` is the cost of the measurements (`RangeCost`, `doa_cost.DoaCost`, or a sum of costs).
+    Cost: that of the measurements plus half the prior's Mahalanobis distance, residual
     ``(log(Q Q_pred^T), t - t_pred)``.
     """
 
     prior: PoseState
     prior_information: FloatArray
-    data: RangeCost
+    data: Any
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
@@ -272,7 +299,7 @@ class MapProblem:
         return MapProblem(prior, information, data)
 
 
-def _is_vague(covariance: FloatArray) -> BoolArray:
+def is_vague(covariance: FloatArray) -> BoolArray:
     """Where (...) the rotation's largest variance is above that of `VAGUE_ROTATION_RAD`."""
     limit = VAGUE_ROTATION_RAD**2
     # The trace bounds the largest eigenvalue: most priors need no more.
@@ -293,15 +320,16 @@ def _flatten(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatA
 _NET = rotations.log(ROTATION_NET)
 
 
-def global_start(problem: MapProblem, vague: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Poses to start from: for vague priors the best of a net of local solves, else the prior.
+def global_start(
+    problem: MapProblem,
+    vague: BoolArray,
+    batch: tuple[int, ...],
+    best_of: Callable[..., tuple[FloatArray, FloatArray]],
+) -> tuple[FloatArray, FloatArray]:
+    """Poses to start from: for vague priors what `best_of` finds, else the prior.
 
-    The net is 24 rotations spread as far as the prior is wide on each axis; every one gets
-    the translation that the squared ranges and the prior imply (a linear problem), then a few
-    Gauss-Newton steps on the full cost.
+    `best_of` takes the problem, the batch, and where in it the trials stand.
     """
-    data = problem.data
-    batch = np.broadcast_shapes(vague.shape, data.ranges.shape[:-2], data.anchors.shape[:-2])
     # A trial alone has no axis to index: it gets one for the search.
     axes = batch or (1,)
     rotation = np.broadcast_to(problem.prior.rotation, (*axes, 3, 3)).copy()
@@ -310,24 +338,41 @@ def global_start(problem: MapProblem, vague: BoolArray) -> tuple[FloatArray, Flo
     size = 1 + _BLOCK // len(_NET)
     for start in range(0, len(trials[0]), size):
         where = tuple(axis[start : start + size] for axis in trials)
-        rotation[where], translation[where] = _best_of_net(problem, axes, where)
+        rotation[where], translation[where] = best_of(problem, axes, where)
     return rotation.reshape((*batch, 3, 3)), translation.reshape((*batch, 3))
 
 
 def _best_of_net(
     problem: MapProblem, batch: tuple[int, ...], where: Index
 ) -> tuple[FloatArray, FloatArray]:
-    """The best local solve (K, 3, 3), (K, 3) of the trials at an index into the batch."""
+    """The best local solve (K, 3, 3), (K, 3) of the trials at an index into the batch.
+
+    The net is 24 rotations spread as far as the prior is wide on each axis; every one gets
+    the translation that the squared ranges and the prior imply (a linear problem), then a few
+    Gauss-Newton steps on the full cost.
+    """
     part = problem.take(batch, where)
     rotation = _spread(part.prior)
     translation = _translation_given(rotation, part)
+    return best_start(problem, batch, where, rotation, translation)
+
+
+def best_start(
+    problem: MapProblem,
+    batch: tuple[int, ...],
+    where: Index,
+    rotation: FloatArray,
+    translation: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """The best local solve (K, 3, 3), (K, 3) from S starts (K, S, 3, 3), (K, S, 3) each."""
+    count = rotation.shape[1]
     # Every start is a trial of its own, so that calls run over all of them.
-    starts = problem.take(batch, tuple(np.repeat(axis, len(_NET)) for axis in where))
+    starts = problem.take(batch, tuple(np.repeat(axis, count) for axis in where))
     solution = minimize_pose(
         starts, rotation.reshape(-1, 3, 3), translation.reshape(-1, 3), 12, tolerance=1e-3
     )
-    cost = solution.at.cost.reshape(-1, len(_NET))
-    best = np.arange(len(cost)) * len(_NET) + np.argmin(cost, axis=1)
+    cost = solution.at.cost.reshape(-1, count)
+    best = np.arange(len(cost)) * count + np.argmin(cost, axis=1)
     return solution.rotation[best], solution.translation[best]
 
 

@@ -145,7 +145,7 @@ def search(part: RangeCost, first: Solution, where: BoolArray) -> tuple[Solution
     best = cheapest(fine)
     # Where many poses are nearly as good the way along the valley is long.
     polished = minimize_pose(part, best.rotation[:, None], best.translation[:, None], 100)
-    return cheapest(polished), _rivals(part, fine)
+    return cheapest(polished), rivals(part.tags, fine)
 
 
 def local_minima(part: RangeCost, first: Solution, where: BoolArray) -> Solution:
@@ -224,8 +224,8 @@ def cheapest(solutions: Solution) -> Solution:
     )
 
 
-def _rivals(part: RangeCost, solutions: Solution) -> Alternatives:
-    """Distinct minima that are about as cheap as the best."""
+def rivals(tags: FloatArray, solutions: Solution) -> Alternatives:
+    """Distinct minima (K, S) that are about as cheap as the best; tags (K, 1, N, 3)."""
     size = len(solutions.at.cost)
     result = no_alternatives(size)
     order = np.argsort(solutions.at.cost, axis=-1)
@@ -233,9 +233,9 @@ def _rivals(part: RangeCost, solutions: Solution) -> Alternatives:
     translation = np.take_along_axis(solutions.translation, order[..., None], axis=1)
     cost = np.take_along_axis(solutions.at.cost, order, axis=1)
     converged = np.take_along_axis(solutions.converged, order, axis=1)
-    positions = ranging.tag_positions(rotation, translation, part.tags)
+    positions = ranging.tag_positions(rotation, translation, tags)
     gap = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1).max(axis=-1)
-    extent = np.linalg.norm(part.tags - part.tags.mean(axis=-2, keepdims=True), axis=-1)
+    extent = np.linalg.norm(tags - tags.mean(axis=-2, keepdims=True), axis=-1)
     far = gap > 1e-3 * np.maximum(extent.max(axis=(-2, -1)), 1e-12)[:, None, None]
     chosen = np.zeros(cost.shape, bool)
     chosen[:, 0] = True

@@ -34,6 +34,10 @@ def _register_environments() -> None:
             "rbl_gym.wrappers.tasks:AnchorSelectionEnv",
             "rbl_gym.wrappers.tasks:AnchorSelectionVectorEnv",
         ),
+        "RBL/BaseStation-v0": (
+            "rbl_gym.envs.base_station:BaseStationEnv",
+            "rbl_gym.envs.base_station:BaseStationVectorEnv",
+        ),
     }
     for env_id, (scalar, vector) in entry_points.items():
         if env_id not in registry:

@@ -30,6 +30,11 @@ def icassp2013() -> FloatArray:
     return np.array([[1, 0, 0], [6, 0, 0], [7, 5, 0], [6, 5, 0], [2, 5, 0], [2.5, 2.5, 5]], float)
 
 
+def doa2019() -> FloatArray:
+    """The 4 tags of the DOA paper, a corner and 3 m along its edges, in its own frame."""
+    return np.concatenate([np.zeros((1, 3)), 3 * np.eye(3)])
+
+
 def octahedron(size_m: float = 1.0) -> FloatArray:
     """Six tags at +- `size_m` / 2 on the three axes."""
     half = 0.5 * _check_size(size_m) * np.eye(3)

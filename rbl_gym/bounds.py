@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym import ranging, rotations
+from rbl_gym import bearing, ranging, rotations
 from rbl_gym.checks import (
     BoolArray,
     FloatArray,
@@ -231,14 +231,80 @@ def pose_crb(
     )
     if prior_information is not None:
         information = information + check_array("prior_information", prior_information, (6, 6))
+    return _covariance(information, "anchors or tags")
+
+
+def _covariance(information: FloatArray, more: str) -> FloatArray:
+    """Inverse of a pose's information, or a ValueError that names its rank and what it lacks."""
     rank = information_rank(information)
     if (rank < 6).any():
         where = tuple(int(i) for i in np.argwhere(rank < 6)[0])
         raise ValueError(
             f"the geometry does not determine the pose: information of rank {int(rank.min())} "
-            f"of 6 at batch index {where}; add anchors or tags, or prior_information"
+            f"of 6 at batch index {where}; add {more}, or prior_information"
         )
     return np.linalg.inv(information)
+
+
+def doa_information(
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: bearing.AngleNoise,
+    station: ArrayLike | None = None,
+) -> FloatArray:
+    """Fisher information (..., 6, 6) of one epoch of directions of arrival about the pose.
+
+    Parameters
+    ----------
+    tags, rotation, translation
+        (..., N, 3), (..., 3, 3), (..., 3); metres.
+    noise
+        Law of the angles.
+    station
+        Place (..., 3) of the base station; None: the origin.
+    """
+    tags = check_array("tags", tags, ("N", 3))
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    if not isinstance(noise, bearing.AngleNoise):
+        raise ValueError(f"noise must be a bearing.AngleNoise, got {noise!r:.80}")
+    if station is not None:
+        translation = translation - check_array("station", station, (3,))
+    return doa_information_at(tags, rotation, translation, noise)
+
+
+def doa_information_at(
+    tags: FloatArray, rotation: FloatArray, translation: FloatArray, noise: bearing.AngleNoise
+) -> FloatArray:
+    """`doa_information` on arrays that are known to be good, seen from the origin."""
+    positions = ranging.tag_positions(rotation, translation, tags)
+    return lift(tag_jacobian(rotation, tags), bearing.information(positions, noise))
+
+
+def doa_crb(
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: bearing.AngleNoise,
+    prior_information: ArrayLike | None = None,
+    station: ArrayLike | None = None,
+) -> FloatArray:
+    """Constrained Cramer-Rao bound (..., 6, 6) of the pose from directions of arrival.
+
+    On the pose error (w, v) the constraint ``R^T R = I`` is built in: ``sqrt(2 tr P_w)`` bounds
+    the Frobenius RMSE of R and ``sqrt(tr P_v)`` the RMSE of t, as the DOA paper has them.
+    Arguments as `doa_information`, and `prior_information` (..., 6, 6).
+
+    Raises
+    ------
+    ValueError
+        As `doa_information`, and where the information is singular, with its rank.
+    """
+    information = doa_information(tags, rotation, translation, noise, station)
+    if prior_information is not None:
+        information = information + check_array("prior_information", prior_information, (6, 6))
+    return _covariance(information, "tags")
 
 
 def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.ndarray:

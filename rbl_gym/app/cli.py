@@ -186,14 +186,15 @@ def _reproduce(options: argparse.Namespace) -> int:
     plot = options.plot or f"out/{options.experiment}.png"
     if options.experiment == "camsap2013":
         figure = figures.camsap2013(result, camsap2013.example(options.seed))
+    elif options.experiment == "doa2019":
+        figure = figures.doa2019(result)
     else:
         figure = figures.static(result)
     figures.save(figure, plot)
     if options.csv:
         papers.write_csv(result, options.csv)
     if write_json(result, options.json):
-        report = reports.print_camsap2013 if "readings" in result else reports.print_static
-        report(result)
+        reports.print_experiment(result)
         print(f"picture: {plot}")
     return 0
 

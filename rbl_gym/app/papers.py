@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rbl_gym.app import camsap2013, icassp2013
+from rbl_gym.app import camsap2013, doa2019, icassp2013
 
 Advance = Callable[[], None]
 
@@ -34,6 +34,11 @@ def experiments() -> dict[str, Experiment]:
             "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), ET-KF's trade",
             camsap2013.work_units(trade=True),
             lambda trials, seed, advance: camsap2013.run(trials, seed, advance, trade=True),
+        ),
+        "doa2019": Experiment(
+            "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
+            doa2019.work_units(),
+            doa2019.run,
         ),
         "icassp2013": _static(
             "icassp2013",

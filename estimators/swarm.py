@@ -1,0 +1,149 @@
+"""The DOA paper's competitors: heuristic searches over the distances of the tags.
+
+With the directions known, K distances from the base station say where K tags are; what is
+searched for is the K distances whose places are as far from each other as the tags are on the
+body. The objective is ``sum_ij (|d_i u_i - d_j u_j| - |c_i - c_j|)^2`` (the paper's norms squared:
+without the square the error would not fall in proportion to the noise). The y of all tags has one
+sign. The paper says little about either search; what was assumed stands in the two classes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbl_gym import bearing
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.doa_newton import Places, body_size
+
+# Objective (B, P) of normalised distances (K, B, P).
+Objective = Callable[[FloatArray], FloatArray]
+# A search counts as converged where its best distances moved less than this (units of the body's
+# size) over the last quarter of its steps.
+_STILL = 1e-3
+
+
+@dataclass(frozen=True)
+class ParticleSwarm:
+    """Particle swarm optimisation with constriction (Clerc and Kennedy 2002), global best.
+
+    Assumed: 40 particles, 200 steps, inertia 0.7298, both attractions 1.4962, distances up to 10
+    body sizes, places clipped to that, velocities start at zero.
+    """
+
+    size: int = 40
+    steps: int = 200
+    reach: float = 10.0
+    inertia: float = 0.7298
+    attraction: float = 1.4962
+
+    def search(
+        self, objective: Objective, shape: tuple[int, int], rng: np.random.Generator
+    ) -> Iterator[FloatArray]:
+        """The best distances (K, B) after each step, in units of `reach`."""
+        x = rng.random((*shape, self.size))
+        velocity = np.zeros_like(x)
+        best, best_cost = x.copy(), objective(x)
+        for _ in range(self.steps):
+            leader = _at(best, best_cost.argmin(axis=-1))
+            own, common = self.attraction * rng.random((2, *x.shape))
+            velocity = self.inertia * velocity + own * (best - x) + common * (leader[..., None] - x)
+            x = np.clip(x + velocity, 0.0, 1.0)
+            cost = objective(x)
+            better = cost < best_cost
+            best = np.where(better, x, best)
+            best_cost = np.where(better, cost, best_cost)
+            yield _at(best, best_cost.argmin(axis=-1))
+
+
+@dataclass(frozen=True)
+class ParticipatorySearch:
+    """Participatory search algorithm (Liu and Gomide, Evolving Intelligence 10, 2017), as sketched.
+
+    A pool of individuals on [0, 1]^K; compatibility of two is one minus their mean absolute
+    difference. At every step, of each individual s and a random other one s': p_s is the one more
+    compatible with the best; ``p_r = s + alpha rho^(1-a) (s' - s)`` recombines them by the
+    participatory learning rule, rho their compatibility; ``p_m = best + rho^(1-a) (p_s - p_r)``
+    mutates, rho that of p_s and p_r; p_m stays where it is better than s. The worst tenth then
+    gives way to new random individuals.
+
+    Assumed: 40 individuals, 200 steps, alpha = 0.5 (learning rate), a = 0 (no arousal),
+    distances up to 10 body sizes, and the new tenth.
+    """
+
+    size: int = 40
+    steps: int = 200
+    reach: float = 10.0
+    learning_rate: float = 0.5
+    arousal: float = 0.0
+    fresh: int = 4
+
+    def search(
+        self, objective: Objective, shape: tuple[int, int], rng: np.random.Generator
+    ) -> Iterator[FloatArray]:
+        """The best distances (K, B) after each step, in units of `reach`."""
+        x = rng.random((*shape, self.size))
+        cost = objective(x)
+        power = 1 - self.arousal
+        for _ in range(self.steps):
+            best = _at(x, cost.argmin(axis=-1))[..., None]
+            other = np.roll(x, rng.integers(1, self.size), axis=-1)
+            nearer = _compatibility(x, best) >= _compatibility(other, best)
+            selected = np.where(nearer, x, other)
+            recombined = x + self.learning_rate * _compatibility(x, other) ** power * (other - x)
+            change = _compatibility(selected, recombined) ** power * (selected - recombined)
+            child = np.clip(best + change, 0.0, 1.0)
+            child_cost = objective(child)
+            better = child_cost < cost
+            x, cost = np.where(better, child, x), np.where(better, child_cost, cost)
+            worst = np.argpartition(-cost, self.fresh, axis=-1)[..., : self.fresh]
+            new = rng.random((*shape, self.fresh))
+            np.put_along_axis(x, np.broadcast_to(worst, new.shape), new, axis=-1)
+            np.put_along_axis(cost, worst, objective(new), axis=-1)
+            yield _at(x, cost.argmin(axis=-1))
+
+
+def search_places(
+    search: ParticleSwarm | ParticipatorySearch,
+    angles: FloatArray,
+    tags: FloatArray,
+    rng: np.random.Generator,
+) -> Places:
+    """Places (B, K, 3) of the tags, y >= 0, by a search; angles (B, 2, K), tags (B, K, 3)."""
+    unit = body_size(tags)
+    rays = bearing.directions(angles)
+    body = (tags / unit[:, None, None]).transpose(2, 1, 0)
+    pairs = np.array(list(itertools.combinations(range(tags.shape[1]), 2))).T
+    gap = body[:, pairs[0]] - body[:, pairs[1]]
+    lengths = np.sqrt((gap * gap).sum(axis=0))[..., None] / search.reach
+    cosines = np.einsum("bpi,bpi->pb", rays[:, pairs[0]], rays[:, pairs[1]])[..., None]
+
+    def objective(x: FloatArray) -> FloatArray:
+        total = np.zeros(x.shape[1:])
+        for i, j, length, cosine in zip(*pairs, lengths, cosines, strict=True):
+            # |d_i u_i - d_j u_j|^2, never below zero by rounding.
+            squared = (x[i] - x[j]) ** 2 + 2 * (1 - cosine) * x[i] * x[j]
+            total += (np.sqrt(np.maximum(squared, 0.0)) - length) ** 2
+        return total
+
+    shape = tags.shape[1], len(tags)
+    still_from = search.steps - search.steps // 4
+    earlier = found = np.zeros(shape)
+    for step, found in enumerate(search.search(objective, shape, rng)):
+        if step == still_from:
+            earlier = found
+    moved = search.reach * np.abs(found - earlier).max(axis=0)
+    positions = rays * (search.reach * unit * found).T[..., None]
+    return Places(positions, np.full(len(tags), search.steps), moved < _STILL)
+
+
+def _at(x: FloatArray, index: np.ndarray) -> FloatArray:
+    """The individuals (K, B) at an index (B,) into (K, B, P)."""
+    return np.take_along_axis(x, index[None, :, None], axis=-1)[..., 0]
+
+
+def _compatibility(x: FloatArray, y: FloatArray) -> FloatArray:
+    return 1 - np.abs(x - y).mean(axis=0)

@@ -1,0 +1,225 @@
+"""RBL/BaseStation-v0: one rigid body, one base station that sees where its tags are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+
+from rbl_gym import bearing, bodies, bounds, ranging, scenes, simulation
+from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
+from rbl_gym.envs.batch import BatchEnv, ScalarEnv
+from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
+from rbl_gym.ranging import LinkModel
+
+ANGLE_STD_RAD = math.radians(0.1)
+# The world, as changes of a scene; it keeps the body on the station's side y > 0.
+WORLD: dict[str, Any] = {
+    "name": "drone_yard",
+    "volume": {"low": [-12, 8, 2], "high": [12, 30, 12]},
+    "anchor_region": {"low": [-20, -6, 0], "high": [20, 0, 6]},
+    "n_anchors": 1,
+    "anchors": [[0, 0, 3]],
+    "anchor_speed_m_s": 3.0,
+    "tags": bodies.centred(bodies.doa2019()).tolist(),
+    "speed_m_s": 2.0,
+}
+
+
+def world(scene: Mapping[str, Any] | None) -> scenes.Scene:
+    """The scene that `WORLD` and these changes of it make.
+
+    Raises
+    ------
+    ValueError
+        If it is not of one base station, or has links or obstacles that angles do not know.
+    """
+    changes = {} if scene is None else scene
+    if not isinstance(changes, Mapping):
+        raise ValueError(f"scene must be a dict of changes, got {scene!r:.80}")
+    found = scenes.get({**WORLD, **changes})
+    if found.n_anchors != 1:
+        raise ValueError(f"scene must have n_anchors = 1, got {found.n_anchors}")
+    if found.links != LinkModel() or found.obstacles:
+        raise ValueError("scene must have neither links that fail nor obstacles")
+    return found
+
+
+class BaseStationVectorEnv(BatchEnv):
+    """`num_envs` independent `BaseStationEnv` worlds; seeding and autoreset as `BatchEnv`.
+
+    Made by ``gym.make_vec("rbl_gym:RBL/BaseStation-v0", num_envs=64)``; arguments as
+    `BaseStationEnv`.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scene: Mapping[str, Any] | None = None,
+        angle_std_rad: float = ANGLE_STD_RAD,
+        reward: str = "bound",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        self.scene = world(scene)
+        self.noise = bearing.AngleNoise(check_number("angle_std_rad", angle_std_rad, low=1e-12))
+        self.reward_mode = check_one_of("reward", reward, REWARDS)
+        self._tags = np.asarray(self.scene.tags)
+        shape = (2, len(self._tags))
+        of_ranges = observation_space(self.scene)
+        place = of_ranges["anchors"]
+        assert isinstance(place, spaces.Box)
+        self.single_observation_space = spaces.Dict(
+            {
+                "angles": spaces.Box(0.0, np.pi, shape, np.float64),
+                "station": spaces.Box(place.low[0], place.high[0], dtype=np.float64),
+                "twist": of_ranges["twist"],
+            }
+        )
+        self.single_action_space = action_space(self.scene)
+        self._configure(num_envs, render_mode, self.scene.steps, max_episode_steps, autoreset_mode)
+        self._episodes = EpisodeStore(self.scene, num_envs)
+        self._normals = np.zeros((num_envs, self.scene.steps + 1, *shape))
+        self._stations = np.zeros((num_envs, 1, 3))
+        self._angles = np.zeros((num_envs, *shape))
+        self._prior = (
+            np.zeros((num_envs, 3, 3)),
+            np.zeros((num_envs, 3)),
+            np.zeros((num_envs, 6, 6)),
+        )
+        self._information = np.zeros((num_envs, 6, 6))
+        self._score_m = np.zeros(num_envs)
+
+    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        start = self._episodes.begin(chosen, generators)
+        for row, generator in zip(chosen, generators, strict=True):
+            generator.standard_normal(out=self._normals[row])
+        self._stations[chosen] = start["anchors"]
+        for held, name in zip(self._prior, ("rotation", "translation", "covariance"), strict=True):
+            held[chosen] = start[f"prior_{name}"]
+        self._information[chosen] = np.linalg.inv(start["prior_covariance"])
+        self._measure(chosen, self._at(chosen))
+
+    def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
+        rows = np.flatnonzero(moving)
+        if len(rows):
+            if self.scene.anchor_speed_m_s > 0:
+                self._stations[rows] = simulation.move_anchors(
+                    self.scene, self._stations[rows], actions[rows]
+                )
+            at = self._at(rows)
+            if self.reward_mode == "bound":
+                self._information[rows] = bounds.predict_information(
+                    self._information[rows], at.twist, self.scene.dt, self.scene.process
+                )
+            self._measure(rows, at)
+        reward = np.zeros(self.num_envs)
+        if self.reward_mode == "bound":
+            reward = -np.log(self._score_m)
+        return reward, np.zeros(self.num_envs, dtype=np.bool_)
+
+    def _at(self, rows: np.ndarray) -> simulation.Epoch:
+        """Some worlds at their epochs."""
+        at = self._episodes.at(self._epochs)
+        fields = (None if field is None else np.ascontiguousarray(field[rows]) for field in at)
+        return simulation.Epoch(*fields)  # pyright: ignore[reportArgumentType]
+
+    def _measure(self, rows: np.ndarray, at: simulation.Epoch) -> None:
+        """Angles of an epoch, and what they tell."""
+        away = at.translation - self._stations[rows, 0]
+        seen = bearing.angles(ranging.tag_positions(at.rotation, away, self._tags))
+        self._angles[rows] = self.noise.sample(seen, self._normals[rows, self._epochs[rows]])
+        if self.reward_mode == "bound":
+            self._information[rows] += bounds.doa_information_at(
+                self._tags, at.rotation, away, self.noise
+            )
+            covariance = np.linalg.inv(self._information[rows])
+            self._score_m[rows] = bounds.score(covariance, at.rotation, self._tags)
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {
+            "angles": self._angles.copy(),
+            "station": self._stations[:, 0].copy(),
+            "twist": np.array(self._episodes.at(self._epochs).twist, order="C"),
+        }
+
+    def _inform(self) -> dict[str, np.ndarray]:
+        at = self._episodes.at(self._epochs)
+        info = {
+            "rotation": np.array(at.rotation, order="C"),
+            "translation": np.array(at.translation, order="C"),
+            "epoch": self._epochs.copy(),
+        }
+        for held, name in zip(self._prior, ("rotation", "translation", "covariance"), strict=True):
+            info[f"prior_{name}"] = held.copy()
+        if self.reward_mode == "bound":
+            info["score_m"] = self._score_m.copy()
+        return info
+
+
+class BaseStationEnv(ScalarEnv):
+    """A rigid body moves; one base station measures directions to its tags: where is it?
+
+    ## Description
+    A body carries N tags at known places. At every epoch a base station at a known place
+    measures, for every tag, the angle alpha of its direction to the x axis and beta to the z
+    axis (`rbl_gym.bearing`; the station's axes are the world's). Distances are not measured: the
+    size of the body tells them, the worse the farther it is. Within a step: the station moves,
+    the body moves, angles are taken, the bound and the reward follow.
+
+    ## Action space
+    ``Box(-1, 1, (3,), float32)``: velocity of the base station in units of its limit (3 m/s; cut
+    to length 1); zero keeps it. Its place is projected onto the scene's anchor region. A scene
+    with ``anchor_speed_m_s`` 0: ``Discrete(1)``.
+
+    ## Observation space
+    A ``Dict``, all float64:
+
+    | key | shape | meaning |
+    |---|---|---|
+    | `angles` | (2, N) | alpha and beta of every tag, radians on [0, pi] |
+    | `station` | (3,) | place of the base station at this epoch, metres |
+    | `twist` | (6,) | known angular velocity (rad/s) and velocity (m/s) of the interval that ends at this epoch |
+
+    ## Reward
+    ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square tag
+    error in metres at the true pose. ``"none"``: 0.
+
+    ## Info
+    `rotation`, `translation`: the true pose; `epoch`; `score_m`: b (with ``reward="bound"``);
+    the prior of the episode (`prior_rotation`, `prior_translation`, `prior_covariance`), which
+    refers to epoch 0 before its update.
+
+    ## Episode end
+    Never terminates; truncates after `scene.steps` steps (100 of 0.1 s).
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+
+    env = gym.make("rbl_gym:RBL/BaseStation-v0", angle_std_rad=0.01)
+    env = gym.make("rbl_gym:RBL/BaseStation-v0", scene={"steps": 50, "anchor_speed_m_s": 0})
+    ```
+    `scene`: changes of the world (`WORLD`), see `rbl_gym.scenes.get`; its noise of ranges is not
+    used. `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``.
+
+    ## Version history
+    * v0: first version.
+    """  # noqa: E501 (a table row cannot be broken)
+
+    batch_class = BaseStationVectorEnv
+
+    def __init__(
+        self,
+        scene: Mapping[str, Any] | None = None,
+        angle_std_rad: float = ANGLE_STD_RAD,
+        reward: str = "bound",
+        render_mode: str | None = None,
+    ) -> None:
+        self._configure(render_mode, scene=scene, angle_std_rad=angle_std_rad, reward=reward)

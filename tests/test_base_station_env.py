@@ -1,0 +1,146 @@
+"""RBL/BaseStation-v0: Gymnasium's contract, angles and score by hand, scalar against vector."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+from rbl_gym import bearing, bounds
+from rbl_gym.envs.base_station import BaseStationEnv, BaseStationVectorEnv
+from tests.helpers import assert_same
+
+ID = "rbl_gym:RBL/BaseStation-v0"
+WORLDS: dict[str, dict[str, Any]] = {
+    "default": {"scene": {"steps": 5}},
+    "fixed station": {"scene": {"steps": 5, "anchor_speed_m_s": 0}},
+    "coarse": {"scene": {"steps": 5}, "angle_std_rad": 0.05, "reward": "none"},
+}
+every_world = pytest.mark.parametrize("kind", WORLDS)
+
+
+def actions_of(env, rng):
+    space = env.single_action_space
+    if isinstance(space, gym.spaces.Discrete):
+        return np.zeros(env.num_envs, dtype=int)
+    return rng.uniform(-1.3, 1.3, env.action_space.shape).astype(np.float32)
+
+
+@every_world
+def test_gymnasiums_checker_has_no_complaint(kind):
+    check_env(gym.make(ID, **WORLDS[kind]).unwrapped)
+
+
+@every_world
+def test_specs_round_trip(kind):
+    env = gym.make(ID, **WORLDS[kind])
+    assert env.spec is not None
+    text = env.spec.to_json()
+    again = gym.make(EnvSpec.from_json(text))
+    assert again.spec is not None
+    assert json.loads(again.spec.to_json()) == json.loads(text)
+    assert_same(again.reset(seed=3), env.reset(seed=3))
+
+
+@every_world
+def test_world_i_of_a_vector_is_the_scalar_environment_seeded_alike(kind):
+    vector = BaseStationVectorEnv(3, **WORLDS[kind])
+    scalars = [BaseStationEnv(**WORLDS[kind]) for _ in range(3)]
+    rng = np.random.default_rng(1)
+    observation, info = vector.reset(seed=7)
+    for i, env in enumerate(scalars):
+        alone, details = env.reset(seed=7 + i)
+        assert_same(alone, {key: value[i] for key, value in observation.items()}, 1e-9, 1e-9)
+        assert_same(details["translation"], info["translation"][i], 1e-9, 1e-9)
+    ended = False
+    for _ in range(9):
+        actions = actions_of(vector, rng)
+        observation, reward, terminated, truncated, info = vector.step(actions)
+        assert not terminated.any()
+        for i, env in enumerate(scalars):
+            if ended:
+                alone, gain, over = env.reset()[0], 0.0, False
+            else:
+                alone, gain, _, over, _ = env.step(actions[i])
+            assert_same(alone, {key: value[i] for key, value in observation.items()}, 1e-9, 1e-9)
+            assert gain == pytest.approx(reward[i], abs=1e-9)
+            assert over == truncated[i]
+        ended = bool(truncated.all())
+
+
+def test_angles_and_score_by_hand():
+    env = BaseStationEnv(scene={"steps": 8})
+    scene, noise = env._batch.scene, env._batch.noise
+    tags = np.array(scene.tags)
+    env.action_space.seed(0)
+    observation, info = env.reset(seed=2)
+    J = np.linalg.inv(info["prior_covariance"])
+    residuals = []
+    for epoch in range(9):
+        if epoch:
+            before = observation["station"]
+            observation, reward, _, truncated, info = env.step(env.action_space.sample())
+            assert np.linalg.norm(observation["station"] - before) <= 3.0 * scene.dt + 1e-9
+            assert truncated == (epoch == 8)
+            J = bounds.predict_information(J, observation["twist"], scene.dt, scene.process)
+            assert reward == pytest.approx(-math.log(info["score_m"]))
+        assert info["epoch"] == epoch
+        pose, station = (info["rotation"], info["translation"]), observation["station"]
+        J = J + bounds.doa_information(tags, *pose, noise, station)
+        score = bounds.score(np.linalg.inv(J), info["rotation"], tags)
+        assert info["score_m"] == pytest.approx(float(score), rel=1e-9)
+        true = bearing.angles(tags @ pose[0].T + pose[1], station)
+        residuals.append((observation["angles"] - true) / noise.std_rad)
+    assert 0.7 < np.std(residuals) < 1.3
+    assert observation["station"][1] < info["translation"][1]
+
+
+def test_a_nearer_station_sees_better():
+    """Toward the body against away from it, the same episodes."""
+    scores = {}
+    for direction in (1.0, -1.0):
+        env = BaseStationVectorEnv(20, scene={"steps": 40})
+        env.reset(seed=5)
+        for _ in range(40):
+            info = env.step(np.tile([0.0, direction, 0.0], (20, 1)))[-1]
+        scores[direction] = np.log(info["score_m"]).mean()
+    assert scores[1.0] < scores[-1.0] - 0.05
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_twins_in_mid_episode_go_on_alike_in_every_mode(mode):
+    env = BaseStationVectorEnv(3, scene={"steps": 4}, autoreset_mode=mode)
+    rng = np.random.default_rng(1)
+    env.reset(seed=1)
+    env.step(actions_of(env, rng))
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    for _ in range(3 if mode == "Disabled" else 7):
+        actions = actions_of(env, rng)
+        want = env.step(actions)
+        for twin in twins:
+            assert_same(twin.step(actions), want)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scene": "uwb_room"}, "scene must be a dict"),
+        ({"scene": {"n_anchors": 2, "anchors": None}}, "n_anchors = 1"),
+        ({"scene": {"links": {"drop_probability": 0.1}}}, "neither links"),
+        ({"scene": {"walls": 2}}, "no field 'walls'"),
+        ({"angle_std_rad": 0.0}, "angle_std_rad must be"),
+        ({"reward": "belief"}, "reward must be one of"),
+        ({"render_mode": "human"}, "render_mode must be None"),
+    ],
+)
+def test_bad_arguments_are_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        BaseStationEnv(**changes)
