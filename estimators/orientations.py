@@ -85,30 +85,44 @@ def along_tree(edges: IntArray, y: FloatArray, n_nodes: int) -> FloatArray:
 
 def chordal(edges: IntArray, y: FloatArray, n_nodes: int) -> FloatArray:
     """Phases (n,) of ``min sum |z_j - e^{iy} z_i|^2`` with ``z_0 = 1``."""
+    return _chordal(edges, y, n_nodes)[0]
+
+
+def _chordal(edges: IntArray, y: FloatArray, n_nodes: int) -> tuple[FloatArray, IntArray]:
+    """`chordal`, and the rank (n,) of the nodes in the order of elimination, node 0 first."""
     if n_nodes == 1:
-        return np.zeros(1)
+        return np.zeros(1), np.zeros(1, dtype=np.intp)
     L = _laplacian(edges, np.exp(-1j * y), n_nodes)
     right = -L[1:, [0]].toarray().ravel()
-    return np.concatenate([[0.0], np.angle(_factorised(L[1:, 1:]).solve(right))])
+    factors = _factorised(L[1:, 1:])
+    phases = np.angle(factors.solve(right))
+    return np.concatenate([[0.0], phases]), np.concatenate([[0], 1 + factors.perm_c])
 
 
 def maximum_likelihood(
     edges: IntArray, y: FloatArray, n_nodes: int, start: FloatArray | None = None
 ) -> FloatArray:
-    """Least squares of the wrapped residuals, by Gauss-Newton steps that wrap anew.
+    """Least squares (n,) of the wrapped residuals, by Gauss-Newton steps that wrap anew.
 
-    One factorisation of the Laplacian serves all steps; once no residual wraps, a step is exact.
+    One factorisation of the Laplacian serves all steps; once no residual wraps, a step is
+    exact. `start` (n,) takes the place of the chordal one.
     """
-    theta = chordal(edges, y, n_nodes) if start is None else start
     if n_nodes == 1:
-        return theta
-    solve = _factorised(_laplacian(edges, np.ones(len(edges)), n_nodes)[1:, 1:]).solve
+        return np.zeros(1)
+    theta, rank = _chordal(edges, y, n_nodes) if start is None else (start, None)
+    # The chordal system has found a good order of elimination: the nodes are named by it.
+    names = np.arange(n_nodes) if rank is None else rank
+    named = names[edges]
+    at = np.empty(n_nodes)
+    at[names] = theta
+    L = _laplacian(named, np.ones(len(edges)), n_nodes)
+    solve = _factorised(L[1:, 1:], "MMD_AT_PLUS_A" if rank is None else "NATURAL").solve
     for _ in range(_MAX_STEPS):
-        step = solve(_gathered(edges, residuals(edges, y, theta), n_nodes)[1:])
-        theta = theta + np.concatenate([[0.0], step])
-        if np.abs(step).max() <= _SETTLED_RAD * max(1.0, float(np.abs(theta).max())):
+        step = solve(_gathered(named, residuals(named, y, at), n_nodes)[1:])
+        at[1:] += step
+        if np.abs(step).max() <= _SETTLED_RAD * max(1.0, float(np.abs(at).max())):
             break
-    return theta
+    return at[names]
 
 
 def spectral(edges: IntArray, y: FloatArray, n_nodes: int) -> FloatArray:
@@ -201,10 +215,10 @@ def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matri
     return sp.csc_matrix((values, (rows, columns)), shape=(n_nodes, n_nodes))
 
 
-def _factorised(A: sp.csc_matrix) -> Any:
-    """LU of a Hermitian matrix with pivots on its diagonal."""
+def _factorised(A: sp.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any:
+    """LU of a Hermitian matrix with pivots on its diagonal, of minimum degree or as it is."""
     return scipy.sparse.linalg.splu(
-        sp.csc_matrix(A), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        sp.csc_matrix(A), permc_spec=order, diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )  # fmt: skip
 
