@@ -7,9 +7,17 @@ change of name.
 from functools import partial
 
 from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
+from rbl_gym.estimators.consensus import (
+    cycle_consensus,
+    cycle_iteration,
+    cycle_projection,
+    ring_least_squares,
+)
 from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
+from rbl_gym.estimators.network_frames import FrameEstimate, frames
+from rbl_gym.estimators.network_orientations import chordal_optimum, orientations
 
 for _name, _constraint in {
     "kf": "none",
@@ -22,15 +30,23 @@ register("iekf", IteratedEkf)
 
 __all__ = [
     "Filter",
+    "FrameEstimate",
     "IteratedEkf",
     "KalmanFamily",
     "KalmanState",
     "PoseBelief",
     "PoseEstimate",
     "PoseState",
+    "chordal_optimum",
+    "cycle_consensus",
+    "cycle_iteration",
+    "cycle_projection",
+    "frames",
     "locate",
     "make",
     "methods",
     "names",
+    "orientations",
     "register",
+    "ring_least_squares",
 ]
