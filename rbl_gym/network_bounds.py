@@ -18,9 +18,7 @@ from rbl_gym.network_graphs import check_connected, incidence
 from rbl_gym.sensing_network import IntArray, check_edges, directions
 
 
-def orientation_covariance(
-    edges: ArrayLike, n_nodes: int, bearing_std_rad: float
-) -> FloatArray:
+def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
     """Bound (n - 1, n - 1) of orientations 1 to n - 1 from edge angles of variance 2 sigma^2."""
     sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
     B = incidence(check_connected(edges, n_nodes), n_nodes)[:, 1:]

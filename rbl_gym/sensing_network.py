@@ -89,9 +89,7 @@ def check_edge_values(name: str, values: ArrayLike, edges: IntArray, trailing: i
     return check_finite(name, array)
 
 
-def unit_disk_edges(
-    positions: ArrayLike, radius_m: float, blind_m: float = 0.0
-) -> IntArray:
+def unit_disk_edges(positions: ArrayLike, radius_m: float, blind_m: float = 0.0) -> IntArray:
     """Edges (m, 2), i < j and sorted, of nodes at most `radius_m` apart.
 
     Nodes nearer than `blind_m` do not see each other.
