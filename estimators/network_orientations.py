@@ -31,7 +31,6 @@ class ChordalOptimum(NamedTuple):
     theta: FloatArray  # (n,) radians, that of node 0 is 0
     cost: float  # sum of |e^{i theta_j} - e^{i y} e^{i theta_i}|^2 = 2 (1 - cos residual)
     certified: bool
-    steps: int
 
 
 def orientations(
@@ -167,10 +166,9 @@ def chordal_optimum(
     edges = check_connected(edges, n_nodes)
     y = check_edge_values("y", y, edges)
     if n_nodes == 1:
-        return ChordalOptimum(np.zeros(1), 0.0, True, 0)
+        return ChordalOptimum(np.zeros(1), 0.0, True)
     theta = maximum_likelihood(edges, y, n_nodes) if start is None else np.asarray(start, float)
-    steps = 0
-    for steps in range(1, _MAX_STEPS + 1):
+    for _ in range(_MAX_STEPS):
         residual = residuals(edges, y, theta)
         # Newton's curvature where it is safe, that of the squares elsewhere.
         curvature = np.maximum(np.cos(residual), 0.1)
@@ -182,7 +180,7 @@ def chordal_optimum(
     residual = residuals(edges, y, theta)
     value = float(4 * (np.sin(residual / 2) ** 2).sum())
     certified = _is_positive(_dual(edges, residual, n_nodes)[1:, 1:])
-    return ChordalOptimum(proj(theta), value, certified, steps)
+    return ChordalOptimum(proj(theta), value, certified)
 
 
 def _dual(edges: IntArray, residual: FloatArray, n_nodes: int) -> sp.csc_matrix:

@@ -97,8 +97,10 @@ def _csv_rows(path: str) -> _Rows:
     extra = ["dx", "dy"] if {"dx", "dy"} & set(names) else []
     extra += list(_INFORMATION) if set(_INFORMATION) & set(names) else []
     if sorted(names) != sorted([*wanted, *extra]):
-        raise ValueError(f"{path}, line {number}: columns must be i, j and dtheta (or y; or a, b), "
-                         f"then dx, dy, I11 to I33 or not, got {', '.join(names)!r:.120}")  # fmt: skip
+        raise ValueError(
+            f"{path}, line {number}: columns must be i, j and dtheta (or y; or a, b), then dx, "
+            f"dy, I11 to I33 or not, got {', '.join(names)!r:.120}"
+        )
     lines, rows = [], []
     for number, line in content:
         lines.append(number)

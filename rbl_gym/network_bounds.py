@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_number

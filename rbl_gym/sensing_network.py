@@ -11,13 +11,13 @@ localization for relative sensing networks". Numbers of equations are the paper'
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from rbl_gym.checks import FloatArray, check_array, check_finite, check_number, check_shape
+from rbl_gym.checks import FloatArray, as_float, check_array, check_finite, check_number
 
 IntArray = NDArray[np.intp]
 _TURN = 2 * np.pi
@@ -40,11 +40,11 @@ class SensingNetwork(NamedTuple):
 def proj(angle: ArrayLike) -> FloatArray:
     """Angles brought into the half-open [-pi, pi); those inside stay to the last bit."""
     angle = np.asarray(angle, dtype=np.float64)
-    turns = np.floor((angle + np.pi) / _TURN)
-    wrapped = np.asarray(angle - _TURN * turns)
+    wrapped = angle - _TURN * np.floor((angle + np.pi) / _TURN)
     # Rounding can leave a value on the open end, or just below the closed one.
     wrapped = np.where(wrapped >= np.pi, wrapped - _TURN, wrapped)
-    return np.where(wrapped < -np.pi, -np.pi, wrapped)
+    wrapped = np.maximum(wrapped, -np.pi)
+    return np.where((angle >= -np.pi) & (angle < np.pi), angle, wrapped)
 
 
 def check_edges(edges: ArrayLike, n_nodes: int) -> IntArray:
@@ -79,11 +79,14 @@ def check_edges(edges: ArrayLike, n_nodes: int) -> IntArray:
     return array
 
 
-def check_edge_values(name: str, values: ArrayLike, edges: IntArray, trailing: int = 0) -> Any:
+def check_edge_values(
+    name: str, values: ArrayLike, edges: IntArray, trailing: int = 0
+) -> FloatArray:
     """`values` as finite floats, one (or a row of `trailing`) for each edge."""
     shape = (len(edges), trailing) if trailing else (len(edges),)
-    array = np.asarray(values, dtype=np.float64) if np.size(values) == 0 else None
-    array = check_shape(name, values, shape) if array is None else array.reshape(-1, *shape[1:])
+    array = as_float(name, values)
+    if array.size == 0 == len(edges):
+        return np.zeros(shape)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape} like the edges, got {array.shape}")
     return check_finite(name, array)
