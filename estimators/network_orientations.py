@@ -21,6 +21,7 @@ from rbl_gym.sensing_network import IntArray, check_edge_values, proj
 
 _SETTLED_RAD = 1e-13
 _MAX_STEPS = 100
+_DENSE = 50  # nodes up to which all eigenvectors are computed
 # Pivots of the dual matrix below this share of a node's number of edges count as zero.
 _PIVOT_FLOOR = 1e-10
 
@@ -126,12 +127,14 @@ def maximum_likelihood(
 
 def spectral(edges: IntArray, y: FloatArray, n_nodes: int) -> FloatArray:
     """Phases (n,) of the eigenvector of the connection Laplacian's smallest eigenvalue."""
-    if n_nodes <= 2:
-        return along_tree(edges, y, n_nodes)
     L = _laplacian(edges, np.exp(-1j * y), n_nodes)
-    start = np.exp(1j * along_tree(edges, y, n_nodes))
-    vector = scipy.sparse.linalg.eigsh(L, k=1, sigma=-1e-6, v0=start)[1][:, 0]
-    return np.angle(vector * np.conj(vector[0]))
+    if n_nodes <= _DENSE:
+        vector = np.linalg.eigh(L.toarray())[1][:, 0]
+    else:
+        start = np.exp(1j * along_tree(edges, y, n_nodes))
+        vector = scipy.sparse.linalg.eigsh(L, k=1, sigma=-1e-6, v0=start)[1][:, 0]
+    phases = np.angle(vector)
+    return phases - phases[0]
 
 
 def _cycle(edges: IntArray, y: FloatArray, n_nodes: int, **options: Any) -> FloatArray:
