@@ -7,7 +7,6 @@ the iteration (14) reaches it with exchanges inside of each cycle only.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -164,6 +163,7 @@ def cycle_iteration(
     order: str = "synchronous",
     rng: np.random.Generator | None = None,
     loss: float = 0.0,
+    branch: ArrayLike | None = None,
 ) -> CycleRun:
     """The cycle-distributed iteration, (14): ``psi <- psi - kappa C^T proj(C psi)`` from y.
 
@@ -187,6 +187,9 @@ def cycle_iteration(
     loss
         Probability that a cycle's message is lost on its way around: its turn then passes
         without effect.
+    branch
+        k (q,) of ``C psi = 2 pi k``, whole numbers, where it is known, for instance from an
+        earlier estimate; None: each cycle takes the nearest, at every step.
 
     Raises
     ------
@@ -206,25 +209,26 @@ def cycle_iteration(
     if rng is None and (one_by_one or loss):
         raise ValueError("rng must be a Generator for a random order or losses, got None")
     step = _step(C, kappa, one_by_one)
+    target = None if branch is None else _TURN * _whole(branch, C.shape[0])
     lengths = np.maximum(np.diff(C.indptr), 1)
     gain = 1 / lengths if step is None else np.full(len(lengths), step)
     kept = [psi.copy()] if history else None
     transposed = C.T.tocsr()
     steps, converged = 0, False
-    while not (converged := bool(np.linalg.norm(off := proj(C @ psi)) <= tol)):
+    while not (converged := bool(np.linalg.norm(off := _around(C @ psi, target)) <= tol)):
         if steps == max_steps:
             break
         heard = np.ones(len(off), dtype=np.bool_) if not loss else rng.random(len(off)) >= loss  # pyright: ignore[reportOptionalMemberAccess]
         if one_by_one:
             turns = rng.permutation(len(off))  # pyright: ignore[reportOptionalMemberAccess]
-            _one_by_one(C, psi, gain, turns[heard[turns]])
+            _one_by_one(C, psi, gain, target, turns[heard[turns]])
         else:
             psi -= transposed @ (gain * off * heard)
         steps += 1
         if kept is not None:
             kept.append(psi.copy())
-    branch = np.rint((C @ psi - off) / _TURN).astype(np.intp)
-    return CycleRun(psi, branch, steps, step, converged, None if kept is None else np.array(kept))
+    reached = np.rint((C @ psi - off) / _TURN).astype(np.intp)
+    return CycleRun(psi, reached, steps, step, converged, None if kept is None else np.array(kept))
 
 
 def _step(C: sp.csr_matrix, kappa: float | str | None, one_by_one: bool) -> float | None:
@@ -241,11 +245,25 @@ def _step(C: sp.csr_matrix, kappa: float | str | None, one_by_one: bool) -> floa
     return kappa
 
 
+def _whole(branch: ArrayLike, size: int) -> FloatArray:
+    array = check_array("branch", branch, (size,)) if size else np.zeros(0)
+    if array.shape != (size,) or (array != np.rint(array)).any():
+        raise ValueError(f"branch must be {size} whole numbers, one a cycle, got {branch!r:.80}")
+    return array
+
+
+def _around(sums: FloatArray, target: FloatArray | None) -> FloatArray:
+    """What is left of the cycles' sums: to the nearest multiple of 2 pi, or to the target."""
+    return proj(sums) if target is None else sums - target
+
+
 def _one_by_one(
-    C: sp.csr_matrix, psi: FloatArray, gain: FloatArray, turns: Sequence[int] | NDArray[np.intp]
-) -> None:
+    C: sp.csr_matrix, psi: FloatArray, gain: FloatArray, target: FloatArray | None,
+    turns: NDArray[np.intp],
+) -> None:  # fmt: skip
     """Each cycle of `turns` in its turn, on the edges as they are by then."""
     for row in turns:
         part = slice(C.indptr[row], C.indptr[row + 1])
         edges, signs = C.indices[part], C.data[part]
-        psi[edges] -= gain[row] * float(proj(signs @ psi[edges])) * signs
+        left = _around(signs @ psi[edges], None if target is None else target[row])
+        psi[edges] -= gain[row] * float(left) * signs

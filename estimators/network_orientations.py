@@ -19,7 +19,8 @@ from rbl_gym.estimators.consensus import cycle_consensus
 from rbl_gym.network_graphs import check_connected, spanning_tree, sum_to_root
 from rbl_gym.sensing_network import IntArray, check_edge_values, proj
 
-_SETTLED_RAD = 1e-13
+# A step is exact to rounding once no residual wraps: the next one is far below this.
+_SETTLED_RAD = 1e-10
 _MAX_STEPS = 100
 _DENSE = 50  # nodes up to which all eigenvectors are computed
 # Pivots of the dual matrix below this share of a node's number of edges count as zero.
@@ -120,7 +121,7 @@ def maximum_likelihood(
     for _ in range(_MAX_STEPS):
         step = solve(_gathered(named, residuals(named, y, at), n_nodes)[1:])
         at[1:] += step
-        if np.abs(step).max() <= _SETTLED_RAD * max(1.0, float(np.abs(at).max())):
+        if np.abs(step).max() <= _SETTLED_RAD:
             break
     return at[names]
 
@@ -178,7 +179,7 @@ def chordal_optimum(
         L = _laplacian(edges, curvature, n_nodes)
         step = _factorised(L[1:, 1:]).solve(_gathered(edges, np.sin(residual), n_nodes)[1:])
         theta = theta + np.concatenate([[0.0], step])
-        if np.abs(step).max() <= 1e-12:
+        if np.abs(step).max() <= _SETTLED_RAD:
             break
     residual = residuals(edges, y, theta)
     value = float(4 * (np.sin(residual / 2) ** 2).sum())

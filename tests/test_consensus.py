@@ -121,6 +121,18 @@ def test_history_begins_with_y_and_lost_messages_do_nothing():
         cycle_consensus(edges, y, n_nodes, max_steps=5)
 
 
+def test_a_branch_that_is_known_is_kept_in_any_order():
+    edges, y, n_nodes = next(networks(1, seed=6))
+    C = cycle_matrix(edges, n_nodes)
+    branch = np.random.default_rng(0).integers(-2, 3, C.shape[0])
+    limit = cycle_projection(C, y, branch)
+    for order in consensus.ORDERS:
+        run = cycle_iteration(edges, y, n_nodes, C, order=order, branch=branch,
+                              rng=np.random.default_rng(1))  # fmt: skip
+        np.testing.assert_array_equal(run.branch, branch)
+        np.testing.assert_allclose(run.psi, limit, atol=1e-10)
+
+
 def test_trees_and_single_nodes_stay_as_they_are():
     y = np.array([0.3, -2.0, 1.0])
     for basis in BASES:
@@ -145,6 +157,8 @@ def test_an_edge_that_comes_twice_was_measured_twice():
         ({"order": "asynchronous"}, "rng must be a Generator"),
         ({"loss": 1.5}, "loss must be"),
         ({"tol": -1.0}, "tol must be"),
+        ({"branch": [0.5]}, "branch must be 1 whole numbers"),
+        ({"branch": [0, 1]}, "branch must have shape"),
     ],
 )
 def test_wrong_arguments_are_named(change, message):

@@ -197,11 +197,13 @@ def consensus(
     i, j = edges.T
     y = edge_angles(np.column_stack([bearings[i, j], bearings[j, i]]))
     if before is not None:
+        # Around any cycle the expected angles sum to 0, and so must those that are near them.
         expected = before[j] - before[i]
         y = expected + proj(y - expected)
     named = (np.cumsum(near) - 1)[edges]
     size = int(near.sum())
-    run = cycle_iteration(named, y, size, tol=_TOL, max_steps=_MAX_STEPS)
+    branch = None if before is None else np.zeros(len(edges) - size + 1)
+    run = cycle_iteration(named, y, size, tol=_TOL, max_steps=_MAX_STEPS, branch=branch)
     theta[near] = proj(along_tree(named, run.psi, size))
     return theta, run.steps
 

@@ -29,6 +29,7 @@ RULES = (None, *consensus.STEP_BOUNDS)
 LOSSES = (0.0, 0.2, 0.5)
 # Networks that convergence is measured on.
 _NETWORKS = 20
+_STRETCHES = 6
 
 
 class Sample(NamedTuple):
@@ -136,7 +137,7 @@ def _one_convergence(one: Sample, basis: str, rule: str | None) -> dict[str, flo
         "lambda_min": low,
         "lambda_max": high,
         "steps": float(run.steps),
-        "measured_factor": measured_factor(errors(C, one.y, run)),
+        "measured_factor": measured_factor(one, C, run),
         "true_factor": true,
         "printed_factor_squared": printed,
         "printed_holds": float(true**2 <= printed + 1e-12),
@@ -150,13 +151,26 @@ def errors(C: Any, y: FloatArray, run: consensus.CycleRun) -> FloatArray:
     return np.linalg.norm(run.history - limit, axis=1)
 
 
-def measured_factor(distance: FloatArray) -> float:
-    """Factor of a step, from the last errors that rounding does not yet touch."""
-    late = np.flatnonzero(distance > 1e-10 * distance[0])
-    first = late[len(late) // 2]
-    if late[-1] <= first:
-        return float(distance[late[-1] + 1] / distance[late[-1]])
-    return float((distance[late[-1]] / distance[first]) ** (1 / (late[-1] - first)))
+def measured_factor(one: Sample, C: Any, run: consensus.CycleRun) -> float:
+    """Factor of a step, from late errors that rounding does not yet touch.
+
+    They are stretched to their first size and iterated on, until one mode is left.
+    """
+    psi, factor = one.y, 0.0
+    nothing = np.zeros(C.shape[0])
+    limit = consensus.cycle_projection(C, one.y, run.branch)
+    for _ in range(_STRETCHES):
+        again = consensus.cycle_iteration(one.edges, psi, N_NODES, C, run.kappa, history=True,
+                                          branch=run.branch)  # fmt: skip
+        distance = errors(C, one.y, again)
+        late = np.flatnonzero(distance > 1e-8 * distance[0])
+        first, last = late[len(late) // 2], late[-1]
+        factor = float((distance[last] / distance[first]) ** (1 / (last - first)))
+        assert again.history is not None
+        stretched = (again.history[last] - limit) * (distance[0] / distance[last])
+        # Rounding off the cycles is stretched as well, and no step would take it away.
+        psi = limit + stretched - consensus.cycle_projection(C, stretched, nothing)
+    return factor
 
 
 def _asynchronous(samples: list[Sample], loss: float, rng: np.random.Generator) -> dict[str, Any]:
