@@ -7,11 +7,19 @@ change of name.
 from functools import partial
 
 from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
+from rbl_gym.estimators.consensus import (
+    cycle_consensus,
+    cycle_iteration,
+    cycle_projection,
+    ring_least_squares,
+)
 from rbl_gym.estimators.doa import locate_doa
 from rbl_gym.estimators.doa_filter import DoaEkf, iterated_ekf
 from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
+from rbl_gym.estimators.network_frames import FrameEstimate, frames
+from rbl_gym.estimators.network_orientations import chordal_optimum, orientations
 
 for _name, _constraint in {
     "kf": "none",
@@ -25,16 +33,24 @@ register("iekf", iterated_ekf)
 __all__ = [
     "DoaEkf",
     "Filter",
+    "FrameEstimate",
     "IteratedEkf",
     "KalmanFamily",
     "KalmanState",
     "PoseBelief",
     "PoseEstimate",
     "PoseState",
+    "chordal_optimum",
+    "cycle_consensus",
+    "cycle_iteration",
+    "cycle_projection",
+    "frames",
     "locate",
     "locate_doa",
     "make",
     "methods",
     "names",
+    "orientations",
     "register",
+    "ring_least_squares",
 ]

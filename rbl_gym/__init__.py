@@ -26,6 +26,10 @@ def _register_environments() -> None:
             "rbl_gym.envs.placement:AnchorPlacementEnv",
             "rbl_gym.envs.placement:AnchorPlacementVectorEnv",
         ),
+        "RBL/PlanarNetwork-v0": (
+            "rbl_gym.envs.network:PlanarNetworkEnv",
+            "rbl_gym.envs.network:PlanarNetworkVectorEnv",
+        ),
         "RBL/MobileAnchors-v0": (
             "rbl_gym.wrappers.tasks:MobileAnchorsEnv",
             "rbl_gym.wrappers.tasks:MobileAnchorsVectorEnv",

@@ -1,6 +1,7 @@
 """Gymnasium wrappers: observation to belief to reward."""
 
 from rbl_gym.wrappers.estimate import EstimatePose
+from rbl_gym.wrappers.estimate_network import EstimateNetwork, VectorEstimateNetwork
 from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
-__all__ = ["EstimatePose", "VectorEstimatePose"]
+__all__ = ["EstimateNetwork", "EstimatePose", "VectorEstimateNetwork", "VectorEstimatePose"]

@@ -1,4 +1,4 @@
-"""The command line: rbl-gym demo, place, replay, reproduce."""
+"""The command line: rbl-gym demo, place, replay, reproduce, network."""
 
 from __future__ import annotations
 
@@ -45,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_transfer(commands)
     _add_replay(commands)
     _add_reproduce(commands)
+    _add_network(commands)
     return parser
 
 
@@ -97,6 +98,19 @@ def _add_reproduce(commands: Any) -> None:
     reproduce.add_argument("--csv", metavar="F", help="every figure as a row")
     add_json(reproduce)
     reproduce.set_defaults(run=_reproduce)
+
+
+def _add_network(commands: Any) -> None:
+    network = commands.add_parser(
+        "network",
+        help="orientations of a planar network or pose graph",
+        description="Maximum-likelihood orientations from edge angles, their cost, and whether "
+        "it is proved that none are better. See docs/networks.md for the file formats.",
+    )
+    network.add_argument("file", metavar="FILE", help=".g2o, or CSV: i,j and dtheta (or a,b)")
+    network.add_argument("--plot", metavar="F", help="picture: the graph and the residuals")
+    add_json(network)
+    network.set_defaults(run=_network)
 
 
 def _add_trials(parser: argparse.ArgumentParser) -> None:
@@ -188,14 +202,38 @@ def _reproduce(options: argparse.Namespace) -> int:
         figure = figures.camsap2013(result, camsap2013.example(options.seed))
     elif options.experiment == "doa2019":
         figure = figures.doa2019(result)
+    elif options.experiment == "network2009":
+        from rbl_gym.app import network_figures
+
+        figure = network_figures.network2009_figure(result)
     else:
         figure = figures.static(result)
     figures.save(figure, plot)
     if options.csv:
         papers.write_csv(result, options.csv)
     if write_json(result, options.json):
-        reports.print_experiment(result)
+        if options.experiment == "network2009":
+            network_figures.print_network2009(result)
+        else:
+            reports.print_experiment(result)
         print(f"picture: {plot}")
+    return 0
+
+
+def _network(options: argparse.Namespace) -> int:
+    from rbl_gym.app import network
+
+    solved = network.run(options.file)
+    if options.plot:
+        from rbl_gym.app import figures, network_figures
+
+        figures.save(network_figures.network_figure(solved), options.plot)
+    if write_json(solved.result, options.json):
+        from rbl_gym.app import network_figures
+
+        network_figures.print_network(solved.result)
+        if options.plot:
+            print(f"picture: {options.plot}")
     return 0
 
 

@@ -37,7 +37,8 @@ DOA_COLOURS = {"NIA + UQ": "#2e86ab", "ML": "#1b7f5c", "PSO": "#e8a33d", "PSA": 
 _MAGNIFY = 200
 
 
-def _new(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure in the style of the house."""
     matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False,
                                 "axes.spines.right": False})  # fmt: skip
     return Figure(figsize=(width, height), layout="constrained")
@@ -51,7 +52,7 @@ def save(figure: Figure, path: str) -> None:
 
 def camsap2013(result: dict[str, Any], example: Example) -> Figure:
     """One trajectory with its beliefs and errors; the error curves of both readings, the bound."""
-    figure = _new(14, 7.2)
+    figure = new_figure(14, 7.2)
     grid = figure.add_gridspec(2, 3, height_ratios=[1.25, 1])
     _trajectory(figure.add_subplot(grid[0, 0]), example)
     lower = figure.add_subplot(grid[1, 0])
@@ -147,7 +148,7 @@ def _errors(axes: Any, example: Example) -> None:
 def static(result: dict[str, Any]) -> Figure:
     """Angle and translation error over the reference range, a column for every setting."""
     settings = result["settings"]
-    figure = _new(3.4 * len(settings) + 1.2, 6.6)
+    figure = new_figure(3.4 * len(settings) + 1.2, 6.6)
     axes = figure.subplots(2, len(settings), squeeze=False, sharex=True)
     rows = (
         ("mean_angular_error_deg", "mean angular error [deg]"),
@@ -221,7 +222,7 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
 
 def replay(recording: Recording, track: Track, found: Errors | None) -> Figure:
     """The track from above with the anchors, and, where truth exists, the errors over time."""
-    figure = _new(12, 5.2 if found is not None else 6)
+    figure = new_figure(12, 5.2 if found is not None else 6)
     grid = figure.add_gridspec(
         2, 2 if found is not None else 1, width_ratios=[1, 1.2] if found is not None else [1]
     )

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rbl_gym.app import camsap2013, doa2019, icassp2013
+from rbl_gym.app import camsap2013, doa2019, icassp2013, network2009
 
 Advance = Callable[[], None]
 
@@ -49,6 +49,11 @@ def experiments() -> dict[str, Experiment]:
             "slides2013",
             "static: 5 tags on a rectangular pyramid, 4 anchors",
             icassp2013.slides2013_settings(),
+        ),
+        "network2009": Experiment(
+            "planar networks: cycle consensus against the bound, convergence (Figs 3 to 6)",
+            network2009.work_units(),
+            network2009.run,
         ),
     }
 

@@ -19,7 +19,8 @@ _CAMSAP_COLUMNS = (
 )
 
 
-def _console() -> Console:
+def new_console() -> Console:
+    """Standard output."""
     # Piped, a table keeps all of its columns.
     return Console(width=None if Console().is_terminal else 130, highlight=False)
 
@@ -36,7 +37,7 @@ def print_experiment(result: dict[str, Any]) -> None:
 
 def print_camsap2013(result: dict[str, Any]) -> None:
     """One table for each reading, and the claims with their figures."""
-    console = _console()
+    console = new_console()
     for reading, data in result["readings"].items():
         table = Table(title=f"camsap2013, turn noise {reading}/s, {result['trials']} trials")
         table.add_column("filter")
@@ -63,7 +64,7 @@ def print_camsap2013(result: dict[str, Any]) -> None:
 
 def print_static(result: dict[str, Any]) -> None:
     """Mean ratios to the bound over the reference ranges, one table for each setting."""
-    console = _console()
+    console = new_console()
     for label, data in result["settings"].items():
         low, high = data["reference_range_db"][0], data["reference_range_db"][-1]
         table = Table(title=f"{result['experiment']}, anchors in {label}, {low} to {high} dB, "
@@ -138,7 +139,7 @@ def print_replay(result: dict[str, Any]) -> None:
 
 def print_training(result: dict[str, Any]) -> None:
     """The learning curve in a few points, and where the time went."""
-    console = _console()
+    console = new_console()
     curve = result["curve"]
     for point in curve[:: max(1, len(curve) // 10)]:
         console.print(f"{point['steps']:>10,} steps  mean return {point['mean_return']:.4f}")
@@ -150,7 +151,7 @@ def print_training(result: dict[str, Any]) -> None:
 
 def print_evaluation(result: dict[str, Any]) -> None:
     """Policies and references, the best first."""
-    console = _console()
+    console = new_console()
     table = Table(title=f"{result['task']}, {result['worlds']} held-out worlds")
     table.add_column("policy")
     for heading in ("loss", "score b (m)", "normalised", "95 %"):
@@ -166,7 +167,7 @@ def print_evaluation(result: dict[str, Any]) -> None:
 
 def print_transfer(result: dict[str, Any]) -> None:
     """One table for each filter: score and real error, and how they go together."""
-    console = _console()
+    console = new_console()
     for name, rows in result["filters"].items():
         table = Table(title=f"{result['task']}, {name}, {result['worlds']} worlds, "
                       f"{result['repeats']} bodies in each")  # fmt: skip

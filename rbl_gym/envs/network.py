@@ -1,0 +1,203 @@
+"""RBL/PlanarNetwork-v0: nodes that see each other's bearing, moved so that they know themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+
+from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
+from rbl_gym.envs.batch import BatchEnv, ScalarEnv
+from rbl_gym.network_bounds import linked_covariance
+from rbl_gym.network_graphs import components
+from rbl_gym.sensing_network import proj
+
+REWARDS = ("bound", "none")
+# Of an orientation that nothing is known of: uniform on the circle.
+PRIOR_STD_RAD = math.pi / math.sqrt(3)
+# Layouts that are tried for one whose nodes are connected at the start.
+_TRIES = 64
+
+
+class PlanarNetworkVectorEnv(BatchEnv):
+    """`num_envs` independent `PlanarNetworkEnv` networks of equal n in arrays.
+
+    Made by ``gym.make_vec("rbl_gym:RBL/PlanarNetwork-v0", num_envs=64)``. Arguments as
+    `PlanarNetworkEnv`; seeding and autoreset as `BatchEnv`.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        n_nodes: int = 12,
+        side_m: float = 10.0,
+        radius_m: float = 4.0,
+        blind_m: float = 0.5,
+        bearing_std_rad: float = 0.05,
+        step_m: float = 0.5,
+        reward: str = "bound",
+        steps: int = 50,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        for name, value, low in (("n_nodes", n_nodes, 2), ("steps", steps, 1)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < low:
+                raise ValueError(f"{name} must be an int of at least {low}, got {value!r}")
+        self.n_nodes = n_nodes
+        self.side_m = check_number("side_m", side_m, low=1e-6)
+        self.radius_m = check_number("radius_m", radius_m, low=0.0)
+        self.blind_m = check_number("blind_m", blind_m, low=1e-9)
+        self.bearing_std_rad = check_number("bearing_std_rad", bearing_std_rad, low=1e-9)
+        self.step_m = check_number("step_m", step_m, low=0.0)
+        self._rewarded = check_one_of("reward", reward, REWARDS) == "bound"
+        square = (n_nodes, n_nodes)
+        self.single_observation_space = spaces.Dict(
+            {
+                "bearings": spaces.Box(-math.pi, math.pi, square, np.float64),
+                "links": spaces.Box(0, 1, square, np.int8),
+            }
+        )
+        self.single_action_space = spaces.Box(-1.0, 1.0, (2 * n_nodes,), np.float32)
+        self._configure(num_envs, render_mode, steps, max_episode_steps, autoreset_mode)
+        self._positions = np.zeros((num_envs, n_nodes, 2))
+        self._orientations = np.zeros((num_envs, n_nodes))
+        self._links = np.zeros((num_envs, *square), dtype=np.bool_)
+        self._bearings = np.zeros((num_envs, *square))
+        self._score_rad = np.zeros(num_envs)
+
+    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        for world, generator in zip(chosen, generators, strict=True):
+            self._positions[world] = self._layout(generator)
+            theta = generator.uniform(-np.pi, np.pi, self.n_nodes)
+            self._orientations[world] = proj(theta - theta[0])
+        self._measure(chosen, generators)
+
+    def _layout(self, generator: np.random.Generator) -> FloatArray:
+        """Uniform in the square, of a connected graph if one comes up in time."""
+        positions = np.zeros((self.n_nodes, 2))
+        for _ in range(_TRIES):
+            positions = generator.uniform(0, self.side_m, (self.n_nodes, 2))
+            edges = np.argwhere(np.triu(self._links_of(positions)[0]))
+            if not components(edges, self.n_nodes).any():
+                break
+        return positions
+
+    def _links_of(self, positions: FloatArray) -> tuple[BoolArray, FloatArray]:
+        """Who sees whom (..., n, n), and what stands between them (..., n, n, 2)."""
+        apart = positions[..., None, :, :] - positions[..., :, None, :]
+        distance = np.linalg.norm(apart, axis=-1)
+        return (distance <= self.radius_m) & (distance >= self.blind_m), apart
+
+    def _measure(self, rows: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+        """Links, bearings and the bound of some worlds."""
+        links, apart = self._links_of(self._positions[rows])
+        toward = np.arctan2(apart[..., 1], apart[..., 0])
+        size = (self.n_nodes, self.n_nodes)
+        normals = np.array([generator.standard_normal(size) for generator in generators])
+        seen = toward - self._orientations[rows][..., None] + self.bearing_std_rad * normals
+        self._links[rows] = links
+        self._bearings[rows] = np.where(links, proj(seen), 0.0)
+        self._score_rad[rows] = score(links, self.bearing_std_rad)
+
+    def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
+        rows = np.flatnonzero(moving)
+        if len(rows):
+            theta = self._orientations[rows]
+            ahead = self.step_m * np.clip(actions[rows], -1, 1).reshape(len(rows), -1, 2)
+            turn = np.exp(1j * theta) * (ahead[..., 0] + 1j * ahead[..., 1])
+            moved = self._positions[rows] + np.stack([turn.real, turn.imag], axis=-1)
+            self._positions[rows] = np.clip(moved, 0.0, self.side_m)
+            self._measure(rows, [self._generators[i] for i in rows])
+        reward = -np.log(self._score_rad) if self._rewarded else np.zeros(self.num_envs)
+        return reward, np.zeros(self.num_envs, dtype=np.bool_)
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {"bearings": self._bearings.copy(), "links": self._links.astype(np.int8)}
+
+    def _inform(self) -> dict[str, np.ndarray]:
+        return {
+            "positions": self._positions.copy(),
+            "orientations": self._orientations.copy(),
+            "score_rad": self._score_rad.copy(),
+        }
+
+
+class PlanarNetworkEnv(ScalarEnv):
+    """Where do the nodes of a network go, so that each learns how it is turned?
+
+    ## Description
+    n nodes in a square, each turned by an angle that nobody knows. Nodes within sensing radius
+    (and not nearer than the blind zone) measure each other's bearing in their own frames, with
+    noise. Orientations relative to node 0 follow from the bearings of each edge
+    (`rbl_gym.sensing_network`); the more edges, and the better they tie the network together,
+    the more exact. Nodes move without turning.
+
+    ## Action space
+    ``Box(-1, 1, (2 n,))``: displacement of each node in its OWN frame, times `step_m`: (ahead,
+    left) of node 0, then of node 1, and so on. Nodes stay in the square.
+
+    ## Observation space
+    ``Dict``: `bearings` (n, n) float64 in [-pi, pi], entry (i, j) of node j in the frame of node
+    i, 0 where there is no link; `links` (n, n) int8, 1 where i and j see each other.
+
+    ## Reward
+    ``-log b``, b the Cramer-Rao bound of the root mean square orientation error in radians of
+    all nodes but node 0, from the bearings of this epoch alone and a prior of pi / sqrt(3) (that
+    of a uniform angle). ``reward="none"``: 0.
+
+    ## Starting state
+    Uniform in the square, redrawn until the network is connected (64 times at most); uniform
+    orientations, that of node 0 is the reference.
+
+    ## Episode end
+    Truncates after `steps`.
+
+    ## Info
+    `positions` (n, 2) and `orientations` (n,), the truth; `score_rad`, b.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+
+    env = gym.make("rbl_gym:RBL/PlanarNetwork-v0", n_nodes=20, radius_m=3.0)
+    ```
+    `n_nodes`; `side_m` of the square; `radius_m` and `blind_m` of sensing; `bearing_std_rad`;
+    `step_m`, the longest displacement on an axis; `reward`; `steps`.
+
+    ## Version history
+    * v0: first version.
+    """
+
+    batch_class = PlanarNetworkVectorEnv
+
+    def __init__(
+        self,
+        n_nodes: int = 12,
+        side_m: float = 10.0,
+        radius_m: float = 4.0,
+        blind_m: float = 0.5,
+        bearing_std_rad: float = 0.05,
+        step_m: float = 0.5,
+        reward: str = "bound",
+        steps: int = 50,
+        render_mode: str | None = None,
+    ) -> None:
+        self._configure(
+            render_mode, n_nodes=n_nodes, side_m=side_m, radius_m=radius_m, blind_m=blind_m,
+            bearing_std_rad=bearing_std_rad, step_m=step_m, reward=reward, steps=steps,
+        )  # fmt: skip
+
+    @property
+    def bearing_std_rad(self) -> float:
+        """Standard deviation of a bearing."""
+        return self._batch.bearing_std_rad
+
+
+def score(links: BoolArray, bearing_std_rad: float) -> FloatArray:
+    """b (...): bound of the root mean square orientation error, radians, of links (..., n, n)."""
+    covariance = linked_covariance(links, bearing_std_rad, PRIOR_STD_RAD)
+    return np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / covariance.shape[-1])

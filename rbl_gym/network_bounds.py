@@ -1,0 +1,142 @@
+"""Cramer-Rao bounds of planar networks: orientations from edge angles, frames from bearings.
+
+Everything is relative to node 0, whose frame is the reference: its orientation is 0 and it
+stands at the origin.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import BoolArray, FloatArray, check_number
+from rbl_gym.network_graphs import check_connected, incidence
+from rbl_gym.sensing_network import IntArray, check_edges, directions
+
+
+def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
+    """Bound (n - 1, n - 1) of orientations 1 to n - 1 from edge angles of variance 2 sigma^2."""
+    sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
+    B = incidence(check_connected(edges, n_nodes), n_nodes)[:, 1:]
+    return 2 * sigma**2 * np.linalg.inv((B.T @ B).toarray())
+
+
+def edge_variance(n_edges: int, n_nodes: int, bearing_std_rad: float) -> float:
+    """Mean bound of a consistent edge angle: ``2 sigma^2 (n - 1) / m``."""
+    return 2 * bearing_std_rad**2 * (n_nodes - 1) / n_edges
+
+
+def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: float) -> FloatArray:
+    """Orientation bound (..., n - 1, n - 1) of many small networks, disconnected ones too.
+
+    Parameters
+    ----------
+    links
+        (..., n, n) symmetric: who sees whom.
+    bearing_std_rad
+        sigma of a bearing.
+    prior_std_rad
+        Of an orientation that nothing is measured of; it keeps the bound finite.
+    """
+    weight = links / (2 * bearing_std_rad**2)
+    information = np.eye(links.shape[-1]) * (weight.sum(axis=-1) + prior_std_rad**-2)[..., None]
+    return np.linalg.inv((information - weight)[..., 1:, 1:])
+
+
+def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
+    """Derivative (2 m, 3 n) of the bearings; columns: n orientations, then x and y of each node.
+
+    Rows are in the order of ``bearings.ravel()``: of j seen by i, of i seen by j, edge by edge.
+    """
+    positions = np.asarray(positions, dtype=np.float64)
+    n_nodes = len(positions)
+    edges = check_edges(edges, n_nodes)
+    toward = directions(positions, edges)
+    apart = positions[edges[:, 1]] - positions[edges[:, 0]]
+    across = np.column_stack([-np.sin(toward), np.cos(toward)])
+    across /= np.linalg.norm(apart, axis=1, keepdims=True)
+    both = np.repeat(across, 2, axis=0)
+    places = n_nodes + 2 * np.repeat(edges, 2, axis=0)[:, :, None] + [0, 1]
+    columns = np.column_stack([edges.ravel(), places.reshape(-1, 4)])
+    values = np.column_stack([np.full(2 * len(edges), -1.0), -both, both])
+    return _rows(values, columns, 3 * n_nodes)
+
+
+def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
+    """Derivative (k, 3 n) of the distances of pairs of nodes, columns as `bearing_jacobian`."""
+    positions = np.asarray(positions, dtype=np.float64)
+    n_nodes = len(positions)
+    pairs = check_edges(pairs, n_nodes)
+    toward = directions(positions, pairs)
+    along = np.column_stack([np.cos(toward), np.sin(toward)])
+    columns = (n_nodes + 2 * pairs[:, :, None] + [0, 1]).reshape(-1, 4)
+    return _rows(np.concatenate([-along, along], axis=1), columns, 3 * n_nodes)
+
+
+def _rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_matrix:
+    rows, each = values.shape
+    return sp.csr_matrix((values.ravel(), columns.ravel(), each * np.arange(rows + 1)),
+                         shape=(rows, width))  # fmt: skip
+
+
+def free_columns(n_nodes: int) -> IntArray:
+    """Columns (3 n - 3,) of the Jacobians that are unknown: all but those of node 0."""
+    known = [0, n_nodes, n_nodes + 1]
+    return np.setdiff1d(np.arange(3 * n_nodes), known)
+
+
+def frame_covariance(
+    positions: ArrayLike,
+    edges: ArrayLike,
+    bearing_std_rad: float,
+    known_pair: tuple[int, int] | None = None,
+    ranges_of: ArrayLike | None = None,
+    range_std_m: float | None = None,
+) -> FloatArray:
+    """Bound (3 n - 3, 3 n - 3) of frames: n - 1 orientations, then x and y of nodes 1 to n - 1.
+
+    Parameters
+    ----------
+    positions
+        (n, 2) metres, in any frame: the bound is of the frame of node 0 turned like it.
+    edges
+        (m, 2), both bearings of each measured.
+    bearing_std_rad
+        sigma of a bearing.
+    known_pair
+        Two nodes whose distance is known exactly.
+    ranges_of, range_std_m
+        Pairs (k, 2) whose distances are measured, and sigma of such a range. One of the two is
+        needed: bearings have no scale.
+
+    Raises
+    ------
+    ValueError
+        If the frames are not determined.
+    """
+    positions = np.asarray(positions, dtype=np.float64)
+    J = bearing_jacobian(positions, edges) / check_number("bearing_std_rad", bearing_std_rad)
+    rows: list[Any] = [J]
+    if ranges_of is not None:
+        rows.append(range_jacobian(positions, ranges_of)
+                    / check_number("range_std_m", range_std_m))  # fmt: skip
+    elif known_pair is None:
+        raise ValueError("known_pair must be given where there are no ranges, got None")
+    free = free_columns(len(positions))
+    J = sp.csr_matrix(sp.vstack(rows))[:, free].toarray()
+    if known_pair is not None:
+        # Moves that keep the known distance: the null space of its one row.
+        row = range_jacobian(positions, [known_pair])[:, free].toarray()[0]
+        basis = np.linalg.svd(row[None])[2][1:].T
+    else:
+        basis = np.eye(len(free))
+    values, vectors = np.linalg.eigh(basis.T @ (J.T @ J) @ basis)
+    if len(values) and values[0] < 1e-12 * values[-1]:
+        missing = int((values < 1e-12 * values[-1]).sum())
+        raise ValueError(f"edges must determine all frames, got {missing} directions without "
+                         "information")  # fmt: skip
+    factor = basis @ vectors / np.sqrt(values)
+    return factor @ factor.T
