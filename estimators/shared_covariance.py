@@ -90,7 +90,10 @@ def _model(n_anchors: int, n_tags: int, *memory: bytes) -> _Model:
     spread = -2 * weights[..., None] * (anchors[:, None] - centre)
     of_tags = extended(tags)
     if stat.is_common and n_tags >= _MANY_TAGS:
-        slopes = [of_tags, np.einsum("kl,mi->mkli", np.eye(4), spread[:, 0]).reshape(-1, 12)]
+        slopes: list[FloatArray] = [
+            of_tags,
+            np.einsum("kl,mi->mkli", np.eye(4), spread[:, 0]).reshape(-1, 12),
+        ]
     else:
         slopes = [(of_tags[:, :, None] * spread[:, :, None]).reshape(-1, 12)]
     return _Model(*information(stat), slopes)

@@ -137,9 +137,8 @@ def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0)
         On an unknown scene, racks outside a room, a number that is none.
     """
     scene = scenes.get(scene)
-    if n_anchors is None:
-        n_anchors = scene.n_anchors - bool(racks)
-    return PlacementTask(scene, n_anchors, racks)
+    usual = scene.n_anchors - bool(racks)
+    return PlacementTask(scene, usual if n_anchors is None else n_anchors, racks)
 
 
 # --- contexts --------------------------------------------------------------------------------
@@ -339,12 +338,14 @@ def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Crit
     # The pose error (w, v) in metres at the tags: C^T (w, v).
     C = np.moveaxis(task.shared.spread, -1, 0)
     values = np.maximum(np.linalg.eigvalsh(np.swapaxes(C, -1, -2) @ covariance @ C), 1e-300)
-    traces = [
-        np.einsum("...ii->...", covariance[..., part, part]) for part in (slice(3, 6), slice(3))
-    ]
+    of_position, of_rotation = (
+        np.sqrt(np.einsum("...ii->...", covariance[..., part, part]).mean(axis=-1))
+        for part in (slice(3, 6), slice(3))
+    )
     return Criteria(
         np.sqrt((b**2).mean(axis=-1)),
-        *(np.sqrt(trace.mean(axis=-1)) for trace in traces),
+        of_position,
+        of_rotation,
         np.exp(0.5 * np.log(values).mean(axis=(-1, -2))),
         np.sqrt(values[..., -1].mean(axis=-1)),
         b.max(axis=-1),

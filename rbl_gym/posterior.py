@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore[reportAttributeAccessIssue]
 
 from rbl_gym import bounds, rotations
 from rbl_gym.checks import BoolArray, FloatArray
@@ -104,11 +104,11 @@ def update(P: FloatArray, information: FloatArray) -> FloatArray:
     ValueError
         If a matrix is not positive definite or not finite.
     """
-    lower, flaw = lapack.dpotrf(P, lower=1, clean=1)
+    lower, flaw = dpotrf(P, lower=1, clean=1)
     if not flaw:
-        root, flaw = lapack.dpotrf(_EYE + lower.T @ information @ lower, lower=1)
+        root, flaw = dpotrf(_EYE + lower.T @ information @ lower, lower=1)
     if not flaw:
-        half, flaw = lapack.dtrtrs(root, lower.T, lower=1)
+        half, flaw = dtrtrs(root, lower.T, lower=1)
     if flaw:
         raise ValueError(_SINGULAR)
     return half.T @ half

@@ -7,7 +7,7 @@ is arithmetic on arrays with leading batch axes.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -243,7 +243,7 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
 
 def whole(episode: Episode) -> Epoch:
     """All epochs of an episode at once: the time axis is the last of the batch's."""
-    return Epoch(*episode[: len(Epoch._fields)])
+    return Epoch(*episode[: len(Epoch._fields)])  # pyright: ignore[reportArgumentType]
 
 
 def measure(
@@ -267,7 +267,8 @@ def measure(
     measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
     clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
     # However the worlds lie in memory, what is observed is in C order.
-    ranges, links, nlos = map(np.ascontiguousarray, (clipped, measured.links, measured.nlos))
+    ranges = np.ascontiguousarray(clipped)
+    links, nlos = np.ascontiguousarray(measured.links), np.ascontiguousarray(measured.nlos)
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     links &= ranges > 0
     return ranging.Measurement(ranges, links, nlos)
@@ -300,7 +301,7 @@ def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
     return np.where(sight, 1.0, scene.blocked_information)
 
 
-def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> FloatArray:
+def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> Any:
     """Share (..., M, N) of its information that each link has: none where it gave no range."""
     return links * link_quality(scene, at, anchors)[..., None] if scene.obstacles else links
 

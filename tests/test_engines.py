@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -258,7 +259,7 @@ def test_only_the_whole_joined_covariance_is_remembered(monkeypatch):
         others = (
             covariance[::-1], covariance[:4], covariance[..., :9, :9], covariance.copy(),
             covariance.swapaxes(-1, -2), np.where(True, covariance, 0.0), covariance + 0.0,
-            covariance.base[::-1], pickle.loads(pickle.dumps(covariance)),
+            np.asarray(covariance.base)[::-1], pickle.loads(pickle.dumps(covariance)),
             np.broadcast_to(covariance, (3, *covariance.shape)),
         )  # fmt: skip
         assert not any(remembered(frame, np.asarray(other)) is not None for other in others)
@@ -372,10 +373,10 @@ def test_the_dense_filter_keeps_the_digits_of_a_vague_prior(tags, scale):
     )
 
 
-def exact_posterior(P, matrix):
+def exact_posterior(P: Any, matrix: Any):
     """``(I + P G)^-1 P`` by elimination in long doubles."""
     result = []
-    for prior, told in zip(np.longdouble(P), np.longdouble(matrix), strict=True):
+    for prior, told in zip(P.astype(np.longdouble), matrix.astype(np.longdouble), strict=True):
         rows = np.concatenate([np.eye(12) + prior @ told, prior], axis=1)
         for i in range(12):
             best = i + np.argmax(np.abs(rows[i:, i]))

@@ -37,6 +37,7 @@ def test_every_world_is_at_its_epoch_of_its_own_episode(name, links):
                 if expected is None:
                     assert got is None
                 else:
+                    assert got is not None
                     np.testing.assert_allclose(got[world], expected, rtol=1e-12, atol=1e-12)
 
 

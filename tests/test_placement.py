@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def textbook(task: PlacementTask, context: Context, anchors):
     """Posterior covariances (P, 6, 6), b (P,), and the middles W (P, 6, 6), by loops."""
     tags = np.array(task.scene.tags)
     reference = getattr(task.scene.noise, "reference_tag", None)
-    law = task.scene.noise
+    law: Any = task.scene.noise
     low, high = np.array(task.scene.volume.low), np.array(task.scene.volume.high)
     prior = np.diag([math.radians(60) ** -2] * 3 + [((high - low).max() / 2) ** -2] * 3)
     covariances, scores, middles = [], [], []
@@ -238,7 +239,9 @@ def test_information_is_additive_over_the_anchors(kind):
              for m in range(task.n_anchors)]  # fmt: skip
     np.testing.assert_allclose(total, sum(parts), rtol=1e-9, atol=1e-9 * np.abs(total).max())
     np.testing.assert_allclose(
-        placement.score_of(task, sum(parts)), placement.score(task, context, anchors), rtol=1e-9
+        placement.score_of(task, np.sum(parts, axis=0)),
+        placement.score(task, context, anchors),
+        rtol=1e-9,
     )
 
 
@@ -310,13 +313,14 @@ def test_a_world_of_another_size_has_scores_of_that_size():
     """In centimetres every length, and the score, is a hundred times as large."""
     task = make("drone_yard")
     context, anchors = problem(task, 15, (3,))
+    noise: Any = task.scene.noise
     k = 100.0
     grown = scenes.get({
         "name": "drone_yard",
         "volume": {name: [k * x for x in getattr(task.scene.volume, name)]
                    for name in ("low", "high")},
         "tags": (k * np.array(task.scene.tags)).tolist(),
-        "noise": {"floor_m": k * task.scene.noise.floor_m},
+        "noise": {"floor_m": k * noise.floor_m},
     })  # fmt: skip
     large = placement.score(
         dataclasses.replace(task, scene=grown),

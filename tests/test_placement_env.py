@@ -38,6 +38,11 @@ every_world = pytest.mark.parametrize("kind", WORLDS)
 some_worlds = pytest.mark.parametrize("kind", ["auv", "at once", "mounts and racks"])
 
 
+def batch_of(env: Any) -> Any:
+    """The vector environment of one world that a scalar one is."""
+    return env.unwrapped._batch
+
+
 def close(got, want):
     """Equal to the last bits that batched arithmetic may turn."""
     assert_same(got, want, rtol=1e-9, atol=1e-9)
@@ -134,7 +139,7 @@ def test_seeds_decide_and_episodes_differ(kind):
     region = first[0][0][-1]["region"]
     assert (env.reset()[1]["region"] != region).any()
     assert (env.reset(seed=5)[1]["region"] != region).any()
-    problem = placement.draw_contexts(env.unwrapped._batch.task, np.random.default_rng(4))
+    problem = placement.draw_contexts(batch_of(env).task, np.random.default_rng(4))
     np.testing.assert_array_equal(region, np.concatenate([problem.centre, problem.half]))
 
 
@@ -144,7 +149,7 @@ def test_seeds_decide_and_episodes_differ(kind):
 @every_world
 def test_rewards_are_the_score_of_the_anchors_in_info(kind):
     env = AnchorPlacementEnv(**WORLDS[kind])
-    task = env.unwrapped._batch.task
+    task = batch_of(env).task
     for seed in range(3):
         steps, _ = episode(env, seed)
         one_shot = WORLDS[kind].get("mode") == "one-shot"
@@ -173,7 +178,7 @@ def test_rewards_are_the_score_of_the_anchors_in_info(kind):
 
 def turned(env, info, mirror):
     """Signs by which the region is brought towards +x and +y."""
-    scene = env.unwrapped._batch.task.scene
+    scene = batch_of(env).task.scene
     low, high = scene.volume.bounds()
     # Legal places that do not lie evenly about the volume are no mirror's.
     mirror &= np.array_equal(sum(scene.anchor_region.bounds())[:2], (low + high)[:2])
@@ -186,7 +191,7 @@ def turned(env, info, mirror):
 @pytest.mark.parametrize("seed", [6, 7, 8])
 def test_sequential_places_each_action_by_the_region(kind, mirror, seed):
     env = AnchorPlacementEnv(**WORLDS[kind], mirror=mirror)
-    task = env.unwrapped._batch.task
+    task = batch_of(env).task
     steps, actions = episode(env, seed)
     for k, step in enumerate(steps):
         shown = np.array(actions[:k], float).reshape(-1, 3) * turned(env, step[4], mirror)
@@ -200,7 +205,7 @@ def test_sequential_places_each_action_by_the_region(kind, mirror, seed):
 @every_world
 def test_observations_by_hand(kind, mirror, seed):
     env = AnchorPlacementEnv(**WORLDS[kind], mirror=mirror)
-    task, mode = env.unwrapped._batch.task, WORLDS[kind].get("mode", "sequential")
+    task, mode = batch_of(env).task, WORLDS[kind].get("mode", "sequential")
     low, high = (np.array(corner) for corner in (task.scene.volume.low, task.scene.volume.high))
     m = task.n_anchors
     steps, actions = episode(env, seed)
@@ -261,7 +266,7 @@ def test_one_shot_equals_sequential():
 
 def test_a_mount_twice_adds_a_second_anchor_there():
     env = AnchorPlacementEnv("uwb_room", "mounts", n_anchors=2, mirror=False)
-    task = env.unwrapped._batch.task
+    task = batch_of(env).task
     _, info = env.reset(seed=8)
     first = env.step(20)
     second = env.step(20)

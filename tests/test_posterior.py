@@ -23,7 +23,7 @@ def assert_close(got, want, rtol):
 def test_steps_of_many_worlds_and_of_one_equal_the_plain_recursion(name, links):
     scene = scenes.get({"name": name, "links": links, "steps": 6})
     episode = simulation.draw_episode(scene, np.random.default_rng(1), (7,))
-    alone = simulation.Episode(*(None if field is None else field[2] for field in episode))
+    alone = simulation.Episode(*(None if field is None else field[2] for field in episode))  # pyright: ignore[reportArgumentType]
     course = simulation.posterior_course(scene, alone)
     want, got, P = None, None, alone.prior_covariance
     for k in range(scene.steps + 1):

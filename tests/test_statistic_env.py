@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -39,7 +41,7 @@ def test_gymnasiums_checker_has_no_complaint(scene, reward):
 
 @SCENES
 def test_space_is_finite_and_holds_every_observation(scene):
-    env = scalar(scene)
+    env: Any = scalar(scene)
     assert set(env.observation_space.keys()) == {"G", "B", "anchors", "twist"}
     for key in ("G", "B"):
         assert np.isfinite(env.observation_space[key].high).all()

@@ -47,6 +47,11 @@ CLASSES = {
 }
 
 
+def batch_of(env: Any) -> Any:
+    """The vector environment of one world that a scalar one is."""
+    return env.unwrapped._batch
+
+
 def short(kind: str, steps: int = 4) -> tuple[type, type, dict[str, Any]]:
     """Scalar class, vector class, and arguments with short episodes."""
     env_id, arguments = WORLDS[kind]
@@ -301,7 +306,7 @@ class Replay:
 @pytest.mark.parametrize("seed", [3, 11])
 def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
     env = MobileAnchorsEnv(difficulty)
-    scene = env.unwrapped._batch.scene
+    scene = batch_of(env).scene
     m, speed = (3, 4.0) if difficulty == "easy" else (2, 2.0)
     assert (scene.n_anchors, scene.anchor_speed_m_s, scene.dt, scene.steps) == (m, speed, 2, 100)
     twin, rng = Replay(scene, seed), np.random.default_rng(seed)
@@ -322,7 +327,7 @@ def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
             step = action[2 * j : 2 * j + 2]
             twin.anchors[i, :2] += 2.0 * speed * step / max(1.0, np.linalg.norm(step))
         observation, reward, _, _, info = env.step(action)
-        np.testing.assert_allclose(env.unwrapped._batch.anchors[0], twin.anchors, atol=1e-9)
+        np.testing.assert_allclose(batch_of(env).anchors[0], twin.anchors, atol=1e-9)
         twin.predict(k)
         twin.update(k)
         np.testing.assert_allclose(
@@ -337,7 +342,7 @@ def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
 @pytest.mark.parametrize("seed", [1, 5])
 def test_selection_rewards_and_observations_by_a_separate_filter(mode, seed):
     env = AnchorSelectionEnv(mode, price=0.07)
-    scene = env.unwrapped._batch.scene
+    scene = batch_of(env).scene
     assert scene.blocked_information == 0.02
     twin, rng = Replay(scene, seed), np.random.default_rng(seed)
     observation, info = env.reset(seed=seed)
@@ -367,7 +372,7 @@ def test_selection_rewards_and_observations_by_a_separate_filter(mode, seed):
 
 def test_a_blocked_link_carries_two_percent_and_the_filter_is_told():
     env = AnchorSelectionEnv(k=1)
-    scene = env.unwrapped._batch.scene
+    scene = batch_of(env).scene
     for seed in range(20):
         probe = Replay(scene, seed)
         shares = [share_by_hand(scene, a, probe.episode.translation[1]) for a in probe.anchors]
@@ -376,7 +381,7 @@ def test_a_blocked_link_carries_two_percent_and_the_filter_is_told():
     env.reset(seed=seed)
     blocked = shares.index(0.02)
     env.step(np.eye(12)[blocked])
-    got = env.unwrapped._batch.state.covariance[0]
+    got = batch_of(env).state.covariance[0]
     beliefs = []
     for told in (True, False):
         twin = Replay(scene, seed)

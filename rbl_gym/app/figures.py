@@ -181,7 +181,7 @@ def static(result: dict[str, Any]) -> Figure:
 def doa2019(result: dict[str, Any]) -> Figure:
     """RMSE of R and t over the noise with the bound, and the success rates; a row a setting."""
     settings = result["settings"]
-    figure = _new(12, 3.3 * len(settings) + 0.6)
+    figure = new_figure(12, 3.3 * len(settings) + 0.6)
     axes = figure.subplots(len(settings), 3, squeeze=False)
     curves = (
         ("rotation_rmse", "rotation RMSE (Frobenius)"),

@@ -84,7 +84,7 @@ def print_static(result: dict[str, Any]) -> None:
 
 def print_doa2019(result: dict[str, Any]) -> None:
     """Accuracy, success and time of every method, one table for each setting."""
-    console = _console()
+    console = new_console()
     for label, data in result["settings"].items():
         table = Table(title=f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials")
         table.add_column("noise (deg)")

@@ -33,8 +33,8 @@ def train(
     if seed * SEED_STRIDE >= HELD_OUT_SEED:
         raise ValueError(f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the "
                          "worlds of larger ones are held out for evaluations")  # fmt: skip
-    import torch
-    from stable_baselines3 import PPO
+    import torch  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
@@ -109,7 +109,7 @@ class _Curve:
         self._returns: list[float] = []
 
     def callback(self) -> Any:
-        from stable_baselines3.common.callbacks import BaseCallback
+        from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
 
         curve = self
 
@@ -131,7 +131,7 @@ class _Curve:
 
 def _policy(model: Any, meta: dict[str, Any]) -> Policy:
     """The policy network of a PPO model as arrays."""
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     layers = [m for m in model.policy.mlp_extractor.policy_net if isinstance(m, torch.nn.Linear)]
     layers.append(model.policy.action_net)

@@ -16,7 +16,7 @@ from rbl_gym import estimators, layout_search, metrics, motion, obstacles, place
 from rbl_gym import rotations as rot
 from rbl_gym.app import evaluation
 from rbl_gym.app.rl_tasks import RlTask
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.placement import Context, PlacementTask
 
 # Steps of an episode, of which the first are the filter's settling; way-points of an episode.
@@ -49,7 +49,7 @@ class Bodies(NamedTuple):
     translation: FloatArray
     twists: FloatArray
     normals: FloatArray
-    reflected: FloatArray
+    reflected: BoolArray
     prior: tuple[FloatArray, FloatArray]
 
 

@@ -214,7 +214,7 @@ def _rows_as_objects(observation: Observation, where: BoolArray) -> np.ndarray:
     """Gymnasium's ``final_obs``: an object array with the observation of each ended world."""
     rows = np.full(len(where), None, dtype=object)
     for i in np.flatnonzero(where):
-        rows[i] = _row(observation, i)
+        rows[i] = _row(observation, int(i))
     return rows
 
 
@@ -231,7 +231,7 @@ class ScalarEnv(gym.Env[Any, Any]):
     `_configure`.
     """
 
-    batch_class: ClassVar[type[BatchEnv]]
+    batch_class: ClassVar[Any]
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own form)
 
     def _configure(self, render_mode: str | None, **arguments: Any) -> None:

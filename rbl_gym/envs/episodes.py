@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class EpisodeStore:
 
         Returns the fields of `simulation.Episode` that have no time axis, of these worlds.
         """
-        starts: list[tuple[FloatArray, ...]] = []
+        starts: list[Any] = []
         for first in range(0, len(worlds), _BLOCK):
             block = worlds[first : first + _BLOCK]
             simulation.draw_each(self._draws, block, generators[first : first + _BLOCK])
