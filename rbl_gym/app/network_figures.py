@@ -53,9 +53,9 @@ def network2009_figure(result: dict[str, Any]) -> Figure:
         axes[1, 1].plot(places, [table[rule]["printed_factor_squared"] ** 0.5 for rule in rules],
                         "k_", ms=14)  # fmt: skip
     axes[1, 1].set_xticks(range(len(rules)), [f"kappa: {rule}" for rule in rules])
-    axes[1, 1].set(ylabel="factor of a step", ylim=(0.6, 1.02))
+    axes[1, 1].set(ylabel="factor of a step", ylim=(0.6, 1.1))
     axes[1, 1].set_title("true (bars), root of Theorem 19's (dashes)", fontsize=9)
-    axes[1, 1].legend(frameon=False)
+    axes[1, 1].legend(frameon=False, ncols=3, loc="upper center")
     return figure
 
 
