@@ -5,6 +5,8 @@ ones, y, do not; which k is meant is the branch. On a branch the least squares a
 the iteration (14) reaches it with exchanges inside of each cycle only.
 """
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false, reportArgumentType=false
 from __future__ import annotations
 
 from typing import NamedTuple

@@ -278,7 +278,7 @@ class KalmanFamily:
         if not doubted.any():
             return
         if anchors.ndim > 2:
-            anchors, largest, vague_rotation = (
+            anchors, largest, vague_rotation = (  # pyright: ignore[reportAssignmentType]
                 np.broadcast_to(array, (*doubted.shape, *array.shape[array.ndim - core :]))[doubted]
                 for array, core in ((anchors, 2), (largest, 0), (vague_rotation, 0))
             )

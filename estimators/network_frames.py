@@ -4,6 +4,8 @@ Bearings fix the shape, one known distance (or ranges) its scale. A linear start
 maximum likelihood: the positions share in what the bearings say about the orientations.
 """
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
 from typing import Any, NamedTuple

@@ -5,6 +5,8 @@ The maximum-likelihood orientations minimise the sum of squared wrapped residual
 Laplacian, whatever the number of cycles.
 """
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportReturnType=false
 from __future__ import annotations
 
 from typing import Any, NamedTuple

@@ -149,7 +149,7 @@ def _newton_step(W: FloatArray, q: FloatArray, y: FloatArray) -> tuple[FloatArra
     usable = (h00 > 0) & (minor > 0) & (determinant > 0)
     if not usable.all():
         hessian = np.where(usable, hessian, np.array([1.0, 0, 0, 1, 0, 1])[:, None])
-    i00, i01, i02, i11, i12, i22 = _inverse(hessian)
+    i00, i01, i02, i11, i12, i22 = _inverse(hessian)  # pyright: ignore[reportArgumentType]
     g0 = (q1 * y2 - q2 * y1).sum(axis=0)
     g1 = (q2 * y0 - q0 * y2).sum(axis=0)
     g2 = (q0 * y1 - q1 * y0).sum(axis=0)

@@ -5,6 +5,8 @@ rigid one, whose rigidity matrix has rank 2 n - 3. Space: bearings leave a turn 
 of sight free, unless triangles take it away.
 """
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false, reportOperatorIssue=false
 from __future__ import annotations
 
 from typing import NamedTuple

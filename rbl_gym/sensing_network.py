@@ -8,6 +8,8 @@ Source: G. Piovan, I. Shames, B. Fidan, F. Bullo, B. D. O. Anderson, "On frame a
 localization for relative sensing networks". Numbers of equations are the paper's.
 """
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import math

@@ -1,5 +1,7 @@
 """Cycle consensus: the ring, the iteration (14), its factor, its limit in any order."""
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
 from __future__ import annotations
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Frames of planar networks: exact data, the bound, ranges beside bearings, wrong input."""
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
 import numpy as np

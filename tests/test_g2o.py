@@ -1,5 +1,7 @@
 """Reading planar graphs: g2o and CSV, and what is wrong in them."""
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
 from __future__ import annotations
 
 import numpy as np

@@ -1,5 +1,8 @@
 """RBL/PlanarNetwork-v0 and EstimateNetwork: the contract, the bound by hand, scalar and vector."""
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalMemberAccess=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
 import copy

@@ -1,5 +1,7 @@
 """Orientations of planar networks: the references, the bound, the proof, the size."""
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
 import itertools

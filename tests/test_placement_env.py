@@ -181,7 +181,7 @@ def turned(env, info, mirror):
     scene = batch_of(env).task.scene
     low, high = scene.volume.bounds()
     # Legal places that do not lie evenly about the volume are no mirror's.
-    mirror &= np.array_equal(sum(scene.anchor_region.bounds())[:2], (low + high)[:2])
+    mirror &= np.array_equal(sum(scene.anchor_region.bounds())[:2], (low + high)[:2])  # pyright: ignore[reportIndexIssue]
     sign = np.where(info["region"][:3] < 0.5 * (low + high), -1, 1) if mirror else np.ones(3)
     return sign * [1, 1, 0] + [0, 0, 1]
 

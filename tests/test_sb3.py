@@ -1,5 +1,7 @@
 """The adapter to stable-baselines3, and the training that stands on it."""
 
+# The package may be absent.
+# pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import json
