@@ -100,8 +100,8 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
         """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
-        mask = self._reset_mask(options)
-        seeds = self._seeds(seed)
+        mask = reset_mask(options, self.num_envs)
+        seeds = seeds_of(seed, self.num_envs)
         if not self._generators:
             if not mask.all():
                 raise gym.error.ResetNeeded("reset all environments before some of them")
@@ -189,25 +189,29 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
         return array.astype(dtype)
 
-    def _reset_mask(self, options: dict[str, Any] | None) -> BoolArray:
-        if options is None or "reset_mask" not in options:
-            return np.ones(self.num_envs, dtype=np.bool_)
-        mask = np.asarray(options["reset_mask"])
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ValueError(
-                f"reset_mask must be ({self.num_envs},) booleans, at least one True, "
-                f"got shape {mask.shape} of {mask.dtype}"
-            )
-        return mask
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed must hold {self.num_envs} seeds, got {len(seed)}")
-        return list(seed)
+def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
+    """Which worlds ``options={"reset_mask": mask}`` resets, all without it; or a ValueError."""
+    if options is None or "reset_mask" not in options:
+        return np.ones(num_envs, dtype=np.bool_)
+    mask = np.asarray(options["reset_mask"])
+    if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
+        raise ValueError(
+            f"reset_mask must be ({num_envs},) booleans, at least one True, "
+            f"got shape {mask.shape} of {mask.dtype}"
+        )
+    return mask
+
+
+def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
+    """A seed for each world: s, s + 1, ... of a number, a list as it is; or a ValueError."""
+    if seed is None:
+        return [None] * num_envs
+    if isinstance(seed, int | np.integer):
+        return [int(seed) + i for i in range(num_envs)]
+    if len(seed) != num_envs:
+        raise ValueError(f"seed must hold {num_envs} seeds, got {len(seed)}")
+    return list(seed)
 
 
 def _rows_as_objects(observation: Observation, where: BoolArray) -> np.ndarray:

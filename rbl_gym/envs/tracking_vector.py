@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 from rbl_gym.components import whole_rows
+from rbl_gym.envs.batch import reset_mask, seeds_of
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import (
     REWARDS,
@@ -102,8 +103,8 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         options: dict[str, Any] | None = None,
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
-        mask = self._reset_mask(options)
-        seeds = self._seeds(seed)
+        mask = reset_mask(options, self.num_envs)
+        seeds = seeds_of(seed, self.num_envs)
         if self._episodes.empty and not mask.all():
             raise gym.error.ResetNeeded("reset all environments before some of them")
         if not self._generators:
@@ -115,26 +116,6 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
         prior = self._restart(mask)
         observation, info, _ = self._observe(fresh=mask, moved=np.zeros_like(mask))
         return observation, {**info, **prior}
-
-    def _reset_mask(self, options: dict[str, Any] | None) -> BoolArray:
-        if options is None or "reset_mask" not in options:
-            return np.ones(self.num_envs, dtype=np.bool_)
-        mask = np.asarray(options["reset_mask"])
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ValueError(
-                f"reset_mask must be ({self.num_envs},) booleans, at least one True, "
-                f"got shape {mask.shape} of {mask.dtype}"
-            )
-        return mask
-
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"seed must hold {self.num_envs} seeds, got {len(seed)}")
-        return list(seed)
 
     def _restart(self, mask: BoolArray) -> dict[str, Any]:
         """New episodes where the mask says; returns their priors as info."""
