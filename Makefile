@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint format types wheel clean
+.PHONY: demo test lint format types docs dist clean
 
 demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png
@@ -20,15 +20,23 @@ format: .venv/dev.stamp
 
 # On an installed copy: no checker follows the mapping from folders to import names.
 types: .venv/dev.stamp
-	rm -rf build
+	rm -rf build/types build/lib
 	$(BIN)/python -m pip install --quiet --no-deps --target build/types .
 	cp -r tests pyproject.toml build/types/
-	cd build/types && ../../$(BIN)/pyright --pythonpath ../../$(BIN)/python
+	cd build/types && ../../$(BIN)/pyright --threads 2 --pythonpath ../../$(BIN)/python
 
-# Built and installed outside the checkout, where the folder mapping has to hold by itself.
-wheel: .venv/dev.stamp
-	rm -rf build dist .venv/smoke
-	$(BIN)/python -m build --wheel --outdir dist .
+# The site, in build/site; its reference is read from an installed copy, as the types are.
+docs: .venv/dev.stamp
+	rm -rf build/docs build/lib
+	$(BIN)/python -m pip install --quiet --no-deps --target build/docs .
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# The wheel, built from the sdist and installed outside the checkout, where the folder mapping has
+# to hold by itself.
+dist: .venv/dev.stamp
+	rm -rf build/lib build/bdist* dist .venv/smoke
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
 	$(BIN)/python -m venv .venv/smoke
 	.venv/smoke/bin/python -m pip install --quiet "$$(ls dist/*.whl)[cli]"
 	cd "$${TMPDIR:-/tmp}" && "$(CURDIR)/.venv/smoke/bin/python" -W error "$(CURDIR)/tests/smoke.py"

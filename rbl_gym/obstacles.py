@@ -29,14 +29,14 @@ def check_obstacles(obstacles: object) -> FloatArray:
 def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> np.ndarray:
     """Which points each anchor sees, (..., P, M) booleans.
 
+    A segment that only touches a box is not blocked; one that ends inside a box is.
+
     Parameters
     ----------
     anchors, points
         (..., M, 3) and (..., P, 3), metres.
     obstacles
         (..., K, 6), centres and half sizes; K may be 0.
-
-    A segment that only touches a box is not blocked; one that ends inside a box is.
     """
     batch = np.broadcast_shapes(anchors.shape[:-2], points.shape[:-2], obstacles.shape[:-2])
     free = np.ones((*batch, points.shape[-2], anchors.shape[-2]), dtype=np.bool_)

@@ -1,0 +1,90 @@
+"""The pages: their Python runs as it stands, their commands are commands, all can be reached."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rbl_gym
+from rbl_gym import ranging
+from rbl_gym.app import place, policies
+from rbl_gym.app.cli import _parser
+from rbl_gym.estimators import belief
+from tests.helpers import ROOT
+
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+# Libraries that are in no extra of ours: blocks that import them are compiled only.
+FOREIGN = re.compile(r"^from (torchrl|ray)\b", re.MULTILINE)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)
+
+
+def write_files_that_pages_read(folder: Path) -> None:
+    """A recording of a body at rest, a policy, the examples."""
+    (folder / "examples").symlink_to(ROOT / "examples")
+    anchors = np.array([[0, 0, 0], [8, 0, 2], [0, 6, 2], [8, 6, 0], [4, 3, 3.0]])
+    tags = np.array([[0.4, 0, 0], [-0.4, 0.3, 0], [0, -0.3, 0.3], [0, 0, -0.4]])
+    noise, rng = ranging.RangeNoise(0.05), np.random.default_rng(0)
+    lines = {"anchors": ["anchor,x,y,z"], "tags": ["tag,x,y,z"], "ranges": ["t,anchor,tag,range"],
+             "truth": ["t,x,y,z,qw,qx,qy,qz"]}  # fmt: skip
+    for name, places in (("anchors", anchors), ("tags", tags)):
+        lines[name] += [f"{i},{x},{y},{z}" for i, (x, y, z) in enumerate(places.tolist())]
+    for t in (0.0, 0.1, 0.2):
+        measured = ranging.simulate(anchors, tags, np.eye(3), [3, 2, 1], noise, rng).ranges
+        lines["ranges"] += [f"{t},{m},{n},{r}" for (m, n), r in np.ndenumerate(measured)]
+        lines["truth"].append(f"{t},3,2,1,1,0,0,0")
+    for name, text in lines.items():
+        (folder / f"{name}.csv").write_text("\n".join(text) + "\n")
+    (folder / "out").mkdir()
+    layer = np.zeros((3, 22)), np.zeros(3)
+    policy = policies.Policy((layer[0],), (layer[1],), "box", {"task": "auv_buoys"})
+    policies.save(policy, folder / "out" / "auv_buoys-0.npz")
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=lambda p: p.stem)
+def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
+    # What a block registers is forgotten after the test.
+    monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(place, "_GENERATIONS", 4)  # pages show how, not how well
+    write_files_that_pages_read(tmp_path)
+    names: dict = {}
+    for block in blocks(page, "python"):
+        code = compile(block, str(page.name), "exec")
+        if not FOREIGN.search(block):
+            exec(code, names)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda p: p.stem)
+def test_every_command_of_a_page_is_one(page):
+    parser = _parser()
+    for block in blocks(page, "sh"):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["rbl-gym"]:
+                parser.parse_args(words[1:])
+
+
+def test_every_page_is_in_the_navigation():
+    named = re.findall(r"^ .*: ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert sorted(named) == sorted(str(page.relative_to(ROOT / "docs")) for page in PAGES)
+
+
+def test_the_version_is_the_same_everywhere():
+    stated = {
+        name: re.search(pattern, (ROOT / name).read_text(), re.MULTILINE)
+        for name, pattern in {
+            "pyproject.toml": r'^version = "(.+)"',
+            "CITATION.cff": r"^version: (.+)",
+            "CHANGELOG.md": r"^## (\S+)",
+        }.items()
+    }
+    assert {name: found and found[1] for name, found in stated.items()} == dict.fromkeys(
+        stated, rbl_gym.__version__
+    )
