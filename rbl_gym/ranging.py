@@ -177,6 +177,13 @@ class LinkNoise:
         return np.maximum(distances + self.std_m * normals, 0.0)
 
 
+# The laws of scenes by the names that scene files and overrides give them.
+NOISE_LAWS: dict[str, type[NoiseLaw]] = {
+    "range": RangeNoise,
+    "squared-range": SquaredRangeNoise,
+}
+
+
 def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None) -> FloatArray:
     """Range (..., M, 1) of the reference tag to every anchor.
 

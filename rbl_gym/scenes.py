@@ -18,15 +18,17 @@ from rbl_gym import bodies, rotations
 from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.obstacles import check_obstacles
-from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
+from rbl_gym.ranging import NOISE_LAWS, LinkModel, NoiseLaw, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box, Region, Shell, Walls
 
 _REGIONS = {"box": Box, "walls": Walls, "shell": Shell}
-_NOISES = {"range": RangeNoise, "squared-range": SquaredRangeNoise}
 _FIELD_KINDS: dict[str, tuple[type, ...]] = {
-    "volume": (Box,), "anchor_region": tuple(_REGIONS.values()), "noise": tuple(_NOISES.values()),
-    "process": (ProcessNoise,), "links": (LinkModel,),
-}  # fmt: skip
+    "volume": (Box,),
+    "anchor_region": tuple(_REGIONS.values()),
+    "noise": tuple(NOISE_LAWS.values()),
+    "process": (ProcessNoise,),
+    "links": (LinkModel,),
+}
 TRAJECTORIES = ("waypoints", "constant", "random-twist", "orbit", "lawn-mower")
 Points = tuple[tuple[float, float, float], ...]
 
@@ -84,7 +86,7 @@ class Scene:
     anchor_region: Region
     n_anchors: int
     tags: Points
-    noise: RangeNoise | SquaredRangeNoise
+    noise: NoiseLaw
     process: ProcessNoise
     dt: float
     initial_rotation_rad: float
@@ -368,9 +370,9 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         A name of `SCENES`; or a mapping with the key ``"name"`` and fields of `Scene` to
         change. Nested fields take mappings of their own: ``{"name": "uwb_room", "steps": 50,
         "links": {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``. A region or noise of
-        another kind is named by ``"kind"`` (``"box"``, ``"walls"``, ``"shell"``; ``"range"``,
-        ``"squared-range"``). Another number of anchors than the scene has, without their places,
-        draws them anew in the region at every reset.
+        another kind is named by ``"kind"`` (``"box"``, ``"walls"``, ``"shell"``; a name of
+        `ranging.NOISE_LAWS`: ``"range"``, ``"squared-range"``). Another number of anchors than the
+        scene has, without their places, draws them anew in the region at every reset.
 
     Raises
     ------
@@ -414,7 +416,7 @@ def _replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
 
 def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
     unset = {"box": Box} if old is None else {}
-    kinds = next((k for k in (_REGIONS, _NOISES) if isinstance(old, tuple(k.values()))), unset)
+    kinds = next((k for k in (_REGIONS, NOISE_LAWS) if isinstance(old, tuple(k.values()))), unset)
     if "kind" not in value:
         if not dataclasses.is_dataclass(old):
             raise ValueError(f"{path} is not a nested field, got a dict {dict(value)!r:.80}")
