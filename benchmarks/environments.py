@@ -14,18 +14,12 @@ Process time of one thread, medians over interleaved repeats:
 
 from __future__ import annotations
 
-import os
+import side_by_side  # isort: skip
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -40,11 +34,7 @@ SCENES = ("camsap2013", "auv_buoys", "uwb_room")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--num-envs", type=int, default=1024)
-    options = parser.parse_args()
+    options = side_by_side.arguments(__doc__, repeats=5, num_envs=1024)
     jobs: dict[str, Callable[[], float]] = {"CartPole-v1 steps": steps_job(cart_pole())}
     for scene in SCENES:
         jobs[f"{scene} normals alone"] = normals_job(scene, options.num_envs)
@@ -72,8 +62,7 @@ def main() -> None:
     for scene, ratios in result["ratios"].items():
         print(scene, ", ".join(f"{name} {value:,.4g}" for name, value in ratios.items()))
     print("import", result["import_seconds"])
-    if options.json:
-        Path(options.json).write_text(json.dumps(result, indent=1) + "\n")
+    side_by_side.write(result, options.json)
 
 
 def cart_pole() -> gym.Env[Any, Any]:

@@ -9,16 +9,9 @@ Process time, one thread, medians over interleaved repeats; the results are chec
 
 from __future__ import annotations
 
-import os
+import side_by_side  # isort: skip
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,25 +28,15 @@ STEPS = 5
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--trials", type=int, default=1024)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = side_by_side.arguments(__doc__, repeats=7, trials=1024, seed=0)
     results = {
         f"{m}x{n}": measure(m, n, options.trials, options.repeats, options.seed) for m, n in SIZES
     }
-    print(f"{'M x N':<7} {'path':<20} {'us/trial':>9} {'filterpy us':>12} {'ratio':>9}")
-    for size, rows in results.items():
-        for path, row in rows.items():
-            print(f"{size:<7} {path:<20} {row['microseconds']:9.3f} "
-                  f"{row['peer_microseconds']:12.1f} {row['ratio']:9.1f}")  # fmt: skip
-    if options.json:
-        Path(options.json).write_text(json.dumps(results, indent=1) + "\n")
+    side_by_side.print_rows(results, "M x N", "path", "filterpy")
+    side_by_side.write(results, options.json)
 
 
-def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, dict[str, float]]:
+def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, side_by_side.Row]:
     """Medians per path at one number of anchors and tags."""
     rng = np.random.default_rng([seed, m, n])
     worlds = {
@@ -68,26 +51,10 @@ def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, d
     for path, world in worlds.items():
         world.check(n_trials=SIZES[m, n], path=path)
     peer = worlds["four filters"].peer(range(SIZES[m, n]))
-    times: dict[str, list[float]] = {path: [] for path in (*worlds, "peer")}
-    for _ in range(repeats):
-        times["peer"].append(clock(peer) / SIZES[m, n])
-        for path, world in worlds.items():
-            times[path].append(clock(world.run) / trials)
-    return {
-        path: {
-            "microseconds": 1e6 * float(np.median(times[path])),
-            "peer_microseconds": 1e6 * float(np.median(times["peer"])),
-            "ratio": float(np.median(np.divide(times["peer"], times[path]))),
-        }
-        for path in worlds
-    }
-
-
-def clock(run: Callable[[], Any]) -> float:
-    """Process time of one step of a run, seconds."""
-    begin = time.process_time()
-    run()
-    return (time.process_time() - begin) / STEPS
+    jobs = {"peer": side_by_side.Job(peer, STEPS * SIZES[m, n])}
+    jobs |= {path: side_by_side.Job(w.run, STEPS * trials) for path, w in worlds.items()}
+    times = side_by_side.interleaved(jobs, repeats)
+    return side_by_side.against(times.pop("peer"), times)
 
 
 class World:

@@ -11,18 +11,12 @@ Process time, one thread, medians over interleaved repeats.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-import time
+import side_by_side  # isort: skip
+
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-# First of all, as it sets the number of threads before numpy is loaded.
-import filters  # isort: skip
-
+import filters
 import numpy as np
 
 from rbl_gym import bounds, estimators, rotations
@@ -34,31 +28,20 @@ PEER_TRIALS, ONE_BODY_REPEATS = 10, 20
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--trials", type=int, default=1024)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = side_by_side.arguments(__doc__, repeats=7, trials=1024, seed=0)
     results = {
         f"{m}x{n}": measure(m, n, options.trials, options.repeats, options.seed) for m, n in SIZES
     }
-    print(f"{'M x N':<7} {'path':<24} {'us/trial':>9} {'filterpy us':>12} {'ratio':>7}")
-    for size, rows in results.items():
-        for path, row in rows.items():
-            print(f"{size:<7} {path:<24} {row['microseconds']:9.2f} "
-                  f"{row['peer_microseconds']:12.1f} {row['ratio']:7.2f}")  # fmt: skip
-    if options.json:
-        Path(options.json).write_text(json.dumps(results, indent=1) + "\n")
+    side_by_side.print_rows(results, "M x N", "path", "filterpy")
+    side_by_side.write(results, options.json)
 
 
-def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, dict[str, float]]:
+def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, side_by_side.Row]:
     """Medians per path at one number of anchors and tags."""
     world = filters.World(np.random.default_rng([seed, m, n]), "kf", m, n, trials)
     start = world.filter.belief(world.prior)
-    jobs: dict[str, tuple[Callable[[], Any], int]] = {
-        "peer": (world.peer(range(PEER_TRIALS)), PEER_TRIALS)
-    }
+    peer = world.peer(range(PEER_TRIALS))
+    jobs = {"peer": side_by_side.Job(peer, filters.STEPS * PEER_TRIALS)}
     for iterations in ITERATIONS:
         filter = estimators.make(
             "iekf", tags=world.tags, noise=filters.NOISE, process=filters.PROCESS,
@@ -67,33 +50,18 @@ def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, d
         prior = filter.initial(start.rotation, start.translation, np.diag([0.02] * 3 + [1.0] * 3))
         run = runner(filter, prior, world.twist, world.ranges, world.anchors)
         check(run(), prior, world, iterations)
-        jobs[f"{iterations} iterations"] = run, trials
         one = runner(
             filter, PoseState(*(field[0] for field in prior)), world.twist[0],
             [ranges[0] for ranges in world.ranges], world.anchors[0],
         )  # fmt: skip
-        jobs[f"{iterations} iterations, one body"] = one, 1
-    times: dict[str, list[float]] = {path: [] for path in jobs}
-    for _ in range(repeats):
-        for path, (run, count) in jobs.items():
-            times[path].append(clock(run, ONE_BODY_REPEATS if count == 1 else 1) / count)
-    peer = times.pop("peer")
-    return {
-        path: {
-            "microseconds": 1e6 * float(np.median(values)),
-            "peer_microseconds": 1e6 * float(np.median(peer)),
-            "ratio": float(np.median(np.divide(peer, values))),
-        }
-        for path, values in times.items()
-    }
-
-
-def clock(run: Callable[[], Any], repeats: int) -> float:
-    """Process time of one step of a run, seconds."""
-    begin = time.process_time()
-    for _ in range(repeats):
-        run()
-    return (time.process_time() - begin) / (filters.STEPS * repeats)
+        name = f"{iterations} iterations"
+        jobs[name] = side_by_side.Job(run, filters.STEPS * trials)
+        jobs[f"{name}, one body"] = side_by_side.Job(
+            lambda one=one: [one() for _ in range(ONE_BODY_REPEATS)],
+            filters.STEPS * ONE_BODY_REPEATS,
+        )
+    times = side_by_side.interleaved(jobs, repeats)
+    return side_by_side.against(times.pop("peer"), times)
 
 
 def runner(

@@ -15,18 +15,11 @@ medians over interleaved repeats. A peer that is not installed is skipped: pip i
 
 from __future__ import annotations
 
-import os
+import side_by_side  # isort: skip
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
 import datetime
-import json
-import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -43,28 +36,17 @@ PRIOR_RAD, PRIOR_M = 0.1, 0.5
 TRIALS, BODIES, PROBLEMS, PEER_PROBLEMS = 1024, 8, 512, 20
 
 
-class Job(NamedTuple):
-    """A run and how many trials (times steps) it works through."""
-
-    run: Callable[[], Any]
-    count: int
-
-
 class Duel(NamedTuple):
     """One peer against ours on the same inputs; `check` raises where the results differ."""
 
     title: str
-    peer: Job
-    ours: dict[str, Job]
+    peer: side_by_side.Job
+    ours: dict[str, side_by_side.Job]
     check: Callable[[], None]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = side_by_side.arguments(__doc__, repeats=7, seed=0)
     rows = []
     for make in (against_simdkalman, against_stonesoup, against_gtsam):
         for m, n in SIZES:
@@ -80,31 +62,15 @@ def main() -> None:
     for row in rows:
         print(f"{row['size']:<6} {row['peer']:<30} {row['peer_microseconds']:10.2f} "
               f"{row['ours']:<24} {row['microseconds']:9.2f} {row['ratio']:8.3g}")  # fmt: skip
-    if options.json:
-        Path(options.json).write_text(json.dumps(rows, indent=1) + "\n")
+    side_by_side.write(rows, options.json)
 
 
 def measure(duel: Duel, size: str, repeats: int) -> list[dict[str, Any]]:
     """Check, then medians of interleaved repeats: a row for each way of ours."""
     duel.check()
-    jobs = {"": duel.peer, **duel.ours}
-    times: dict[str, list[float]] = {name: [] for name in jobs}
-    for _ in range(repeats):
-        for name, job in jobs.items():
-            begin = time.process_time()
-            job.run()
-            times[name].append((time.process_time() - begin) / job.count)
-    return [
-        {
-            "size": size,
-            "peer": duel.title,
-            "peer_microseconds": 1e6 * float(np.median(times[""])),
-            "ours": name,
-            "microseconds": 1e6 * float(np.median(times[name])),
-            "ratio": float(np.median(np.divide(times[""], times[name]))),
-        }
-        for name in duel.ours
-    ]
+    times = side_by_side.interleaved({"": duel.peer, **duel.ours}, repeats)
+    rows = side_by_side.against(times.pop(""), times)
+    return [{"size": size, "peer": duel.title, "ours": name, **row} for name, row in rows.items()]
 
 
 def require_equal(what: str, got: np.ndarray, want: np.ndarray, tolerance: float) -> None:
@@ -210,8 +176,8 @@ def against_simdkalman(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
         count = TRIALS * STEPS
         return Duel(
             f"simdkalman, {len(H)} rows",
-            Job(peer, count),
-            {"kf, shared covariance": Job(lambda: tracks.ours(slice(None)), count)},
+            side_by_side.Job(peer, count),
+            {"kf, shared covariance": side_by_side.Job(lambda: tracks.ours(slice(None)), count)},
             check,
         )
 
@@ -283,10 +249,10 @@ def against_stonesoup(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
     return [
         Duel(
             "stonesoup, 12 rows",
-            Job(peer, BODIES * STEPS),
+            side_by_side.Job(peer, BODIES * STEPS),
             {
-                "kf, one body": Job(one_by_one, BODIES * STEPS),
-                f"kf, {TRIALS} bodies": Job(tracks.apart, TRIALS * STEPS),
+                "kf, one body": side_by_side.Job(one_by_one, BODIES * STEPS),
+                f"kf, {TRIALS} bodies": side_by_side.Job(tracks.apart, TRIALS * STEPS),
             },
             check,
         )
@@ -384,11 +350,13 @@ def against_gtsam(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
                 ours[1](k)
 
         jobs = {
-            f"{ours[0]}, {PROBLEMS} epochs": Job(lambda: ours[1](slice(None)), PROBLEMS),
-            f"{ours[0]}, one epoch": Job(one_by_one, PEER_PROBLEMS),
+            f"{ours[0]}, {PROBLEMS} epochs": side_by_side.Job(
+                lambda: ours[1](slice(None)), PROBLEMS
+            ),
+            f"{ours[0]}, one epoch": side_by_side.Job(one_by_one, PEER_PROBLEMS),
         }
-        ready = Job(lambda: [solve(*inputs) for inputs in graphs], PEER_PROBLEMS)
-        built = Job(
+        ready = side_by_side.Job(lambda: [solve(*inputs) for inputs in graphs], PEER_PROBLEMS)
+        built = side_by_side.Job(
             lambda: [solve(*build(k, start, prior=prior)) for k in range(PEER_PROBLEMS)],
             PEER_PROBLEMS,
         )

@@ -10,15 +10,7 @@ results are checked equal first.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
-import time
-from pathlib import Path
+import side_by_side  # isort: skip
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -30,22 +22,13 @@ METHODS = ("ls", "cls", "procrustes", "two-step", "ml", "robust")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = side_by_side.arguments(__doc__, repeats=5, seed=0)
     results = {str(db): measure(db, options.repeats, options.seed) for db in (40, 60, 80)}
-    print(f"{'dB':>4} {'method':<12} {'us/problem':>11} {'scipy us':>9} {'ratio':>7}")
-    for db, rows in results.items():
-        for method, row in rows.items():
-            print(f"{db:>4} {method:<12} {row['microseconds']:11.1f} "
-                  f"{row['peer_microseconds']:9.0f} {row['ratio']:7.1f}")  # fmt: skip
-    if options.json:
-        Path(options.json).write_text(json.dumps(results, indent=1) + "\n")
+    side_by_side.print_rows(results, "dB", "method", "scipy")
+    side_by_side.write(results, options.json)
 
 
-def measure(db: int, repeats: int, seed: int) -> dict[str, dict[str, float]]:
+def measure(db: int, repeats: int, seed: int) -> dict[str, side_by_side.Row]:
     """Medians per method at a reference range."""
     rng = np.random.default_rng([seed, db])
     scene = scenes.SCENES["icassp2013"]
@@ -71,25 +54,15 @@ def measure(db: int, repeats: int, seed: int) -> dict[str, dict[str, float]]:
     found = estimators.locate(ranges, anchors, tags, noise, "ml")
     costs = [peer(k) for k in range(PEER_PROBLEMS)]
     assert (found.cost[:PEER_PROBLEMS] <= np.array(costs) * (1 + 1e-6)).all()
-    times: dict[str, list[float]] = {method: [] for method in (*METHODS, "peer")}
-    for _ in range(repeats):
-        begin = time.process_time()
-        for k in range(PEER_PROBLEMS):
-            peer(k)
-        times["peer"].append((time.process_time() - begin) / PEER_PROBLEMS)
-        for method in METHODS:
-            begin = time.process_time()
-            estimators.locate(ranges, anchors, tags, noise, method)
-            times[method].append((time.process_time() - begin) / PROBLEMS)
-    ratios = {m: np.median(np.divide(times["peer"], times[m])) for m in METHODS}
-    return {
-        method: {
-            "microseconds": 1e6 * float(np.median(times[method])),
-            "peer_microseconds": 1e6 * float(np.median(times["peer"])),
-            "ratio": float(ratios[method]),
-        }
-        for method in METHODS
+    jobs = {
+        "peer": side_by_side.Job(lambda: [peer(k) for k in range(PEER_PROBLEMS)], PEER_PROBLEMS)
     }
+    for method in METHODS:
+        jobs[method] = side_by_side.Job(
+            lambda method=method: estimators.locate(ranges, anchors, tags, noise, method), PROBLEMS
+        )
+    times = side_by_side.interleaved(jobs, repeats)
+    return side_by_side.against(times.pop("peer"), times)
 
 
 if __name__ == "__main__":

@@ -10,17 +10,7 @@ repeats; ratios are raw ranges over the statistic.
 
 from __future__ import annotations
 
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-import argparse
-import json
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+import side_by_side  # isort: skip
 
 import numpy as np
 
@@ -31,32 +21,23 @@ SIZES = ((4, 5), (10, 6), (50, 20))
 NOISE = ranging.SquaredRangeNoise(0.05)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
 STAGES = ("normals", "generation", "step")
+CALLS = 5
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", metavar="F")
-    parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--trials", type=int, default=1024)
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+    options = side_by_side.arguments(__doc__, repeats=15, trials=1024, seed=0)
     results = {
         f"{m}x{n}": measure(m, n, options.trials, options.repeats, options.seed) for m, n in SIZES
     }
-    print(f"{'M x N':<7} {'stage':<11} {'ranges us':>10} {'statistic us':>13} {'ratio':>7}")
-    for size, rows in results.items():
-        for stage, row in rows.items():
-            print(f"{size:<7} {stage:<11} {row['ranges_microseconds']:10.3f} "
-                  f"{row['statistic_microseconds']:13.3f} {row['ratio']:7.2f}")  # fmt: skip
-    if options.json:
-        Path(options.json).write_text(json.dumps(results, indent=1) + "\n")
+    side_by_side.print_rows(results, "M x N", "statistic", "ranges")
+    side_by_side.write(results, options.json)
 
 
-def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, dict[str, float]]:
-    """Medians per stage at one number of anchors and tags."""
+def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, side_by_side.Row]:
+    """Medians per stage at one number of anchors and tags; the peer is the raw ranges."""
     world = World(np.random.default_rng([seed, m, n]), m, n, trials)
     world.check()
-    jobs = {
+    runs = {
         ("normals", "ranges"): lambda: world.rng.standard_normal((trials, m, n)),
         ("normals", "statistic"): lambda: world.rng.standard_normal((trials, 3, 4)),
         ("generation", "ranges"): world.ranges,
@@ -66,27 +47,15 @@ def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, d
             world.prior, *world.statistic()
         ),
     }
-    times: dict[tuple[str, str], list[float]] = {job: [] for job in jobs}
-    for _ in range(repeats):
-        for job, run in jobs.items():
-            times[job].append(clock(run) / trials)
+    jobs = {
+        name: side_by_side.Job(lambda run=run: [run() for _ in range(CALLS)], CALLS * trials)
+        for name, run in runs.items()
+    }
+    times = side_by_side.interleaved(jobs, repeats)
     rows = {}
     for stage in STAGES:
-        raw, small = times[stage, "ranges"], times[stage, "statistic"]
-        rows[stage] = {
-            "ranges_microseconds": 1e6 * float(np.median(raw)),
-            "statistic_microseconds": 1e6 * float(np.median(small)),
-            "ratio": float(np.median(np.divide(raw, small))),
-        }
+        rows |= side_by_side.against(times[stage, "ranges"], {stage: times[stage, "statistic"]})
     return rows
-
-
-def clock(run: Callable[[], Any], calls: int = 5) -> float:
-    """Process time of a call, seconds."""
-    begin = time.process_time()
-    for _ in range(calls):
-        run()
-    return (time.process_time() - begin) / calls
 
 
 class World:
