@@ -117,7 +117,7 @@ def make(
     ValueError
         On an unknown name or option, or an argument out of its range.
     """
-    factory = _FACTORIES.get(name)
+    factory = _FACTORIES.get(name) if isinstance(name, str) else None
     if factory is None:
         found = [entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name == name]
         if not found:

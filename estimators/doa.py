@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bearing, bounds
-from rbl_gym.checks import FloatArray, are_finite, check_array, check_number
+from rbl_gym.checks import FloatArray, are_finite, check_array, check_number, check_one_of
 from rbl_gym.estimators.doa_cost import DoaCost
 from rbl_gym.estimators.doa_global import global_search
 from rbl_gym.estimators.doa_newton import newton_iteration, unit_quaternion
@@ -92,8 +92,7 @@ def locate_doa(
         On wrong shapes, NaN, angles outside [0, pi], fewer than three tags or collinear ones,
         an unknown method or half-space.
     """
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}, got {method!r}")
+    check_one_of("method", method, list(METHODS))
     if half_space not in HALF_SPACES:
         raise ValueError(f"half_space must be 'y>0', 'y<0' or None, got {half_space!r}")
     if not isinstance(noise, bearing.AngleNoise):

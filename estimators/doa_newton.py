@@ -13,8 +13,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym import bearing, rotations
-from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.components import solve
+
+# Behind the door: places far off make it large.
+_VEE = kernel(rotations.vee)
 
 # Distances are known, angles are noisy: a distance counts as an angle of this many radians for
 # an error of the body's size.
@@ -143,6 +146,6 @@ def unit_quaternion(positions: FloatArray, tags: FloatArray) -> tuple[FloatArray
     P = np.empty((*H.shape[:-2], 4, 4))
     P[..., 0, 0] = np.einsum("...ii->...", H)
     P[..., 1:, 1:] = H + np.swapaxes(H, -1, -2) - P[..., :1, :1] * np.eye(3)
-    P[..., 0, 1:] = P[..., 1:, 0] = 2 * rotations.vee(H)
+    P[..., 0, 1:] = P[..., 1:, 0] = 2 * _VEE(H)
     rotation = rotations.from_quaternion(np.linalg.eigh(P)[1][..., 3])
     return rotation, s_mean - (rotation @ c_mean[..., None])[..., 0]

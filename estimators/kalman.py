@@ -17,13 +17,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import rotations
 from rbl_gym.bounds import symmetric
-from rbl_gym.checks import (
-    BoolArray,
-    FloatArray,
-    check_array,
-    check_number,
-    check_one_of,
-)
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of, kernel
 from rbl_gym.estimators.belief import PoseBelief, inverse
 from rbl_gym.estimators.engines import ENGINES, FEW_TRIALS, Epoch, Prediction
 from rbl_gym.estimators.four_filters import (
@@ -48,6 +42,9 @@ from rbl_gym.estimators.squared_range import geometric_rank
 from rbl_gym.estimators.unitary import column_fit, coupled_fit, decoupled_fit
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
+
+# Behind the door: what is not determined is NaN.
+_HAT = kernel(rotations.hat)
 
 
 class KalmanState(NamedTuple):
@@ -177,7 +174,7 @@ class KalmanFamily:
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=False)
         self._check_determined(state, anchors)
         if self.weights is None:
-            with np.errstate(invalid="ignore"):
+            with np.errstate(invalid="ignore", over="ignore"):
                 variance = self.noise.squared_range_variance(ranges, mask)
             try:
                 weights = 1 / check_variance(variance, mask)
@@ -370,7 +367,7 @@ def state_jacobian(rotation: FloatArray) -> FloatArray:
     """Derivative (..., 12, 6) of ``[vec Q; t]`` by the pose error (w, v)."""
     J = np.zeros((*rotation.shape[:-2], 12, 6))
     for k in range(3):
-        J[..., 3 * k : 3 * k + 3, :3] = -rotations.hat(rotation[..., :, k])
+        J[..., 3 * k : 3 * k + 3, :3] = -_HAT(rotation[..., :, k])
     J[..., 9:, 3:] = np.eye(3)
     return J
 

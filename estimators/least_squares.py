@@ -10,8 +10,11 @@ import numpy as np
 
 from rbl_gym import rotations
 from rbl_gym.bounds import information_rank
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, kernel
 from rbl_gym.estimators.squared_range import Statistic, information
+
+# Behind the doors: entries of what is not determined are NaN here.
+_EXP, _NEAREST = kernel(rotations.exp), kernel(rotations.nearest)
 
 # The generators of SO(3): E[i] = [e_i]x.
 _E = rotations.hat(np.eye(3))
@@ -66,12 +69,14 @@ def procrustes(
         smallest = np.linalg.eigvalsh(hessian)[..., 0]
         scale = np.trace(gauss, axis1=-2, axis2=-1)
         shift = np.maximum(0.0, 1e-9 * scale - smallest) * 1.5 + damping * scale + 1e-300
+        # Of a weight that is rounding only, as of tags in one point, nothing else is certain.
+        shift += 1e-15 * np.abs(hessian).max(axis=(-2, -1))
         step = -np.linalg.solve(hessian + shift[..., None, None] * np.eye(3), gradient[..., None])
         step = step[..., 0]
         # A step past a quarter turn leaves the region the quadratic model speaks of.
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         step = step * np.minimum(1.0, 1.5 / np.maximum(length, 1e-300))
-        candidate = rotations.exp(step) @ Q
+        candidate = _EXP(step) @ Q
         new_residual = vec(candidate) - target
         new_pull = (weight @ new_residual[..., None])[..., 0]
         new_cost = 0.5 * np.einsum("...i,...i->...", new_residual, new_pull)
@@ -112,7 +117,7 @@ def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
     middle = (share[..., None] * stat.tags).sum(axis=-2)
     weighted = share[..., None] * (stat.tags - middle[..., None, :])
     cross = np.swapaxes(places - centre[..., None, :], -1, -2) @ weighted
-    rotation = rotations.nearest(cross)
+    rotation = _NEAREST(cross)
     translation = centre - (rotation @ middle[..., None])[..., 0]
     few = known.sum(axis=-1) < 3
     return np.where(few[..., None, None], np.nan, rotation), np.where(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, ranging, rotations
-from rbl_gym.checks import BoolArray, FloatArray, are_finite, check_array, check_number
+from rbl_gym.checks import BoolArray, FloatArray, are_finite, check_array, check_number, kernel
 from rbl_gym.estimators import least_squares
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.kalman import state_jacobian
@@ -28,6 +28,9 @@ from rbl_gym.estimators.range_cost import RangeCost
 from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import Statistic, information, statistic
 from rbl_gym.ranging import NoiseLaw
+
+# Of what is not known the cost is not a number: no door here.
+_DISTANCES = kernel(ranging.distances)
 
 ENTRY_POINT_GROUP = "rbl_gym.locators"
 # Trials of a block: their arrays stay in the processor's cache.
@@ -139,6 +142,7 @@ def locate(
         coplanar; tags not collinear, for ``ls`` not coplanar).
     """
     fit = _method(method)
+    ranging.check_law("noise", noise)
     tags = check_array("tags", tags, ("N", 3))
     ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
     epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
@@ -181,7 +185,7 @@ def _range_cost_of(
 ) -> FloatArray:
     """Half the sum of squared whitened range residuals (B,), infinite where no pose is known."""
     turned = epoch.tags @ np.swapaxes(rotation, -1, -2)
-    residual = ranging.distances(epoch.anchors, turned + translation[:, None]) - epoch.ranges
+    residual = _DISTANCES(epoch.anchors, turned + translation[:, None]) - epoch.ranges
     cost = 0.5 * np.einsum("bmn,bmn,bmn->b", epoch.weights, residual, residual)
     return np.where(known, cost, np.inf)
 
@@ -407,7 +411,7 @@ def methods() -> list[str]:
 
 
 def _method(name: str) -> Callable[[Epoch], Fit]:
-    if name in METHODS:
+    if isinstance(name, str) and name in METHODS:
         return METHODS[name]
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         if entry.name == name:

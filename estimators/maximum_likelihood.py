@@ -12,12 +12,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import bounds, ranging
-from rbl_gym.checks import BoolArray, FloatArray, are_finite
+from rbl_gym.checks import BoolArray, FloatArray, are_finite, kernel
 from rbl_gym.estimators.least_squares import points_fit
 from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.range_cost import RangeCost, geman_mcclure, huber
 from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import statistic
+
+# Behind the doors: what comes to these was checked, or made here.
+_TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
 # A cost this many standard deviations above its chi-square mean calls for a global search.
 _SUSPICIOUS = 5.0
@@ -109,7 +112,7 @@ def _with_tag_noise(cost: RangeCost, solution: Solution, tag_std_m: float) -> So
     if tag_std_m == 0:
         return solution
     for _ in range(2):
-        positions = ranging.tag_positions(solution.rotation, solution.translation, cost.tags)
+        positions = _TAG_POSITIONS(solution.rotation, solution.translation, cost.tags)
         unit = bounds.directions(cost.anchors, positions)[1]
         eased = dataclasses.replace(cost, tag_variance=tag_std_m**2, tag_unit=unit)
         solution = minimize_pose(eased, solution.rotation, solution.translation, iterations=8)
@@ -233,7 +236,7 @@ def rivals(tags: FloatArray, solutions: Solution) -> Alternatives:
     translation = np.take_along_axis(solutions.translation, order[..., None], axis=1)
     cost = np.take_along_axis(solutions.at.cost, order, axis=1)
     converged = np.take_along_axis(solutions.converged, order, axis=1)
-    positions = ranging.tag_positions(rotation, translation, tags)
+    positions = _TAG_POSITIONS(rotation, translation, tags)
     gap = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1).max(axis=-1)
     extent = np.linalg.norm(tags - tags.mean(axis=-2, keepdims=True), axis=-1)
     far = gap > 1e-3 * np.maximum(extent.max(axis=(-2, -1)), 1e-12)[:, None, None]
@@ -305,8 +308,8 @@ def _inliers(cost: RangeCost, solution: Solution) -> BoolArray:
 def _squared_residuals(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray
 ) -> FloatArray:
-    positions = ranging.tag_positions(rotation, translation, cost.tags)
-    return cost.weights * (ranging.distances(cost.anchors, positions) - cost.ranges) ** 2
+    positions = _TAG_POSITIONS(rotation, translation, cost.tags)
+    return cost.weights * (_DISTANCES(cost.anchors, positions) - cost.ranges) ** 2
 
 
 def _narrow(

@@ -23,7 +23,7 @@ from rbl_gym.rigidity import check_frames, check_joint
 from rbl_gym.sensing_network import (
     IntArray,
     check_edge_values,
-    check_edges,
+    check_pair,
     edge_angles,
     proj,
     true_bearings,
@@ -116,7 +116,7 @@ def _measured(
     if lengths.any():
         std = check_number("range_std_m", range_std, low=1e-12)
     if known is not None:
-        known = tuple(check_edges([known], n_nodes)[0].tolist())
+        known = check_pair("known_pair", known, n_nodes)
         length = check_number("length_m", length, low=1e-12)
     return _Measured(edges, bearings, bearing_std, lengths, std, known, length or 1.0)
 

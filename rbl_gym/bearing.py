@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_finite, check_number, check_shape
+from rbl_gym.checks import FloatArray, check_array, check_finite, check_number, check_shape, checked
 from rbl_gym.ranging import tag_positions
 
 # What the angles cannot tell apart.
@@ -136,6 +136,7 @@ def information(positions: FloatArray, noise: AngleNoise) -> FloatArray:
     return np.moveaxis(np.einsum("k...,ki...,kj...->ij...", weight, J, J), (0, 1), (-2, -1))
 
 
+@checked(tags=("N", 3), rotation=(3, 3), translation=(3,))
 def simulate(
     tags: ArrayLike,
     rotation: ArrayLike,
@@ -145,6 +146,8 @@ def simulate(
     station: ArrayLike | None = None,
 ) -> FloatArray:
     """Noisy angles (..., 2, N) of bodies at given poses."""
+    if not isinstance(noise, AngleNoise):
+        raise ValueError(f"noise must be an AngleNoise, got {noise!r:.80}")
     true = angles(tag_positions(rotation, translation, tags), station)
     return noise.sample(true, rng.standard_normal(true.shape))
 

@@ -53,7 +53,7 @@ def plate(length_m: float = 1.0, width_m: float = 1.0) -> FloatArray:
     Coplanar tags leave the 12-state linear filters without rank; the filters on the manifold
     do not mind.
     """
-    half = 0.5 * np.array([_check_size(length_m), _check_size(width_m), 0.0])
+    half = 0.5 * np.array([_check_size(length_m, "length_m"), _check_size(width_m, "width_m"), 0.0])
     return half * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]])
 
 
@@ -64,5 +64,5 @@ def perturb(tags: ArrayLike, std_m: float, rng: np.random.Generator) -> FloatArr
     return tags + std_m * rng.standard_normal(tags.shape)
 
 
-def _check_size(size_m: float) -> float:
-    return check_number("size_m", size_m, low=1e-9)
+def _check_size(size_m: float, name: str = "size_m") -> float:
+    return check_number(name, size_m, low=1e-9)

@@ -17,8 +17,14 @@ from rbl_gym.checks import (
     check_links,
     check_number,
     check_one_of,
+    checked,
+    kernel,
 )
 from rbl_gym.motion import ProcessNoise
+
+# Behind the doors: what comes to these was checked, or made here.
+_HAT, _EXP = kernel(rotations.hat), kernel(rotations.exp)
+_TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
 _EYE = np.eye(6)
 # J_n as a linear function of (c_n, 1), c_n turned: J_n[i, a] = sum_k (c_n, 1)[k] _BY_POSE[k, i, a].
@@ -32,7 +38,7 @@ def tag_jacobian(rotation: FloatArray, tags: FloatArray) -> FloatArray:
     """Derivative (..., N, 3, 6) of the tag positions by the pose error: ``[-[Q c_n]x, I]``."""
     turned = tags @ np.swapaxes(rotation, -1, -2)
     J = np.zeros((*turned.shape, 6))
-    J[..., :3] = -rotations.hat(turned)
+    J[..., :3] = -_HAT(turned)
     J[..., 3:] = np.eye(3)
     return J
 
@@ -141,7 +147,7 @@ def range_information(
     if model == "raw" and tag_std_m == 0:
         information = information_at(anchors, tags, rotation, translation, noise, mask)
     else:
-        positions = ranging.tag_positions(rotation, translation, tags)
+        positions = _TAG_POSITIONS(rotation, translation, tags)
         of_tag = _raw_tag_information if model == "raw" else _squared_tag_information
         per_tag = of_tag(anchors, positions, noise, mask)
         damping = np.eye(3) + tag_std_m**2 * per_tag
@@ -184,7 +190,7 @@ def _squared_tag_information(
     anchors: FloatArray, positions: FloatArray, noise: ranging.NoiseLaw, links: BoolArray | None
 ) -> FloatArray:
     """Information ``4 A Pi_n A^T`` (..., N, 3, 3) about each tag, |s|^2 projected out."""
-    distance = ranging.distances(anchors, positions)
+    distance = _DISTANCES(anchors, positions)
     weight = 1 / np.broadcast_to(noise.squared_range_variance(distance), distance.shape)
     weight = weight if links is None else weight * links
     spread, weighted = weighted_spread(anchors, weight)
@@ -278,7 +284,7 @@ def doa_information_at(
     tags: FloatArray, rotation: FloatArray, translation: FloatArray, noise: bearing.AngleNoise
 ) -> FloatArray:
     """`doa_information` on arrays that are known to be good, seen from the origin."""
-    positions = ranging.tag_positions(rotation, translation, tags)
+    positions = _TAG_POSITIONS(rotation, translation, tags)
     return lift(tag_jacobian(rotation, tags), bearing.information(positions, noise))
 
 
@@ -316,7 +322,9 @@ def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.nd
     # With a unit diagonal no eigenvalue exceeds n: a determinant bounds the smallest one, and
     # spares most matrices the eigenvalues.
     rank = np.full(scaled.shape[:-2], n)
-    open_ = np.asarray(np.linalg.det(scaled) <= 2 * tolerance * n ** (n - 1))
+    with np.errstate(divide="ignore"):  # of zeros, on the way to their determinant
+        determinant = np.linalg.det(scaled)
+    open_ = np.asarray(determinant <= 2 * tolerance * n ** (n - 1))
     if open_.any():
         rank[open_] = (np.linalg.eigvalsh(scaled[open_]) > tolerance).sum(axis=-1)
     return rank
@@ -355,6 +363,8 @@ def posterior_crb_step(
     twist = check_array("twist", twist, (6,))
     if (check_array("dt", dt, ()) < 0).any():
         raise ValueError(f"dt must not be negative, got {dt}")
+    if not callable(getattr(process, "covariance", None)):
+        raise ValueError(f"process must be a ProcessNoise, got {process!r:.80}")
     predicted = predict_information(J, twist, dt, process)
     return predicted + range_information(anchors, tags, rotation, translation, noise, links)
 
@@ -377,7 +387,7 @@ def predict_covariance(
 
 def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
     """``F matrix F^T`` of a symmetric matrix: the error is global, so its rotation part turns."""
-    step = rotations.exp(twist[..., :3] * np.asarray(dt, float)[..., None])
+    step = _EXP(twist[..., :3] * np.asarray(dt, float)[..., None])
     if matrix.ndim == step.ndim == 2:
         F = _EYE.copy()
         F[:3, :3] = step
@@ -396,6 +406,7 @@ def symmetric(matrix: FloatArray) -> FloatArray:
     return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
+@checked(covariance=(6, 6), rotation=(3, 3), tags=("N", 3))
 def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> FloatArray:
     """Root mean square tag error b (...) in metres that a pose covariance (..., 6, 6) implies.
 

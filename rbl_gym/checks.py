@@ -1,13 +1,17 @@
 """Checks of arguments: in comes a finite float64 array of the right shape, or an error goes out.
 
 Every error names the argument, the shape it should have, the shape it has, and the first
-offending value with its index.
+offending value with its index. Public functions check at the door: those that hot paths call get
+it from `checked`, and whoever has checked already takes the `kernel` behind it.
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,6 +19,49 @@ from numpy.typing import ArrayLike, NDArray
 # float64 throughout; numpy's own stubs promise no more than this of most functions.
 FloatArray = NDArray[np.floating[Any]]
 BoolArray = NDArray[np.bool_]
+# No length, time or variance is larger; beyond it squares and products would overflow.
+LARGEST = 1e30
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def checked(
+    **shapes: tuple[int | str, ...],
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """A decorator: `check_array` of these arguments, by their names, before the function runs.
+
+    An argument whose default is None may be None.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        parameters = list(inspect.signature(function).parameters.values())
+        doors = [
+            (place, p.name, shapes[p.name], p.default is None)
+            for place, p in enumerate(parameters)
+            if p.name in shapes
+        ]
+
+        @functools.wraps(function)
+        def door(*args: P.args, **kwargs: P.kwargs) -> R:
+            values: list[Any] = list(args)
+            for place, name, shape, optional in doors:
+                held, key = (values, place) if place < len(values) else (kwargs, name)
+                if held is kwargs and name not in kwargs:
+                    continue
+                if not (optional and held[key] is None):  # pyright: ignore[reportArgumentType, reportCallIssue]
+                    held[key] = check_array(name, held[key], shape)  # pyright: ignore
+            return function(*values, **kwargs)
+
+        door.kernel = function  # pyright: ignore[reportAttributeAccessIssue]
+        return door
+
+    return decorate
+
+
+def kernel(function: Callable[P, R]) -> Callable[P, R]:
+    """The function behind the door of `checked`, for callers whose arguments are checked."""
+    return function.kernel  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> FloatArray:
@@ -28,12 +75,13 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
         What came.
     shape
         Trailing axes: an int is an exact size, a string a free one of at least 1
-        (``("M", 3)`` accepts ``(..., M, 3)``). Leading axes are free.
+        (``("M", 3)`` accepts ``(..., M, 3)``). Leading axes are free, but not empty.
 
     Raises
     ------
     ValueError
-        If `value` is not numeric, has other trailing axes, or holds NaN or inf.
+        If `value` is not numeric, has other trailing axes, or holds NaN, inf, or what is
+        larger than `LARGEST`.
     """
     return check_finite(name, check_shape(name, value, shape))
 
@@ -48,6 +96,8 @@ def check_shape(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
     ):
         wanted = ", ".join(["...", *map(str, shape)])
         raise ValueError(f"{name} must have shape ({wanted}), got {array.shape}")
+    if not array.size:
+        raise ValueError(f"{name} must not be empty, got shape {array.shape}")
     return array
 
 
@@ -63,10 +113,12 @@ def as_float(name: str, value: Any) -> FloatArray:
 
 
 def check_finite(name: str, array: FloatArray) -> FloatArray:
-    """`array` unchanged, or a ValueError with the first entry that is NaN or inf."""
-    if not np.isfinite(array).all():
-        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name} must be finite, got {array[index]} at index {index}")
+    """`array` unchanged, or a ValueError with the first entry that is NaN, inf or too large."""
+    sound = np.abs(array) <= LARGEST
+    if not sound.all():
+        index = tuple(int(i) for i in np.argwhere(~sound)[0])
+        what = "of at most 1e30" if np.isfinite(array[index]) else "finite"
+        raise ValueError(f"{name} must be {what}, got {array[index]} at index {index}")
     return array
 
 
@@ -83,7 +135,7 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be a number, got {value!r:.80}") from error
-    if not math.isfinite(number) or not low <= number <= high:
+    if not abs(number) <= LARGEST or not low <= number <= high:
         bounds = f" in [{low:g}, {high:g}]" if low > -math.inf or high < math.inf else ""
         raise ValueError(f"{name} must be a finite number{bounds}, got {number}")
     return number
@@ -99,9 +151,14 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
     """
     if links is None:
         return None
-    mask = np.asarray(links)
+    try:
+        mask = np.asarray(links)
+    except ValueError as error:
+        raise ValueError(f"links must be an array of booleans, got {links!r:.80}") from error
     if mask.shape[-2:] != shape[-2:]:
         raise ValueError(f"links must have shape (..., {shape[-2]}, {shape[-1]}), got {mask.shape}")
+    if not mask.size:
+        raise ValueError(f"links must not be empty, got shape {mask.shape}")
     if mask.dtype != np.bool_:
         if mask.dtype.kind not in "iuf" or not np.isin(mask, (0, 1)).all():
             raise ValueError("links must be boolean (True: measured), got other values")
@@ -111,6 +168,6 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
 
 def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) -> str:
     """`value` if it is among `choices`, or a ValueError that lists them."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
     return value

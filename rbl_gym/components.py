@@ -14,7 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbl_gym import rotations
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, kernel
+
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LOG = kernel(rotations.exp), kernel(rotations.log)
+_LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 
 
 @contextlib.contextmanager
@@ -67,7 +71,7 @@ def product(A: FloatArray, B: FloatArray) -> FloatArray:
 def exp(w: FloatArray) -> FloatArray:
     """Rotation matrices (3, 3, ...) of rotation vectors (3, ...); `rotations.exp`."""
     if w.ndim == 1:
-        return rotations.exp(w)
+        return _EXP(w)
     squared = np.einsum("i...,i...->...", w, w)
     a, b, _ = rotations.coefficients(squared)
     return _series(w, a, b, 1.0 - b * squared)
@@ -82,13 +86,13 @@ def exp_and_left_jacobian(w: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def log(Q: FloatArray) -> FloatArray:
     """Rotation vectors (3, ...) of rotation matrices (3, 3, ...); `rotations.log`."""
-    return np.ascontiguousarray(first(rotations.log(last(Q, 2)), 1))
+    return np.ascontiguousarray(first(_LOG(last(Q, 2)), 1))
 
 
 def left_jacobian_inverse(w: FloatArray) -> FloatArray:
     """``Jl(w)^-1`` (3, 3, ...) of rotation vectors (3, ...); `rotations.left_jacobian_inverse`."""
     if w.ndim == 1:
-        return rotations.left_jacobian_inverse(w)
+        return _LEFT_JACOBIAN_INVERSE(w)
     squared = np.einsum("i...,i...->...", w, w)
     c = rotations.inverse_coefficient(squared)
     return _series(w, np.full_like(squared, -0.5), c, 1.0 - c * squared)

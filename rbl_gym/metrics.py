@@ -6,9 +6,10 @@ import numpy as np
 from scipy import special
 
 from rbl_gym import rotations
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, checked
 
 
+@checked(rotation_hat=(3, 3), translation_hat=(3,), rotation=(3, 3), translation=(3,))
 def pose_error(
     rotation_hat: FloatArray,
     translation_hat: FloatArray,
@@ -21,6 +22,9 @@ def pose_error(
     return np.concatenate(np.broadcast_arrays(turn, shift), axis=-1)
 
 
+@checked(
+    rotation_hat=(3, 3), translation_hat=(3,), rotation=(3, 3), translation=(3,), tags=("N", 3)
+)
 def tag_error(
     rotation_hat: FloatArray,
     translation_hat: FloatArray,
@@ -36,17 +40,27 @@ def tag_error(
     return np.sqrt(square / displacement.shape[-2])
 
 
+@checked(vector=("n",))
 def length(vector: FloatArray) -> FloatArray:
     """Euclidean length (...) of vectors (..., n)."""
     return np.sqrt(np.einsum("...i,...i->...", vector, vector))
 
 
+@checked(error=("n",), covariance=("n", "n"))
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Normalised estimation error squared (...), ``e^T P^-1 e``; mean 6 for a consistent pose."""
-    solved = np.linalg.solve(covariance, error[..., None])[..., 0]
+    if covariance.shape[-2:] != (error.shape[-1],) * 2:
+        raise ValueError(
+            f"covariance must fit error of {error.shape[-1]} entries, got {covariance.shape}"
+        )
+    try:
+        solved = np.linalg.solve(covariance, error[..., None])[..., 0]
+    except np.linalg.LinAlgError as mistake:
+        raise ValueError(f"covariance must not be singular, got {covariance!r:.80}") from mistake
     return np.einsum("...i,...i->...", error, solved)
 
 
+@checked(matrix=(3, 3), rotation=(3, 3))
 def mean_angular_error(matrix: FloatArray, rotation: FloatArray) -> FloatArray:
     """Mean angle (...) in radians between the columns of an estimate and of the rotation.
 
@@ -57,6 +71,7 @@ def mean_angular_error(matrix: FloatArray, rotation: FloatArray) -> FloatArray:
     return rotations.angle_between(*columns).mean(axis=-1)
 
 
+@checked(covariance=(6, 6), rotation=(3, 3))
 def expected_mean_angular_error(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
     """The mean angular error (...) in radians of a Gaussian error of this pose covariance.
 

@@ -16,7 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import rotations
-from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.checks import FloatArray, check_array, check_number, checked, kernel
+
+_MOST_STEPS = 10**9
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class ProcessNoise:
         the noise is on the angular velocity, the error on the rotation it makes.
         """
         dt = np.asarray(dt, dtype=np.float64)[..., None]
-        jacobian = rotations.left_jacobian(twist[..., :3] * dt)
+        jacobian = _LEFT_JACOBIAN(twist[..., :3] * dt)
         variance = dt * self._variance
         covariance = np.zeros((*jacobian.shape[:-2], 6, 6))
         covariance[..., :3, :3] = (jacobian * variance[..., None, :3]) @ np.swapaxes(
@@ -92,12 +96,13 @@ class Path(NamedTuple):
     translation: FloatArray
 
 
+@checked(rotation=(3, 3), translation=(3,), twist=(6,), dt=())
 def propagate(
     rotation: FloatArray, translation: FloatArray, twist: FloatArray, dt: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
     """The pose one step of `dt` seconds later under a constant twist."""
     dt = np.asarray(dt, dtype=np.float64)[..., None]
-    return rotations.exp(twist[..., :3] * dt) @ rotation, translation + twist[..., 3:] * dt
+    return _EXP(twist[..., :3] * dt) @ rotation, translation + twist[..., 3:] * dt
 
 
 def simulate(
@@ -134,7 +139,7 @@ def simulate(
     twists *= dt
     rotation = _trials_last(batch, n_steps + 1, 3, 3)
     rotation[..., 0, :, :] = trajectory.rotation
-    rotations.exp(twists[..., :3], out=rotation[..., 1:, :, :])
+    _EXP(twists[..., :3], out=rotation[..., 1:, :, :])
     _chain(rotation)
     translation = _trials_last(batch, n_steps + 1, 3)
     translation[..., 0, :] = 0.0
@@ -367,6 +372,7 @@ def interpolate(
 
 
 def _check_steps(steps: int, name: str = "steps") -> int:
-    if not isinstance(steps, (int, float, np.number)) or steps < 1 or steps % 1 != 0:
+    whole = isinstance(steps, (int, float, np.number)) and steps % 1 == 0
+    if not whole or not 1 <= steps <= _MOST_STEPS:
         raise ValueError(f"{name} must be a positive int, got {steps!r}")
     return int(steps)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_number
 from rbl_gym.network_graphs import check_connected, incidence
-from rbl_gym.sensing_network import IntArray, check_edges, directions
+from rbl_gym.sensing_network import IntArray, check_edges, check_pair, check_positions, directions
 
 
 def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
@@ -51,13 +51,19 @@ def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
 
     Rows are in the order of ``bearings.ravel()``: of j seen by i, of i seen by j, edge by edge.
     """
-    positions = np.asarray(positions, dtype=np.float64)
+    positions = check_positions(positions)
     n_nodes = len(positions)
     edges = check_edges(edges, n_nodes)
     toward = directions(positions, edges)
     apart = positions[edges[:, 1]] - positions[edges[:, 0]]
     across = np.column_stack([-np.sin(toward), np.cos(toward)])
-    across /= np.linalg.norm(apart, axis=1, keepdims=True)
+    length = np.linalg.norm(apart, axis=1, keepdims=True)
+    if (length == 0).any():
+        i, j = edges[int(np.argmin(length))]
+        raise ValueError(
+            f"positions must differ along edges, those of nodes {i} and {j} are the same"
+        )
+    across /= length
     both = np.repeat(across, 2, axis=0)
     places = n_nodes + 2 * np.repeat(edges, 2, axis=0)[:, :, None] + [0, 1]
     columns = np.column_stack([edges.ravel(), places.reshape(-1, 4)])
@@ -117,25 +123,28 @@ def frame_covariance(
     ValueError
         If the frames are not determined.
     """
-    positions = np.asarray(positions, dtype=np.float64)
-    J = bearing_jacobian(positions, edges) / check_number("bearing_std_rad", bearing_std_rad)
+    positions = check_positions(positions)
+    J = bearing_jacobian(positions, edges) / check_number(
+        "bearing_std_rad", bearing_std_rad, low=1e-12
+    )
     rows: list[Any] = [J]
     if ranges_of is not None:
         rows.append(range_jacobian(positions, ranges_of)
-                    / check_number("range_std_m", range_std_m))  # fmt: skip
+                    / check_number("range_std_m", range_std_m, low=1e-12))  # fmt: skip
     elif known_pair is None:
         raise ValueError("known_pair must be given where there are no ranges, got None")
     free = free_columns(len(positions))
     J = sp.csr_matrix(sp.vstack(rows))[:, free].toarray()
     if known_pair is not None:
         # Moves that keep the known distance: the null space of its one row.
-        row = range_jacobian(positions, [known_pair])[:, free].toarray()[0]
+        pair = check_pair("known_pair", known_pair, len(positions))
+        row = range_jacobian(positions, [pair])[:, free].toarray()[0]
         basis = np.linalg.svd(row[None])[2][1:].T
     else:
         basis = np.eye(len(free))
     values, vectors = np.linalg.eigh(basis.T @ (J.T @ J) @ basis)
-    if len(values) and values[0] < 1e-12 * values[-1]:
-        missing = int((values < 1e-12 * values[-1]).sum())
+    if len(values) and values[0] <= 1e-12 * values[-1]:
+        missing = int((values <= 1e-12 * values[-1]).sum())
         raise ValueError(f"edges must determine all frames, got {missing} directions without "
                          "information")  # fmt: skip
     factor = basis @ vectors / np.sqrt(values)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, checked, kernel
 
 
 class NoiseLaw(Protocol):
@@ -177,6 +177,13 @@ class LinkNoise:
         return np.maximum(distances + self.std_m * normals, 0.0)
 
 
+def check_law(name: str, noise: Any) -> None:
+    """A ValueError where something does not offer what a `NoiseLaw` does."""
+    methods = ("variance", "squared_range_variance", "sample")
+    if not all(callable(getattr(noise, method, None)) for method in methods):
+        raise ValueError(f"{name} must have {', '.join(methods)}, got {noise!r:.80}")
+
+
 # The laws of scenes by the names that scene files and overrides give them.
 NOISE_LAWS: dict[str, type[NoiseLaw]] = {
     "range": RangeNoise,
@@ -251,6 +258,7 @@ class Measurement(NamedTuple):
     nlos: BoolArray
 
 
+@checked(rotation=(3, 3), translation=(3,), tags=("N", 3))
 def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
     """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
     rotation, tags = np.asarray(rotation), np.asarray(tags)
@@ -270,6 +278,7 @@ def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) 
     return np.add(turned, np.asarray(translation)[..., None, :], order="C")
 
 
+@checked(anchors=("M", 3), positions=("N", 3))
 def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
     """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
     positions, anchors = np.asarray(positions), np.asarray(anchors)
@@ -329,6 +338,7 @@ def measure(
     return Measurement(np.where(links, ranges, 0.0), links, nlos & links)
 
 
+@checked(anchors=("M", 3), tags=("N", 3), rotation=(3, 3), translation=(3,))
 def simulate(
     anchors: ArrayLike,
     tags: ArrayLike,
@@ -339,7 +349,8 @@ def simulate(
     link_model: LinkModel | None = None,
 ) -> Measurement:
     """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`."""
-    true = distances(anchors, tag_positions(rotation, translation, tags))
+    check_law("noise", noise)
+    true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
     normals = rng.standard_normal(true.shape)
     uniforms = None
     if link_model is not None and link_model.is_random:

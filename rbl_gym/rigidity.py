@@ -20,7 +20,7 @@ from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, check_array, check_one_of
 from rbl_gym.network_bounds import bearing_jacobian, range_jacobian
 from rbl_gym.network_graphs import check_connected, components
-from rbl_gym.sensing_network import check_edges, directions
+from rbl_gym.sensing_network import check_edges, check_positions, directions
 
 # Eigenvalues of a Gram matrix of unit rows below this are zero.
 _ZERO = 1e-10
@@ -94,7 +94,7 @@ def parallel_rigidity_rank(positions: ArrayLike, edges: ArrayLike) -> tuple[int,
 
 def localizability(positions: ArrayLike, edges: ArrayLike) -> Localizability:
     """What the bearings of a planar network determine at these positions."""
-    positions = check_array("positions", positions, ("n", 2))
+    positions = check_positions(positions)
     parts = int(components(edges, len(positions)).max()) + 1
     return Localizability(parts, *parallel_rigidity_rank(positions, edges))
 
@@ -241,6 +241,8 @@ def freedom(positions: ArrayLike, edges: ArrayLike) -> Freedom:
         (m, 2), both nodes of an edge measure the other's direction in their own frame.
     """
     positions = check_array("positions", positions, ("n", 3))
+    if positions.ndim != 2:
+        raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
     n_nodes = len(positions)
     edges = check_edges(edges, n_nodes)
     rows = np.zeros((len(edges), 2, 3, 2, n_nodes, 3))

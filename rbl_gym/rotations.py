@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array
+from rbl_gym.checks import FloatArray, check_array, checked, kernel
 
 # Above this squared angle the closed forms are exact enough.
 _SMALL_SQUARED_ANGLE = 1e-4
@@ -27,6 +27,7 @@ _SMALL_BATCH = 32
 _WELL_CONDITIONED = 1e-3
 
 
+@checked(w=(3,))
 def hat(w: ArrayLike) -> FloatArray:
     """Cross-product matrix ``[w]x`` of shape (..., 3, 3), with ``hat(w) @ v == cross(w, v)``."""
     w = np.asarray(w, dtype=np.float64)
@@ -36,6 +37,7 @@ def hat(w: ArrayLike) -> FloatArray:
     return W
 
 
+@checked(W=(3, 3))
 def vee(W: ArrayLike) -> FloatArray:
     """Vector (..., 3) of the skew-symmetric part of ``W`` (..., 3, 3); inverse of `hat`."""
     W = np.asarray(W, dtype=np.float64)
@@ -128,6 +130,7 @@ def _one_coefficients(w: FloatArray) -> tuple[float, float, float, float]:
     return s, sine / x, 2 * half * half / s, (x - sine) / (s * x)
 
 
+@checked(w=(3,))
 def exp(w: ArrayLike, out: FloatArray | None = None) -> FloatArray:
     """Rotation matrix (..., 3, 3) of the rotation vector ``w`` (..., 3) in radians (Rodrigues).
 
@@ -142,6 +145,7 @@ def exp(w: ArrayLike, out: FloatArray | None = None) -> FloatArray:
     return _series(w, a, b, 1.0 - b * squared, out)
 
 
+@checked(w=(3,))
 def left_jacobian(w: ArrayLike) -> FloatArray:
     """Left Jacobian (..., 3, 3): ``exp(w + d) = exp(Jl(w) d) exp(w)`` to first order in d."""
     w = np.asarray(w, dtype=np.float64)
@@ -153,6 +157,7 @@ def left_jacobian(w: ArrayLike) -> FloatArray:
     return _series(w, b, c, 1.0 - c * squared)
 
 
+@checked(w=(3,))
 def left_jacobian_inverse(w: ArrayLike) -> FloatArray:
     """Inverse of `left_jacobian`: ``log(exp(d) exp(w)) = w + Jl(w)^-1 d`` to first order in d.
 
@@ -172,6 +177,7 @@ def left_jacobian_inverse(w: ArrayLike) -> FloatArray:
     return _series(w, np.full_like(squared, -0.5), c, 1.0 - c * squared)
 
 
+@checked(Q=(3, 3))
 def log(Q: ArrayLike) -> FloatArray:
     """Rotation vector (..., 3), ``|w| <= pi``, of the rotation matrix ``Q`` (..., 3, 3).
 
@@ -180,7 +186,7 @@ def log(Q: ArrayLike) -> FloatArray:
     Q = np.asarray(Q, dtype=np.float64)
     if Q.ndim == 2:
         return _one_log(Q)
-    vector = vee(Q)
+    vector = kernel(vee)(Q)
     sine = np.sqrt(np.einsum("...i,...i->...", vector, vector))
     cosine = 0.5 * (np.einsum("...ii->...", Q) - 1)
     vector *= (np.arctan2(sine, cosine) / np.maximum(sine, 1e-300))[..., None]
@@ -204,11 +210,12 @@ def _one_log(Q: FloatArray) -> FloatArray:
 
 def _wide_log(Q: FloatArray) -> FloatArray:
     """`log` of turns by more than 154 degrees: the sine of the half angle carries the axis."""
-    q = quaternion(Q)
+    q = kernel(quaternion)(Q)
     sine = np.sqrt(np.einsum("...i,...i->...", q[..., 1:], q[..., 1:]))
     return (2 * np.arctan2(sine, q[..., 0]) / sine)[..., None] * q[..., 1:]
 
 
+@checked(Q=(3, 3))
 def quaternion(Q: ArrayLike) -> FloatArray:
     """Unit quaternion (..., 4) as (w, x, y, z) with w >= 0 of the rotation ``Q`` (..., 3, 3)."""
     Q = np.asarray(Q, dtype=np.float64)
@@ -254,6 +261,7 @@ def from_quaternion(q: ArrayLike) -> FloatArray:
     )
 
 
+@checked(yaw=(), pitch=(), roll=())
 def from_euler_zyx(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
     """Rotation ``Rz(yaw) Ry(pitch) Rx(roll)``, angles in radians, broadcast together."""
     yaw, pitch, roll = np.broadcast_arrays(yaw, pitch, roll)
@@ -262,12 +270,14 @@ def from_euler_zyx(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatAr
     return exp(angles[0]) @ exp(angles[1]) @ exp(angles[2])
 
 
+@checked(Q=(3, 3))
 def yaw(Q: ArrayLike) -> FloatArray:
     """Heading of the body's x axis in the world's xy plane, radians, ``atan2(Q10, Q00)``."""
     Q = np.asarray(Q, dtype=np.float64)
     return np.arctan2(Q[..., 1, 0], Q[..., 0, 0])
 
 
+@checked(M=(3, 3))
 def nearest(M: ArrayLike) -> FloatArray:
     """Proper rotation nearest to ``M`` (..., 3, 3) in Frobenius norm.
 
@@ -334,11 +344,13 @@ def _cofactors(X: FloatArray) -> FloatArray:
     return C
 
 
+@checked(Q_hat=(3, 3), Q=(3, 3))
 def error(Q_hat: ArrayLike, Q: ArrayLike) -> FloatArray:
     """Global rotation error ``w`` (..., 3) with ``Q_hat = exp(w) Q``; its norm is the angle."""
     return log(np.asarray(Q_hat) @ np.swapaxes(np.asarray(Q), -1, -2))
 
 
+@checked(u=(3,), v=(3,))
 def angle_between(u: ArrayLike, v: ArrayLike) -> FloatArray:
     """Angle in radians between vectors (..., 3), by atan2: exact near 0 and pi."""
     u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 from rbl_gym.checks import FloatArray, as_float, check_array, check_finite, check_number
 
 IntArray = NDArray[np.intp]
+_MOST_NODES = 10**9
 _TURN = 2 * np.pi
 
 
@@ -41,7 +42,7 @@ class SensingNetwork(NamedTuple):
 
 def proj(angle: ArrayLike) -> FloatArray:
     """Angles brought into the half-open [-pi, pi); those inside stay to the last bit."""
-    angle = np.asarray(angle, dtype=np.float64)
+    angle = check_finite("angle", as_float("angle", angle))
     wrapped = angle - _TURN * np.floor((angle + np.pi) / _TURN)
     # Rounding can leave a value on the open end, or just below the closed one.
     wrapped = np.where(wrapped >= np.pi, wrapped - _TURN, wrapped)
@@ -49,8 +50,15 @@ def proj(angle: ArrayLike) -> FloatArray:
     return np.where((angle >= -np.pi) & (angle < np.pi), angle, wrapped)
 
 
-def check_edges(edges: ArrayLike, n_nodes: int) -> IntArray:
-    """`edges` as (m, 2) indices of two different nodes each.
+def check_n_nodes(n_nodes: int) -> None:
+    """A ValueError where it is no number of nodes that memory could hold."""
+    whole = isinstance(n_nodes, int | np.integer) and not isinstance(n_nodes, bool)
+    if not whole or not 1 <= n_nodes <= _MOST_NODES:
+        raise ValueError(f"n_nodes must be a positive int, got {n_nodes!r:.80}")
+
+
+def check_edges(edges: ArrayLike, n_nodes: int, name: str = "edges") -> IntArray:
+    """`edges` as (m, 2) indices of two different nodes each, under this or another `name`.
 
     An edge may come twice, in either direction: then it was measured twice. No edges at all
     are an empty sequence.
@@ -60,25 +68,35 @@ def check_edges(edges: ArrayLike, n_nodes: int) -> IntArray:
     ValueError
         If they are not pairs of whole numbers in [0, n_nodes), or an edge joins a node to itself.
     """
-    if isinstance(n_nodes, bool) or not isinstance(n_nodes, int | np.integer) or n_nodes < 1:
-        raise ValueError(f"n_nodes must be a positive int, got {n_nodes!r}")
-    array = np.asarray(edges)
+    check_n_nodes(n_nodes)
+    try:
+        array = np.asarray(edges)
+    except ValueError as error:
+        raise ValueError(f"{name} must be integers of shape (m, 2), got {edges!r:.80}") from error
     if array.size == 0:
         return np.zeros((0, 2), dtype=np.intp)
     if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
-        raise ValueError(f"edges must be integers of shape (m, 2), got {array.shape} "
+        raise ValueError(f"{name} must be integers of shape (m, 2), got {array.shape} "
                          f"of {array.dtype}")  # fmt: skip
     array = array.astype(np.intp, copy=False)
     if array.min() < 0 or array.max() >= n_nodes:
         row = int(np.argmax(((array < 0) | (array >= n_nodes)).any(axis=1)))
-        raise ValueError(f"edges must join nodes 0 to {n_nodes - 1}, got {array[row].tolist()} "
+        raise ValueError(f"{name} must join nodes 0 to {n_nodes - 1}, got {array[row].tolist()} "
                          f"at row {row}")  # fmt: skip
     loops = array[:, 0] == array[:, 1]
     if loops.any():
         row = int(np.argmax(loops))
-        raise ValueError(f"edges must join two different nodes, got {array[row].tolist()} "
+        raise ValueError(f"{name} must join two different nodes, got {array[row].tolist()} "
                          f"at row {row}")  # fmt: skip
     return array
+
+
+def check_pair(name: str, pair: ArrayLike, n_nodes: int) -> tuple[int, int]:
+    """A pair of nodes, or a ValueError."""
+    pairs = check_edges([pair], n_nodes, name)  # pyright: ignore[reportArgumentType]
+    if not len(pairs):
+        raise ValueError(f"{name} must be two nodes, got {pair!r:.80}")
+    return int(pairs[0, 0]), int(pairs[0, 1])
 
 
 def check_edge_values(
@@ -99,7 +117,7 @@ def unit_disk_edges(positions: ArrayLike, radius_m: float, blind_m: float = 0.0)
 
     Nodes nearer than `blind_m` do not see each other.
     """
-    positions = _positions(positions)
+    positions = check_positions(positions)
     radius_m = check_number("radius_m", radius_m, low=0.0)
     pairs = np.sort(cKDTree(positions).query_pairs(radius_m, output_type="ndarray"), axis=1)
     if blind_m > 0:
@@ -116,7 +134,7 @@ def directions(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
     ValueError
         If the nodes of an edge stand on the same point: there is no bearing.
     """
-    positions = _positions(positions)
+    positions = check_positions(positions)
     edges = check_edges(edges, len(positions))
     apart = positions[edges[:, 1]] - positions[edges[:, 0]]
     same = (apart == 0).all(axis=1)
@@ -129,8 +147,11 @@ def directions(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
 def true_bearings(positions: ArrayLike, orientations: ArrayLike, edges: ArrayLike) -> FloatArray:
     """Bearings (m, 2) without noise: of j in the frame of i, and of i in the frame of j."""
     toward = directions(positions, edges)
-    edges = check_edges(edges, len(_positions(positions)))
-    turned = check_array("orientations", orientations, (len(_positions(positions)),))[edges]
+    edges = check_edges(edges, len(check_positions(positions)))
+    turned = check_array("orientations", orientations, (len(check_positions(positions)),))
+    if turned.ndim != 1:
+        raise ValueError(f"orientations must have shape (n,), got {turned.shape}")
+    turned = turned[edges]
     return proj(toward[:, None] + [0.0, np.pi] - turned)
 
 
@@ -167,7 +188,8 @@ def edge_angles(bearings: ArrayLike) -> FloatArray:
     bearings
         (m, 2): a of j in the frame of i, b of i in the frame of j, radians.
     """
-    if np.size(bearings) == 0:
+    bearings = as_float("bearings", bearings)
+    if bearings.size == 0:
         return np.zeros(0)
     a, b = check_array("bearings", bearings, ("m", 2)).T
     return proj(a - b + np.pi)
@@ -183,6 +205,7 @@ def random_network(
     """
     from rbl_gym.network_graphs import components
 
+    check_n_nodes(n_nodes)
     mean_degree = check_number("mean_degree", mean_degree, low=0.0)
     positions = rng.uniform(0.0, math.sqrt(n_nodes), (n_nodes, 2))
     edges = unit_disk_edges(positions, math.sqrt(mean_degree / np.pi))
@@ -197,7 +220,8 @@ def random_network(
     return SensingNetwork(positions, theta, edges, bearings)
 
 
-def _positions(positions: ArrayLike) -> FloatArray:
+def check_positions(positions: ArrayLike) -> FloatArray:
+    """Places (n, 2) of nodes as an array, or a ValueError."""
     array = check_array("positions", positions, ("n", 2))
     if array.ndim != 2:
         raise ValueError(f"positions must have shape (n, 2), got {array.shape}")

@@ -12,10 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import bounds, motion, posterior, ranging, rotations, statistic
-from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.obstacles import in_sight
 from rbl_gym.scenes import Scene
 from rbl_gym.statistic import EpochStatistic
+
+# Behind the doors: what comes to these was checked, or made here.
+_TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
 
 class Draws(NamedTuple):
@@ -258,12 +261,12 @@ def measure(
     `positions` of the tags (..., N, 3) and `quality` (`link_quality`): where known already.
     """
     if positions is None:
-        positions = ranging.tag_positions(at.rotation, at.translation, scene.tags)
+        positions = _TAG_POSITIONS(at.rotation, at.translation, scene.tags)
     normals = at.normals
     if scene.obstacles:
         quality = link_quality(scene, at, anchors) if quality is None else quality
         normals = normals / np.sqrt(quality)[..., None]
-    distances = ranging.distances(anchors, positions)
+    distances = _DISTANCES(anchors, positions)
     measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
     clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
     # However the worlds lie in memory, what is observed is in C order.

@@ -56,8 +56,15 @@ class RlTask:
         )
 
 
-def _loop(env_id: str, steps: int, **arguments: Any) -> RlTask:
-    return RlTask(env_id, arguments, steps, 50, gamma=0.95, gae_lambda=0.9)
+def _mobile(steps: int, **arguments: Any) -> RlTask:
+    return RlTask("RBL/MobileAnchors-v0", arguments, steps, 50, gamma=0.95, gae_lambda=0.9)
+
+
+def _selection(**arguments: Any) -> RlTask:
+    # What is chosen now is felt for a few steps only: a short horizon is learned faster.
+    return RlTask(
+        "RBL/AnchorSelection-v0", arguments, 600_000, 13, gamma=0.8, gae_lambda=0.9, num_envs=256
+    )
 
 
 def _placement(steps: int, n_anchors: int, **arguments: Any) -> RlTask:
@@ -70,10 +77,10 @@ TASKS: dict[str, RlTask] = {
     "uwb_room": _placement(1_200_000, 5, scene="uwb_room", racks=2),
     "satellite": _placement(450_000, 5, scene="satellite"),
     "mounts": _placement(1_200_000, 5, scene="uwb_room", racks=2, mode="mounts"),
-    "mobile-easy": _loop("RBL/MobileAnchors-v0", 600_000, difficulty="easy"),
-    "mobile-hard": _loop("RBL/MobileAnchors-v0", 1_500_000, difficulty="hard"),
-    "selection": _loop("RBL/AnchorSelection-v0", 600_000, k=3),
-    "selection-priced": _loop("RBL/AnchorSelection-v0", 600_000, mode="priced"),
+    "mobile-easy": _mobile(600_000, difficulty="easy"),
+    "mobile-hard": _mobile(1_500_000, difficulty="hard"),
+    "selection": _selection(k=3),
+    "selection-priced": _selection(mode="priced"),
 }
 
 

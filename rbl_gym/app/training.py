@@ -59,6 +59,11 @@ def train(
             seed=seed,
             device="cpu",
         )
+    if task.gamma < 1:
+        # Rewards that never end sum to far from zero: a critic that starts there learns what
+        # matters, the differences, from the first update on.
+        with torch.no_grad():
+            model.policy.value_net.bias.fill_(_mean_reward(task, seed) / (1 - task.gamma))
     # After PPO has seeded the worlds itself, with seeds that neighbouring trainings share.
     envs.venv.seed(seed * SEED_STRIDE)
     curve = _Curve(advance)
@@ -80,6 +85,14 @@ def train(
         "command": f"rbl-gym train {name} --steps {steps} --seed {seed}",
     }
     return _policy(model, meta), figures
+
+
+def _mean_reward(task: RlTask, seed: int) -> float:
+    """Mean reward of a step under random actions, over a short rollout."""
+    envs = task.make(16)
+    envs.reset(seed=seed * SEED_STRIDE)
+    envs.action_space.seed(seed)
+    return float(np.mean([envs.step(envs.action_space.sample())[1] for _ in range(task.rollout)]))
 
 
 class _Timed:
