@@ -11,7 +11,6 @@ import functools
 import hashlib
 import inspect
 import json
-import platform
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -113,6 +112,11 @@ def key_of(record: Mapping[str, Any]) -> str:
     return json.dumps([record[name] for name in KEY], sort_keys=True)
 
 
+def timing_key(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a time belongs to within one run."""
+    return row["scene_hash"], row["condition"], row["filter"]
+
+
 def keys_of(task: Task) -> dict[str, str]:
     """The key of every filter's record of a task."""
     return {filter: key_of(_head(task, filter)) for filter in task.filters}
@@ -176,7 +180,6 @@ def versions() -> dict[str, str]:
         "code": _digest(files),
         "numpy": np.__version__,
         "scipy": scipy.__version__,
-        "python": platform.python_version(),
     }
 
 
@@ -187,7 +190,9 @@ def _digest(files: list[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def summary(records: Sequence[Mapping[str, Any]], timings: Mapping[str, float]) -> dict[str, Any]:
+def summary(
+    records: Sequence[Mapping[str, Any]], timings: Mapping[tuple[str, ...], float | None]
+) -> dict[str, Any]:
     """The leaderboard as plain numbers.
 
     Parameters
@@ -195,7 +200,7 @@ def summary(records: Sequence[Mapping[str, Any]], timings: Mapping[str, float]) 
     records
         Of one run.
     timings
-        Microseconds per step by `key_of` a record.
+        Microseconds per step by `timing_key` of a record.
 
     Returns
     -------
@@ -219,5 +224,5 @@ def summary(records: Sequence[Mapping[str, Any]], timings: Mapping[str, float]) 
         "benchmark": "rbl-gym bench",
         "conditions": {name: text for name, text in CONDITIONS.items() if name in used},
         "rows": rows,
-        "microseconds_per_step": [timings.get(key_of(record)) for record in records],
+        "microseconds_per_step": [timings.get(timing_key(record)) for record in records],
     }
