@@ -45,6 +45,9 @@ class Task(NamedTuple):
     trials: int
     seed: int
 
+    def __str__(self) -> str:
+        return f"{self.label} {self.condition}"
+
 
 def default_filters() -> list[str]:
     """All filters by name, ours and those of installed packages, and `VARIANTS`."""
