@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rbl_gym import estimators, metrics, scenes
-from rbl_gym.app import bench_figures, bench_files, bench_worlds, leaderboard
+from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
+from rbl_gym.app import bench_figures, bench_files, bench_worlds, leaderboard, replay
 from rbl_gym.app.cli import main
+from rbl_gym.recordings import read_recording
 
 SHORT = {"name": "uwb_room", "steps": 4}
 
@@ -402,3 +403,84 @@ def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
     (tmp_path / "empty.jsonl").write_text("")
     assert main(["rerun", str(tmp_path / "empty.jsonl")]) == 2
     assert "holds no record" in capsys.readouterr().err
+
+
+# --- recordings -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A log of 81 epochs of a body that turns and drifts, as files and the file that names them."""
+    rng = np.random.default_rng(4)
+    tags = bodies.octahedron(0.8)
+    anchors = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3], [4, 0, 3], [4, 8, 0.0]])
+    nominal = motion.constant_twist(np.eye(3), [2, 2, 1], [0, 0.05, 0.3, 0.2, 0.2, 0.02], 80)
+    path = motion.simulate(nominal, 0.2, motion.ProcessNoise())
+    pose = path.rotation, path.translation
+    measured = ranging.simulate(anchors, tags, *pose, ranging.RangeNoise(0.03), rng).ranges
+    tables = {
+        "anchors": ("anchor,x,y,z", [[i, *a] for i, a in enumerate(anchors)]),
+        "tags": ("tag,x,y,z", [[i, *c] for i, c in enumerate(tags)]),
+        "truth": ("t,x,y,z,qw,qx,qy,qz", np.column_stack(
+            [0.2 * np.arange(81), path.translation, rotations.quaternion(path.rotation)])),
+        "ranges": ("t,anchor,tag,range", [
+            [0.2 * k, a, t, measured[k, a, t]]
+            for k in range(81) for a in range(6) for t in range(len(tags))]),
+    }  # fmt: skip
+    for name, (header, values) in tables.items():
+        lines = [",".join(map(str, row)) for row in values]
+        (tmp_path / f"{name}.csv").write_text("\n".join([header, *lines]))
+    names = "".join(f'{name} = "{name}.csv"\n' for name in tables)
+    path = tmp_path / "walk.toml"
+    path.write_text(f"{names}range_std_m = 0.03\nwalk_m = 0.5\nwalk_deg = 25\n")
+    return path
+
+
+def test_a_recording_is_a_scene(tmp_path, recording, capsys):
+    status, data = bench(tmp_path, "--scenes", recording, "--filters", "iekf,uc-kf,et-kf")
+    assert status == 0
+    found = {(r["condition"], r["filter"]): r for r in rows(data)}
+    assert len(found) == 18
+    first = found["nominal", "iekf"]
+    settings = replay.Settings(range_std_m=0.03, walk_m=0.5, walk_deg=25, robust=False)
+    files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags", "truth")}
+    log = read_recording(**files)
+    track = replay.run(log, settings)
+    figures = replay.figures(log, track, replay.errors(log, track, settings), settings)
+    # The stretches leave out what the last of 81 epochs does not fill.
+    for part, name in (("position_m", "position_rmse_m"), ("rotation_deg", "rotation_rmse_deg")):
+        np.testing.assert_allclose(first[part]["rmse"], figures[name], rtol=0.02)
+    np.testing.assert_allclose(first["anees"], figures["anees"], rtol=0.02)
+    assert len(first["per_trial"]["tags_m"]) == 20
+    assert "to_bound" not in first["tags_m"]
+    assert "lost" not in first
+    tags = {key: record["tags_m"]["rmse"] for key, record in found.items()}
+    for condition in ("nlos", "lost-links", "anchor-off"):
+        assert tags[condition, "iekf"] > 1.2 * tags["nominal", "iekf"]
+    assert found["noise-x2", "iekf"]["anees"] > 2 * first["anees"]
+    assert 0 < found["nlos", "et-kf"]["trigger_rate"] <= 1
+    assert "walk, stress" in capsys.readouterr().out
+    assert main(["rerun", str(tmp_path / "x.jsonl")]) == 0
+    (tmp_path / "tags.csv").write_text((tmp_path / "tags.csv").read_text() + "\n# touched\n")
+    # Another file is another seed of what a condition draws, and of nothing else.
+    assert main(["rerun", str(tmp_path / "x.jsonl"), "--json"]) == 1
+    again = json.loads(capsys.readouterr().out.split("identical\n")[-1])
+    assert list(again["sources"]) == ["walk"]
+    drawn = {"nlos", "lost-links", "anchor-off", "tag-off"}
+    assert {row["condition"] for row in again["changed"]} == drawn
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name = "uwb_room"\nranges = "x.csv"', "must have the name of a scene, or the files of"),
+        ("steps = 3", "must have the name of a scene, or the files of"),
+        ('ranges = "ranges.csv"\nspeed = 3', "a recording has no 'speed'"),
+        ('ranges = "ranges.csv"\nanchors = "a.csv"', "a recording needs 'tags'"),
+        ("ranges = ", "walk.toml: Invalid value"),
+    ],
+)
+def test_a_file_that_is_no_scene_is_refused(tmp_path, recording, text, message, capsys):
+    recording.write_text(text)
+    assert bench(tmp_path, "--scenes", recording)[0] == 2
+    assert message in capsys.readouterr().err

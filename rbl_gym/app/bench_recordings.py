@@ -55,11 +55,14 @@ def load(spec: Mapping[str, Any]) -> Log:
     for key in FILES[:4]:
         if key not in spec:
             raise ValueError(f"a recording needs {key!r}, got {', '.join(spec)}")
-    return _load(tuple(sorted(spec.items())))
+    files = [Path(spec[key]).stat() for key in FILES if key in spec]
+    stamps = tuple((file.st_mtime_ns, file.st_size) for file in files)
+    return _load(tuple(sorted(spec.items())), stamps)
 
 
 @functools.lru_cache(maxsize=2)
-def _load(items: tuple[tuple[str, Any], ...]) -> Log:
+def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...]) -> Log:
+    """`load` of a checked mapping; the stamps tell files that were written again."""
     spec = dict(items)
     paths = {key: spec[key] for key in FILES if key in spec}
     settings = replay.Settings(**{key: spec[key] for key in SETTINGS if key in spec})
