@@ -147,14 +147,14 @@ def _factory(name: str) -> Callable[..., Filter]:
     if isinstance(name, str) and ":" in name:
         module, _, attribute = name.partition(":")
         try:
-            factory = getattr(importlib.import_module(module), attribute)
+            factory: Any = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
             raise ValueError(f"filter {name!r:.80} cannot be imported: {error}") from error
         if not callable(factory):
             raise ValueError(f"filter {name!r:.80} must be callable, got {factory!r:.80}")
         return factory
     raise ValueError(
-        f"filter must be one of {', '.join(names())}, a name given by "
+        f"filter must be one of {', '.join(names())}, or a name given by "
         f"rbl_gym.estimators.register, or 'module:factory', got {name!r:.80}"
     )
 

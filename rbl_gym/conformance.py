@@ -51,9 +51,11 @@ def simulate(rng: np.random.Generator, batch: tuple[int, ...], count: int) -> Ep
     offset = _PRIOR_STD * rng.standard_normal((*batch, 6))
     covariance = np.broadcast_to(np.diag(_PRIOR_STD**2), (*batch, 6, 6)).copy()
     prior = rotations.exp(offset[..., :3]) @ start[0], start[1] + offset[..., 3:], covariance
-    axis = len(batch)
-    arrays = (path.rotation, path.translation, twists, ranges)
-    return Epochs(*(np.ascontiguousarray(np.moveaxis(a, axis, 0)) for a in arrays), prior)
+    rotation, translation, twists, measured = (
+        np.ascontiguousarray(np.moveaxis(array, len(batch), 0))
+        for array in (path.rotation, path.translation, twists, ranges)
+    )
+    return Epochs(rotation, translation, twists, measured, prior)
 
 
 def require(condition: Any, message: str) -> None:
@@ -76,8 +78,9 @@ def call(name: str, function: Callable[..., Any], *arguments: Any, **options: An
 
 def trial(epochs: Epochs, index: int) -> Epochs:
     """One trial of a batch with one axis."""
-    prior = tuple(array[index] for array in epochs.prior)
-    return Epochs(*(array[:, index] for array in epochs[:4]), prior)  # pyright: ignore[reportArgumentType]
+    rotation, translation, covariance = (array[index] for array in epochs.prior)
+    rows = [array[:, index] for array in epochs[:4]]
+    return Epochs(rows[0], rows[1], rows[2], rows[3], (rotation, translation, covariance))
 
 
 def take(pose: Any, index: int) -> dict[str, FloatArray]:

@@ -60,6 +60,12 @@ def test_two_dask_workers_give_the_bytes_of_one_process(folder, cluster):
     assert same(folder, "dask")
 
 
+def test_ray_gives_the_bytes_of_one_process(folder):
+    pytest.importorskip("ray", reason="ray is not installed")
+    assert bench(folder, "ray", "--backend", "ray", "--jobs", "2") == 0
+    assert same(folder, "ray")
+
+
 @pytest.fixture
 def killer(monkeypatch):
     """A filter that kills the first worker that makes it, and the file that says it did."""
