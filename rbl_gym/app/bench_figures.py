@@ -57,9 +57,10 @@ class Reference(NamedTuple):
 def figures(errors: Errors, reference: Reference | None) -> dict[str, Any]:
     """All figures of a filter under a condition, as plain numbers; None for what is not finite.
 
-    Without a reference (a recording) what is relative to the bound is absent.
+    Without a reference (a recording, whose trials are stretches of it) what is relative to the
+    bound is absent, and what is of single epochs.
     """
-    result: dict[str, Any] = {"per_trial": {}, "per_epoch": {}}
+    result: dict[str, Any] = {"per_trial": {}}
     for part in PARTS:
         values = _finite_or_inf(getattr(errors, part))
         rows = {
@@ -77,10 +78,11 @@ def figures(errors: Errors, reference: Reference | None) -> dict[str, Any]:
         lost = is_lost(errors.tags_m, reference)
         result["lost"] = plain(lost.mean())
         result["flipped"] = plain(is_flipped(errors, reference).mean())
-        result["per_epoch"]["bound_tags_m"] = plain(rms(reference.bound["tags_m"], axis=1))
-    result["per_epoch"]["tags_m"] = plain(rms(_finite_or_inf(errors.tags_m), axis=1))
-    anees = _finite_or_inf(errors.nees).mean(axis=1) / errors.dof
-    result["per_epoch"]["anees"] = plain(anees)
+        result["per_epoch"] = {
+            "tags_m": plain(rms(_finite_or_inf(errors.tags_m), axis=1)),
+            "bound_tags_m": plain(rms(reference.bound["tags_m"], axis=1)),
+            "anees": plain(_finite_or_inf(errors.nees).mean(axis=1) / errors.dof),
+        }
     return result
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, ranging, simulation
+from rbl_gym import bounds, simulation
 from rbl_gym.checks import FloatArray
 from rbl_gym.scenes import Scene
 
@@ -124,11 +124,14 @@ def _true_scene(scene: Scene, condition: str) -> Scene:
 
 
 def _noisier(noise: Any, factor: float) -> Any:
-    if isinstance(noise, ranging.SquaredRangeNoise):
-        return ranging.SquaredRangeNoise(factor * noise.sigma_m)
-    return dataclasses.replace(
-        noise, floor_m=factor * noise.floor_m, proportional=factor * noise.proportional
-    )
+    scaled = {
+        field.name: factor * getattr(noise, field.name)
+        for field in dataclasses.fields(noise)
+        if field.name in ("floor_m", "proportional", "sigma_m")
+    }
+    if not scaled:
+        raise ValueError(f"condition noise-x2 cannot double {noise!r:.80}")
+    return dataclasses.replace(noise, **scaled)
 
 
 def _draws(scene: Scene, true: Scene, trials: int, entropy: list[int]) -> simulation.Draws:
