@@ -147,7 +147,7 @@ def _factory(name: str) -> Callable[..., Filter]:
     if isinstance(name, str) and ":" in name:
         module, _, attribute = name.partition(":")
         try:
-            factory: Any = getattr(importlib.import_module(module), attribute)
+            factory: Callable[..., Filter] = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError, ValueError) as error:
             raise ValueError(f"filter {name!r:.80} cannot be imported: {error}") from error
         if not callable(factory):

@@ -98,7 +98,9 @@ def test_a_task_that_kills_every_worker_is_an_error_that_names_it(monkeypatch):
     def dies(task):
         os.kill(os.getpid(), 9)
 
-    with pytest.raises(RuntimeError, match=r"workers died 2 times .* 1 tasks left, .* them poison"):
+    with pytest.raises(
+        ChildProcessError, match=r"workers died 2 times .* 1 tasks left, .* them poison"
+    ):
         list(backends.each(dies, ["poison"], jobs=2))
 
 

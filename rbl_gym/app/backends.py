@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from typing import Any
 
 from rbl_gym.app.terminal import require
@@ -38,7 +39,7 @@ def each(
     ------
     MissingExtraError
         Where joblib or the backend is not installed.
-    RuntimeError
+    ChildProcessError
         When workers die again and again on the same tasks; a worker that dies otherwise loses
         nothing but time: its tasks are run again.
     """
@@ -75,7 +76,7 @@ def _surviving(
             patience -= 1
             if not patience:
                 left = ", ".join(str(tasks[index]) for index in sorted(open_)[:jobs])
-                raise RuntimeError(
+                raise ChildProcessError(
                     f"workers died {_PATIENCE} times in a row with {len(open_)} tasks left, "
                     f"among them {left:.300}"
                 ) from error
@@ -84,8 +85,7 @@ def _surviving(
 def _finished(
     function: Callable[[Any], Any], tasks: Sequence[Any], indices: list[int], **options: Any
 ) -> Iterator[tuple[int, Any]]:
-    import joblib
-
+    joblib: Any = import_module("joblib")
     # One task at a time: what is done is handed over, and safe, at once.
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, **options)
     found = parallel(joblib.delayed(_indexed)(function, index, tasks[index]) for index in indices)
@@ -101,30 +101,33 @@ def _dask(
     function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, address: str | None
 ) -> Iterator[tuple[int, Any]]:
     """A dask cluster, which itself hands the tasks of a worker that dies to another."""
-    import joblib
-    from dask.distributed import Client, LocalCluster
-
+    joblib: Any = import_module("joblib")
+    distributed: Any = import_module("distributed")
     with contextlib.ExitStack() as stack:
         if address is None:
             address = stack.enter_context(
-                LocalCluster(n_workers=jobs, threads_per_worker=1, dashboard_address=None)
+                distributed.LocalCluster(
+                    n_workers=jobs, threads_per_worker=1, dashboard_address=None
+                )
             )
-        client = stack.enter_context(Client(address))
+        client = stack.enter_context(distributed.Client(address))
         stack.enter_context(joblib.parallel_config(backend="dask", client=client))
-        yield from _finished(function, tasks, list(range(len(tasks))), n_jobs=-1)
+        try:
+            yield from _finished(function, tasks, list(range(len(tasks))), n_jobs=-1)
+        except distributed.KilledWorker as error:
+            raise ChildProcessError(f"workers died again and again: {error}") from error
 
 
 def _ray(
     function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, address: str | None
 ) -> Iterator[tuple[int, Any]]:
     """A ray cluster; its joblib backend returns lists, so the tasks go in portions."""
-    import joblib
-    import ray
-    from ray.util.joblib import register_ray
-
-    options = {"num_cpus": jobs} if address is None else {"address": address}
+    joblib: Any = import_module("joblib")
+    ray: Any = import_module("ray")
+    ray_joblib: Any = import_module("ray.util.joblib")
+    options: dict[str, Any] = {"num_cpus": jobs} if address is None else {"address": address}
     with ray.init(ignore_reinit_error=True, log_to_driver=False, **options):
-        register_ray()
+        ray_joblib.register_ray()
         workers = max(1, int(ray.cluster_resources().get("CPU", jobs)))
         with joblib.parallel_config(backend="ray", n_jobs=workers):
             for start in range(0, len(tasks), 2 * workers):

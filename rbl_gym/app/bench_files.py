@@ -171,7 +171,7 @@ def tasks_of(records: Sequence[Mapping[str, Any]]) -> list[Task]:
     grouped: dict[str, Task] = {}
     for record in records:
         task = Task(
-            *(record[name] for name in ("scene", "spec", "condition")),
+            record["scene"], record["spec"], record["condition"],
             (record["filter"],), record["trials"], record["seed"],
         )  # fmt: skip
         key = json.dumps(task._replace(filters=()), sort_keys=True)

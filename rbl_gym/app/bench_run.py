@@ -148,9 +148,11 @@ def _track(beliefs: Iterator[tuple[Any, estimators.PoseBelief]]) -> Tracked:
         except Exception as error:
             raise StoppedError(epoch, error) from error
     seconds = time.process_time() - start
-    columns = [np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)]
+    rotation, translation, covariance = (
+        np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)
+    )
     rate = None if triggers[0] is None else float(np.mean(triggers))
-    return Tracked(*columns, rate, seconds)
+    return Tracked(rotation, translation, covariance, rate, seconds)
 
 
 def _stopped(stop: StoppedError) -> dict[str, Any]:

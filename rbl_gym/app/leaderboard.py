@@ -176,7 +176,7 @@ def versions() -> dict[str, str]:
         *map(Path, (*estimators.__path__, *wrappers.__path__)),
     ]
     files = [file for folder in folders for file in folder.glob("*.py")]
-    files += [Path(module.__file__) for module in (bench_figures, bench_recordings, bench_run,
+    files += [Path(str(module.__file__)) for module in (bench_figures, bench_recordings, bench_run,
                                                    bench_worlds, replay)]  # fmt: skip
     return {
         "rbl-gym": rbl_gym.__version__,
