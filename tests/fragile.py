@@ -39,4 +39,20 @@ def stumbles(*, epoch: int = 1, tags: Any, noise: Any, process: Any) -> Any:
     return Stumbles()
 
 
+def refuses_the_paper(*, tags: Any, noise: Any, process: Any) -> Any:
+    """A ValueError on a law that is not of its kind; a belief of the wrong shape elsewhere."""
+    if not hasattr(noise, "floor_m"):
+        raise ValueError("noise must have a floor")
+    inner = estimators.make("iekf", tags=tags, noise=noise, process=process)
+
+    class Flat:
+        initial, predict, update = inner.initial, inner.predict, inner.update
+
+        def belief(self, state: Any) -> Any:
+            belief = inner.belief(state)
+            return belief._replace(covariance=belief.covariance[..., :3, :3])
+
+    return Flat()
+
+
 not_callable = 3

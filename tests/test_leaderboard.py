@@ -274,6 +274,17 @@ def test_a_filter_that_fails_is_a_row_and_a_status(tmp_path, short, capsys):
     assert "failed at epoch 2: TypeError: stumbled" in capsys.readouterr().out
 
 
+def test_a_filter_that_takes_no_such_law_and_one_without_a_pose_are_rows(tmp_path, short):
+    status, data = bench(tmp_path, "--scenes", f"camsap2013,{short}", "--conditions", "nominal",
+                         "--filters", "tests.fragile:refuses_the_paper")  # fmt: skip
+    assert status == 1
+    paper, room = rows(data)
+    assert (paper["status"], paper["message"]) == ("refused", "at epoch 0: noise must have a floor")
+    assert room["status"] == "failed"
+    assert "TypeError: beliefs must have arrays" in room["message"]
+    assert "got [(6, 3, 3), (6, 3), (6, 3, 3)]" in room["message"]
+
+
 def test_event_triggered_filters_say_how_often(tmp_path, short):
     _, data = bench(tmp_path, "--scenes", short, "--conditions", "nominal",
                     "--filters", "kf,et-kf,et-kf/threshold=0,kf-ortho,iekf")  # fmt: skip

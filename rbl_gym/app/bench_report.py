@@ -104,11 +104,9 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
     for condition, row in conditions.items():
         if row["message"]:
             lines.append(f"{name}, {condition}: {row['status']} {row['message']}")
-    rates = [row["trigger_rate"] for row in conditions.values()
-             if row.get("trigger_rate") not in (None, 0.0, 1.0)]  # fmt: skip
-    if rates:
-        rate = conditions.get("nominal", first)["trigger_rate"]
-        lines.append(f"{name}: triggered at {100 * rate:.0f} % of the updates, "
+    rates = [rate for row in conditions.values() if (rate := row.get("trigger_rate")) is not None]
+    if any(0 < rate < 1 for rate in rates):
+        lines.append(f"{name}: triggered at {100 * rates[0]:.0f} % of the updates, "
                      f"{100 * max(rates):.0f} % where most")  # fmt: skip
     return lines
 

@@ -48,6 +48,8 @@ class Stage(NamedTuple):
     anchors, tags
         True geometry; `pose_rank` the directions of the pose that it determines, None where
         that depends on the way.
+    batch
+        Leading axes of a belief.
     """
 
     make: Callable[[str, dict[str, Any]], estimators.Filter]
@@ -56,6 +58,7 @@ class Stage(NamedTuple):
     anchors: FloatArray
     tags: FloatArray
     pose_rank: int | None
+    batch: tuple[int, ...]
 
 
 def scene_stage(spec: Any, condition: str, trials: int, seed: int) -> Stage:
@@ -77,7 +80,8 @@ def scene_stage(spec: Any, condition: str, trials: int, seed: int) -> Stage:
         return bench_figures.figures(_errors(world, tracked), reference)
 
     rank = bench_worlds.pose_rank(world)
-    return Stage(make, lambda f: _beliefs(world, f), figures, world.anchors, world.tags, rank)
+    geometry = world.anchors, world.tags, rank
+    return Stage(make, lambda f: _beliefs(world, f), figures, *geometry, (trials,))
 
 
 def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> Stage:
@@ -96,6 +100,7 @@ def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> Stage
         log.recording.anchors,
         log.recording.tags,
         None,
+        (),
     )
 
 
@@ -106,16 +111,19 @@ def run(stage: Stage, name: str, options: dict[str, Any]) -> tuple[dict[str, Any
     (it leans on its prior); ``"refused"`` where it raised a ValueError; ``"failed"`` where it
     raised anything else. `message` says at which epoch and what; no time is given of those two.
     """
-    filter = stage.make(name, options)
     result: dict[str, Any] = {"status": "ok", "message": None}
     result["rank"], result["states"] = stage.pose_rank, 6
+    try:
+        filter = stage.make(name, options)
+    except Exception as error:
+        return result | _stopped(StoppedError(0, error)), None
     if isinstance(filter, estimators.KalmanFamily):
         result["rank"] = int(geometric_rank(stage.anchors, stage.tags).min())
         result["states"] = 12
     if result["rank"] is not None and result["rank"] < result["states"]:
         result["status"] = "unobservable"
     try:
-        tracked = _track(stage.beliefs(filter))
+        tracked = _track(stage.beliefs(filter), stage.batch)
     except StoppedError as stop:
         return result | _stopped(stop), None
     result["trigger_rate"] = bench_figures.plain(tracked.trigger_rate)
@@ -134,8 +142,8 @@ def _beliefs(
         yield state, filter.belief(state)
 
 
-def _track(beliefs: Iterator[tuple[Any, estimators.PoseBelief]]) -> Tracked:
-    """All beliefs of a filter; a StoppedError where it raises."""
+def _track(beliefs: Iterator[tuple[Any, estimators.PoseBelief]], batch: tuple[int, ...]) -> Tracked:
+    """All beliefs of a filter; a StoppedError where it raises or gives none."""
     rows, triggers, epoch = [], [], 0
     start = time.process_time()
     # What a filter that diverges overflows is told by its figures.
@@ -143,6 +151,13 @@ def _track(beliefs: Iterator[tuple[Any, estimators.PoseBelief]]) -> Tracked:
         try:
             for state, belief in beliefs:
                 rows.append((belief.rotation, belief.translation, belief.covariance))
+                for value, core in zip(rows[-1], ((3, 3), (3,), (6, 6)), strict=True):
+                    if np.shape(value) != (*batch, *core):
+                        raise TypeError(
+                            f"beliefs must have arrays (..., 3, 3), (..., 3), (..., 6, 6) for "
+                            f"batch {batch}, got {[np.shape(array) for array in rows[-1]]}; see "
+                            "rbl_gym.testing.check_filter"
+                        )
                 triggers.append(getattr(state, "constrained", None))
                 epoch += 1
         except Exception as error:
