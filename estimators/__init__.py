@@ -6,7 +6,14 @@ change of name.
 
 from functools import partial
 
-from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
+from rbl_gym.estimators.belief import (
+    ENTRY_POINT_GROUP,
+    Filter,
+    PoseBelief,
+    make,
+    names,
+    register,
+)
 from rbl_gym.estimators.consensus import (
     cycle_consensus,
     cycle_iteration,
@@ -31,6 +38,7 @@ for _name, _constraint in {
 register("iekf", iterated_ekf)
 
 __all__ = [
+    "ENTRY_POINT_GROUP",
     "DoaEkf",
     "Filter",
     "FrameEstimate",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 from collections.abc import Callable
 from importlib.metadata import entry_points
@@ -100,8 +101,9 @@ def make(
     Parameters
     ----------
     name
-        ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, or one that a package
-        offers by the entry-point group ``rbl_gym.filters``.
+        ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``; one that a package
+        offers by the entry-point group ``rbl_gym.filters``; or ``"package.module:factory"``,
+        which is imported.
     tags
         (N, 3), places on the body, metres, body frame.
     noise
@@ -117,15 +119,7 @@ def make(
     ValueError
         On an unknown name or option, or an argument out of its range.
     """
-    factory = _FACTORIES.get(name) if isinstance(name, str) else None
-    if factory is None:
-        found = [entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name == name]
-        if not found:
-            raise ValueError(
-                f"filter must be one of {', '.join(names())}, or a name given by "
-                f"rbl_gym.estimators.register, got {name!r:.80}"
-            )
-        factory = found[0].load()
+    factory = _factory(name)
     tags = check_array("tags", tags, ("N", 3))
     of_ranges = options.get("measurement", "ranges") == "ranges"
     for label, value, methods in (
@@ -141,6 +135,28 @@ def make(
         known = [key for key in parameters if key not in ("tags", "noise", "process")]
         raise ValueError(f"filter {name!r} has no option {unknown[0]!r}; it has {', '.join(known)}")
     return factory(tags=tags, noise=noise, process=process, **options)
+
+
+def _factory(name: str) -> Callable[..., Filter]:
+    """What makes the filters of a name: registered, of an entry point, or to be imported."""
+    if isinstance(name, str) and name in _FACTORIES:
+        return _FACTORIES[name]
+    found = [entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name == name]
+    if found:
+        return found[0].load()
+    if isinstance(name, str) and ":" in name:
+        module, _, attribute = name.partition(":")
+        try:
+            factory: Callable[..., Filter] = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(f"filter {name!r:.80} cannot be imported: {error}") from error
+        if not callable(factory):
+            raise ValueError(f"filter {name!r:.80} must be callable, got {factory!r:.80}")
+        return factory
+    raise ValueError(
+        f"filter must be one of {', '.join(names())}, or a name given by "
+        f"rbl_gym.estimators.register, or 'module:factory', got {name!r:.80}"
+    )
 
 
 def inverse(matrix: FloatArray) -> FloatArray:

@@ -158,14 +158,15 @@ def update(
         statistical: Any = filter
         return statistical.update_statistic(state, observation["G"], observation["B"])
     ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
-    if "quality" in observation and _has_noise(filter):
+    if "quality" in observation and has_noise(filter):
         seen = links.astype(np.bool_, copy=False)
         noise = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
         filter = dataclasses.replace(filter, noise=noise)  # pyright: ignore[reportArgumentType]
     return filter.update(state, ranges, anchors, links)
 
 
-def _has_noise(filter: Filter) -> bool:
+def has_noise(filter: Filter) -> bool:
+    """Whether a filter takes another noise law by `dataclasses.replace`."""
     return dataclasses.is_dataclass(filter) and any(
         field.name == "noise" for field in dataclasses.fields(filter)
     )

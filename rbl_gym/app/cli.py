@@ -1,4 +1,4 @@
-"""The command line: rbl-gym demo, place, replay, reproduce, network."""
+"""The command line: rbl-gym demo, place, train, bench, replay, reproduce, network."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rbl_gym import __version__
-from rbl_gym.app import learning
+from rbl_gym.app import bench_command, learning
 from rbl_gym.app.terminal import (
     MissingExtraError,
     add_json,
@@ -43,6 +43,8 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_train(commands)
     learning.add_evaluate(commands)
     learning.add_transfer(commands)
+    bench_command.add_bench(commands)
+    bench_command.add_rerun(commands)
     _add_replay(commands)
     _add_reproduce(commands)
     _add_network(commands)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from rbl_gym import estimators, metrics, motion, ranging, recordings, rotations
 from rbl_gym.checks import FloatArray, check_number
 from rbl_gym.recordings import Recording
+from rbl_gym.wrappers.estimate import has_noise
 
 # What the planar constraint leaves to height (m), roll and pitch (rad).
 _PLANAR_STD = 1e-3
@@ -76,21 +77,36 @@ def run(
     recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
 ) -> Track:
     """Filter a recording causally, epoch by epoch; `advance` is called after each."""
-    filter = make_filter(recording, settings)
-    state = filter.initial(*_prior(recording, settings))
-    reported = settings.range_std_m is None and recording.range_std is not None
     beliefs = []
+    for _, belief in steps(recording, settings, make_filter(recording, settings)):
+        beliefs.append(belief)
+        advance()
+    return track_of(recording, beliefs)
+
+
+def steps(
+    recording: Recording, settings: Settings, filter: estimators.Filter
+) -> Iterator[tuple[Any, estimators.PoseBelief]]:
+    """State and belief of a filter after every epoch of a recording, started from nothing.
+
+    A noise that the recording reports itself reaches a filter that has a field `noise`.
+    """
+    state = filter.initial(*_prior(recording, settings))
+    reported = settings.range_std_m is None and has_noise(filter)
     before = recording.times[0]
     for k, now in enumerate(recording.times):
-        if reported:
-            law = ranging.LinkNoise(recording.range_std[k])  # pyright: ignore[reportOptionalSubscript]
+        if reported and recording.range_std is not None:
+            law = ranging.LinkNoise(recording.range_std[k])
             filter = dataclasses.replace(filter, noise=law)  # pyright: ignore[reportArgumentType]
         if now > before:
             state = filter.predict(state, np.zeros(6), now - before)
         state = filter.update(state, recording.ranges[k], recording.anchors, recording.links[k])
-        beliefs.append(filter.belief(state))
+        yield state, filter.belief(state)
         before = now
-        advance()
+
+
+def track_of(recording: Recording, beliefs: list[estimators.PoseBelief]) -> Track:
+    """Beliefs after every epoch as arrays."""
     return Track(
         recording.times,
         np.array([belief.rotation for belief in beliefs]),
@@ -101,16 +117,21 @@ def run(
 
 def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
     """The named filter with the recording's tags, a random walk and the range noise."""
+    options = {"robust": settings.robust} if settings.filter == "iekf" else {}
+    return named_filter(recording, settings, settings.filter, options)
+
+
+def named_filter(
+    recording: Recording, settings: Settings, name: str, options: dict[str, Any]
+) -> estimators.Filter:
+    """`make_filter` for any filter and options of its own."""
     walk, turn = settings.walk_m, math.radians(settings.walk_deg)
     if settings.planar:
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
     else:
         process = motion.ProcessNoise(turn, walk)
-    options = {"robust": settings.robust} if settings.filter == "iekf" else {}
     noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
-    return estimators.make(
-        settings.filter, tags=recording.tags, noise=noise, process=process, **options
-    )
+    return estimators.make(name, tags=recording.tags, noise=noise, process=process, **options)
 
 
 def _prior(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -125,13 +146,17 @@ def _prior(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatA
 
 
 class Errors(NamedTuple):
-    """Errors where truth exists: mask (K,), distance (m), yaw (rad), rotation angle (rad), NEES."""
+    """Errors where truth exists: mask (K,), distance (m), yaw (rad), rotation angle (rad), NEES.
+
+    `tags`: root mean square over the tags (m).
+    """
 
     known: np.ndarray
     position: FloatArray
     yaw: FloatArray
     rotation: FloatArray
     nees: FloatArray
+    tags: FloatArray
 
 
 def errors(recording: Recording, track: Track, settings: Settings) -> Errors | None:
@@ -159,12 +184,16 @@ def errors(recording: Recording, track: Track, settings: Settings) -> Errors | N
     axes = [2, 3, 4] if settings.planar else list(range(6))
     block = track.covariance[:, axes][:, :, axes]
     turn = rotations.yaw(track.rotation) - rotations.yaw(expected)
+    place = translation.copy()
+    if settings.planar:
+        place[:, 2] = track.translation[:, 2]
     return Errors(
         known,
         np.linalg.norm(error[:, 3 : 5 if settings.planar else 6], axis=-1),
         (turn + np.pi) % (2 * np.pi) - np.pi,
         np.linalg.norm(error[:, :3], axis=-1),
         metrics.nees(error[:, axes], block),
+        metrics.tag_error(track.rotation, track.translation, expected, place, recording.tags),
     )
 
 

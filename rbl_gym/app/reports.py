@@ -19,10 +19,10 @@ _CAMSAP_COLUMNS = (
 )
 
 
-def new_console() -> Console:
+def new_console(width: int = 130) -> Console:
     """Standard output."""
     # Piped, a table keeps all of its columns.
-    return Console(width=None if Console().is_terminal else 130, highlight=False)
+    return Console(width=None if Console().is_terminal else width, highlight=False)
 
 
 def print_experiment(result: dict[str, Any]) -> None:

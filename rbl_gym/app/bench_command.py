@@ -1,0 +1,139 @@
+"""The commands bench and rerun."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from rbl_gym.app.backends import BACKENDS
+from rbl_gym.app.terminal import add_json, natural, positive, progress, write_json
+
+
+def add_bench(commands: Any) -> None:
+    """The parser of ``rbl-gym bench``."""
+    bench = commands.add_parser(
+        "bench",
+        help="the leaderboard: every filter on every scene",
+        description="Monte Carlo of filters on scenes, as they are and under stress, with the "
+        "same noise for all: accuracy beside the bound, honesty, failures, time. A run that was "
+        "stopped goes on where it was. See docs/leaderboard.md.",
+    )
+    bench.add_argument("--filters", type=_names, metavar="A,B",
+                       help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all")  # fmt: skip
+    bench.add_argument("--scenes", type=_names, metavar="A,B",
+                       help="names, or files .toml or .json: a scene with changes, or a "
+                       "recording; default all named ones")  # fmt: skip
+    bench.add_argument("--conditions", type=_names, metavar="A,B", help="default all")
+    bench.add_argument("--trials", type=positive, default=200, help="default 200")
+    bench.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
+    bench.add_argument("--out", default="out/bench.jsonl", metavar="F",
+                       help="records, one a line; default out/bench.jsonl")  # fmt: skip
+    bench.add_argument("--fresh", action="store_true", help="do not take up what F holds")
+    _add_workers(bench)
+    add_json(bench)
+    bench.set_defaults(run=_bench)
+
+
+def add_rerun(commands: Any) -> None:
+    """The parser of ``rbl-gym rerun``."""
+    rerun = commands.add_parser(
+        "rerun",
+        help="the records of a bench once more, and what differs",
+        description="Run again what made a file of rbl-gym bench; status 1 if a figure differs.",
+    )
+    rerun.add_argument("file", metavar="FILE", help="of rbl-gym bench")
+    _add_workers(rerun)
+    add_json(rerun)
+    rerun.set_defaults(run=_rerun)
+
+
+def _add_workers(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--jobs", type=positive, default=1, help="processes, default 1")
+    parser.add_argument("--backend", choices=BACKENDS, help="of joblib, default loky")
+    parser.add_argument("--address", metavar="A", help="of an existing dask or ray cluster")
+
+
+def _bench(options: argparse.Namespace) -> int:
+    from rbl_gym import scenes
+    from rbl_gym.app import bench_files, leaderboard
+
+    workers = _workers(options)
+    tasks = leaderboard.tasks(
+        _specs(options.scenes or list(scenes.SCENES)),
+        options.conditions or list(leaderboard.CONDITIONS),
+        options.filters or leaderboard.default_filters(),
+        options.trials,
+        options.seed,
+    )
+    with progress("bench", sum(len(task.filters) for task in tasks)) as advance:
+        records, timings = bench_files.run(
+            tasks, Path(options.out), fresh=options.fresh, advance=advance, **workers
+        )
+    result = leaderboard.summary(records, timings)
+    if write_json(result, options.json):
+        from rbl_gym.app import bench_report
+
+        bench_report.print_bench(result)
+        print(f"records: {options.out}")
+    return int(any(row["status"] == "failed" for row in result["rows"]))
+
+
+def _rerun(options: argparse.Namespace) -> int:
+    from rbl_gym.app import bench_files
+
+    workers = _workers(options)
+    path = Path(options.file)
+    records = bench_files.read(path)
+    if not records:
+        raise ValueError(f"{path} holds no record of rbl-gym bench")
+    with progress("rerun", len(records)) as advance:
+        result = bench_files.rerun(records, advance=advance, **workers)
+    if write_json(result, options.json):
+        from rbl_gym.app import bench_report
+
+        bench_report.print_rerun(result)
+    return int(bool(result["changed"]))
+
+
+def _workers(options: argparse.Namespace) -> dict[str, Any]:
+    if options.address and options.backend not in ("dask", "ray"):
+        raise ValueError(f"--address needs --backend dask or ray, got {options.backend}")
+    return {"jobs": options.jobs, "backend": options.backend, "address": options.address}
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.split(",")]
+    if "" in names or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"must be different names with commas, got {text!r}")
+    return names
+
+
+def _specs(names: list[str]) -> dict[str, Any]:
+    """Scenes by label: names, changes of scenes and recordings from files."""
+    specs: dict[str, Any] = {}
+    for name in names:
+        path = Path(name)
+        label = path.stem if path.suffix in (".toml", ".json") else name
+        if label in specs:
+            raise ValueError(f"--scenes: two are named {label!r}: rename a file")
+        specs[label] = name if label == name else _from_file(path)
+    return specs
+
+
+def _from_file(path: Path) -> dict[str, Any]:
+    """A mapping for `scenes.get`, or one of a recording, its files found beside this one."""
+    text = path.read_text(encoding="utf-8")
+    try:
+        spec = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
+        raise ValueError(f"{path}: must have the name of a scene, or the files of a recording")
+    if "ranges" in spec:
+        from rbl_gym.app.bench_recordings import FILES
+
+        spec |= {key: str(path.parent / spec[key]) for key in FILES if key in spec}
+    return spec

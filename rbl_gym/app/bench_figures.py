@@ -1,0 +1,197 @@
+"""Figures of a filter in the benchmark: errors, efficiency, consistency, failures, differences."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import special
+
+from rbl_gym.checks import FloatArray
+
+PARTS = ("position_m", "rotation_deg", "tags_m")
+# A trial is lost where its tags end off by more than this many bounds, and by more than the
+# prior said at the start.
+LOST_BOUNDS = 10.0
+# Beyond this angle (degrees) at the end, a pose is one of the wrong side.
+FLIPPED_DEG = 90.0
+LEVEL = 0.95
+RESAMPLES = 2000
+# Digits that are kept of a figure: what differs beyond is rounding, not the filter.
+_DIGITS = 9
+
+
+class Errors(NamedTuple):
+    """Errors of a filter over K epochs and B trials, (K, B) each.
+
+    `position_m`, `rotation_deg` and `tags_m` (root mean square over the tags) are lengths;
+    `nees` has `dof` degrees of freedom.
+    """
+
+    position_m: FloatArray
+    rotation_deg: FloatArray
+    tags_m: FloatArray
+    nees: FloatArray
+    dof: int = 6
+
+
+class Reference(NamedTuple):
+    """What errors are held against.
+
+    Attributes
+    ----------
+    bound
+        Expected errors (K, B) by the posterior Cramer-Rao bound, by part.
+    prior_tags_m
+        Expected tag error (B,) of the prior.
+    mirror_m
+        Distance (B,) of the last position to the truth's image behind the anchors' plane; None
+        where they have no plane.
+    """
+
+    bound: dict[str, FloatArray]
+    prior_tags_m: FloatArray
+    mirror_m: FloatArray | None
+
+
+def figures(errors: Errors, reference: Reference | None) -> dict[str, Any]:
+    """All figures of a filter under a condition, as plain numbers; None for what is not finite.
+
+    Without a reference (a recording, whose trials are stretches of it) what is relative to the
+    bound is absent, and what is of single epochs.
+    """
+    result: dict[str, Any] = {"per_trial": {}}
+    for part in PARTS:
+        values = _finite_or_inf(getattr(errors, part))
+        rows = {
+            "rmse": rms(values),
+            "median": np.quantile(values, 0.5, method="higher"),
+            "p95": np.quantile(values, 0.95, method="higher"),
+        }
+        if reference is not None:
+            bound = rms(reference.bound[part])
+            rows |= {"bound": bound, "to_bound": rows["rmse"] / bound}
+        result[part] = {key: plain(value) for key, value in rows.items()}
+        result["per_trial"][part] = plain(rms(values, axis=0))
+    result |= consistency(errors.nees, errors.dof)
+    if reference is not None:
+        lost = is_lost(errors.tags_m, reference)
+        result["lost"] = plain(lost.mean())
+        result["flipped"] = plain(is_flipped(errors, reference).mean())
+        result["per_epoch"] = {
+            "tags_m": plain(rms(_finite_or_inf(errors.tags_m), axis=1)),
+            "bound_tags_m": plain(rms(reference.bound["tags_m"], axis=1)),
+            "anees": plain(_finite_or_inf(errors.nees).mean(axis=1) / errors.dof),
+        }
+    return result
+
+
+def rms(values: FloatArray, axis: int | None = None) -> Any:
+    """Root mean square; inf where any is."""
+    with np.errstate(over="ignore"):
+        return np.sqrt(np.mean(np.square(values), axis=axis))
+
+
+def consistency(nees: FloatArray, dof: int) -> dict[str, Any]:
+    """The average NEES per degree of freedom (K, B), and what it says of the filter.
+
+    Honest beliefs have 1. At one epoch the sum over B trials is chi-square of ``dof B``
+    degrees of freedom; an average over epochs that depend on each other strays no farther, so
+    the interval of one epoch is a safe one: above it the filter is ``"optimistic"`` (its errors
+    are larger than it says), below it ``"pessimistic"``. `within` is the share of epochs whose
+    own average lies in the interval.
+    """
+    nees = _finite_or_inf(nees)
+    freedom = dof * nees.shape[1]
+    tail = 0.5 * (1 - LEVEL)
+    low, high = (special.chdtri(freedom, p) / freedom for p in (1 - tail, tail))
+    anees = nees.mean() / dof
+    verdict = "optimistic" if anees > high else "pessimistic" if anees < low else "consistent"
+    per_epoch = nees.mean(axis=1) / dof
+    return {
+        "anees": plain(anees),
+        "anees_interval": [plain(low), plain(high)],
+        "verdict": verdict,
+        "within": plain(((per_epoch >= low) & (per_epoch <= high)).mean()),
+    }
+
+
+def is_lost(tags_m: FloatArray, reference: Reference) -> np.ndarray:
+    """Trials (B,) that end, over the last quarter, worse than they began and far off the bound."""
+    last = slice(-max(1, len(tags_m) // 4), None)
+    end = rms(_finite_or_inf(tags_m)[last], axis=0)
+    bound = rms(reference.bound["tags_m"][last], axis=0)
+    return end > np.maximum(LOST_BOUNDS * bound, reference.prior_tags_m)
+
+
+def is_flipped(errors: Errors, reference: Reference) -> np.ndarray:
+    """Trials (B,) whose last pose is of the wrong side.
+
+    It is turned by more than 90 degrees, or nearer to the truth's mirror image behind the
+    anchors' plane than to the truth.
+    """
+    flipped = ~(errors.rotation_deg[-1] <= FLIPPED_DEG)
+    if reference.mirror_m is not None:
+        flipped |= ~(errors.position_m[-1] <= reference.mirror_m)
+    return flipped
+
+
+def differences(
+    per_trial: dict[str, dict[str, list[float | None]]], seed: int
+) -> dict[str, dict[str, Any]]:
+    """How much worse each filter is than the best, by root mean squares over the trials.
+
+    Parameters
+    ----------
+    per_trial
+        Of each filter, of each of `PARTS`, the root mean square error of every trial; all
+        filters saw the same trials.
+    seed
+        Of the resamples, which all filters share.
+
+    Returns
+    -------
+    Of each filter and part: `best` (the filter with the least error), `difference`, and the ends
+    `low` and `high` of its 95 % interval by the paired bootstrap over trials; None where an
+    error is not finite.
+    """
+    names = list(per_trial)
+    result: dict[str, dict[str, Any]] = {name: {} for name in names}
+    count = min((len(per_trial[name][PARTS[0]]) for name in names), default=0)
+    if not count:
+        return result
+    resamples = np.random.default_rng([seed, count]).multinomial(
+        count, np.full(count, 1 / count), RESAMPLES
+    )
+    for part in PARTS:
+        rows = np.array([per_trial[name][part] for name in names], dtype=np.float64)
+        rmse = rms(rows, axis=1)
+        if not np.isfinite(rmse).any():
+            continue
+        best = int(np.nanargmin(rmse))
+        # Trials without a figure are None, here NaN: they stay so through the sums.
+        drawn = np.sqrt((resamples @ np.square(rows).T) / count)
+        for k, name in enumerate(names):
+            difference = drawn[:, k] - drawn[:, best]
+            low, high = np.quantile(difference, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
+            result[name][part] = {
+                "best": names[best],
+                "difference": plain(rmse[k] - rmse[best]),
+                "low": plain(low),
+                "high": plain(high),
+            }
+    return result
+
+
+def _finite_or_inf(values: FloatArray) -> FloatArray:
+    return np.where(np.isfinite(values), values, np.inf)
+
+
+def plain(value: Any) -> Any:
+    """Numbers for JSON, to nine digits; None for what is not finite."""
+    if value is None:
+        return None
+    if np.ndim(value):
+        return [plain(item) for item in value]
+    value = float(value)
+    return float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None

@@ -1,0 +1,502 @@
+"""rbl-gym bench and rerun: their worlds, figures, rows and files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
+from rbl_gym.app import bench_figures, bench_files, bench_worlds, leaderboard, replay
+from rbl_gym.app.cli import main
+from rbl_gym.recordings import read_recording
+
+SHORT = {"name": "uwb_room", "steps": 4}
+
+
+@pytest.fixture
+def short(tmp_path):
+    """A scene of five epochs as a file."""
+    path = tmp_path / "short.json"
+    path.write_text(json.dumps(SHORT))
+    return str(path)
+
+
+def bench(tmp_path, *arguments, name="x.jsonl"):
+    """Run the command; its status and the file's bytes."""
+    out = tmp_path / name
+    status = main(["bench", "--out", str(out), "--trials", "6", *map(str, arguments)])
+    return status, out.read_bytes() if out.exists() else b""
+
+
+def rows(data: bytes):
+    return [json.loads(line) for line in data.decode().splitlines()]
+
+
+# --- worlds ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    scene = scenes.get({**SHORT, "steps": 10})
+    return {name: bench_worlds.simulate(scene, name, 40, 3) for name in bench_worlds.CONDITIONS}
+
+
+@pytest.mark.parametrize("name", [n for n in bench_worlds.CONDITIONS if n != "nominal"])
+def test_motion_and_prior_are_the_same_under_every_condition(worlds, name):
+    for field in ("rotation", "translation", "twists", "anchors", "tags"):
+        np.testing.assert_array_equal(
+            getattr(worlds[name], field), getattr(worlds["nominal"], field)
+        )
+    for one, other in zip(worlds[name].prior, worlds["nominal"].prior, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def ranges(world):
+    return np.array([seen["ranges"] for seen in world.observations])
+
+
+def true_ranges(world):
+    places = np.einsum("kbij,nj->kbni", world.rotation, world.tags) + world.translation[:, :, None]
+    return np.linalg.norm(places[:, :, None] - world.anchors[:, :, None], axis=-1)
+
+
+def test_noise_is_doubled_and_the_filter_is_not_told(worlds):
+    clean = true_ranges(worlds["nominal"])
+    once, twice = (ranges(worlds[name]) - clean for name in ("nominal", "noise-x2"))
+    np.testing.assert_allclose(twice, 2 * once, atol=1e-12)
+    assert worlds["noise-x2"].told == worlds["nominal"].told
+    assert 0.095 < once.std() < 0.105
+
+
+def test_a_tenth_of_the_ranges_is_reflected(worlds):
+    extra = ranges(worlds["nlos"]) - ranges(worlds["nominal"])
+    reflected = extra > 1
+    np.testing.assert_allclose(extra[reflected], 5.0)
+    np.testing.assert_array_equal(extra[~reflected], 0.0)
+    assert 0.09 < reflected.mean() < 0.11
+    # The bound of clean ranges.
+    np.testing.assert_allclose(worlds["nlos"].bound, worlds["nominal"].bound)
+
+
+def test_half_of_the_links_are_lost_and_the_bound_knows(worlds):
+    links = np.array([seen["links"] for seen in worlds["lost-links"].observations])
+    assert 0.48 < links.mean() < 0.52
+    np.testing.assert_array_equal(ranges(worlds["lost-links"]), ranges(worlds["nominal"]) * links)
+    traces = [np.trace(worlds[n].bound, axis1=2, axis2=3).mean() for n in ("lost-links", "nominal")]
+    assert traces[0] > 1.3 * traces[1]
+
+
+def test_an_anchor_and_a_tag_are_told_wrong_and_nothing_else(worlds):
+    nominal = worlds["nominal"]
+    told = worlds["anchor-off"].observations[0]["anchors"] - nominal.anchors
+    np.testing.assert_allclose(np.linalg.norm(told[:, 0], axis=-1), 0.5)
+    np.testing.assert_array_equal(told[:, 1:], 0.0)
+    assert np.abs(told[:, 0].mean(axis=0)).max() < 0.2
+    tags = np.array(worlds["tag-off"].told.tags) - nominal.tags
+    np.testing.assert_allclose(np.linalg.norm(tags[0]), 0.05)
+    np.testing.assert_array_equal(tags[1:], 0.0)
+    for name in ("anchor-off", "tag-off"):
+        np.testing.assert_array_equal(ranges(worlds[name]), ranges(nominal))
+
+
+def test_another_seed_and_another_scene_are_another_world():
+    scene = scenes.get(SHORT)
+    first = bench_worlds.simulate(scene, "nominal", 2, 0)
+    for other in (
+        bench_worlds.simulate(scene, "nominal", 2, 1),
+        bench_worlds.simulate(scenes.get({**SHORT, "speed_m_s": 1.1}), "nominal", 2, 0),
+    ):
+        assert np.abs(other.translation[0] - first.translation[0]).max() > 0.01
+    again = bench_worlds.simulate(scene, "nominal", 2, 0)
+    np.testing.assert_array_equal(again.translation, first.translation)
+
+
+def test_the_scene_hash_sees_every_field():
+    hashes = {bench_worlds.scene_hash(scene) for scene in scenes.SCENES.values()}
+    assert len(hashes) == len(scenes.SCENES)
+    for change in ({"dt": 0.2}, {"noise": {"floor_m": 0.2}}, {"links": {"nlos_bias_m": 4.0}},
+                   {"noise": {"kind": "squared-range", "sigma_m": 0.1}}):  # fmt: skip
+        scene = scenes.get({"name": "uwb_room", **change})
+        assert bench_worlds.scene_hash(scene) not in hashes
+
+
+def test_mirror_images_are_those_of_the_anchors_plane():
+    flat = bench_worlds.simulate(scenes.get({"name": "auv_buoys", "steps": 2}), "nominal", 3, 0)
+    image = bench_worlds.mirrored(flat)
+    assert image is not None
+    np.testing.assert_allclose(image, flat.translation * [1, 1, -1], atol=1e-9)
+    room = bench_worlds.simulate(scenes.get(SHORT), "nominal", 3, 0)
+    assert bench_worlds.mirrored(room) is None
+
+
+# --- figures --------------------------------------------------------------------------------
+
+
+def test_the_verdict_is_that_of_the_chi_square_interval():
+    rng = np.random.default_rng(0)
+    honest = rng.chisquare(6, (30, 100))
+    found = bench_figures.consistency(honest, 6)
+    low, high = stats.chi2.interval(0.95, 600)
+    np.testing.assert_allclose(found["anees_interval"], [low / 600, high / 600], rtol=1e-8)
+    assert found["verdict"] == "consistent"
+    assert found["within"] >= 0.8
+    np.testing.assert_allclose(found["anees"], honest.mean() / 6)
+    assert bench_figures.consistency(1.3 * honest, 6)["verdict"] == "optimistic"
+    assert bench_figures.consistency(0.7 * honest, 6)["verdict"] == "pessimistic"
+    honest[3, 4] = np.nan
+    broken = bench_figures.consistency(honest, 6)
+    assert (broken["verdict"], broken["anees"]) == ("optimistic", None)
+
+
+def test_differences_have_the_interval_of_the_paired_bootstrap():
+    rng = np.random.default_rng(1)
+    base = np.abs(rng.standard_normal(150))
+    errors = {"good": base, "bad": base * 1.1 + 0.05, "none": np.full(150, np.nan)}
+    per_trial = {
+        name: {part: bench_figures.plain(values) for part in bench_figures.PARTS}
+        for name, values in errors.items()
+    }
+    found = bench_figures.differences(per_trial, 0)
+    want = stats.bootstrap(
+        (errors["bad"], errors["good"]), lambda a, b, axis: bench_figures.rms(a, axis)
+        - bench_figures.rms(b, axis), paired=True, method="percentile", n_resamples=4000,
+        rng=np.random.default_rng(2),
+    ).confidence_interval  # fmt: skip
+    row = found["bad"]["tags_m"]
+    np.testing.assert_allclose([row["low"], row["high"]], want, rtol=0.05)
+    assert row["best"] == "good"
+    assert row["low"] < row["difference"] < row["high"]
+    assert found["good"]["tags_m"]["difference"] == 0
+    assert found["none"]["tags_m"]["low"] is None
+
+
+def test_lost_and_flipped_are_what_they_say():
+    K, B = 8, 5
+    error = np.full((K, B), 0.01)
+    rotation = np.full((K, B), 1.0)
+    error[:, 1] = 0.2  # far off the bound, but within what was known at the start
+    error[-2:, 2] = 5.0  # ends far off
+    error[-1, 3] = np.nan
+    rotation[-1, 4] = 120.0
+    errors = bench_figures.Errors(error, rotation, error, np.full((K, B), 6.0))
+    mirror = np.array([9.0, 9.0, 4.0, 9.0, 9.0])
+    bound = {part: np.full((K, B), 0.01) for part in bench_figures.PARTS}
+    reference = bench_figures.Reference(bound, np.full(B, 0.5), mirror)
+    assert bench_figures.is_lost(error, reference).tolist() == [False, False, True, True, False]
+    assert bench_figures.is_flipped(errors, reference).tolist() == [False, False, True, True, True]
+    away = reference._replace(mirror_m=None)
+    assert bench_figures.is_flipped(errors, away).tolist() == [False] * 4 + [True]
+
+
+def test_a_record_has_the_figures_of_a_plain_loop(tmp_path, short):
+    _, data = bench(tmp_path, "--scenes", short, "--filters", "uc-kf", "--conditions", "nominal")
+    record = rows(data)[0]
+    scene = scenes.get(SHORT)
+    world = bench_worlds.simulate(scene, "nominal", 6, 0)
+    filter = estimators.make("uc-kf", tags=scene.tags, noise=scene.noise, process=scene.process)
+    tags, nees, position = [], [], []
+    for b in range(6):
+        state = filter.initial(*(array[b] for array in world.prior))
+        for k, seen in enumerate(world.observations):
+            if k:
+                state = filter.predict(state, world.twists[k, b], scene.dt)
+            state = filter.update(state, seen["ranges"][b], world.anchors[b])
+            belief = filter.belief(state)
+            truth = world.rotation[k, b], world.translation[k, b]
+            tags.append(metrics.tag_error(*belief[:2], *truth, world.tags))
+            error = metrics.pose_error(*belief[:2], *truth)
+            position.append(np.linalg.norm(error[3:]))
+            nees.append(metrics.nees(error, belief.covariance))
+    np.testing.assert_allclose(record["tags_m"]["rmse"], np.sqrt(np.mean(np.square(tags))))
+    np.testing.assert_allclose(record["position_m"]["rmse"], np.sqrt(np.mean(np.square(position))))
+    np.testing.assert_allclose(record["position_m"]["median"], np.median(position), rtol=0.05)
+    assert np.quantile(position, 0.9) <= record["position_m"]["p95"] <= max(position)
+    np.testing.assert_allclose(record["anees"], np.mean(nees) / 6)
+    bound = np.sqrt(np.trace(world.bound[..., 3:, 3:], axis1=-2, axis2=-1).mean())
+    np.testing.assert_allclose(record["position_m"]["bound"], bound)
+    np.testing.assert_allclose(
+        record["position_m"]["to_bound"], record["position_m"]["rmse"] / bound
+    )
+    assert record["rank"] == record["states"] == 12
+    assert len(record["per_trial"]["tags_m"]) == 6
+    assert len(record["per_epoch"]["tags_m"]) == 5
+
+
+def test_the_iterated_ekf_is_at_the_bound_and_honest():
+    task = leaderboard.Task("room", "uwb_room", "nominal", ("iekf",), 100, 0)
+    ((record, microseconds),) = leaderboard.run(task)
+    for part in bench_figures.PARTS:
+        assert 0.95 < record[part]["to_bound"] < 1.03
+    assert record["verdict"] == "consistent"
+    assert record["lost"] == record["flipped"] == 0
+    assert microseconds is not None
+    assert microseconds > 0
+
+
+# --- rows that are not figures --------------------------------------------------------------
+
+
+def test_a_filter_that_cannot_observe_is_a_row_with_its_rank(tmp_path, capsys):
+    (tmp_path / "sea.json").write_text('{"name": "auv_buoys", "steps": 3}')
+    (tmp_path / "vague.toml").write_text(
+        'name = "auv_buoys"\nsteps = 3\ninitial_rotation_rad = 3.0'
+    )
+    scene_files = f"{tmp_path / 'sea.json'},{tmp_path / 'vague.toml'}"
+    status, data = bench(tmp_path, "--scenes", scene_files, "--filters", "kf,iekf",
+                         "--conditions", "nominal,lost-links")  # fmt: skip
+    assert status == 0
+    found = {(r["scene"], r["filter"], r["condition"]): r for r in rows(data)}
+    sea, vague = found["sea", "kf", "nominal"], found["vague", "kf", "nominal"]
+    assert (sea["status"], sea["rank"], sea["states"]) == ("unobservable", 8, 12)
+    assert sea["tags_m"]["rmse"] > 0
+    assert (vague["status"], vague["rank"]) == ("refused", 8)
+    assert vague["message"].startswith("at epoch 0: anchors and tags determine only rank 8")
+    assert found["sea", "iekf", "nominal"]["status"] == "ok"
+    assert (found["sea", "iekf", "nominal"]["rank"], found["sea", "iekf", "nominal"]["states"]) == (
+        6,
+        6,
+    )
+    table = capsys.readouterr().out
+    assert "kf: cannot observe this scene, rank 8 of 12" in table
+    assert "kf, lost-links: refused at epoch 0" in table
+
+
+def test_a_filter_that_fails_is_a_row_and_a_status(tmp_path, short, capsys):
+    status, data = bench(tmp_path, "--scenes", short, "--conditions", "nominal",
+                         "--filters", "iekf,tests.fragile:stumbles/epoch=2")  # fmt: skip
+    assert status == 1
+    good, bad = rows(data)
+    assert good["status"] == "ok"
+    assert (bad["status"], bad["message"]) == ("failed", "at epoch 2: TypeError: stumbled")
+    assert "failed at epoch 2: TypeError: stumbled" in capsys.readouterr().out
+
+
+def test_a_filter_that_takes_no_such_law_and_one_without_a_pose_are_rows(tmp_path, short):
+    status, data = bench(tmp_path, "--scenes", f"camsap2013,{short}", "--conditions", "nominal",
+                         "--filters", "tests.fragile:refuses_the_paper")  # fmt: skip
+    assert status == 1
+    paper, room = rows(data)
+    assert (paper["status"], paper["message"]) == ("refused", "at epoch 0: noise must have a floor")
+    assert room["status"] == "failed"
+    assert "TypeError: beliefs must have arrays" in room["message"]
+    assert "got [(6, 3, 3), (6, 3), (6, 3, 3)]" in room["message"]
+
+
+def test_event_triggered_filters_say_how_often(tmp_path, short):
+    _, data = bench(tmp_path, "--scenes", short, "--conditions", "nominal",
+                    "--filters", "kf,et-kf,et-kf/threshold=0,kf-ortho,iekf")  # fmt: skip
+    rates = [record["trigger_rate"] for record in rows(data)]
+    assert rates[0] == 0
+    assert 0 < rates[1] < 1
+    assert rates[2:] == [1, 1, None]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--filters", "magic"], "filter must be one of"),
+        (["--filters", "nowhere.at_all:make"], "cannot be imported: No module named 'nowhere'"),
+        (["--filters", "tests.fragile:missing"], "cannot be imported: module 'tests.fragile'"),
+        (["--filters", "tests.fragile:not_callable"], "must be callable, got 3"),
+        (["--filters", "iekf/robust"], "must be name/option=value"),
+        (["--filters", "iekf/gain=2"], "filter 'iekf' has no option 'gain'"),
+        (["--scenes", "moon"], "scene must be one of"),
+        (["--scenes", "nowhere.toml"], "nowhere.toml"),
+        (["--conditions", "rain"], "condition must be one of"),
+        (["--address", "tcp://127.0.0.1:1"], "--address needs --backend dask or ray"),
+    ],
+)
+def test_what_is_wrong_is_said_before_the_work_with_status_2(tmp_path, arguments, message, capsys):
+    status, data = bench(tmp_path, *arguments)
+    assert status == 2
+    assert message in capsys.readouterr().err
+    assert data == b""
+
+
+# --- files ----------------------------------------------------------------------------------
+
+
+def test_a_run_that_was_cut_off_goes_on_and_ends_in_the_same_bytes(
+    tmp_path, short, monkeypatch, capsys
+):
+    options = ["--scenes", short, "--filters", "kf,iekf", "--conditions", "nominal,nlos"]
+    _, whole = bench(tmp_path, *options)
+    assert [(r["condition"], r["filter"]) for r in rows(whole)] == [
+        (condition, filter) for condition in ("nominal", "nlos") for filter in ("kf", "iekf")
+    ]  # fmt: skip
+    lines = whole.splitlines(keepends=True)
+    # The second record is missing, the last was being written.
+    (tmp_path / "cut.jsonl").write_bytes(lines[0] + lines[2] + lines[3][:100])
+    ran = []
+    run = leaderboard.run
+    monkeypatch.setattr(leaderboard, "run", lambda task: ran.append(task) or run(task))
+    _, again = bench(tmp_path, *options, name="cut.jsonl")
+    assert again == whole
+    assert [(task.condition, task.filters) for task in ran] == [
+        ("nominal", ("iekf",)), ("nlos", ("iekf",))
+    ]  # fmt: skip
+    # A part of it, and then another filter beside it: nothing is run twice, nothing is dropped.
+    ran.clear()
+    _, more = bench(tmp_path, "--scenes", short, "--conditions", "nlos", "--filters", "iekf,uc-kf",
+                    name="cut.jsonl")  # fmt: skip
+    assert [task.filters for task in ran] == [("uc-kf",)]
+    assert set(more.splitlines()) > set(whole.splitlines())
+    assert [r["filter"] for r in rows(more)][:2] == ["iekf", "uc-kf"]
+
+
+def test_a_file_takes_one_run_unless_it_is_replaced(tmp_path, short, capsys):
+    options = ["--scenes", short, "--filters", "kf", "--conditions", "nominal"]
+    _, first = bench(tmp_path, *options)
+    status, kept = bench(tmp_path, *options, "--seed", 1)
+    assert (status, kept) == (2, first)
+    assert "has records of seed 0, this run is of 1" in capsys.readouterr().err
+    status, other = bench(tmp_path, *options, "--seed", 1, "--fresh")
+    assert status == 0
+    assert rows(other)[0]["tags_m"] != rows(first)[0]["tags_m"]
+    (tmp_path / "x.jsonl").write_text("not a record\n{}\n")
+    assert bench(tmp_path, *options)[0] == 2
+    assert "line 1: no record of rbl-gym bench" in capsys.readouterr().err
+
+
+def test_records_say_what_they_are_of_and_times_stand_apart(tmp_path, short, capsys):
+    options = ["--scenes", short, "--filters", "kf,iekf", "--conditions", "nominal,nlos"]
+    _, data = bench(tmp_path, *options, "--json", tmp_path / "x.json")
+    for record in rows(data):
+        assert record["spec"] == SHORT
+        assert record["scene_hash"] == bench_worlds.scene_hash(scenes.get(SHORT))
+        assert (record["trials"], record["seed"]) == (6, 0)
+        assert {"rbl-gym", "code", "numpy", "scipy"} == record["versions"].keys()
+    assert b"microseconds" not in data
+    times = bench_files.read_timings(tmp_path / "x.jsonl")
+    assert len(times) == 4
+    assert min(times.values()) > 0
+    result = json.loads((tmp_path / "x.json").read_text())
+    assert len(result["rows"]) == len(result["microseconds_per_step"]) == 4
+    assert all("per_trial" not in row for row in result["rows"])
+    worse = [row["difference"]["tags_m"] for row in result["rows"]]
+    assert {row["best"] for row in worse} <= {"kf", "iekf"}
+    assert sorted(row["difference"] == 0 for row in worse) == [False, False, True, True]
+    assert "tags (m)" in capsys.readouterr().out
+
+
+def test_rerun_gives_the_same_and_says_what_differs(tmp_path, short, capsys):
+    options = [
+        "--scenes",
+        short,
+        "--filters",
+        "kf,iekf/robust=true",
+        "--conditions",
+        "nominal,nlos",
+    ]
+    _, data = bench(tmp_path, *options)
+    path = str(tmp_path / "x.jsonl")
+    assert main(["rerun", path]) == 0
+    assert "4 of 4 records are identical" in capsys.readouterr().out
+    changed = rows(data)
+    changed[2]["tags_m"]["rmse"] *= 1.5
+    changed[3]["versions"]["numpy"] = "1.0"
+    (tmp_path / "y.jsonl").write_text("".join(json.dumps(row) + "\n" for row in changed))
+    assert main(["rerun", str(tmp_path / "y.jsonl"), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert (found["records"], found["identical"]) == (4, 3)
+    assert found["versions"] == {"numpy": ["1.0", np.__version__]}
+    (row,) = found["changed"]
+    assert (row["condition"], row["filter"], row["field"]) == ("nlos", "kf", "tags_m.rmse")
+    np.testing.assert_allclose(row["relative_change"], 1 / 3)
+    assert main(["rerun", str(tmp_path / "y.jsonl")]) == 1
+    assert "3 of 4 records are identical" in capsys.readouterr().out
+
+
+def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
+    (tmp_path / "empty.jsonl").write_text("")
+    assert main(["rerun", str(tmp_path / "empty.jsonl")]) == 2
+    assert "holds no record" in capsys.readouterr().err
+
+
+# --- recordings -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A log of 41 epochs of a body that turns and drifts, as files and the file that names them."""
+    rng = np.random.default_rng(4)
+    tags = bodies.octahedron(0.8)
+    anchors = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3], [4, 0, 3], [4, 8, 0.0]])
+    nominal = motion.constant_twist(np.eye(3), [2, 2, 1], [0, 0.05, 0.3, 0.2, 0.2, 0.02], 40)
+    path = motion.simulate(nominal, 0.2, motion.ProcessNoise())
+    pose = path.rotation, path.translation
+    measured = ranging.simulate(anchors, tags, *pose, ranging.RangeNoise(0.03), rng).ranges
+    tables = {
+        "anchors": ("anchor,x,y,z", [[i, *a] for i, a in enumerate(anchors)]),
+        "tags": ("tag,x,y,z", [[i, *c] for i, c in enumerate(tags)]),
+        "truth": ("t,x,y,z,qw,qx,qy,qz", np.column_stack(
+            [0.2 * np.arange(41), path.translation, rotations.quaternion(path.rotation)])),
+        "ranges": ("t,anchor,tag,range", [
+            [0.2 * k, a, t, measured[k, a, t]]
+            for k in range(41) for a in range(6) for t in range(len(tags))]),
+    }  # fmt: skip
+    for name, (header, values) in tables.items():
+        lines = [",".join(map(str, row)) for row in values]
+        (tmp_path / f"{name}.csv").write_text("\n".join([header, *lines]))
+    names = "".join(f'{name} = "{name}.csv"\n' for name in tables)
+    path = tmp_path / "walk.toml"
+    path.write_text(f"{names}range_std_m = 0.03\nwalk_m = 0.5\nwalk_deg = 25\n")
+    return path
+
+
+def test_a_recording_is_a_scene(tmp_path, recording, capsys):
+    status, data = bench(tmp_path, "--scenes", recording, "--filters", "iekf,et-kf")
+    assert status == 0
+    found = {(r["condition"], r["filter"]): r for r in rows(data)}
+    assert len(found) == 12
+    first = found["nominal", "iekf"]
+    settings = replay.Settings(range_std_m=0.03, walk_m=0.5, walk_deg=25, robust=False)
+    files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags", "truth")}
+    log = read_recording(**files)
+    track = replay.run(log, settings)
+    figures = replay.figures(log, track, replay.errors(log, track, settings), settings)
+    # The stretches leave out what the last of 41 epochs does not fill.
+    for part, name in (("position_m", "position_rmse_m"), ("rotation_deg", "rotation_rmse_deg")):
+        np.testing.assert_allclose(first[part]["rmse"], figures[name], rtol=0.02)
+    np.testing.assert_allclose(first["anees"], figures["anees"], rtol=0.02)
+    assert len(first["per_trial"]["tags_m"]) == 20
+    assert "to_bound" not in first["tags_m"]
+    assert not {"lost", "per_epoch"} & first.keys()
+    tags = {key: record["tags_m"]["rmse"] for key, record in found.items()}
+    for condition in ("nlos", "lost-links", "anchor-off"):
+        assert tags[condition, "iekf"] > 1.2 * tags["nominal", "iekf"]
+    assert found["noise-x2", "iekf"]["anees"] > 2 * first["anees"]
+    assert 0 < found["nlos", "et-kf"]["trigger_rate"] <= 1
+    assert "walk, stress" in capsys.readouterr().out
+
+
+def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, capsys):
+    bench(tmp_path, "--scenes", recording, "--filters", "kf", "--conditions", "nominal,nlos")
+    path = str(tmp_path / "x.jsonl")
+    assert main(["rerun", path]) == 0
+    assert "2 of 2 records are identical" in capsys.readouterr().out
+    (tmp_path / "tags.csv").write_text((tmp_path / "tags.csv").read_text() + "\n# touched\n")
+    # Another file is another seed of what a condition draws, and of nothing else.
+    assert main(["rerun", path, "--json"]) == 1
+    again = json.loads(capsys.readouterr().out)
+    assert list(again["sources"]) == ["walk"]
+    assert [row["condition"] for row in again["changed"]] == ["nlos"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name = "uwb_room"\nranges = "x.csv"', "must have the name of a scene, or the files of"),
+        ("steps = 3", "must have the name of a scene, or the files of"),
+        ('ranges = "ranges.csv"\nspeed = 3', "a recording has no 'speed'"),
+        ('ranges = "ranges.csv"\nanchors = "a.csv"', "a recording needs 'tags'"),
+        ("ranges = ", "walk.toml: Invalid value"),
+    ],
+)
+def test_a_file_that_is_no_scene_is_refused(tmp_path, recording, text, message, capsys):
+    recording.write_text(text)
+    assert bench(tmp_path, "--scenes", recording)[0] == 2
+    assert message in capsys.readouterr().err
