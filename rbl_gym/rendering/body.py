@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -109,9 +109,12 @@ def limits_of(band: FloatArray, error: FloatArray) -> tuple[float, float]:
     if not np.isfinite(both).any():
         return 0.1, 10.0
     least = np.nanmin(band if np.isfinite(band).any() else error) / 30
-    return _half_decade(least, math.floor), _half_decade(1.2 * np.nanmax(both), math.ceil)
+    return _step(least, below=True), _step(1.2 * np.nanmax(both), below=False)
 
 
-def _half_decade(value: float, direction: Callable[[float], int]) -> float:
-    power = direction(2 * math.log10(max(value, 1e-12)))
-    return 10.0 ** (power // 2) * (3.0 if power % 2 else 1.0)
+def _step(value: float, below: bool) -> float:
+    """The next of ..., 1, 3, 10, ... below or above a positive value."""
+    decade = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
+    if below:
+        return decade * (3 if value >= 3 * decade else 1)
+    return decade * (1 if value <= decade else 3 if value <= 3 * decade else 10)

@@ -57,8 +57,11 @@ class Film:
             raise gym.error.ResetNeeded("nothing to render yet: call reset()")
         episode: list[tuple[int, Any, Any]] = []
         for epochs, shot, belief in reversed(self._taken):
-            episode.append((int(epochs[world]), shot, belief))
-            if epochs[world] == 0:
+            at = int(epochs[world])
+            # Worlds that wait while others reset are taken again at the same epoch.
+            if not episode or at != episode[-1][0]:
+                episode.append((at, shot, belief))
+            if at == 0:
                 break
         episode.reverse()
         if episode[-1][2] is None and any(belief is not None for *_, belief in episode):
