@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -89,7 +90,8 @@ def figure(story: Story) -> go.Figure:
     for trace, (row, column) in first:
         shown.add_trace(trace, row=row, col=column)
     which = list(range(count, count + len(first)))
-    places = max(0, 1 - int(np.floor(np.log10(max(np.ptp(story.times) / len(moments), 1e-9)))))
+    apart = np.ptp(story.times) / max(len(moments) - 1, 1)
+    places = max(0, -math.floor(math.log10(max(apart, 1e-9))))
     labels = [f"{story.times[k]:.{places}f}" for k in moments]
     shown.frames = [
         go.Frame(name=label, traces=which,
