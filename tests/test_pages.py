@@ -83,7 +83,7 @@ def demo() -> str:
 ROWS = [
     {"filter": "iekf", "scene": "auv", "ratio": 1.02, "flips": None, "verdict": "consistent"},
     {"filter": "<kf>", "scene": "yard", "ratio": 10.5, "flips": 0.25, "verdict": "optimistic"},
-    {"filter": "uc-kf", "scene": "yard", "ratio": 2.25, "us_per_step": 31, "verdict": True},
+    {"filter": "uc-kf", "scene": "yard", "ratio": 2.25, "error_rmse_m": 31, "verdict": True},
 ]
 
 
@@ -93,7 +93,7 @@ ROWS = [
 def test_a_leaderboard_shows_every_row_and_every_key():
     text = page.leaderboard_page(ROWS, "who is best", ["a < b"])
     assert cells(text) == [
-        ["filter", "scene", "ratio", "flips", "verdict", "us per step"],
+        ["filter", "scene", "ratio", "flips", "verdict", "error rmse (m)"],
         ["iekf", "auv", "1.02", "-", "consistent", "-"],
         ["<kf>", "yard", "10.5", "0.25", "optimistic", "-"],
         ["uc-kf", "yard", "2.25", "-", "yes", "31"],

@@ -61,6 +61,7 @@ document.querySelectorAll("table.sortable").forEach(table => {
   });
 });
 """
+_UNITS = ("m", "deg", "rad", "s", "us", "hz")
 # Tables of more rows than this get a field that filters them.
 _MANY = 12
 
@@ -163,8 +164,16 @@ def leaderboard_page(
         raise ValueError("rows must hold at least one row, got none")
     keys = list(dict.fromkeys(key for row in rows for key in row))
     cells = [[row.get(key) for key in keys] for row in rows]
-    shown = table(f"{len(rows)} rows", [key.replace("_", " ") for key in keys], cells)
+    shown = table(f"{len(rows)} rows", [_heading(key) for key in keys], cells)
     return document(title, [shown, *map(note, notes)])
+
+
+def _heading(key: str) -> str:
+    """A key as people read it: ``position_rmse_m`` is "position rmse (m)"."""
+    name, _, unit = key.rpartition("_")
+    return (
+        f"{name.replace('_', ' ')} ({unit})" if name and unit in _UNITS else key.replace("_", " ")
+    )
 
 
 def write(text: str, path: str) -> None:
