@@ -234,7 +234,7 @@ def test_scenes_have_equal_scales():
 def test_an_ellipsoid_holds_95_percent_and_its_net_is_closed():
     covariance = np.diag([1.0, 4.0, 0.25])
     shape = solids.ellipsoid(np.array([1.0, 2.0, 3.0]), covariance)
-    points = np.stack([shape[name] for name in "xyz"], axis=-1) - [1.0, 2.0, 3.0]
+    points = np.array([shape[name] for name in "xyz"], dtype=float).T - [1.0, 2.0, 3.0]
     length = np.einsum("ki,ij,kj->k", points, np.linalg.inv(covariance), points)
     np.testing.assert_allclose(length, RADIUS_95**2, rtol=1e-3)
     triangles = np.array([solids.net()[name] for name in "ijk"]).T

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import time
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,7 @@ from gymnasium.wrappers import HumanRendering, RecordVideo
 
 from rbl_gym import bodies, rendering
 from rbl_gym.rendering import body, drawing, film
+from rbl_gym.scenes import SCENES
 from rbl_gym.wrappers import (
     EstimateNetwork,
     EstimatePose,
@@ -26,11 +28,11 @@ IDS = ("Tracking", "AnchorPlacement", "MobileAnchors", "AnchorSelection", "BaseS
 GREEN = np.array([0x1B, 0x7F, 0x5C])
 
 
-def make(name: str, **arguments):
+def make(name: str, **arguments) -> Any:
     return gym.make(f"rbl_gym:RBL/{name}-v0", render_mode="rgb_array", **arguments)
 
 
-def make_vec(name: str, **arguments):
+def make_vec(name: str, **arguments) -> Any:
     return gym.make_vec(f"rbl_gym:RBL/{name}-v0", render_mode="rgb_array", **arguments)
 
 
@@ -101,6 +103,13 @@ def test_without_a_render_mode_render_warns_and_returns_nothing(name):
         assert env.unwrapped.render() is None
 
 
+@pytest.mark.parametrize("scene", [*SCENES, {"name": "uwb_room", "tags": [[0, 0, 0]]}])
+def test_every_scene_can_be_rendered(scene):
+    env = make("Tracking", scene=scene)
+    env.reset(seed=0)
+    assert (env.render()[:, :576].min(axis=-1) < 250).mean() > 0.01
+
+
 def test_nothing_can_be_rendered_before_the_first_reset():
     with pytest.raises(gym.error.ResetNeeded, match="call reset"):
         make("Tracking").unwrapped.render()
@@ -115,7 +124,7 @@ def test_an_environment_that_was_rendered_can_be_pickled():
 
 
 def test_a_list_of_frames_collects_every_step():
-    env = gym.make("rbl_gym:RBL/Tracking-v0", render_mode="rgb_array_list")
+    env: Any = gym.make("rbl_gym:RBL/Tracking-v0", render_mode="rgb_array_list")
     env.reset(seed=0)
     for _ in range(3):
         env.step(0)
@@ -129,7 +138,7 @@ def test_a_list_of_frames_collects_every_step():
 def test_human_rendering_shows_the_frames(monkeypatch):
     pytest.importorskip("pygame", reason="the extra video is not installed")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    env = HumanRendering(EstimatePose(make("Tracking"), "iekf"))
+    env: Any = HumanRendering(EstimatePose(make("Tracking"), "iekf"))
     env.reset(seed=0)
     env.step(0)
     import pygame
@@ -176,7 +185,7 @@ def test_worlds_of_a_vector_look_like_scalar_ones(name):
 @pytest.mark.parametrize("wrapped", [True, False])
 def test_a_frame_after_an_autoreset_shows_the_new_episode(mode, wrapped):
     scene = {"name": "uwb_room", "steps": 2}
-    envs = make_vec("Tracking", num_envs=2, scene=scene, autoreset_mode=mode)
+    envs: Any = make_vec("Tracking", num_envs=2, scene=scene, autoreset_mode=mode)
     if wrapped:
         envs = VectorEstimatePose(envs, "iekf")
     envs.reset(seed=3)
@@ -187,7 +196,7 @@ def test_a_frame_after_an_autoreset_shows_the_new_episode(mode, wrapped):
         envs.step(zeros)
     elif mode == "Disabled":
         envs.reset(options={"reset_mask": np.array([True, False])})
-    env = make("Tracking", scene=scene)
+    env: Any = make("Tracking", scene=scene)
     if wrapped:
         env = EstimatePose(env, "iekf")
     env.reset(seed=3)
@@ -204,8 +213,8 @@ def test_a_frame_after_an_autoreset_shows_the_new_episode(mode, wrapped):
 
 
 def test_beliefs_of_a_vector_look_like_scalar_ones():
-    envs = VectorEstimateNetwork(make_vec("PlanarNetwork", num_envs=2))
-    env = EstimateNetwork(make("PlanarNetwork"))
+    envs: Any = VectorEstimateNetwork(make_vec("PlanarNetwork", num_envs=2))
+    env: Any = EstimateNetwork(make("PlanarNetwork"))
     envs.reset(seed=2)
     env.reset(seed=3)
     np.testing.assert_array_equal(envs.render()[1], env.render())
@@ -231,7 +240,7 @@ def test_a_wrapper_in_between_sees_the_last_epoch_of_which_the_belief_is_known()
             self.seen = self.env.render()
             return result
 
-    env = EstimatePose(peeking := Peeking(make("Tracking")), "iekf")
+    env: Any = EstimatePose(peeking := Peeking(make("Tracking")), "iekf")
     env.reset(seed=0)
     first = env.render()
     env.step(0)
@@ -240,7 +249,7 @@ def test_a_wrapper_in_between_sees_the_last_epoch_of_which_the_belief_is_known()
 
 
 def test_the_curves_are_the_errors_and_three_sigma():
-    env = EstimatePose(make("Tracking", scene="uwb_room"), "iekf")
+    env: Any = EstimatePose(make("Tracking", scene="uwb_room"), "iekf")
     observation, info = env.reset(seed=0)
     rows = []
     for _ in range(5):
@@ -268,7 +277,11 @@ def test_the_axes_of_the_curves_hold_them(band, error, limits):
 
 def test_only_the_episode_that_runs_is_kept_in_a_frame():
     kept = []
-    roll = film.Film(lambda world, epochs, *_: kept.append((world, epochs.tolist())), steps=3)
+
+    def paint(world, epochs, *_) -> Any:
+        kept.append((world, epochs.tolist()))
+
+    roll = film.Film(paint, steps=3)
     for epochs in ([0, 0], [1, 1], [0, 2], [1, 3]):
         roll.take(epochs, rendering.Pose(*np.zeros((3, 2))))
     roll.frame(0)
@@ -329,7 +342,7 @@ def test_numbers_are_rounded_down_to_handsome_ones(value, rounded):
 
 
 def test_twenty_frames_a_second():
-    env = EstimatePose(make("Tracking", scene="drone_yard"), "iekf")
+    env: Any = EstimatePose(make("Tracking", scene="drone_yard"), "iekf")
     env.reset(seed=0)
     env.render()
     seconds = []

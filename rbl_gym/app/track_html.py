@@ -76,7 +76,7 @@ def figure(story: Story) -> go.Figure:
     if rows == 2:
         specs.append([{"colspan": 2}, None] * 3)
         titles += [f"position error {story.axes} (m)", f"{judged} error (deg)", "NEES"]
-    shown = make_subplots(
+    shown: Any = make_subplots(
         rows, 6, specs=specs, subplot_titles=titles, row_heights=[0.66, 0.34][:rows],
         horizontal_spacing=0.05, vertical_spacing=0.07,
     )  # fmt: skip

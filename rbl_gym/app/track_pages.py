@@ -29,8 +29,9 @@ def demo(result: dict[str, Any], example: Example) -> str:
     scene, episode = example.world.scene, example.world.episode
     beliefs = {
         name: Beliefs(
-            *(np.array([getattr(belief, field)[0] for belief in steps])
-              for field in ("rotation", "translation", "covariance")),
+            np.array([belief.rotation[0] for belief in steps]),
+            np.array([belief.translation[0] for belief in steps]),
+            np.array([belief.covariance[0] for belief in steps]),
             COLOURS[name],
         )
         for name, steps in example.beliefs.items()

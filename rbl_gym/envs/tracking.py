@@ -180,8 +180,11 @@ class TrackingEnv(gym.Env[Any, Any]):
             reward = -math.log(info["score_m"])
         if self.film is not None:
             bound = self._covariance[None] if self.reward_mode == "bound" else None
-            seen = links_of(observation, self.scene), self._anchors, at.rotation, at.translation
-            self.film.take([k], rendering.shot(*(field[None] for field in seen), bound))
+            links, pose = (
+                links_of(observation, self.scene),
+                (at.rotation[None], at.translation[None]),
+            )
+            self.film.take([k], rendering.shot(links[None], self._anchors[None], *pose, bound))
         observation["anchors"] = self._anchors.copy()
         observation["twist"] = at.twist.copy()
         return observation, info, reward

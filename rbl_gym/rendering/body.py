@@ -46,7 +46,7 @@ def shot(
     bound: FloatArray | None = None,
 ) -> Shot:
     """A shot of worlds: links (B, M, N), anchors (B, M, 3), poses, and maybe bounds (B, 6, 6)."""
-    return Shot(anchors, links.any(axis=-1), Pose(rotation, translation, bound))
+    return Shot(anchors, np.asarray(links.any(axis=-1)), Pose(rotation, translation, bound))
 
 
 def frame(
@@ -108,8 +108,8 @@ def limits_of(band: FloatArray, error: FloatArray) -> tuple[float, float]:
     both = np.concatenate([band, error])
     if not np.isfinite(both).any():
         return 0.1, 10.0
-    least = np.nanmin(band if np.isfinite(band).any() else error) / 30
-    return _step(least, below=True), _step(1.2 * np.nanmax(both), below=False)
+    least = float(np.nanmin(band if np.isfinite(band).any() else error)) / 30
+    return _step(least, below=True), _step(1.2 * float(np.nanmax(both)), below=False)
 
 
 def _step(value: float, below: bool) -> float:

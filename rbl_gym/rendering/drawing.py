@@ -130,7 +130,7 @@ def view_of(axes: Any) -> View:
     from mpl_toolkits.mplot3d import proj3d
 
     corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    x, y, _ = proj3d.proj_transform(*corners.T, axes.get_proj())
+    x, y, _ = proj3d.proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], axes.get_proj())
     seen = axes.transData.transform(np.column_stack([x, y]))
     return View(seen[0], (seen[1:] - seen[0]).T)
 

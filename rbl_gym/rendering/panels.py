@@ -46,7 +46,7 @@ class _World:
         self.panel = panel = Panel(LEFT, HEIGHT)
         axes = space(panel, (0.02, 0.06, 0.98, 0.9), stage.low, stage.high)
         panel.figure.text(0.025, 0.955, stage.name, fontsize=12, weight="bold", color=INK)
-        self._legend(stage)
+        self._legend()
         panel.freeze()
         self._view = view = view_of(axes)
         self._floor = min(stage.low[2], stage.high[2])
@@ -67,7 +67,7 @@ class _World:
         self._axes = [panel.line(color=colour, lw=2.2) for colour in AXES]
         self._body = panel.line(color=INK, marker="o", ms=4.5, ls="", mec="white", mew=0.6)
 
-    def _legend(self, stage: Stage) -> None:
+    def _legend(self) -> None:
         from matplotlib.lines import Line2D
 
         handles = [
@@ -120,7 +120,9 @@ class _CloseUp:
         self.panel = panel = Panel(WIDTH - LEFT, TOP)
         self._tags = np.asarray(stage.tags)
         self._edges = body_edges(self._tags)
-        self._radius = radius = float(np.linalg.norm(self._tags, axis=-1).max())
+        # A body of one tag has no size of its own.
+        radius = float(np.linalg.norm(self._tags, axis=-1).max()) or 1.0
+        self._radius = radius
         self._legend(source)
         scale = 0.36 * TOP / radius
         self._view = view_at((0.5 * (WIDTH - LEFT), 0.48 * TOP), scale)
@@ -163,7 +165,10 @@ class _CloseUp:
         """`path` (K, 3) up to now, the pose and its belief; `shown`, what is drawn of both."""
         place = true.translation
         factor, size = self._scales(shown, place)
-        view = lambda points: self._view(size * points)  # noqa: E731
+
+        def view(points: FloatArray) -> FloatArray:
+            return self._view(size * points)
+
         body = self._tags @ true.rotation.T
         self._trail.set_data(*view(path - place).T)
         self._body.set_data(*gapped(view(body[self._edges])).T)
@@ -211,12 +216,12 @@ class _Strips:
         labels: tuple[str, ...],
         legend: tuple[str, str],
         along: str = "epoch",
-        height: int = HEIGHT - TOP,
     ) -> None:
         from matplotlib.lines import Line2D
         from matplotlib.patches import Patch
         from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
+        height = HEIGHT - TOP
         self.panel = panel = Panel(WIDTH - LEFT, height)
         self._bands, self._errors = [], []
         foot, head = 36.0 / height, 1 - 26.0 / height
