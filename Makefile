@@ -1,11 +1,11 @@
-# make demo: everything from nothing to a table and a picture.  make test: the whole suite.
+# make demo: everything from nothing to a table, a picture and a page.  make test: the whole suite.
 PYTHON ?= python3
 BIN := .venv/bin
 
 .PHONY: demo test lint format types docs dist clean
 
 demo: .venv/demo.stamp
-	$(BIN)/rbl-gym demo --plot out/demo.png
+	$(BIN)/rbl-gym demo --plot out/demo.png --html out/demo.html
 
 test: .venv/dev.stamp
 	$(BIN)/python -m pytest -n 2
@@ -50,7 +50,7 @@ clean:
 	$(PYTHON) -m venv .venv
 
 .venv/demo.stamp: pyproject.toml | .venv/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[cli]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[cli,viz]'
 	touch $@
 
 .venv/dev.stamp: pyproject.toml | .venv/bin/python

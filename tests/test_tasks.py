@@ -568,7 +568,7 @@ def test_other_scenes_give_finite_observations(kind, scene):
         (1, {"price": math.nan}, "price must be a finite number"),
         (1, {"price": "cheap"}, "price must be a number, got 'cheap'"),
         (1, {"scene": None}, "scene must be a name or a dict"),
-        (1, {"render_mode": "rgb_array"}, "render_mode must be None"),
+        (1, {"render_mode": "human"}, "render_mode must be None"),
     ],
 )  # fmt: skip
 def test_bad_arguments_are_named(kind, arguments, message):

@@ -500,7 +500,7 @@ def test_bad_reward_is_named(reward):
 
 
 def test_bad_render_mode_is_named():
-    with pytest.raises(ValueError, match="render_mode must be None, got 'human'"):
+    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', got 'human'"):
         TrackingEnv(render_mode="human")
 
 

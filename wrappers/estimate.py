@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from rbl_gym import bounds, estimators, metrics, scenes, simulation
+from rbl_gym import bounds, estimators, metrics, rendering, scenes, simulation
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 
@@ -114,6 +114,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """Errors against the true pose, into `info`."""
         figures = judge(belief, info["rotation"], info["translation"], self._tags)
         info.update({name: float(value) for name, value in figures.items()})
+        rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
         return present(self._kind, observation, belief, self._scene)

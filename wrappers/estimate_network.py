@@ -17,6 +17,8 @@ from rbl_gym.estimators.consensus import cycle_iteration
 from rbl_gym.estimators.network_orientations import along_tree
 from rbl_gym.network_bounds import linked_covariance
 from rbl_gym.network_graphs import components
+from rbl_gym.rendering import tell
+from rbl_gym.rendering.network import Headings
 from rbl_gym.sensing_network import edge_angles, proj
 
 REWARDS = ("belief", "error")
@@ -90,6 +92,7 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         figures, std = _judge(links, self._sigma, self._theta, info["orientations"])
         info.update({name: float(value) for name, value in figures.items()})
         info["consensus_steps"] = steps
+        tell(self.env, Headings(self._theta, std), single=True)
         return {**observation, "orientations": self._theta.copy(), "orientation_std": std}
 
 
@@ -168,6 +171,7 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
             self._theta[world], steps[world] = found
         theta = np.array(self._theta)
         figures, std = _judge(links, self._sigma, theta, info["orientations"])
+        tell(self.env, Headings(theta, std))
         for name, value in {**figures, "consensus_steps": steps}.items():
             info[name], info[f"_{name}"] = value, np.ones(self.num_envs, dtype=np.bool_)
         return {**observation, "orientations": theta, "orientation_std": std}

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bounds, metrics, scenes, simulation
+from rbl_gym import bounds, metrics, rendering, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.envs.episodes import EpisodeStore
@@ -130,6 +130,15 @@ class FilterLoop(BatchEnv):
             "epoch": self._epochs.copy(),
         }
 
+    def _measuring(self) -> BoolArray:
+        """Which anchors (B, M) measured last."""
+        return np.ones(self.anchors.shape[:2], dtype=np.bool_)
+
+    def _shot(self) -> tuple[Any, rendering.Pose]:
+        at, links = self.at, self._measuring()[..., None]
+        shot = rendering.shot(links, self.anchors, at.rotation, at.translation)
+        return shot, rendering.Pose(*self.state[:3])
+
     def _log_std(self) -> FloatArray:
         """Logarithms (B, 6) of the standard deviations, less that of their usual size."""
         std = np.sqrt(np.diagonal(self.state.covariance, axis1=-2, axis2=-1))
@@ -182,6 +191,7 @@ class MobileAnchorsVectorEnv(FilterLoop):
         size = 15 + 3 * world.n_anchors
         self.single_action_space = spaces.Box(-1.0, 1.0, (2 * world.n_anchors,), np.float32)
         self.single_observation_space = spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32)
+        self.film = rendering.film_of(render_mode, world)
         self._configure(num_envs, render_mode, world.steps, max_episode_steps, autoreset_mode)
         self._configure_loop(world, num_envs)
         self.order = np.tile(np.arange(world.n_anchors), (num_envs, 1))
@@ -252,6 +262,9 @@ class MobileAnchorsEnv(ScalarEnv):
     `score_m` (b of the belief), real errors `rotation_error_rad`, `position_error_m`,
     `tag_error_m`, `nees` (6 degrees of freedom), `epoch`.
 
+    ## Rendering
+    ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
+
     ## Arguments
     ```python
     import gymnasium as gym
@@ -305,6 +318,7 @@ class AnchorSelectionVectorEnv(FilterLoop):
             else spaces.MultiBinary(world.n_anchors)
         )
         self.single_observation_space = spaces.Box(-_LIMIT, _LIMIT, (18,), np.float32)
+        self.film = rendering.film_of(render_mode, world)
         self._configure(num_envs, render_mode, world.steps, max_episode_steps, autoreset_mode)
         self._configure_loop(world, num_envs)
         self._chosen = np.zeros((num_envs, world.n_anchors), dtype=np.bool_)
@@ -343,6 +357,9 @@ class AnchorSelectionVectorEnv(FilterLoop):
         place = (self.state.translation - 0.5 * (low + high)) / half
         return _flat([place, self._velocity(), self._log_std(), self._columns()])
 
+    def _measuring(self) -> BoolArray:
+        return self._chosen
+
     def _inform(self) -> dict[str, np.ndarray]:
         return {**super()._inform(), "chosen": self._chosen.astype(np.int8)}
 
@@ -374,6 +391,9 @@ class AnchorSelectionEnv(ScalarEnv):
     ## Info
     `chosen` (12), `score_m`, real errors `rotation_error_rad`, `position_error_m`,
     `tag_error_m`, `nees`, `epoch`.
+
+    ## Rendering
+    ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
 
     ## Arguments
     ```python

@@ -10,6 +10,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
+from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.wrappers.estimate import (
@@ -168,6 +169,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
 
     def _present(self, observation: dict[str, np.ndarray]) -> Any:
         assert self._belief is not None
+        rendering.tell(self.env, rendering.Pose(*self._belief[:3]))
         belief = PoseBelief(*(field.copy() for field in self._belief))
         return present(self._kind, observation, belief, self._scene)
 

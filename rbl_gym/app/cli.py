@@ -59,6 +59,7 @@ def _add_demo(commands: Any) -> None:
     )
     _add_trials(demo)
     demo.add_argument("--plot", default="out/demo.png", metavar="F", help="default out/demo.png")
+    demo.add_argument("--html", metavar="F", help="3-D page of a trial, charts and tables")
     add_json(demo)
     demo.set_defaults(run=_demo)
 
@@ -173,6 +174,7 @@ def _add_replay(commands: Any) -> None:
     )
     replay.add_argument("--no-robust", action="store_true", help="squares in place of Huber's loss")
     replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")
+    replay.add_argument("--html", metavar="F", help="3-D page of the track with charts and tables")
     add_json(replay)
     replay.set_defaults(run=_replay)  # fmt: skip
 
@@ -180,15 +182,28 @@ def _add_replay(commands: Any) -> None:
 def _demo(options: argparse.Namespace) -> int:
     from rbl_gym.app import camsap2013
 
+    if options.html:
+        require("plotly", "viz")
     with progress("tracking", camsap2013.work_units()) as advance:
         result = camsap2013.run(options.trials, options.seed, advance)
     from rbl_gym.app import figures, reports
 
-    figures.save(figures.camsap2013(result, camsap2013.example(options.seed)), options.plot)
+    example = camsap2013.example(options.seed)
+    figures.save(figures.camsap2013(result, example), options.plot)
+    if options.html:
+        from rbl_gym.app import page, track_pages
+
+        page.write(track_pages.demo(result, example), options.html)
     if write_json(result, options.json):
         reports.print_camsap2013(result)
-        print(f"picture: {options.plot}")
+        _print_files(picture=options.plot, page=options.html)
     return 0
+
+
+def _print_files(**files: str | None) -> None:
+    for label, path in files.items():
+        if path:
+            print(f"{label}: {path}")
 
 
 def _reproduce(options: argparse.Namespace) -> int:
@@ -234,8 +249,7 @@ def _network(options: argparse.Namespace) -> int:
         from rbl_gym.app import network_figures
 
         network_figures.print_network(solved.result)
-        if options.plot:
-            print(f"picture: {options.plot}")
+        _print_files(picture=options.plot)
     return 0
 
 
@@ -266,9 +280,7 @@ def _place(options: argparse.Namespace) -> int:
         from rbl_gym.app import place_report
 
         place_report.print_place(placed.result)
-        for label, path in (("picture", options.plot), ("page", options.html)):
-            if path:
-                print(f"{label}: {path}")
+        _print_files(picture=options.plot, page=options.html)
     return 0
 
 
@@ -276,6 +288,8 @@ def _replay(options: argparse.Namespace) -> int:
     from rbl_gym import recordings
     from rbl_gym.app import replay
 
+    if options.html:
+        require("plotly", "viz")
     settings = replay.Settings(
         filter=options.filter,
         range_std_m=options.range_std_m,
@@ -302,6 +316,10 @@ def _replay(options: argparse.Namespace) -> int:
         from rbl_gym.app import figures
 
         figures.save(figures.replay(recording, track, found), options.plot)
+    if options.html:
+        from rbl_gym.app import page, track_pages
+
+        page.write(track_pages.replay(recording, track, result, settings), options.html)
     return 0
 
 

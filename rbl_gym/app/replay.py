@@ -159,10 +159,12 @@ class Errors(NamedTuple):
     tags: FloatArray
 
 
-def errors(recording: Recording, track: Track, settings: Settings) -> Errors | None:
-    """Errors against the recording's truth, interpolated; None without truth.
+def truth_of(
+    recording: Recording, track: Track, settings: Settings
+) -> tuple[FloatArray, FloatArray, np.ndarray] | None:
+    """What the estimates are judged by: rotation (K, 3, 3), translation (K, 3), known (K,).
 
-    Planar: position in x and y, NEES of (yaw, x, y); the truth's roll and pitch are not read.
+    The recording's truth, interpolated and turned by the offset; planar: its heading alone.
     """
     if recording.truth is None:
         return None
@@ -179,7 +181,18 @@ def errors(recording: Recording, track: Track, settings: Settings) -> Errors | N
         heading = np.zeros((len(known), 3))
         heading[:, 2] = rotations.yaw(rotation)
         rotation = rotations.exp(heading)
-    expected = offset @ rotation
+    return offset @ rotation, translation, known
+
+
+def errors(recording: Recording, track: Track, settings: Settings) -> Errors | None:
+    """Errors against the recording's truth, interpolated; None without truth.
+
+    Planar: position in x and y, NEES of (yaw, x, y); the truth's roll and pitch are not read.
+    """
+    truth = truth_of(recording, track, settings)
+    if truth is None:
+        return None
+    expected, translation, known = truth
     error = metrics.pose_error(track.rotation, track.translation, expected, translation)
     axes = [2, 3, 4] if settings.planar else list(range(6))
     block = track.covariance[:, axes][:, :, axes]

@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-_CAMSAP_COLUMNS = (
+CAMSAP_COLUMNS = (
     ("rotation RMSE", "rotation_rmse", "{:.4f}"),
     ("translation RMSE (m)", "translation_rmse_m", "{:.4f}"),
     ("mean angle (deg)", "mean_angular_error_deg", "{:.3f}"),
@@ -41,10 +41,10 @@ def print_camsap2013(result: dict[str, Any]) -> None:
     for reading, data in result["readings"].items():
         table = Table(title=f"camsap2013, turn noise {reading}/s, {result['trials']} trials")
         table.add_column("filter")
-        for heading, _, _ in _CAMSAP_COLUMNS:
+        for heading, _, _ in CAMSAP_COLUMNS:
             table.add_column(heading, justify="right")
         for label, figures in data["filters"].items():
-            table.add_row(label, *(form.format(figures[key]) for _, key, form in _CAMSAP_COLUMNS))
+            table.add_row(label, *(form.format(figures[key]) for _, key, form in CAMSAP_COLUMNS))
         console.print(table)
         for claim in data["claims"]:
             verdict = "holds" if claim["holds"] else "FAILS"

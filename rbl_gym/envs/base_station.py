@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bearing, bodies, bounds, ranging, scenes, simulation
+from rbl_gym import bearing, bodies, bounds, ranging, rendering, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.envs.episodes import EpisodeStore
@@ -83,6 +83,7 @@ class BaseStationVectorEnv(BatchEnv):
             }
         )
         self.single_action_space = action_space(self.scene)
+        self.film = rendering.film_of(render_mode, self.scene, "base station")
         self._configure(num_envs, render_mode, self.scene.steps, max_episode_steps, autoreset_mode)
         self._episodes = EpisodeStore(self.scene, num_envs)
         self._normals = np.zeros((num_envs, self.scene.steps + 1, *shape))
@@ -162,6 +163,12 @@ class BaseStationVectorEnv(BatchEnv):
             info["score_m"] = self._score_m.copy()
         return info
 
+    def _shot(self) -> tuple[Any, None]:
+        at = self._episodes.at(self._epochs)
+        bound = np.linalg.inv(self._information) if self.reward_mode == "bound" else None
+        seen = np.ones((self.num_envs, 1, 1), dtype=np.bool_)
+        return rendering.shot(seen, self._stations, at.rotation, at.translation, bound), None
+
 
 class BaseStationEnv(ScalarEnv):
     """A rigid body moves; one base station measures directions to its tags: where is it?
@@ -198,6 +205,9 @@ class BaseStationEnv(ScalarEnv):
 
     ## Episode end
     Never terminates; truncates after `scene.steps` steps (100 of 0.1 s).
+
+    ## Rendering
+    ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, of the bound.
 
     ## Arguments
     ```python

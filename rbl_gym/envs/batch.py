@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
+from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 
 Observation = Any
@@ -33,11 +34,14 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
     first observation, and `info` holds ``final_obs`` and ``final_info``. ``"Disabled"``: call
     ``reset(options={"reset_mask": mask})``.
 
-    `_configure` is called by subclasses at the end of their ``__init__``.
+    `_configure` is called by subclasses at the end of their ``__init__``; before it those that
+    are to be rendered make their `film`.
     """
 
     single_observation_space: gym.Space[Any]
     single_action_space: gym.Space[Any]
+    render_fps: ClassVar[int] = 20
+    film: rendering.Film | None = None
 
     def _configure(
         self,
@@ -49,8 +53,7 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive int, got {num_envs!r}")
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
+        rendering.check_mode(render_mode)
         if max_episode_steps is not None and (
             isinstance(max_episode_steps, bool)
             or not isinstance(max_episode_steps, int)
@@ -63,7 +66,11 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.steps_limit = min(steps, max_episode_steps or steps)
-        self.metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}
+        self.metadata = {
+            "render_modes": rendering.RENDER_MODES,
+            "render_fps": self.render_fps,
+            "autoreset_mode": autoreset_mode,
+        }
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.autoreset_mode = autoreset_mode
@@ -91,6 +98,10 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         """Infos of all worlds, in memory of their own."""
         raise NotImplementedError
 
+    def _shot(self) -> tuple[Any, Any]:
+        """What a film keeps of an epoch, and the beliefs where the worlds have their own."""
+        raise NotImplementedError
+
     # --- Gymnasium's side -------------------------------------------------------------------
 
     def reset(
@@ -111,6 +122,7 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
                 if seeds[i] is not None:
                     self._generators[i] = seeding.np_random(seeds[i])[0]
         self._begin(mask)
+        self._shoot()
         return self._observe(), self._masked_info()
 
     def step(
@@ -135,6 +147,7 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         self._done = terminated | truncated
         if ended.any():
             self._begin(ended)
+        self._shoot()
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not self._done.any():
             return self._observe(), reward, terminated, truncated, self._masked_info()
         last = self._done.copy()
@@ -143,10 +156,19 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             "final_info": self._masked_info(last),
         }
         self._begin(last)
+        self._shoot()
         info = self._masked_info()
         for name, value in final.items():
             info[name], info[f"_{name}"] = value, last.copy()
         return self._observe(), reward, terminated, truncated, info
+
+    def render(self) -> Any:
+        """A frame of every world, (height, width, 3) of uint8."""
+        return rendering.picture(self.film, self.num_envs)
+
+    def _shoot(self) -> None:
+        if self.film is not None:
+            self.film.take(self._epochs, *self._shot())
 
     def _begin(self, mask: BoolArray) -> None:
         chosen = np.flatnonzero(mask)
@@ -236,7 +258,10 @@ class ScalarEnv(gym.Env[Any, Any]):
     """
 
     batch_class: ClassVar[Any]
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own form)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own form)
+        "render_modes": rendering.RENDER_MODES,
+        "render_fps": BatchEnv.render_fps,
+    }
 
     def _configure(self, render_mode: str | None, **arguments: Any) -> None:
         self.render_mode = render_mode
@@ -245,6 +270,16 @@ class ScalarEnv(gym.Env[Any, Any]):
         )
         self.observation_space = self._batch.single_observation_space
         self.action_space = self._batch.single_action_space
+        self.metadata = {**self.metadata, "render_fps": self._batch.render_fps}
+
+    @property
+    def film(self) -> rendering.Film | None:
+        """What the frames are drawn from, with a render mode."""
+        return self._batch.film
+
+    def render(self) -> Any:
+        """A frame, (height, width, 3) of uint8."""
+        return rendering.picture(self.film)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -13,6 +14,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.network_bounds import linked_covariance
 from rbl_gym.network_graphs import components
+from rbl_gym.rendering import network as rendering
 from rbl_gym.sensing_network import proj
 
 REWARDS = ("bound", "none")
@@ -28,6 +30,8 @@ class PlanarNetworkVectorEnv(BatchEnv):
     Made by ``gym.make_vec("rbl_gym:RBL/PlanarNetwork-v0", num_envs=64)``. Arguments as
     `PlanarNetworkEnv`; seeding and autoreset as `BatchEnv`.
     """
+
+    render_fps = 10
 
     def __init__(
         self,
@@ -62,6 +66,7 @@ class PlanarNetworkVectorEnv(BatchEnv):
             }
         )
         self.single_action_space = spaces.Box(-1.0, 1.0, (2 * n_nodes,), np.float32)
+        self.film = rendering.film_of(render_mode, self.side_m, n_nodes, steps)
         self._configure(num_envs, render_mode, steps, max_episode_steps, autoreset_mode)
         self._positions = np.zeros((num_envs, n_nodes, 2))
         self._orientations = np.zeros((num_envs, n_nodes))
@@ -125,6 +130,12 @@ class PlanarNetworkVectorEnv(BatchEnv):
             "score_rad": self._score_rad.copy(),
         }
 
+    def _shot(self) -> tuple[Any, None]:
+        covariance = linked_covariance(self._links, self.bearing_std_rad, PRIOR_STD_RAD)
+        std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        std = np.concatenate([np.zeros((self.num_envs, 1)), std], axis=-1)
+        return rendering.Network(self._positions, self._orientations, self._links, std), None
+
 
 class PlanarNetworkEnv(ScalarEnv):
     """Where do the nodes of a network go, so that each learns how it is turned?
@@ -158,6 +169,10 @@ class PlanarNetworkEnv(ScalarEnv):
 
     ## Info
     `positions` (n, 2) and `orientations` (n,), the truth; `score_rad`, b.
+
+    ## Rendering
+    ``render_mode="rgb_array"``: nodes, links and headings, with the orientations of
+    `EstimateNetwork`; without it the bound.
 
     ## Arguments
     ```python

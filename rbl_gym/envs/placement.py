@@ -15,6 +15,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.placement import Context
 from rbl_gym.regions import Region
+from rbl_gym.rendering import placement as rendering
 
 # Signs by which a problem may be mirrored: neither, x, y, both.
 _MIRRORS = ((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1))
@@ -29,6 +30,8 @@ class AnchorPlacementVectorEnv(BatchEnv):
     Made by ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64, scene=...)``. Arguments
     as `AnchorPlacementEnv`; seeding and autoreset as `BatchEnv`.
     """
+
+    render_fps = 2
 
     def __init__(
         self,
@@ -49,6 +52,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
         size = observation_size(self.task, self.mode)
         self.single_observation_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
         steps = 1 if mode == "one-shot" else self.task.n_anchors
+        self.film = rendering.film_of(render_mode, self.task)
         # An episode terminates by itself with the last anchor.
         self._configure(num_envs, render_mode, steps + 1, max_episode_steps, autoreset_mode)
         self._placements = steps
@@ -67,6 +71,10 @@ class AnchorPlacementVectorEnv(BatchEnv):
             self._sight = np.zeros((num_envs, len(self._mounts)))
             self._information = np.zeros((num_envs, self.task.n_poses, 6, 6))
             self._log_score = np.zeros(num_envs)
+
+    def _shot(self) -> tuple[Any, None]:
+        share = self.task.n_anchors // self._placements
+        return rendering.Layout(self._contexts, self._anchors, share * self._epochs), None
 
     def _action_space(self) -> spaces.Space[Any]:
         if self.mode == "mounts":
@@ -200,6 +208,10 @@ class AnchorPlacementEnv(ScalarEnv):
     ## Info
     `anchors` (M, 3), zeros where not yet placed; `region` (centre and half size, metres),
     `racks` (K, 6); `score_m` of the complete layout, 0 before; mounts: `action_mask` (57).
+
+    ## Rendering
+    ``render_mode="rgb_array"``: the problem and its anchors in space and in plan, the expected
+    tag error at the poses of the region, and its root mean square by the number of anchors.
 
     ## Arguments
     ```python

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from rbl_gym import posterior, ranging, scenes, simulation
+from rbl_gym import posterior, ranging, rendering, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 
 REWARDS = ("bound", "none")
@@ -71,6 +71,11 @@ class TrackingEnv(gym.Env[Any, Any]):
     ## Episode end
     Never terminates; truncates after `scene.steps` steps.
 
+    ## Rendering
+    ``render_mode="rgb_array"``: anchors, body and path in space, the body close up with the 95 %
+    region of its position, and errors against three standard deviations; (540, 960, 3). Beliefs
+    are those of `EstimatePose`; without it the region is that of the bound.
+
     ## Arguments
     ```python
     import gymnasium as gym
@@ -90,7 +95,10 @@ class TrackingEnv(gym.Env[Any, Any]):
     * v0: first version.
     """  # noqa: E501 (a table row cannot be broken)
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own form)
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own form)
+        "render_modes": rendering.RENDER_MODES,
+        "render_fps": 20,
+    }
 
     def __init__(
         self,
@@ -99,9 +107,8 @@ class TrackingEnv(gym.Env[Any, Any]):
         render_mode: str | None = None,
         observation: str = "ranges",
     ) -> None:
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
         self.scene = scenes.get(scene)
+        self.film = rendering.film_of(render_mode, self.scene)
         self.reward_mode = check_one_of("reward", reward, REWARDS)
         self.render_mode = render_mode
         self.statistic = is_statistic(observation, self.scene)
@@ -171,9 +178,20 @@ class TrackingEnv(gym.Env[Any, Any]):
         if self.reward_mode == "bound":
             info["score_m"] = self._carry_bound(at, links_of(observation, self.scene))
             reward = -math.log(info["score_m"])
+        if self.film is not None:
+            bound = self._covariance[None] if self.reward_mode == "bound" else None
+            links, pose = (
+                links_of(observation, self.scene),
+                (at.rotation[None], at.translation[None]),
+            )
+            self.film.take([k], rendering.shot(links[None], self._anchors[None], *pose, bound))
         observation["anchors"] = self._anchors.copy()
         observation["twist"] = at.twist.copy()
         return observation, info, reward
+
+    def render(self) -> Any:
+        """The world, the body close up, and its errors (or the bound): an RGB frame, uint8."""
+        return rendering.picture(self.film)
 
     def _start_bound(self, episode: simulation.Episode) -> None:
         """All of the bound that no action of the episode changes."""

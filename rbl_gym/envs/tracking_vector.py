@@ -12,13 +12,14 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
-from rbl_gym import scenes, simulation
+from rbl_gym import rendering, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 from rbl_gym.components import whole_rows
 from rbl_gym.envs.batch import reset_mask, seeds_of
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import (
     REWARDS,
+    TrackingEnv,
     action_space,
     are_zeros,
     is_statistic,
@@ -67,8 +68,6 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
             raise ValueError(f"num_envs must be a positive int, got {num_envs!r}")
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, got {render_mode!r}")
         if max_episode_steps is not None and max_episode_steps < 1:
             raise ValueError(f"max_episode_steps must be at least 1, got {max_episode_steps!r}")
         modes = [mode.value for mode in AutoresetMode]
@@ -76,10 +75,11 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
             autoreset_mode = AutoresetMode(check_one_of("autoreset_mode", autoreset_mode, modes))
         self.num_envs = num_envs
         self.scene = scenes.get(scene)
+        self.film = rendering.film_of(render_mode, self.scene)
         self.reward_mode = check_one_of("reward", reward, REWARDS)
         self.render_mode = render_mode
         self.steps_limit = min(self.scene.steps, max_episode_steps or self.scene.steps)
-        self.metadata = {"render_modes": [], "autoreset_mode": autoreset_mode}
+        self.metadata = {**TrackingEnv.metadata, "autoreset_mode": autoreset_mode}
         self._mode = autoreset_mode
         self.statistic = is_statistic(observation, self.scene)
         self.single_observation_space = observation_space(self.scene, self.statistic)
@@ -234,9 +234,18 @@ class TrackingVectorEnv(VectorEnv[Any, Any, Any]):
             self._carry_bound(at, observation["anchors"], links, fresh, moved)
             info["score_m"] = self._score.copy()
             reward = -np.log(info["score_m"])
+        if self.film is not None:
+            bound = np.linalg.inv(self._information) if self.reward_mode == "bound" else None
+            links = links_of(observation, self.scene, (self.num_envs,))
+            seen = links, self._anchors, at.rotation, at.translation
+            self.film.take(self._epochs, rendering.shot(*seen, bound))
         for key in list(info):
             info[f"_{key}"] = np.ones(self.num_envs, dtype=np.bool_)
         return observation, info, reward
+
+    def render(self) -> Any:
+        """A frame of every world, as `TrackingEnv.render`."""
+        return rendering.picture(self.film, self.num_envs)
 
     def _carry_bound(
         self,

@@ -1,0 +1,269 @@
+"""What frames are drawn with: panels whose still part is drawn once, and a flat view of space.
+
+Matplotlib is imported by the functions that need it, never by importing this module.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rbl_gym.checks import FloatArray
+
+Image = NDArray[np.uint8]
+# Truth, belief and bound, anchors, error, what stands in the way.
+INK, BELIEF, ANCHOR, ERROR, OBSTACLE = "#222222", "#1b7f5c", "#d1495b", "#2e86ab", "#6c757d"
+AXES = ("#c0392b", "#27964f", "#2f5fb3")  # of a body: x, y, z
+_DPI = 100
+_ELEVATION, _AZIMUTH = 24.0, -58.0  # where space is seen from, degrees
+# Radius that holds 95 % of a Gaussian in space, in standard deviations (chi-square, 3).
+RADIUS_95 = math.sqrt(7.814727903251179)
+# The twelve edges of a box by its corners (z fastest); its faces, four corners each.
+_BOX_EDGES = np.array([(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4),
+                       (1, 5), (2, 6), (3, 7)])  # fmt: skip
+_BOX_FACES = np.array([(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4),
+                       (1, 3, 7, 5)])  # fmt: skip
+
+
+class Panel:
+    """A figure of some pixels; a picture is its still part with artists drawn over it.
+
+    Redrawing axes and labels takes tens of milliseconds, copying their pixels less than one.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        with matplotlib.rc_context({"font.size": 8, "axes.linewidth": 0.6}):
+            self.figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, facecolor="white")
+            self._canvas: Any = FigureCanvasAgg(self.figure)
+
+    def freeze(self) -> None:
+        """Draw what stays the same; artists that are animated are left out."""
+        self._canvas.draw()
+        self._still = self._canvas.copy_from_bbox(self.figure.bbox)
+
+    def paint(self, artists: Iterable[Any], picture: Image) -> None:
+        """The still part with these artists over it, into (height, width, 3)."""
+        self._canvas.restore_region(self._still)
+        renderer = self._canvas.get_renderer()
+        for artist in artists:
+            artist.draw(renderer)
+        pixels = np.asarray(self._canvas.buffer_rgba())
+        # Channel by channel: six times as fast as all three at once.
+        for channel in range(3):
+            picture[..., channel] = pixels[..., channel]
+
+    def line(self, axes: Any = None, **style: Any) -> Any:
+        """A moving line: in the data of some axes, or in the pixels of the panel."""
+        from matplotlib.lines import Line2D
+        from matplotlib.transforms import IdentityTransform
+
+        transform = IdentityTransform() if axes is None else axes.transData
+        line = Line2D([], [], transform=transform, animated=True, **style)
+        self.figure.add_artist(line)
+        if axes is not None:
+            line.set_clip_path(axes.patch)
+        return line
+
+    def patch(self, axes: Any = None, **style: Any) -> Any:
+        """A moving polygon, as `line`."""
+        from matplotlib.patches import Polygon
+        from matplotlib.transforms import IdentityTransform
+
+        transform = IdentityTransform() if axes is None else axes.transData
+        polygon = Polygon(
+            np.zeros((1, 2)), closed=True, transform=transform, animated=True, **style
+        )
+        self.figure.add_artist(polygon)
+        if axes is not None:
+            polygon.set_clip_path(axes.patch)
+        return polygon
+
+
+def write(picture: Image, row: int, column: int, text: str, colour: str = "#495057") -> None:
+    """Write a text of 9 points on white into a picture, its upper left corner at a pixel.
+
+    Glyph by glyph from a store of them: matplotlib takes ten milliseconds for a line that changes.
+    """
+    for character in text:
+        glyph = _glyph(character, colour)
+        height, width, _ = glyph.shape
+        picture[row : row + height, column : column + width] = glyph
+        column += width
+
+
+@functools.lru_cache(maxsize=256)
+def _glyph(character: str, colour: str) -> Image:
+    panel = Panel(40, 16)
+    text = panel.figure.text(0, 0.3, f"{character}||", fontsize=9, color=colour)
+    whole = text.get_window_extent().width
+    text.set_text("||")
+    width = max(1, round(whole - text.get_window_extent().width))
+    text.set_text(character)
+    panel.freeze()
+    picture = np.empty((16, 40, 3), dtype=np.uint8)
+    panel.paint([], picture)
+    return picture[:, :width]
+
+
+class View:
+    """Space seen from one direction without perspective: points (..., 3) to pixels (..., 2)."""
+
+    def __init__(self, origin: FloatArray, matrix: FloatArray) -> None:
+        self._origin, self.matrix = origin, matrix
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Pixels (..., 2) of points (..., 3)."""
+        return self._origin + np.asarray(points) @ self.matrix.T
+
+
+def view_of(axes: Any) -> View:
+    """The view of axes in 3-D that have been drawn."""
+    from mpl_toolkits.mplot3d import proj3d
+
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    x, y, _ = proj3d.proj_transform(corners[:, 0], corners[:, 1], corners[:, 2], axes.get_proj())
+    seen = axes.transData.transform(np.column_stack([x, y]))
+    return View(seen[0], (seen[1:] - seen[0]).T)
+
+
+def view_at(place: tuple[float, float], scale: float) -> View:
+    """The same direction, the origin at a pixel, `scale` pixels a metre."""
+    up, around = math.radians(_ELEVATION), math.radians(_AZIMUTH)
+    right = [-math.sin(around), math.cos(around), 0.0]
+    above = [-math.cos(around) * math.sin(up), -math.sin(around) * math.sin(up), math.cos(up)]
+    return View(np.array(place), scale * np.array([right, above]))
+
+
+def space(panel: Panel, area: tuple[float, float, float, float], low: Any, high: Any) -> Any:
+    """Axes in 3-D with equal scales between two corners, as large as an area of the panel allows.
+
+    `area`: left, bottom, right, top, from 0 to 1.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    axes: Any = panel.figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="ortho")
+    extent = high - low
+    # What is flat still needs some height to be drawn in.
+    extent = np.maximum(extent, 0.02 * extent.max())
+    for name, middle, size in zip("xyz", 0.5 * (low + high), extent, strict=True):
+        getattr(axes, f"set_{name}lim")(middle - 0.5 * size, middle + 0.5 * size)
+        # Ticks at the corners of the box would collide with those of the next axis.
+        few = max(3, round(6 * size / extent.max()))
+        ticks = MaxNLocator(few, prune="lower" if name == "z" else "both")
+        axis = getattr(axes, f"{name}axis")
+        axis.set_major_locator(ticks)
+        axis.set_tick_params(labelsize=7, pad=0)
+        axis.set_label_text(f"{name} [m]", fontsize=8)
+        axis.labelpad = 3 if size > 0.3 * extent.max() else -3
+        axis.pane.set_facecolor("#f7f8f9")
+        axis._axinfo["grid"].update(color="#dfe3e6", linewidth=0.5)
+    axes.view_init(elev=_ELEVATION, azim=_AZIMUTH)
+    target = np.array(area).reshape(2, 2) * panel.figure.bbox.size
+    zoom = 0.8
+    for _ in range(3):
+        axes.set_box_aspect(extent, zoom=zoom)
+        box = _seen(panel, axes, low, high)
+        zoom *= float((np.ptp(target, axis=0) / np.ptp(box, axis=0)).min())
+    left, bottom = (target.mean(axis=0) - box.mean(axis=0)) / panel.figure.bbox.size
+    axes.set_position((left, bottom, 1, 1))
+    return axes
+
+
+def _seen(panel: Panel, axes: Any, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Corners (2, 2), pixels, of what axes in 3-D cover: their box, its ticks and labels."""
+    panel.freeze()
+    points = [view_of(axes)(box_corners(low, high))]
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        points.append(axis.get_tightbbox().get_points())
+    covered = np.concatenate(points)
+    return np.array([covered.min(axis=0), covered.max(axis=0)])
+
+
+def chain(strokes: Iterable[FloatArray]) -> FloatArray:
+    """Strokes (K, d) as one line with gaps of NaN between them."""
+    parts: list[FloatArray] = []
+    for stroke in strokes:
+        parts += [stroke, np.full((1, stroke.shape[-1]), np.nan)]
+    return np.concatenate(parts) if parts else np.empty((0, 2))
+
+
+def gapped(segments: FloatArray) -> FloatArray:
+    """Segments (S, 2, d) as one line with gaps."""
+    gap = np.full((len(segments), 1, segments.shape[-1]), np.nan)
+    return np.concatenate([segments, gap], axis=1).reshape(-1, segments.shape[-1])
+
+
+def box_corners(low: Any, high: Any) -> FloatArray:
+    """The eight corners (8, 3) of a box, z fastest."""
+    grid = np.meshgrid(*np.stack([low, high], axis=-1), indexing="ij")
+    return np.stack(grid, axis=-1).reshape(8, 3)
+
+
+def box_edges(low: Any, high: Any) -> FloatArray:
+    """The edges (12, 2, 3) of a box."""
+    return box_corners(low, high)[_BOX_EDGES]
+
+
+def box_faces(low: Any, high: Any) -> FloatArray:
+    """The faces (6, 4, 3) of a box."""
+    return box_corners(low, high)[_BOX_FACES]
+
+
+def body_edges(tags: Any) -> NDArray[np.intp]:
+    """Pairs (E, 2) of tags that outline a body: the edges of its hull; of flat bodies, all pairs.
+
+    Edges between faces of one plane are left out.
+    """
+    from scipy.spatial import ConvexHull, QhullError
+
+    tags = np.asarray(tags, float)
+    pairs = np.array([(i, j) for i in range(len(tags)) for j in range(i)], dtype=np.intp)
+    spread = np.linalg.svd(tags - tags.mean(axis=0), compute_uv=False)
+    if len(tags) < 4 or spread[2] < 1e-9 * spread[0]:
+        return pairs.reshape(-1, 2)
+    try:
+        hull = ConvexHull(tags)
+    except QhullError:
+        return pairs
+    normals: dict[tuple[int, int], list[FloatArray]] = {}
+    for corners, plane in zip(hull.simplices, hull.equations, strict=True):
+        for k in range(3):
+            i, j = sorted((int(corners[k]), int(corners[k - 1])))
+            normals.setdefault((i, j), []).append(plane[:3])
+    sharp = [pair for pair, (one, other) in normals.items() if one @ other < 1 - 1e-6]
+    return np.array(sorted(sharp), dtype=np.intp)
+
+
+def outline(matrix: FloatArray, covariance: FloatArray, radius: float) -> FloatArray:
+    """Outline (K, 2) of an ellipsoid of `radius` standard deviations, seen by `matrix` (2, 3)."""
+    values, vectors = np.linalg.eigh(matrix @ covariance @ matrix.T)
+    circle = _circle()
+    return radius * (circle * np.sqrt(np.maximum(values, 0))) @ vectors.T
+
+
+def rings(covariance: FloatArray, radius: float) -> list[FloatArray]:
+    """The three circles (K, 3) of an ellipsoid in the planes of its axes."""
+    values, vectors = np.linalg.eigh(covariance)
+    half = radius * vectors * np.sqrt(np.maximum(values, 0))
+    return [_circle() @ half[:, [i, j]].T for i, j in ((0, 1), (0, 2), (1, 2))]
+
+
+def _circle() -> FloatArray:
+    angle = np.linspace(0, 2 * np.pi, 49)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def round_number(value: float) -> float:
+    """The largest of 1, 2, 5, 10, ... and their tenths that does not exceed a positive value."""
+    decade = 10.0 ** math.floor(math.log10(value))
+    return max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-12))

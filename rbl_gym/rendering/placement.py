@@ -1,0 +1,219 @@
+"""Frames of a placement: region, racks and anchors in space and in plan, the score so far."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds, placement
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement import Context, PlacementTask
+from rbl_gym.rendering import panels
+from rbl_gym.rendering.body import limits_of
+from rbl_gym.rendering.drawing import (
+    ANCHOR,
+    INK,
+    OBSTACLE,
+    Image,
+    Panel,
+    box_edges,
+    box_faces,
+    gapped,
+    space,
+    view_of,
+    write,
+)
+from rbl_gym.rendering.film import Film, check_mode
+
+# Colours of the expected error: from metres to centimetres, a step every half decade.
+_STEPS_M = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
+_COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#d7c51a", "#f2a05c")
+_NAMES = ("to 3 cm", "10 cm", "30 cm", "1 m", "3 m", "more")
+_MOST_RACKS = placement.MAX_RACKS
+
+
+class Layout(NamedTuple):
+    """B problems, their anchors (B, M, 3), and how many of them stand already."""
+
+    context: Context
+    anchors: FloatArray
+    placed: np.ndarray
+
+
+def film_of(render_mode: str | None, task: PlacementTask) -> Film | None:
+    """A film of a task, None where nothing is to be rendered."""
+    if check_mode(render_mode) is None:
+        return None
+    return Film(functools.partial(_frame, task), task.n_anchors)
+
+
+def _frame(
+    task: PlacementTask, world: int, epochs: np.ndarray, shots: Sequence[Layout], beliefs: Any
+) -> Image:
+    last = shots[-1]
+    context = Context(*(field[world] for field in last.context))
+    anchors = last.anchors[world, : int(last.placed[world])]
+    errors = _errors(task, context, anchors)
+    # One-shot tasks place all at once: the curve is that of the anchors in their order.
+    counts = np.arange(1, len(anchors) + 1)
+    scores = np.array([placement.score(task, context, anchors[:k]) for k in counts])
+    headline = f"{len(anchors)} of {task.n_anchors} anchors"
+    if len(anchors):
+        headline += f"      expected tag error {scores[-1]:.3g} m"
+    picture, left, upper, lower = panels.empty()
+    places = placement.positions(task, context)
+    _world(task).paint(context, anchors, places, errors, headline, left)
+    _plan(task).paint(context, anchors, places, errors, upper)
+    nothing = np.full(len(counts), np.nan)
+    strips = panels.strips(
+        task.n_anchors, (limits_of(nothing, scores),), ("tag error [m]",),
+        ("expected tag error, RMS over the region", ""), "anchors placed",
+    )  # fmt: skip
+    strips.paint(counts, scores[None], nothing[None], lower)
+    return picture
+
+
+def _errors(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Expected tag error b (P,) at the task's poses."""
+    information = task.prior_information
+    if len(anchors):
+        information = information + placement.information(task, context, anchors)
+    covariance = np.linalg.inv(np.broadcast_to(information, (task.n_poses, 6, 6)))
+    return bounds.score(covariance, task.poses[0], np.asarray(task.scene.tags))
+
+
+class _Points:
+    """Places coloured by their error: a line of markers for every colour."""
+
+    def __init__(self, panel: Panel, axes: Any = None) -> None:
+        self.lines = [
+            panel.line(axes, color=colour, marker="o", ms=4.5, ls="", mec="white", mew=0.4)
+            for colour in _COLOURS
+        ]
+
+    def set(self, places: FloatArray, errors: FloatArray) -> None:
+        """Places (P, 2) and errors (P,)."""
+        which = np.searchsorted(_STEPS_M, errors)
+        for index, line in enumerate(self.lines):
+            line.set_data(*places[which == index].T)
+
+
+class _World:
+    """The problem and its anchors in space."""
+
+    def __init__(self, task: PlacementTask) -> None:
+        from matplotlib.lines import Line2D
+
+        low, high = _corners(task)
+        self.panel = panel = Panel(panels.LEFT, panels.HEIGHT)
+        axes = space(panel, (0.02, 0.08, 0.98, 0.9), low, high)
+        title = f"{task.scene.name}: where do the anchors go?"
+        panel.figure.text(0.025, 0.955, title, fontsize=12, weight="bold", color=INK)
+        handles = [
+            Line2D([], [], color=ANCHOR, marker="^", ms=8, ls="", label="anchor"),
+            Line2D([], [], color=INK, lw=1.2, ls=(0, (4, 2)), label="work region"),
+            *(Line2D([], [], color=colour, marker="o", ms=4.5, ls="", label=name)
+              for colour, name in zip(_COLOURS, _NAMES, strict=True)),
+        ]  # fmt: skip
+        panel.figure.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 0.01),
+                            ncols=8, columnspacing=0.9, handletextpad=0.2, fontsize=7.5,
+                            frameon=False, borderaxespad=0.0)  # fmt: skip
+        panel.figure.text(0.5, 0.062, "expected tag error at poses of the region:", fontsize=7.5,
+                          ha="center", color="#495057")  # fmt: skip
+        panel.freeze()
+        self._view, self._floor = view_of(axes), low[2]
+        self._racks = [panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
+                       for _ in range(6 * _MOST_RACKS)]  # fmt: skip
+        self._stems = panel.line(color="#b4bac0", lw=0.8, ls=(0, (2, 2)))
+        self._region = panel.line(color=INK, lw=1.1, ls=(0, (4, 2)))
+        self._points = _Points(panel)
+        self._anchors = panel.line(color=ANCHOR, marker="^", ms=10, ls="", mec="white", mew=1.0)
+
+    def paint(
+        self,
+        context: Context,
+        anchors: FloatArray,
+        places: FloatArray,
+        errors: FloatArray,
+        headline: str,
+        picture: Image,
+    ) -> None:
+        """A problem, the anchors (K, 3) that stand, errors (P,) at its places (P, 3)."""
+        view = self._view
+        low, high = context.centre - context.half, context.centre + context.half
+        feet = anchors.copy()
+        feet[:, 2] = self._floor
+        self._stems.set_data(*gapped(view(np.stack([anchors, feet], axis=1))).T)
+        self._region.set_data(*gapped(view(box_edges(low, high))).T)
+        self._points.set(view(places), errors)
+        self._anchors.set_data(*view(anchors).T)
+        faces = [face for box in context.racks
+                 for face in view(box_faces(box[:3] - box[3:], box[:3] + box[3:]))]  # fmt: skip
+        for patch, face in zip(self._racks, faces, strict=False):
+            patch.set_xy(face)
+        artists = [*self._racks[: len(faces)], self._stems, self._region, *self._points.lines]
+        self.panel.paint([*artists, self._anchors], picture)
+        write(picture, 34, 14, headline)
+
+
+class _Plan:
+    """The same from above."""
+
+    def __init__(self, task: PlacementTask) -> None:
+        low, high = _corners(task)
+        self.panel = panel = Panel(panels.WIDTH - panels.LEFT, panels.TOP)
+        axes: Any = panel.figure.add_axes((0.145, 0.145, 0.825, 0.82))
+        margin = 0.05 * (high - low).max()
+        axes.set_xlim(low[0] - margin, high[0] + margin)
+        axes.set_ylim(low[1] - margin, high[1] + margin)
+        axes.set_aspect("equal", adjustable="box")
+        axes.set_xlabel("x [m]", fontsize=8, labelpad=1)
+        axes.set_ylabel("y [m]", fontsize=8)
+        axes.tick_params(labelsize=7, length=2.5)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(alpha=0.3, lw=0.5)
+        panel.freeze()
+        self._racks = [panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)
+                       for _ in range(_MOST_RACKS)]  # fmt: skip
+        self._region = panel.line(axes, color=INK, lw=1.1, ls=(0, (4, 2)))
+        self._points = _Points(panel, axes)
+        style = {"ls": "", "mec": "white", "mew": 0.8}
+        self._anchors = panel.line(axes, color=ANCHOR, marker="^", ms=10, **style)
+        self._anchors.set_clip_on(False)
+        self._pixels = axes.transData
+
+    def paint(
+        self,
+        context: Context,
+        anchors: FloatArray,
+        places: FloatArray,
+        errors: FloatArray,
+        picture: Image,
+    ) -> None:
+        """As `_World.paint`; anchors carry their numbers."""
+        around = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+        region = context.centre[:2] + around * context.half[:2]
+        self._region.set_data(*region.T)
+        self._points.set(places[:, :2], errors)
+        self._anchors.set_data(*anchors[:, :2].T)
+        for patch, box in zip(self._racks, context.racks, strict=False):
+            patch.set_xy(box[:2] + around * box[3:5])
+        artists = [*self._racks[: len(context.racks)], self._region, *self._points.lines]
+        self.panel.paint([*artists, self._anchors], picture)
+        for k, (x, y) in enumerate(self._pixels.transform(anchors[:, :2])):
+            row = int(np.clip(panels.TOP - y - 8, 0, panels.TOP - 17))
+            column = int(np.clip(x + 8, 0, panels.WIDTH - panels.LEFT - 24))
+            write(picture, row, column, str(k + 1), ANCHOR)
+
+
+def _corners(task: PlacementTask) -> tuple[FloatArray, FloatArray]:
+    """What is shown: the body's volume, and where anchors may stand."""
+    corners = np.array([*task.scene.volume.bounds(), *task.scene.anchor_region.bounds()])
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+_world = functools.lru_cache(maxsize=4)(_World)
+_plan = functools.lru_cache(maxsize=4)(_Plan)
