@@ -183,7 +183,7 @@ class AugmentedEkf:
                 np.where(vague[..., None], found.translation, start[1]),
             )
             covariance = np.where(vague[..., None, None], found.covariance, covariance)
-        threshold = HUBER if self.pose.robust else None
+        threshold = 1.0 if self.pose.robust else None
         return AugmentedState(
             *bias_cost.solve(problem, start, covariance, self.pose.iterations, threshold)
         )
