@@ -6,6 +6,8 @@ change of name.
 
 from functools import partial
 
+from rbl_gym.estimators.asynchronous import Asynchronous, Stream
+from rbl_gym.estimators.augmented import AugmentedEkf, AugmentedState, iekf_bias, iekf_cv
 from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
 from rbl_gym.estimators.consensus import (
     cycle_consensus,
@@ -29,8 +31,13 @@ for _name, _constraint in {
 }.items():
     register(_name, partial(KalmanFamily, constraint=_constraint))
 register("iekf", iterated_ekf)
+register("iekf-cv", iekf_cv)
+register("iekf-bias", iekf_bias)
 
 __all__ = [
+    "Asynchronous",
+    "AugmentedEkf",
+    "AugmentedState",
     "DoaEkf",
     "Filter",
     "FrameEstimate",
@@ -40,6 +47,7 @@ __all__ = [
     "PoseBelief",
     "PoseEstimate",
     "PoseState",
+    "Stream",
     "chordal_optimum",
     "cycle_consensus",
     "cycle_iteration",

@@ -97,7 +97,7 @@ class BiasProblem:
         return Linearization(cost, gradient, hessian)
 
     def weighed(self, share: FloatArray | None = None) -> BiasProblem:
-        """The problem with its `weight`; a `share` (..., L) of a link's says how far to trust it."""
+        """The problem with its `weight`, each link of it worth a `share` (..., L) of its own."""
         S = self.sums @ self.spread @ self.sums.T
         n = S.shape[-1]
         variance = self.variance

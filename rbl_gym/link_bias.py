@@ -49,7 +49,11 @@ class LinkBias:
 
 
 def simulate(
-    law: LinkBias, times: ArrayLike, links: int, rng: np.random.Generator, batch: tuple[int, ...] = ()
+    law: LinkBias,
+    times: ArrayLike,
+    links: int,
+    rng: np.random.Generator,
+    batch: tuple[int, ...] = (),
 ) -> FloatArray:
     """Biases (..., K, links) in metres at times (K,), drawn from the law."""
     times = check_array("times", times, ("K",))

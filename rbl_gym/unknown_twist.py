@@ -168,7 +168,9 @@ def simulate(
         twists[k + 1] = twists[k] + change
     axes = range(1, 1 + len(batch))
     return WanderingPath(
-        Q.transpose((*axes, 0, -2, -1)), t.transpose((*axes, 0, -1)), twists.transpose((*axes, 0, -1))
+        Q.transpose((*axes, 0, -2, -1)),
+        t.transpose((*axes, 0, -1)),
+        twists.transpose((*axes, 0, -1)),
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from rbl_gym import estimators, metrics, motion, ranging, recordings, rotations
 from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.link_bias import LinkBias
 from rbl_gym.recordings import Recording
 
 # What the planar constraint leaves to height (m), roll and pitch (rad).
@@ -31,7 +32,11 @@ class Settings:
     walk_m, walk_deg
         No twist is known: the pose is a random walk of this standard deviation after 1 s.
     robust
-        Huber's loss (iterated EKF only).
+        Huber's loss (the iterated EKFs only).
+    bias_std_m, bias_time_s, bias_common_m
+        Law of the links' biases, of the filter ``"iekf-bias"`` (`rbl_gym.link_bias.LinkBias`).
+    accel_m, accel_deg
+        Of the filter ``"iekf-cv"``: how much speed (m/s) and turn rate (deg/s) change in 1 s.
     planar
         Hold height, roll and pitch by a tight prior.
     height_offset_m
@@ -46,6 +51,11 @@ class Settings:
     walk_m: float = 0.1
     walk_deg: float = 7.0
     robust: bool = True
+    bias_std_m: float = 0.02
+    bias_time_s: float | None = 3.0
+    bias_common_m: float = 0.0
+    accel_m: float = 0.5
+    accel_deg: float = 30.0
     planar: bool = False
     height_offset_m: float = 0.0
     yaw_offset_deg: float = 0.0
@@ -55,6 +65,9 @@ class Settings:
             check_number("range_std_m", self.range_std_m, low=1e-6)
         check_number("walk_m", self.walk_m, low=0.0)
         check_number("walk_deg", self.walk_deg, low=0.0)
+        LinkBias(self.bias_std_m, self.bias_time_s, self.bias_common_m)
+        check_number("accel_m", self.accel_m, low=0.0)
+        check_number("accel_deg", self.accel_deg, low=0.0)
         if check_number("height_offset_m", self.height_offset_m) != 0 and not self.planar:
             raise ValueError("height_offset_m means nothing without planar")
         check_number("yaw_offset_deg", self.yaw_offset_deg)
@@ -84,7 +97,7 @@ def run(
     for k, now in enumerate(recording.times):
         if reported:
             law = ranging.LinkNoise(recording.range_std[k])  # pyright: ignore[reportOptionalSubscript]
-            filter = dataclasses.replace(filter, noise=law)  # pyright: ignore[reportArgumentType]
+            filter = _with_noise(filter, law)
         if now > before:
             state = filter.predict(state, np.zeros(6), now - before)
         state = filter.update(state, recording.ranges[k], recording.anchors, recording.links[k])
@@ -106,11 +119,45 @@ def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
     else:
         process = motion.ProcessNoise(turn, walk)
-    options = {"robust": settings.robust} if settings.filter == "iekf" else {}
+    options = _options(settings)
     noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
     return estimators.make(
         settings.filter, tags=recording.tags, noise=noise, process=process, **options
     )
+
+
+# Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
+_ANY_TURN, _ANY_SPEED = 1.0, 3.0
+
+
+def _options(settings: Settings) -> dict[str, Any]:
+    """What the settings say to the named filter."""
+    if settings.filter == "iekf":
+        return {"robust": settings.robust}
+    if settings.filter == "iekf-bias":
+        return {
+            "robust": settings.robust,
+            "bias_std_m": settings.bias_std_m,
+            "bias_time_s": settings.bias_time_s,
+            "common_std_m": settings.bias_common_m,
+        }
+    if settings.filter == "iekf-cv":
+        turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.planar else ((1, 1, 1), (1, 1, 1))
+        return {
+            "robust": settings.robust,
+            "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),
+            "speed_m_s": tuple(_ANY_SPEED * axis for axis in shift),
+            "turn_acceleration": tuple(math.radians(settings.accel_deg) * axis for axis in turn),
+            "acceleration": tuple(settings.accel_m * axis for axis in shift),
+        }
+    return {}
+
+
+def _with_noise(filter: Any, law: ranging.LinkNoise) -> Any:
+    """The filter with another law of the ranges."""
+    if isinstance(filter, estimators.AugmentedEkf):
+        return dataclasses.replace(filter, pose=dataclasses.replace(filter.pose, noise=law))
+    return dataclasses.replace(filter, noise=law)
 
 
 def _prior(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
