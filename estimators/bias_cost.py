@@ -9,6 +9,7 @@ S summing the biases of every link. Given the pose, ``nu = r - d - S (x0 + G e)`
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -80,10 +81,24 @@ class BiasProblem:
         D[..., 3:, 3:] = np.eye(3)
         distance, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
         distance = distance.reshape((*distance.shape[:-2], -1))[..., self.chosen]
-        gain = self.sums @ self.gain
-        nu = self.ranges - distance - _times(gain, e) - self.extra @ self.sums.T
-        H = np.swapaxes(J[..., self.chosen], -1, -2) + gain @ D
+        nu = self._unbiased - distance - _times(self._slope, e)
+        H = np.swapaxes(J[..., self.chosen], -1, -2) + self._slope @ D
         return nu, H, e, D
+
+    @functools.cached_property
+    def _unbiased(self) -> FloatArray:
+        """The ranges less the biases expected at the prior's pose."""
+        return self.ranges - self.extra @ self.sums.T
+
+    @functools.cached_property
+    def _slope(self) -> FloatArray:
+        """By how much the expected biases (..., L, 6) change with the pose."""
+        return self.sums @ self.gain
+
+    @functools.cached_property
+    def _own(self) -> FloatArray:
+        """Covariance (..., L, L) of the biases given the pose."""
+        return self.sums @ self.spread @ self.sums.T
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
@@ -98,11 +113,11 @@ class BiasProblem:
 
     def weighed(self, share: FloatArray | None = None) -> BiasProblem:
         """The problem with its `weight`, each link of it worth a `share` (..., L) of its own."""
-        S = self.sums @ self.spread @ self.sums.T
+        S = self._own
         n = S.shape[-1]
         variance = self.variance
         if share is not None:
-            own = S[..., range(n), range(n)]
+            own = np.diagonal(S, axis1=-2, axis2=-1)
             variance = (own + variance) / share - own
         S = S + variance[..., None] * np.eye(n)
         if self.links is None:
@@ -116,8 +131,7 @@ class BiasProblem:
     ) -> FloatArray:
         """Huber's weights (..., L) of the innovations at a pose whose covariance is P (None: 0)."""
         nu, H, _, _ = self.innovation(rotation, translation)
-        own = self.sums @ self.spread @ self.sums.T
-        variance = own[..., range(nu.shape[-1]), range(nu.shape[-1])] + self.variance
+        variance = np.diagonal(self._own, axis1=-2, axis2=-1) + self.variance
         if P is not None:
             variance = variance + np.einsum("...la,...ab,...lb->...l", H, P, H)
         return huber(threshold)(nu**2 / variance)[1]

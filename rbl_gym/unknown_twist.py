@@ -150,6 +150,8 @@ def simulate(
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     dt = check_number("dt", dt, low=1e-12)
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise ValueError(f"steps must be a positive int, got {steps!r:.80}")
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     twists = np.empty((steps + 1, *batch, 6))
     twists[0] = law.prior_std() * rng.standard_normal((*batch, 6))
