@@ -264,7 +264,7 @@ def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
     gain = product(across, inverse(P[:6, :6]))
     moved = np.einsum("ij...,j...->i...", gain, np.concatenate([turn, shift]))
     # An error of the new pose is one of the old times blkdiag(Jl^-1, I).
-    slope = gain.copy()
+    slope = np.broadcast_to(gain, (*gain.shape[:2], *new.shape[2:])).copy()
     slope[:, :3] = product(gain[:, :3], left_jacobian_inverse(turn))
     covariance = np.empty((*P.shape[:2], *new.shape[2:]))
     covariance[:6, :6] = new

@@ -179,7 +179,9 @@ def test_drawn_trajectories_have_the_laws_moments():
         (lambda: ut.TwistSensor(gyro_std_rad_s=0), "gyro_std_rad_s must be a finite number"),
         (lambda: ut.TwistSensor(frame="moon"), "frame must be one of"),
         (
-            lambda: ut.simulate(np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 0, np.random.default_rng(0)),
+            lambda: ut.simulate(
+                np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 0, np.random.default_rng(0)
+            ),
             "steps must be a positive int",
         ),
         (
