@@ -127,7 +127,8 @@ def test_their_own_times_are_worth_more_than_one_stamp_for_all():
         metrics.pose_error(*links.belief(stream)[:2], np.eye(3), time * velocity),
         links.belief(stream).covariance,
     ).mean()
-    assert 4 < nees < 8
+    # The truth keeps its twist, and the filter allows for more: honest, if anything careful.
+    assert 2.5 < nees < 7
 
 
 @pytest.mark.parametrize(
