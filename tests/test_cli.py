@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, motion, ranging, rotations
-from rbl_gym.app import camsap2013
+from rbl_gym import bodies, motion, ranging, recordings, rotations
+from rbl_gym.app import camsap2013, replay
 from rbl_gym.app.cli import main
 from tests.helpers import ROOT
 
@@ -240,6 +240,40 @@ def test_biases_of_a_real_recording(calibrated, options, limits, tmp_path, capsy
     assert result["position_rmse_m"] <= limits[0]
     assert result["yaw_rmse_deg"] <= limits[1]
     assert 0.5 < result["anees"] < 2.0
+
+
+@pytest.mark.skipif(not LIAS.is_dir(), reason="the LIAS recording is not on this machine")
+def test_static_runs_of_a_real_recording(tmp_path):
+    """30 poses, each from nothing: at most 0.035 m over every fourth epoch of all runs."""
+    settings = replay.Settings(
+        filter="iekf-bias", planar=True, height_offset_m=0.08, yaw_offset_deg=5.6, range_std_m=0.06
+    )
+    truth = {
+        row["run"]: row
+        for row in csv.DictReader((LIAS / "static_truth.csv").read_text().splitlines())
+    }
+    runs: dict[str, list[list[str]]] = {run: [] for run in truth}
+    header, *rows = csv.reader((LIAS / "static_ranges.csv").read_text().splitlines())
+    for run, *cells in rows:
+        runs[run].append(cells)
+    squares, nees = [], []
+    for run, cells in runs.items():
+        place = [truth[run][key] for key in ("x", "y", "yaw_deg")]
+        ends = [[cells[k][0], *place] for k in (0, -1)]
+        recording = recordings.read_recording(
+            write(tmp_path / "ranges.csv", header[1:], cells[::4]),
+            LIAS / "anchors_8_14.csv",
+            LIAS / "tags_8_14.csv",
+            write(tmp_path / "truth.csv", ["t", "x", "y", "yaw_deg"], ends),
+            LIAS / "calibration_8_14.csv",
+        )
+        found = replay.errors(recording, replay.run(recording, settings), settings)
+        assert found is not None
+        squares.append(np.mean(found.position[found.known] ** 2))
+        nees.append(found.nees[found.known].mean() / 3)
+    assert len(squares) == 30
+    assert np.sqrt(np.mean(squares)) <= 0.035
+    assert 0.5 < np.mean(nees) < 2
 
 
 @pytest.mark.parametrize(
