@@ -12,7 +12,6 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +21,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log, product
 from rbl_gym.estimators import bias_cost
 from rbl_gym.estimators.belief import PoseBelief
+from rbl_gym.estimators.bias_cost import AugmentedState
 from rbl_gym.estimators.inputs import check_epoch, check_variance
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState, is_vague
 from rbl_gym.link_bias import LinkBias
@@ -32,26 +32,6 @@ from rbl_gym.unknown_twist import TwistSensor, WanderingTwist, predict_covarianc
 # Whitened innovation at which Huber's loss on biased ranges turns from squares to absolute values:
 # what is left of real ranges has heavier tails than noise (1.0 was measured better than 1.5).
 HUBER = 1.0
-
-
-class AugmentedState(NamedTuple):
-    """Pose, further states, and the covariance of all errors, with leading batch axes.
-
-    Attributes
-    ----------
-    rotation, translation
-        (..., 3, 3) and (..., 3).
-    extra
-        (..., K): the twist (6) where it is unknown, then the biases of the M N links, by anchors,
-        of one law after the other (none before the first ranges have said how many anchors).
-    covariance
-        (..., 6 + K, 6 + K) of ``(w, v)`` and the extra states, estimate less truth.
-    """
-
-    rotation: FloatArray
-    translation: FloatArray
-    extra: FloatArray
-    covariance: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

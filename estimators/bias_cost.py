@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,19 @@ from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
 from rbl_gym.estimators.range_cost import huber
 
 
-class State(Protocol):
-    """What `augmented.AugmentedState` holds."""
+class AugmentedState(NamedTuple):
+    """Pose, further states, and the covariance of all errors, with leading batch axes.
+
+    Attributes
+    ----------
+    rotation, translation
+        (..., 3, 3) and (..., 3).
+    extra
+        (..., K): the twist (6) where it is unknown, then the biases of the M N links, by anchors,
+        of one law after the other (none before the first ranges have said how many anchors).
+    covariance
+        (..., 6 + K, 6 + K) of ``(w, v)`` and the extra states, estimate less truth.
+    """
 
     rotation: FloatArray
     translation: FloatArray
@@ -143,7 +154,7 @@ def sums_of(n_twist: int, n_laws: int, links: int) -> FloatArray:
 
 
 def problem(
-    state: State,
+    state: AugmentedState,
     sums: FloatArray,
     ranges: FloatArray,
     variance: FloatArray,

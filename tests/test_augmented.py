@@ -252,21 +252,25 @@ def test_biases_of_links_are_learned_and_the_covariance_stays_honest(law, gain):
     assert 0.4 < nees[1] < 1.2
 
 
-def test_biases_are_forgotten_as_their_law_says():
+@pytest.mark.parametrize("twist", [None, ut.WanderingTwist()], ids=["known", "unknown"])
+def test_biases_are_forgotten_as_their_law_says(twist):
     rng = np.random.default_rng(6)
     anchors, tags, rotation, translation = random_world(rng, 4, 3)
     law = LinkBias(0.3, 2.0, 0.1)
-    filter = AugmentedEkf(IteratedEkf(tags, NOISE, PROCESS), biases=(law,))
+    filter = AugmentedEkf(IteratedEkf(tags, NOISE, PROCESS), twist, biases=(law,))
+    biases = slice(-12, None)
     state = filter.initial(rotation, translation, 0.01 * np.eye(6))
     ranges = simulate(rng, anchors, tags, rotation, translation, NOISE) + 0.3
     state = filter.update(state, ranges, anchors)
     later = filter.predict(state, np.zeros(6), 1.0)
-    np.testing.assert_allclose(later.extra, np.exp(-0.5) * state.extra)
-    own = state.covariance[6:, 6:]
+    np.testing.assert_allclose(later.extra[biases], np.exp(-0.5) * state.extra[biases])
+    np.testing.assert_array_equal(later.extra[:-12], state.extra[:-12])
+    own = state.covariance[biases, biases]
     want = np.exp(-1) * own + (1 - np.exp(-1)) * law.covariance(12)
-    np.testing.assert_allclose(later.covariance[6:, 6:], want)
+    np.testing.assert_allclose(later.covariance[biases, biases], want)
     much_later = filter.predict(state, np.zeros(6), 100.0)
-    np.testing.assert_allclose(much_later.covariance[6:, 6:], law.covariance(12), atol=1e-12)
+    own = much_later.covariance[biases, biases]
+    np.testing.assert_allclose(own, law.covariance(12), atol=1e-12)
 
 
 def test_drawn_biases_have_their_laws_moments():

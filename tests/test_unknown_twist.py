@@ -174,7 +174,10 @@ def test_drawn_trajectories_have_the_laws_moments():
     ("call", "message"),
     [
         (lambda: ut.WanderingTwist(turn_rate_rad_s=-1), "turn_rate_rad_s must not be negative"),
-        (lambda: ut.WanderingTwist(speed_m_s=(1, 2)), "speed_m_s must be one number or three"),
+        (
+            lambda: ut.WanderingTwist(speed_m_s=(1, 2)),  # pyright: ignore[reportArgumentType]
+            "speed_m_s must be one number or three",
+        ),
         (lambda: ut.WanderingTwist(acceleration=np.nan), "acceleration must be finite"),
         (lambda: ut.TwistSensor(gyro_std_rad_s=0), "gyro_std_rad_s must be a finite number"),
         (lambda: ut.TwistSensor(frame="moon"), "frame must be one of"),
