@@ -6,6 +6,8 @@ change of name.
 
 from functools import partial
 
+from rbl_gym.estimators.asynchronous import Asynchronous, Stream
+from rbl_gym.estimators.augmented import AugmentedEkf, AugmentedState, iekf_bias, iekf_cv
 from rbl_gym.estimators.belief import (
     ENTRY_POINT_GROUP,
     Filter,
@@ -13,6 +15,7 @@ from rbl_gym.estimators.belief import (
     make,
     names,
     register,
+    with_noise,
 )
 from rbl_gym.estimators.consensus import (
     cycle_consensus,
@@ -36,9 +39,14 @@ for _name, _constraint in {
 }.items():
     register(_name, partial(KalmanFamily, constraint=_constraint))
 register("iekf", iterated_ekf)
+register("iekf-cv", iekf_cv)
+register("iekf-bias", iekf_bias)
 
 __all__ = [
     "ENTRY_POINT_GROUP",
+    "Asynchronous",
+    "AugmentedEkf",
+    "AugmentedState",
     "DoaEkf",
     "Filter",
     "FrameEstimate",
@@ -48,6 +56,7 @@ __all__ = [
     "PoseBelief",
     "PoseEstimate",
     "PoseState",
+    "Stream",
     "chordal_optimum",
     "cycle_consensus",
     "cycle_iteration",
@@ -61,4 +70,5 @@ __all__ = [
     "orientations",
     "register",
     "ring_least_squares",
+    "with_noise",
 ]

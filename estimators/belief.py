@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 from collections.abc import Callable
@@ -101,9 +102,9 @@ def make(
     Parameters
     ----------
     name
-        ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``; one that a package
-        offers by the entry-point group ``rbl_gym.filters``; or ``"package.module:factory"``,
-        which is imported.
+        ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
+        ``"iekf-bias"``; one that a package offers by the entry-point group
+        ``rbl_gym.filters``; or ``"package.module:factory"``, which is imported.
     tags
         (N, 3), places on the body, metres, body frame.
     noise
@@ -157,6 +158,20 @@ def _factory(name: str) -> Callable[..., Filter]:
         f"filter must be one of {', '.join(names())}, or a name given by "
         f"rbl_gym.estimators.register, or 'module:factory', got {name!r:.80}"
     )
+
+
+def with_noise(filter: Filter, law: NoiseLaw) -> Filter | None:
+    """The filter with another law of the ranges, or None where it takes none.
+
+    It takes one if it is a dataclass with a field `noise`, or with a filter `pose` that has one.
+    """
+    if not dataclasses.is_dataclass(filter):
+        return None
+    fields = {field.name for field in dataclasses.fields(filter)}
+    if "noise" in fields:
+        return dataclasses.replace(filter, noise=law)  # pyright: ignore[reportArgumentType]
+    inner = with_noise(getattr(filter, "pose", None), law) if "pose" in fields else None  # pyright: ignore[reportArgumentType]
+    return None if inner is None else dataclasses.replace(filter, pose=inner)  # pyright: ignore[reportArgumentType]
 
 
 def inverse(matrix: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
 PLAIN_MODELS = {
     "rotations", "ranging", "bearing", "sensing_network", "bounds", "components", "motion",
-    "checks", "network_bounds", "network_graphs", "rigidity",
+    "checks", "network_bounds", "network_graphs", "rigidity", "unknown_twist", "link_bias",
 }  # fmt: skip
 # numpy.random's names that are no global state.
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 
 from rbl_gym import bounds, estimators, metrics, rendering, scenes, simulation
 from rbl_gym.checks import FloatArray, check_one_of
-from rbl_gym.estimators import Filter, PoseBelief
+from rbl_gym.estimators import Filter, PoseBelief, with_noise
 
 REWARDS = ("belief", "error")
 OBSERVATIONS = ("dict", "flat")
@@ -153,24 +152,17 @@ def update(
 ) -> Any:
     """The filter's state after the measurements of an epoch, with their `quality` if it is told.
 
-    A filter learns of the quality by its noise law, if it is a dataclass with a field `noise`.
+    A filter learns of the quality by its noise law, if it takes one (`estimators.with_noise`).
     """
     if "G" in observation:
         statistical: Any = filter
         return statistical.update_statistic(state, observation["G"], observation["B"])
     ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
-    if "quality" in observation and has_noise(filter):
+    if "quality" in observation:
         seen = links.astype(np.bool_, copy=False)
-        noise = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
-        filter = dataclasses.replace(filter, noise=noise)  # pyright: ignore[reportArgumentType]
+        law = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
+        filter = with_noise(filter, law) or filter
     return filter.update(state, ranges, anchors, links)
-
-
-def has_noise(filter: Filter) -> bool:
-    """Whether a filter takes another noise law by `dataclasses.replace`."""
-    return dataclasses.is_dataclass(filter) and any(
-        field.name == "noise" for field in dataclasses.fields(filter)
-    )
 
 
 def judge(

@@ -151,7 +151,7 @@ def _add_replay(commands: Any) -> None:
         metavar="X",
         help="yaw error = estimate - (truth + offset)",
     )
-    replay.add_argument("--filter", default="iekf", metavar="NAME", help="default iekf")
+    replay.add_argument("--filter", metavar="NAME", help="default iekf, iekf-bias with a bias")
     replay.add_argument(
         "--range-std-m",
         type=float,
@@ -171,6 +171,43 @@ def _add_replay(commands: Any) -> None:
         default=7.0,
         metavar="X",
         help="random walk of the rotation after 1 s, default 7",
+    )
+    replay.add_argument(
+        "--bias-std-m",
+        type=float,
+        metavar="X",
+        help="filter iekf-bias: of a link's bias, default 0.02, with --raw 0.05",
+    )
+    replay.add_argument(
+        "--bias-time-s",
+        type=float,
+        metavar="X",
+        help="how long a bias lasts, default 3, with --raw for ever",
+    )
+    replay.add_argument(
+        "--bias-common-m",
+        type=float,
+        metavar="X",
+        help="of the bias that all links have in common, default 0, with --raw 0.1",
+    )
+    replay.add_argument(
+        "--raw",
+        action="store_true",
+        help="ranges of radios that nobody calibrated: iekf-bias learns the biases that stay",
+    )
+    replay.add_argument(
+        "--accel-m",
+        type=float,
+        default=0.5,
+        metavar="X",
+        help="filter iekf-cv: change of the speed (m/s) after 1 s, default 0.5",
+    )
+    replay.add_argument(
+        "--accel-deg",
+        type=float,
+        default=30.0,
+        metavar="X",
+        help="filter iekf-cv: change of the turn rate (deg/s) after 1 s, default 30",
     )
     replay.add_argument("--no-robust", action="store_true", help="squares in place of Huber's loss")
     replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")
@@ -291,10 +328,12 @@ def _replay(options: argparse.Namespace) -> int:
     if options.html:
         require("plotly", "viz")
     settings = replay.Settings(
-        filter=options.filter,
+        **_bias(options),
         range_std_m=options.range_std_m,
         walk_m=options.walk_m,
         walk_deg=options.walk_deg,
+        accel_m=options.accel_m,
+        accel_deg=options.accel_deg,
         robust=not options.no_robust,
         planar=options.planar,
         height_offset_m=options.height_offset_m,
@@ -321,6 +360,23 @@ def _replay(options: argparse.Namespace) -> int:
 
         page.write(track_pages.replay(recording, track, result, settings), options.html)
     return 0
+
+
+def _bias(options: argparse.Namespace) -> dict[str, Any]:
+    """The filter's name and the law of the biases, from what was said of either."""
+    given = {
+        name: getattr(options, name)
+        for name in ("bias_std_m", "bias_time_s", "bias_common_m")
+        if getattr(options, name) is not None
+    }
+    if options.raw:
+        if options.calibration:
+            raise ValueError("--raw means ranges without --calibration")
+        given = {"bias_std_m": 0.05, "bias_time_s": None, "bias_common_m": 0.1, **given}
+    name = options.filter or ("iekf-bias" if given else "iekf")
+    if given and name != "iekf-bias":
+        raise ValueError(f"{name} knows no biases: --raw and --bias-... are of iekf-bias")
+    return {"filter": name, **given}
 
 
 def _numbers(text: str) -> range:

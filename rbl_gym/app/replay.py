@@ -11,8 +11,8 @@ import numpy as np
 
 from rbl_gym import estimators, metrics, motion, ranging, recordings, rotations
 from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.link_bias import LinkBias
 from rbl_gym.recordings import Recording
-from rbl_gym.wrappers.estimate import has_noise
 
 # What the planar constraint leaves to height (m), roll and pitch (rad).
 _PLANAR_STD = 1e-3
@@ -32,7 +32,11 @@ class Settings:
     walk_m, walk_deg
         No twist is known: the pose is a random walk of this standard deviation after 1 s.
     robust
-        Huber's loss (iterated EKF only).
+        Huber's loss (the iterated EKFs only).
+    bias_std_m, bias_time_s, bias_common_m
+        Law of the links' biases, of the filter ``"iekf-bias"`` (`rbl_gym.link_bias.LinkBias`).
+    accel_m, accel_deg
+        Of the filter ``"iekf-cv"``: how much speed (m/s) and turn rate (deg/s) change in 1 s.
     planar
         Hold height, roll and pitch by a tight prior.
     height_offset_m
@@ -47,6 +51,11 @@ class Settings:
     walk_m: float = 0.1
     walk_deg: float = 7.0
     robust: bool = True
+    bias_std_m: float = 0.02
+    bias_time_s: float | None = 3.0
+    bias_common_m: float = 0.0
+    accel_m: float = 0.5
+    accel_deg: float = 30.0
     planar: bool = False
     height_offset_m: float = 0.0
     yaw_offset_deg: float = 0.0
@@ -56,6 +65,9 @@ class Settings:
             check_number("range_std_m", self.range_std_m, low=1e-6)
         check_number("walk_m", self.walk_m, low=0.0)
         check_number("walk_deg", self.walk_deg, low=0.0)
+        LinkBias(self.bias_std_m, self.bias_time_s, self.bias_common_m)
+        check_number("accel_m", self.accel_m, low=0.0)
+        check_number("accel_deg", self.accel_deg, low=0.0)
         if check_number("height_offset_m", self.height_offset_m) != 0 and not self.planar:
             raise ValueError("height_offset_m means nothing without planar")
         check_number("yaw_offset_deg", self.yaw_offset_deg)
@@ -89,15 +101,16 @@ def steps(
 ) -> Iterator[tuple[Any, estimators.PoseBelief]]:
     """State and belief of a filter after every epoch of a recording, started from nothing.
 
-    A noise that the recording reports itself reaches a filter that has a field `noise`.
+    A noise that the recording reports itself reaches a filter that takes one.
     """
     state = filter.initial(*_prior(recording, settings))
-    reported = settings.range_std_m is None and has_noise(filter)
+    reported = settings.range_std_m is None
     before = recording.times[0]
     for k, now in enumerate(recording.times):
         if reported and recording.range_std is not None:
-            law = ranging.LinkNoise(recording.range_std[k])
-            filter = dataclasses.replace(filter, noise=law)  # pyright: ignore[reportArgumentType]
+            filter = (
+                estimators.with_noise(filter, ranging.LinkNoise(recording.range_std[k])) or filter
+            )
         if now > before:
             state = filter.predict(state, np.zeros(6), now - before)
         state = filter.update(state, recording.ranges[k], recording.anchors, recording.links[k])
@@ -117,8 +130,7 @@ def track_of(recording: Recording, beliefs: list[estimators.PoseBelief]) -> Trac
 
 def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
     """The named filter with the recording's tags, a random walk and the range noise."""
-    options = {"robust": settings.robust} if settings.filter == "iekf" else {}
-    return named_filter(recording, settings, settings.filter, options)
+    return named_filter(recording, settings, settings.filter, _options(settings))
 
 
 def named_filter(
@@ -132,6 +144,33 @@ def named_filter(
         process = motion.ProcessNoise(turn, walk)
     noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
     return estimators.make(name, tags=recording.tags, noise=noise, process=process, **options)
+
+
+# Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
+_ANY_TURN, _ANY_SPEED = 1.0, 3.0
+
+
+def _options(settings: Settings) -> dict[str, Any]:
+    """What the settings say to the named filter."""
+    if settings.filter == "iekf":
+        return {"robust": settings.robust}
+    if settings.filter == "iekf-bias":
+        return {
+            "robust": settings.robust,
+            "bias_std_m": settings.bias_std_m,
+            "bias_time_s": settings.bias_time_s,
+            "common_std_m": settings.bias_common_m,
+        }
+    if settings.filter == "iekf-cv":
+        turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.planar else ((1, 1, 1), (1, 1, 1))
+        return {
+            "robust": settings.robust,
+            "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),
+            "speed_m_s": tuple(_ANY_SPEED * axis for axis in shift),
+            "turn_acceleration": tuple(math.radians(settings.accel_deg) * axis for axis in turn),
+            "acceleration": tuple(settings.accel_m * axis for axis in shift),
+        }
+    return {}
 
 
 def _prior(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:

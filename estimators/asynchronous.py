@@ -1,0 +1,190 @@
+"""Ranges one at a time, each with a time of its own, some of them late.
+
+Radios measure one link after another, and a range may arrive after later ones. `Asynchronous`
+puts any filter of `rbl_gym.estimators.Filter` on such a stream: it moves the state to the time of
+every range, and takes it back within a short window when a range comes out of order, so that the
+result is that of the ordered stream, to the last bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, check_array, check_finite, check_number
+from rbl_gym.estimators.belief import Filter, PoseBelief
+
+
+class TimedRange(NamedTuple):
+    """One range: seconds, indices of anchor and tag, metres (...), twist of the interval before."""
+
+    time: float
+    anchor: int
+    tag: int
+    range: FloatArray
+    twist: FloatArray | None
+
+
+class Checkpoint(NamedTuple):
+    """The filter's state right after a range (None: the start)."""
+
+    time: float
+    state: Any
+    measured: TimedRange | None
+
+
+class Stream(NamedTuple):
+    """What a stream of ranges has come to.
+
+    Attributes
+    ----------
+    checkpoints
+        In the order of their times: the last one before the window, and all inside it.
+    refused
+        How many ranges came too late for the window, and were left out.
+    """
+
+    checkpoints: tuple[Checkpoint, ...]
+    refused: int
+
+    @property
+    def time(self) -> float:
+        """Time of the newest range, seconds."""
+        return self.checkpoints[-1].time
+
+
+@dataclass(frozen=True, eq=False)
+class Asynchronous:
+    """A filter on ranges that come one at a time, also out of order; pure functions.
+
+    Parameters
+    ----------
+    filter
+        Any filter.
+    anchors
+        (M, 3), metres.
+    n_tags
+        Of the body.
+    window_s
+        How late a range may be, against the newest one, and still count.
+
+    Example
+    -------
+    >>> links = Asynchronous(filter, anchors, n_tags=6, window_s=0.1)
+    >>> stream = links.start(filter.initial(rotation, translation, covariance), time=0.0)
+    >>> stream = links.add(stream, time=0.013, anchor=2, tag=5, range=7.31)
+    >>> links.belief(stream)
+    """
+
+    filter: Filter
+    anchors: FloatArray
+    n_tags: int
+    window_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "anchors", check_array("anchors", self.anchors, ("M", 3)))
+        if self.anchors.ndim != 2:
+            raise ValueError(f"anchors must be (M, 3), got shape {self.anchors.shape}")
+        _check_index("n_tags", self.n_tags - 1, 1 << 30)
+        check_number("window_s", self.window_s, low=0.0)
+
+    def start(self, state: Any, time: float) -> Stream:
+        """A stream from a state of the filter at a time (s).
+
+        One range does not determine a pose: a body of which nothing is known starts from the
+        filter's state after a first epoch of all links.
+        """
+        return Stream((Checkpoint(check_number("time", time), state, None),), 0)
+
+    def add(
+        self,
+        stream: Stream,
+        time: float,
+        anchor: int,
+        tag: int,
+        range: ArrayLike,
+        twist: ArrayLike | None = (0.0,) * 6,
+    ) -> Stream:
+        """The stream with one more range (metres; (...) of many bodies with the same times).
+
+        One that lies before the start, or before the newest by more than the window, is left out
+        and counted as refused.
+
+        Parameters
+        ----------
+        twist
+            (..., 6) of the interval that ends at this range: at rest, a random walk, unless it is
+            told; None for a filter that estimates it.
+
+        Raises
+        ------
+        ValueError
+            On an index out of range, a range or a twist that cannot be.
+        """
+        time = check_number("time", time)
+        _check_index("anchor", anchor, len(self.anchors))
+        _check_index("tag", tag, self.n_tags)
+        value = check_finite("range", np.asarray(range, dtype=np.float64))
+        if (value <= 0).any():
+            raise ValueError(f"range must be positive, got {value.min()}")
+        if twist is not None:
+            twist = check_array("twist", twist, (6,))
+        measured = TimedRange(time, int(anchor), int(tag), value, twist)
+        newest = max(time, stream.time)
+        if time < stream.checkpoints[0].time or time < newest - self.window_s:
+            return stream._replace(refused=stream.refused + 1)
+        kept = [point for point in stream.checkpoints if point.time <= time]
+        later = [point.measured for point in stream.checkpoints[len(kept) :]]
+        for each in (measured, *later):
+            kept.append(self._advanced(kept[-1], each))  # pyright: ignore[reportArgumentType]
+        # The last one at or before the window's edge is what a range at the edge starts from.
+        first = max(
+            k for k, point in enumerate(kept) if k == 0 or point.time < newest - self.window_s
+        )
+        return Stream(tuple(kept[first:]), stream.refused)
+
+    def _advanced(self, point: Checkpoint, measured: TimedRange) -> Checkpoint:
+        state = self._moved(point, measured.time, measured.twist)
+        shape = (len(self.anchors), self.n_tags)
+        ranges = np.zeros((*measured.range.shape, *shape))
+        ranges[..., measured.anchor, measured.tag] = measured.range
+        links = np.zeros(shape, np.bool_)
+        links[measured.anchor, measured.tag] = True
+        state = self.filter.update(state, ranges, self.anchors, links)
+        return Checkpoint(measured.time, state, measured)
+
+    def _moved(self, point: Checkpoint, time: float, twist: FloatArray | None) -> Any:
+        if time == point.time:
+            return point.state
+        return self.filter.predict(point.state, twist, time - point.time)  # pyright: ignore[reportArgumentType]
+
+    def state(
+        self, stream: Stream, time: float | None = None, twist: ArrayLike | None = (0.0,) * 6
+    ) -> Any:
+        """The filter's state at a time (s) not before the newest range; None: at that one."""
+        newest = stream.checkpoints[-1]
+        if time is None:
+            return newest.state
+        time = check_number("time", time)
+        if time < newest.time:
+            raise ValueError(f"time must not lie before the newest range {newest.time}, got {time}")
+        return self._moved(
+            newest, time, None if twist is None else check_array("twist", twist, (6,))
+        )
+
+    def belief(
+        self, stream: Stream, time: float | None = None, twist: ArrayLike | None = (0.0,) * 6
+    ) -> PoseBelief:
+        """The belief over the pose at a time, as `state`."""
+        return self.filter.belief(self.state(stream, time, twist))
+
+
+def _check_index(name: str, value: int, size: int) -> None:
+    """An int of [0, size), or a ValueError."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise ValueError(f"{name} must be an int, got {value!r:.80}")
+    if not 0 <= value < size:
+        raise ValueError(f"{name} must be one of 0 ... {size - 1}, got {value}")

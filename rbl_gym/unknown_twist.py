@@ -1,0 +1,294 @@
+"""A body whose twist nobody tells: its law, trajectories drawn from it, the bound of 12 states.
+
+The twist (angular velocity in the world frame, then velocity) wanders by white acceleration;
+the pose follows it:
+
+    Q[k+1] = exp(W[k] dt + n_w) Q[k],   t[k+1] = t[k] + V[k] dt + n_v,   twist[k+1] = twist[k] + n_a
+
+with ``(n, n_a)`` of a step jointly Gaussian as an acceleration that is white over the step makes
+them: variances ``q dt^3 / 3`` and ``q dt``, covariance ``q dt^2 / 2``. What a `ProcessNoise` adds
+to the pose comes on top, on the twist's side of the left Jacobian as everywhere. The error of the
+12 states is ``(w, v, dW, dV)``: that of the pose as everywhere, then estimate less truth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import bounds, ranging, rotations
+from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
+from rbl_gym.components import exp_and_left_jacobian, first, last, product
+from rbl_gym.motion import ProcessNoise
+
+FRAMES = ("world", "body")
+Axes = float | tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class WanderingTwist:
+    """Law of an unknown twist.
+
+    Parameters
+    ----------
+    turn_rate_rad_s, speed_m_s
+        Standard deviations of the first angular velocity and velocity about zero, per axis.
+    turn_acceleration, acceleration
+        By how much they wander: standard deviations of their change after 1 s (rad/s, m/s).
+
+    All are a float, or three of them for the world's axes (a planar body has zeros among them).
+
+    Raises
+    ------
+    ValueError
+        If a value is negative or not finite, or there are neither 1 nor 3.
+    """
+
+    turn_rate_rad_s: Axes = 0.5
+    speed_m_s: Axes = 5.0
+    turn_acceleration: Axes = 0.3
+    acceleration: Axes = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("turn_rate_rad_s", "speed_m_s", "turn_acceleration", "acceleration"):
+            value = check_array(name, getattr(self, name), ())
+            if value.shape not in ((), (3,)):
+                raise ValueError(f"{name} must be one number or three, got shape {value.shape}")
+            if (value < 0).any():
+                raise ValueError(f"{name} must not be negative, got {value.tolist()}")
+            # Lists come out of JSON; tuples keep the configuration hashable.
+            value = float(value) if value.ndim == 0 else tuple(value.tolist())
+            object.__setattr__(self, name, value)
+
+    def prior_std(self) -> FloatArray:
+        """Standard deviations (6,) of the first twist."""
+        return _six(self.turn_rate_rad_s, self.speed_m_s)
+
+    def std(self) -> FloatArray:
+        """Standard deviations (6,) of the twist's change after 1 s."""
+        return _six(self.turn_acceleration, self.acceleration)
+
+
+@dataclass(frozen=True)
+class TwistSensor:
+    """A gyroscope and a speedometer with white noise, read once an interval.
+
+    Parameters
+    ----------
+    gyro_std_rad_s, speed_std_m_s
+        Standard deviation of a reading, per axis; None: not measured.
+    frame
+        Axes of the readings: ``"world"``, as twists are everywhere in this package, or
+        ``"body"``, as a sensor on the body has them.
+    """
+
+    gyro_std_rad_s: float | None = None
+    speed_std_m_s: float | None = None
+    frame: str = "world"
+
+    def __post_init__(self) -> None:
+        check_one_of("frame", self.frame, FRAMES)
+        for name in ("gyro_std_rad_s", "speed_std_m_s"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), low=1e-12)
+
+    def std(self) -> FloatArray:
+        """Standard deviations (6,) of a reading of the twist, infinite where it is not measured."""
+        values = (self.gyro_std_rad_s, self.speed_std_m_s)
+        return np.repeat([np.inf if value is None else value for value in values], 3)
+
+    def read(self, rotation: FloatArray, twist: FloatArray) -> FloatArray:
+        """What the sensor would read (..., 6) of a twist (..., 6) without noise."""
+        if self.frame == "world":
+            return twist
+        return _turned(np.swapaxes(rotation, -1, -2), twist)
+
+    def in_world(self, rotation: FloatArray, reading: FloatArray) -> FloatArray:
+        """A reading (..., 6) turned to the world's axes by a rotation (..., 3, 3)."""
+        return reading if self.frame == "world" else _turned(rotation, reading)
+
+    def jacobian(self, twist: FloatArray) -> FloatArray:
+        """Derivative (..., 6, 12) of the reading, turned to the world, by the error of the states.
+
+        In the body frame the reading depends on the rotation: ``Q_hat Q^T W = W - w x W``, so that
+        the error of the prediction is ``dW + W x w``.
+        """
+        H = np.zeros((*twist.shape[:-1], 6, 12))
+        H[..., 6:] = np.eye(6)
+        if self.frame == "body":
+            H[..., :3, :3] = rotations.hat(twist[..., :3])
+            H[..., 3:, :3] = rotations.hat(twist[..., 3:])
+        return H
+
+    def information(self, twist: FloatArray) -> FloatArray:
+        """Fisher information (..., 12, 12) of one reading about the states."""
+        H = self.jacobian(twist)
+        return np.swapaxes(H, -1, -2) @ (H / self.std()[:, None] ** 2)
+
+
+class WanderingPath(NamedTuple):
+    """Poses and twists at T + 1 epochs; the twist is that of the interval that begins there."""
+
+    rotation: FloatArray  # (..., T + 1, 3, 3)
+    translation: FloatArray  # (..., T + 1, 3) metres
+    twists: FloatArray  # (..., T + 1, 6)
+
+
+def simulate(
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    law: WanderingTwist,
+    process: ProcessNoise,
+    dt: float,
+    steps: int,
+    rng: np.random.Generator,
+) -> WanderingPath:
+    """Trajectories drawn from the law, one for each start (..., 3, 3), (..., 3)."""
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    dt = check_number("dt", dt, low=1e-12)
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
+        raise ValueError(f"steps must be a positive int, got {steps!r:.80}")
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    twists = np.empty((steps + 1, *batch, 6))
+    twists[0] = law.prior_std() * rng.standard_normal((*batch, 6))
+    Q = np.empty((steps + 1, *batch, 3, 3))
+    t = np.empty((steps + 1, *batch, 3))
+    Q[0], t[0] = rotation, translation
+    for k in range(steps):
+        z = rng.standard_normal((3, *batch, 6))
+        change = np.sqrt(dt) * law.std() * z[0]
+        # Of the place an acceleration reaches, half the change of speed times dt is explained by
+        # that change; what is left has variance q dt^3 / 12.
+        moved = 0.5 * dt * change + np.sqrt(dt**3 / 12) * law.std() * z[1]
+        moved = moved + np.sqrt(dt) * process.std() * z[2] + dt * twists[k]
+        Q[k + 1] = rotations.exp(moved[..., :3]) @ Q[k]
+        t[k + 1] = t[k] + moved[..., 3:]
+        twists[k + 1] = twists[k] + change
+    axes = range(1, 1 + len(batch))
+    return WanderingPath(
+        Q.transpose((*axes, 0, -2, -1)),
+        t.transpose((*axes, 0, -1)),
+        twists.transpose((*axes, 0, -1)),
+    )
+
+
+def predict_covariance(
+    P: FloatArray,
+    twist: FloatArray,
+    dt: float,
+    process: ProcessNoise,
+    law: WanderingTwist | None,
+) -> FloatArray:
+    """Covariance (..., n, n) of n >= 12 states after `dt` seconds of an estimated twist (..., 6).
+
+    ``F P F^T + Q`` where F takes ``(w, v)`` to ``(exp(W dt) w + dt Jl dW, v + dt dV)``; states
+    beyond the twelve stand still. Without a law the twist is known: all beyond six stand still.
+    """
+    batch = np.broadcast_shapes(P.shape[:-2], twist.shape[:-1])
+    ndim = len(batch)
+    turn, jacobian = exp_and_left_jacobian(np.ascontiguousarray(first(twist, 1, ndim)[:3]) * dt)
+    P = first(P, 2, ndim)
+    half = np.empty((*P.shape[:2], *batch))
+    half[...] = P
+    drift = None if law is None else dt * jacobian
+    _advance(half, P, turn, drift, dt)
+    moved = half.copy()
+    _advance(moved.swapaxes(0, 1), half.swapaxes(0, 1), turn, drift, dt)
+    wander = np.zeros(6) if law is None else law.std() ** 2
+    pose = dt * process.std() ** 2 + dt**3 / 3 * wander
+    both = dt**2 / 2 * wander
+    spread = jacobian * pose[:3].reshape((3, *[1] * ndim))
+    moved[:3, :3] += product(spread, jacobian.swapaxes(0, 1))
+    for i in range(3, 6):
+        moved[i, i] += pose[i]
+    if law is None:
+        return last(moved, 2)
+    crossed = jacobian * both[:3].reshape((3, *[1] * ndim))
+    moved[:3, 6:9] += crossed
+    moved[6:9, :3] += crossed.swapaxes(0, 1)
+    for i in range(3, 6):
+        moved[i, i + 6] += both[i]
+        moved[i + 6, i] += both[i]
+    for i in range(6):
+        moved[i + 6, i + 6] += dt * wander[i]
+    return last(moved, 2)
+
+
+def _advance(
+    out: FloatArray, P: FloatArray, turn: FloatArray, drift: FloatArray | None, dt: float
+) -> None:
+    """The pose's rows of ``F P`` (n, n, ...), where the turn rate moves it by `drift`."""
+    out[:3] = product(turn, P[:3])
+    if drift is not None:
+        out[:3] += product(drift, P[6:9])
+        out[3:6] = P[3:6] + dt * P[9:12]
+
+
+def posterior_crb_step(
+    J: ArrayLike,
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    twist: ArrayLike,
+    dt: float,
+    process: ProcessNoise,
+    law: WanderingTwist,
+    links: ArrayLike | None = None,
+    sensor: TwistSensor | None = None,
+) -> FloatArray:
+    """One step of the posterior Cramer-Rao recursion of pose and twist, at the truth.
+
+    Parameters
+    ----------
+    J
+        Posterior information (..., 12, 12) of the epoch before; that of a start is the inverse of
+        ``blkdiag(pose prior, diag(law.prior_std()^2))``, plus that of its ranges.
+    anchors, tags, rotation, translation, noise, links
+        At the new epoch, as `bounds.posterior_crb_step`.
+    twist
+        True twist (..., 6) of the interval that ends there.
+    dt, process, law
+        Seconds, and the laws of pose and twist.
+    sensor
+        Reads the twist of that interval; None: nobody does.
+
+    Returns
+    -------
+    Information (..., 12, 12); the first six rows of its inverse bound the pose.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes or values, and where J is singular.
+    """
+    J = check_array("J", J, (12, 12))
+    twist = check_array("twist", twist, (6,))
+    dt = check_number("dt", dt, low=0.0)
+    if sensor is not None:
+        J = J + sensor.information(twist)
+    try:
+        P = bounds.symmetric(np.linalg.inv(J))
+        predicted = np.linalg.inv(predict_covariance(P, twist, dt, process, law))
+    except np.linalg.LinAlgError as error:
+        raise ValueError("J must be information about all 12 states, is singular") from error
+    seen = bounds.range_information(anchors, tags, rotation, translation, noise, links)
+    batch = np.broadcast_shapes(predicted.shape[:-2], seen.shape[:-2])
+    result = np.broadcast_to(bounds.symmetric(predicted), (*batch, 12, 12)).copy()
+    result[..., :6, :6] += seen
+    return result
+
+
+def _six(rotation: Axes, translation: Axes) -> FloatArray:
+    return np.concatenate([np.broadcast_to(rotation, 3), np.broadcast_to(translation, 3)])
+
+
+def _turned(rotation: FloatArray, twist: FloatArray) -> FloatArray:
+    """Both halves (..., 6) of a twist turned."""
+    halves = twist.reshape((*twist.shape[:-1], 2, 3)) @ np.swapaxes(rotation, -1, -2)
+    return halves.reshape((*halves.shape[:-2], 6))
