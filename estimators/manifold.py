@@ -36,8 +36,9 @@ from rbl_gym.estimators.inputs import (
     check_variance,
     spanned_dimensions,
 )
-from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
+from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.range_cost import Index, RangeCost, huber, lift_map, pick
+from rbl_gym.estimators.robust_update import HUBER, robust_solution
 from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import statistic
 from rbl_gym.motion import ProcessNoise, propagate
@@ -45,8 +46,6 @@ from rbl_gym.ranging import NoiseLaw
 
 # Beyond this standard deviation (rad) of the prior rotation, no single linearisation is right.
 VAGUE_ROTATION_RAD = 0.5
-# Whitened innovation at which Huber's loss turns from squares to absolute values.
-HUBER = 1.5
 # At most so many trials, and so many links, are updated at once: the temporaries of a block
 # then stay in the cache.
 _BLOCK, _BLOCK_LINKS = 1024, 32_000
@@ -172,7 +171,8 @@ class IteratedEkf:
             _check_determined(anchors, self.tags)
             batch = np.broadcast_shapes(vague.shape, ranges.shape[:-2], anchors.shape[:-2])
             start = global_start(problem, vague, batch, _best_of_net)
-        return posterior(problem, *start, self.iterations)
+        solve = robust_solution if self.robust else minimize_pose
+        return posterior(problem, *start, self.iterations, solve)
 
     def belief(self, state: PoseState) -> PoseBelief:
         """The state as a belief (copies)."""
@@ -237,10 +237,11 @@ def map_problem(state: PoseState, data: Any) -> MapProblem:
 
 
 def posterior(
-    problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
-) -> PoseState:
+    problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int,
+    solve: Callable[..., Solution] = minimize_pose,
+) -> PoseState:  # fmt: skip
     """The most likely pose near a start, with the covariance there."""
-    found = minimize_pose(problem, rotation, translation, iterations=iterations)
+    found = solve(problem, rotation, translation, iterations)
     covariance = last(inverse(first(found.at.hessian, 2)), 2)
     fields = found.rotation, found.translation, covariance
     return PoseState(*(np.array(field, order="C") for field in fields))

@@ -15,7 +15,7 @@ from rbl_gym import bounds, ranging
 from rbl_gym.checks import BoolArray, FloatArray, are_finite
 from rbl_gym.estimators.least_squares import points_fit
 from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
-from rbl_gym.estimators.range_cost import RangeCost, geman_mcclure, huber
+from rbl_gym.estimators.range_cost import RangeCost, geman_mcclure, huber, squared_residuals
 from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import statistic
 
@@ -298,22 +298,15 @@ def robust(
 
 def _inliers(cost: RangeCost, solution: Solution) -> BoolArray:
     """Links (..., M, N) within 4 standard deviations of a solution."""
-    squared = _squared_residuals(cost, solution.rotation, solution.translation)
+    squared = squared_residuals(cost, solution.rotation, solution.translation)
     return (squared < 16.0) & (cost.weights > 0)
-
-
-def _squared_residuals(
-    cost: RangeCost, rotation: FloatArray, translation: FloatArray
-) -> FloatArray:
-    positions = ranging.tag_positions(rotation, translation, cost.tags)
-    return cost.weights * (ranging.distances(cost.anchors, positions) - cost.ranges) ** 2
 
 
 def _narrow(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray, widest: float
 ) -> Solution:
     """Geman-McClure from the quantile `widest` of the residuals to 3 standard deviations."""
-    residuals = np.sqrt(_squared_residuals(cost, rotation, translation))
+    residuals = np.sqrt(squared_residuals(cost, rotation, translation))
     scale = np.maximum(np.quantile(residuals, widest, axis=(-2, -1)), 3.0)
     while True:
         narrowed = dataclasses.replace(cost, loss=geman_mcclure(scale[..., None, None]))
