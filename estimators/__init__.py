@@ -6,6 +6,7 @@ change of name.
 
 from functools import partial
 
+from rbl_gym.estimators.bank import IteratedEkfBank
 from rbl_gym.estimators.belief import Filter, PoseBelief, make, names, register
 from rbl_gym.estimators.consensus import (
     cycle_consensus,
@@ -15,6 +16,7 @@ from rbl_gym.estimators.consensus import (
 )
 from rbl_gym.estimators.doa import locate_doa
 from rbl_gym.estimators.doa_filter import DoaEkf, iterated_ekf
+from rbl_gym.estimators.hypotheses import BankState
 from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
@@ -29,12 +31,15 @@ for _name, _constraint in {
 }.items():
     register(_name, partial(KalmanFamily, constraint=_constraint))
 register("iekf", iterated_ekf)
+register("iekf-bank", IteratedEkfBank)
 
 __all__ = [
+    "BankState",
     "DoaEkf",
     "Filter",
     "FrameEstimate",
     "IteratedEkf",
+    "IteratedEkfBank",
     "KalmanFamily",
     "KalmanState",
     "PoseBelief",

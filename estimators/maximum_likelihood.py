@@ -329,4 +329,12 @@ def _without_pairs_of_anchors(part: RangeCost) -> tuple[FloatArray, FloatArray]:
     kept = np.ones((len(pairs), n_anchors, 1), bool)
     kept[np.arange(len(pairs))[:, None], pairs, 0] = False
     squared = part.weights / (4 * np.where(part.weights > 0, part.ranges, 1.0) ** 2)
-    return points_fit(statistic(part.ranges, part.anchors, part.tags, squared * kept))
+    rotation, translation = points_fit(
+        statistic(part.ranges, part.anchors, part.tags, squared * kept)
+    )
+    # The anchors that are left may lie in a plane: then there is no linear solution.
+    known = are_finite(translation, 1) & are_finite(rotation, 2)
+    return (
+        np.where(known[..., None, None], rotation, np.eye(3)),
+        np.where(known[..., None], translation, part.anchors.mean(axis=-2)),
+    )

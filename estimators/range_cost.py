@@ -220,9 +220,7 @@ class RangeCost:
         )
 
 
-def squared_residuals(
-    cost: RangeCost, rotation: FloatArray, translation: FloatArray
-) -> FloatArray:
+def squared_residuals(cost: RangeCost, rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """Squared whitened residuals (..., M, N) of a cost's ranges at a pose."""
     positions = ranging.tag_positions(rotation, translation, cost.tags)
     return cost.weights * (ranging.distances(cost.anchors, positions) - cost.ranges) ** 2
