@@ -8,6 +8,8 @@ the range is an integral.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -24,6 +26,7 @@ from rbl_gym.motion import ProcessNoise
 GROUPS = ("link", "anchor", "tag", "common")
 # Nodes of the trapezoid rule on +-9 standard deviations; such integrands converge exponentially.
 _NODES = np.linspace(-9.0, 9.0, 721)
+_ALL_MEASURE = ranging.LinkModel()
 # Links whose integrals are taken at once.
 _BLOCK = 512
 
@@ -101,7 +104,7 @@ def realised_crb(
     ValueError
         As `bounds.pose_crb`: also where the links of a single draw do not determine the pose.
     """
-    _check_link_model(link_model)
+    _check_laws(noise, link_model)
     if not isinstance(rng, np.random.Generator):
         raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r:.80}")
     if isinstance(draws, bool) or not isinstance(draws, int) or draws < 1:
@@ -341,8 +344,8 @@ def _checked(
     )
 
 
-def _check_laws(noise: ranging.NoiseLaw, link_model: ranging.LinkModel | None = None) -> None:
+def _check_laws(noise: Any, link_model: Any = _ALL_MEASURE) -> None:
     if not callable(getattr(noise, "variance", None)):
         raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
-    if not isinstance(link_model, ranging.LinkModel | None):
+    if not isinstance(link_model, ranging.LinkModel):
         raise ValueError(f"link_model must be a ranging.LinkModel, got {link_model!r:.80}")
