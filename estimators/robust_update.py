@@ -78,9 +78,7 @@ def _narrowed(
         doubted = _contradicted(squared > cutoff**2, part.data.weights)
         loss = cut_loss(np.where(doubted, np.inf, cutoff))
         narrowed = dataclasses.replace(part, data=dataclasses.replace(part.data, loss=loss))
-        found = minimize_pose(
-            narrowed, found.rotation, found.translation, iterations, tolerance=1e-3
-        )
+        found = minimize_pose(narrowed, found.rotation, found.translation, iterations)
     return found
 
 
