@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from rbl_gym.checks import BoolArray, FloatArray, check_array
 from rbl_gym.estimators.belief import PoseBelief
 from rbl_gym.estimators.hypotheses import (
+    SAME,
     BankState,
     alone,
     distance,
@@ -48,8 +49,6 @@ _STRAIN = 4.0
 _LOST = -10.0
 # Rivals less likely than this against their leader (log odds) have lost.
 _BEATEN = -12.0
-# Squared distance, in the covariance of one of them, below which two hypotheses are the same.
-_SAME = 1.0
 # A pose has six directions: fewer ranges than that determine none.
 _FEWEST_LINKS = 6
 
@@ -205,7 +204,7 @@ class IteratedEkfBank:
         of_leader = _log_likelihood(prior.covariance[rows], _Scored(*(a[rows] for a in led)))
         odds = prior.log_odds[where] + _log_likelihood(before.covariance, scored) - of_leader
         after = PoseState(*scored[:3])
-        same = distance(after, PoseState(*(a[rows] for a in led[:3]))) < _SAME
+        same = distance(after, PoseState(*(a[rows] for a in led[:3]))) < SAME
         log_odds = prior.log_odds.copy()
         log_odds[where] = np.where(same | (odds < _BEATEN), -np.inf, odds)
         return with_rivals(state._replace(log_odds=log_odds), where, after)
@@ -243,16 +242,15 @@ class IteratedEkfBank:
         odds -= _log_likelihood(prior.covariance[rows], leader)[trial]
         odds += np.where(own, 0.0, _LOST)
         after = PoseState(*scored[:3])
-        rivals = PoseState(
-            state.rival_rotation[rows][trial],
-            state.rival_translation[rows][trial],
-            state.rival_covariance[rows][trial],
-        )
-        taken = np.isfinite(state.log_odds[rows][trial])
-        spread = PoseState(*(a[:, None] for a in after))
-        same = (taken & (distance(spread, rivals) < _SAME)).any(axis=-1)
-        same |= distance(after, PoseState(*(a[trial] for a in leader[:3]))) < _SAME
-        odds[same | (odds < _BEATEN)] = -np.inf
+        odds[distance(after, PoseState(*(a[trial] for a in leader[:3]))) < SAME] = -np.inf
+        if self.volume is not None:
+            odds[self._is_outside(after.translation, after.covariance)] = -np.inf
+            # A leader outside its volume is no measure: the best candidate is.
+            best = np.full(len(rows), -np.inf)
+            np.maximum.at(best, trial, odds)
+            out = self._is_outside(leader.translation, leader.covariance) & np.isfinite(best)
+            odds -= np.where(out, best, 0.0)[trial]
+        odds[odds < _BEATEN] = -np.inf
         return with_best(state, rows, known.nonzero(), known.shape[1], after, odds)
 
     def _candidates(self, epoch: _Epoch) -> tuple[FloatArray, FloatArray, BoolArray]:

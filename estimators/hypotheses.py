@@ -12,6 +12,14 @@ from rbl_gym.estimators.manifold import PoseState
 from rbl_gym.rotations import error as rotation_error
 
 RIVALS = 3
+# Squared distance, in the covariance of one of them, below which two hypotheses are the same.
+SAME = 1.0
+# What stands in the slots of rivals that are none.
+EMPTY = PoseState(
+    np.broadcast_to(np.eye(3), (RIVALS, 3, 3)),
+    np.zeros((RIVALS, 3)),
+    np.broadcast_to(np.eye(6), (RIVALS, 6, 6)),
+)
 
 
 class BankState(NamedTuple):
@@ -49,9 +57,7 @@ def alone(leader: PoseState) -> BankState:
     batch = leader.translation.shape[:-1]
     return BankState(
         *leader,
-        np.broadcast_to(np.eye(3), (*batch, RIVALS, 3, 3)).copy(),
-        np.zeros((*batch, RIVALS, 3)),
-        np.broadcast_to(np.eye(6), (*batch, RIVALS, 6, 6)).copy(),
+        *(np.broadcast_to(a, (*batch, *a.shape)).copy() for a in EMPTY),
         np.full((*batch, RIVALS), -np.inf),
         np.zeros(batch),
         np.zeros(batch),
@@ -70,18 +76,36 @@ def with_best(
     new = np.full((len(rows), candidates), -np.inf)
     new[place] = odds
     everyone = np.concatenate([state.log_odds[rows], new], axis=1)
-    order = np.argsort(-everyone, axis=1)[:, :RIVALS]
-    fields = {"log_odds": state.log_odds.copy()}
-    fields["log_odds"][rows] = np.take_along_axis(everyone, order, axis=1)
+    fields = []
     for name, value in found._asdict().items():
-        old = getattr(state, f"rival_{name}")
-        added = np.zeros((len(rows), candidates, *value.shape[1:]))
+        # What no candidate fills is the stand-in of an empty slot.
+        added = np.repeat(getattr(EMPTY, name)[None, :1], len(rows), axis=0)
+        added = np.repeat(added, candidates, axis=1)
         added[place] = value
-        both = np.concatenate([old[rows], added], axis=1)
-        index = order.reshape(*order.shape, *[1] * (value.ndim - 1))
-        fields[f"rival_{name}"] = old.copy()
-        fields[f"rival_{name}"][rows] = np.take_along_axis(both, index, axis=1)
-    return state._replace(**fields)
+        fields.append(np.concatenate([getattr(state, f"rival_{name}")[rows], added], axis=1))
+    poses = PoseState(*fields)
+    order = np.argsort(-everyone, axis=1)
+    poses, everyone = _ordered(poses, everyone, order)
+    gaps = distance(PoseState(*(a[:, :, None] for a in poses)),
+                    PoseState(*(a[:, None] for a in poses)))  # fmt: skip
+    # Of those that are the same the likeliest stays.
+    likelier = np.tri(everyone.shape[1], k=-1, dtype=bool) & np.isfinite(everyone)[:, None]
+    everyone[((gaps < SAME) & likelier).any(axis=-1)] = -np.inf
+    order = np.argsort(-everyone, axis=1)[:, :RIVALS]
+    poses, everyone = _ordered(poses, everyone, order)
+    log_odds = state.log_odds.copy()
+    log_odds[rows] = everyone
+    where = tuple(index.ravel() for index in np.broadcast_arrays(rows[:, None], range(RIVALS)))
+    best = PoseState(*(a.reshape((-1, *a.shape[2:])) for a in poses))
+    return with_rivals(state._replace(log_odds=log_odds), where, best)
+
+
+def _ordered(
+    poses: PoseState, log_odds: FloatArray, order: np.ndarray
+) -> tuple[PoseState, FloatArray]:
+    """Hypotheses (R, C, ...) and their odds in an order (R, C)."""
+    row = np.arange(len(order))[:, None]
+    return PoseState(*(a[row, order] for a in poses)), log_odds[row, order]
 
 
 def distance(one: PoseState, other: PoseState) -> FloatArray:

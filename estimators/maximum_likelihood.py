@@ -228,7 +228,8 @@ def rivals(tags: FloatArray, solutions: Solution) -> Alternatives:
     """Distinct minima (K, S) that are about as cheap as the best; tags (K, 1, N, 3)."""
     size = len(solutions.at.cost)
     result = no_alternatives(size)
-    order = np.argsort(solutions.at.cost, axis=-1)
+    # Stable: of exact mirror images `cheapest` takes the first too.
+    order = np.argsort(solutions.at.cost, axis=-1, kind="stable")
     rotation = np.take_along_axis(solutions.rotation, order[..., None, None], axis=1)
     translation = np.take_along_axis(solutions.translation, order[..., None], axis=1)
     cost = np.take_along_axis(solutions.at.cost, order, axis=1)
