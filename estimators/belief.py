@@ -100,8 +100,8 @@ def make(
     Parameters
     ----------
     name
-        ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, or one that a package
-        offers by the entry-point group ``rbl_gym.filters``.
+        ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-bank"``, or one
+        that a package offers by the entry-point group ``rbl_gym.filters``.
     tags
         (N, 3), places on the body, metres, body frame.
     noise

@@ -118,14 +118,17 @@ def distance(one: PoseState, other: PoseState) -> FloatArray:
 
 
 def leader_of(state: BankState) -> PoseState:
+    """The leading hypothesis."""
     return PoseState(*state[:3])
 
 
 def rivals_of(state: BankState, where: tuple[np.ndarray, ...]) -> PoseState:
+    """The rivals (L, ...) at an index into trials and slots."""
     return PoseState(*(array[where] for array in state[3:6]))
 
 
 def with_rivals(state: BankState, where: tuple[np.ndarray, ...], rivals: PoseState) -> BankState:
+    """The state with rivals (L, ...) put at an index into trials and slots."""
     fields = {}
     for name, value in rivals._asdict().items():
         fields[f"rival_{name}"] = getattr(state, f"rival_{name}").copy()
@@ -144,6 +147,7 @@ def flat(state: BankState, batch: tuple[int, ...]) -> BankState:
 
 
 def of_batch(state: BankState, batch: tuple[int, ...]) -> BankState:
+    """A flat state with the axes of its batch again."""
     return BankState(*(array.reshape((*batch, *array.shape[1:])) for array in state))
 
 

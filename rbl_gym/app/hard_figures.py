@@ -19,7 +19,7 @@ def hard_figure(result: dict[str, Any]) -> Figure:
     """Translation errors over the bound, and who is back after wrong starts."""
     figure = new_figure(12, 8)
     upper, lower = figure.subfigures(2, 1)
-    axes = upper.subplots(1, len(result["links"]))
+    axes = upper.subplots(1, len(result["links"]), squeeze=False)[0]
     for axis, (name, conditions) in zip(axes, result["links"].items(), strict=True):
         filters = list(next(iter(conditions.values()))["filters"])
         for shift, label in enumerate(filters):
@@ -33,7 +33,7 @@ def hard_figure(result: dict[str, Any]) -> Figure:
         )
         axis.legend(frameon=False, loc="upper left")
     after = result["starts"]["after"]
-    axes = lower.subplots(1, len(result["starts"]["scenes"]))
+    axes = lower.subplots(1, len(result["starts"]["scenes"]), squeeze=False)[0]
     for axis, (name, starts) in zip(axes, result["starts"]["scenes"].items(), strict=True):
         for label in starts["wrong"]:
             for start, style in (("wrong", "o-"), ("wrong, 10 % NLOS", "s:")):

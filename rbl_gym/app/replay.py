@@ -106,7 +106,7 @@ def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
     else:
         process = motion.ProcessNoise(turn, walk)
-    options = {"robust": settings.robust} if settings.filter == "iekf" else {}
+    options = {"robust": settings.robust} if settings.filter in ("iekf", "iekf-bank") else {}
     noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
     return estimators.make(
         settings.filter, tags=recording.tags, noise=noise, process=process, **options
