@@ -236,7 +236,11 @@ class IteratedEkfBank:
         state = state._replace(nis=nis)
         if not len(trial):
             return state
-        scored = self._scored(before, part.take(trial), (rotation, translation))
+        try:
+            scored = self._scored(before, part.take(trial), (rotation, translation))
+        except np.linalg.LinAlgError:
+            # Anchors so far apart that rounding hides what they tell: nothing is found here.
+            return state
         leader = _Scored(*(a[rows] for a in led))
         odds = _log_likelihood(before.covariance, scored)
         odds -= _log_likelihood(prior.covariance[rows], leader)[trial]

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import (
+    HUGE,
     BoolArray,
     FloatArray,
     check_array,
@@ -56,11 +57,16 @@ def check_epoch(
     anchors = check_array("anchors", anchors, ("M", 3))
     shape = (anchors.shape[-2], tags.shape[-2])
     mask = check_links(links, shape)
+    ranges = check_shape("ranges", ranges, shape)
     if mask is not None:
-        ranges = np.where(mask, np.asarray(ranges, dtype=np.float64), 0.0)
+        try:
+            ranges = np.where(mask, ranges, 0.0)
+        except ValueError as error:
+            raise ValueError(
+                f"links and ranges must broadcast, got {mask.shape} and {ranges.shape}"
+            ) from error
         if mask.all():
             mask = None
-    ranges = check_shape("ranges", ranges, shape)
     if values or mask is not None:
         check_ranges(ranges, mask)
     return ranges, anchors, mask
@@ -80,7 +86,7 @@ def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
 def are_positive(values: FloatArray) -> bool:
     """Whether all are positive and finite, without a mask of them: NaN fails both comparisons."""
     if values.size <= _PART or not values.flags.c_contiguous:
-        return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < np.inf)
+        return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < HUGE)
     flat = values.reshape(-1)
     return all(are_positive(flat[k : k + _PART]) for k in range(0, flat.size, _PART))
 

@@ -177,7 +177,7 @@ class KalmanFamily:
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=False)
         self._check_determined(state, anchors)
         if self.weights is None:
-            with np.errstate(invalid="ignore"):
+            with np.errstate(invalid="ignore", over="ignore"):
                 variance = self.noise.squared_range_variance(ranges, mask)
             try:
                 weights = 1 / check_variance(variance, mask)

@@ -139,6 +139,8 @@ def locate(
         coplanar; tags not collinear, for ``ls`` not coplanar).
     """
     fit = _method(method)
+    if not all(callable(getattr(noise, m, None)) for m in ("variance", "squared_range_variance")):
+        raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
     tags = check_array("tags", tags, ("N", 3))
     ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
     epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
@@ -234,7 +236,7 @@ def _epoch(
         weights = np.where(mask, weights, 0.0)
         flat_mask = flat(mask)
     stat = statistic(flat(ranges), flat(anchors), flat(tags), flat(1 / squared), flat_mask)
-    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0)
+    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
     return Epoch(flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m), batch
 
 

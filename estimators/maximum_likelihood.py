@@ -201,7 +201,8 @@ def _positions(part: RangeCost) -> FloatArray:
     values, axes = np.linalg.eigh(np.swapaxes(spread, -1, -2) @ spread)
     pull = -0.5 * np.einsum("kmi,km->ki", spread, d)
     along = np.einsum("kij,ki->kj", axes, pull)
-    along = np.where(values > 1e-9 * values[:, 2:], along / np.maximum(values, 1e-300), 0.0)
+    known = values > 1e-9 * values[:, 2:]
+    along = np.where(known, along / np.where(known, values, 1.0), 0.0)
     flat = along * [0, 1, 1]
     # What is left of the squared ranges in the plane is the squared height over it.
     in_plane = (axes @ flat[..., None])[..., 0]

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 # float64 throughout; numpy's own stubs promise no more than this of most functions.
 FloatArray = NDArray[np.floating[Any]]
 BoolArray = NDArray[np.bool_]
+# No length, time or rate is as large; its powers still are finite numbers.
+HUGE = 1e50
 
 
 def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> FloatArray:
@@ -63,8 +65,14 @@ def as_float(name: str, value: Any) -> FloatArray:
 
 
 def check_finite(name: str, array: FloatArray) -> FloatArray:
-    """`array` unchanged, or a ValueError with the first entry that is NaN or inf."""
-    if not np.isfinite(array).all():
+    """`array` unchanged, or a ValueError with the first entry that is NaN, inf or `HUGE`."""
+    # False of NaN too.
+    if not (array.min(initial=0.0) > -HUGE and array.max(initial=0.0) < HUGE):
+        if np.isfinite(array).all():
+            index = tuple(int(i) for i in np.argwhere(np.abs(array) >= HUGE)[0])
+            raise ValueError(
+                f"{name} must be below {HUGE:g} in magnitude, got {array[index]} at index {index}"
+            )
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name} must be finite, got {array[index]} at index {index}")
     return array
@@ -83,7 +91,7 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be a number, got {value!r:.80}") from error
-    if not math.isfinite(number) or not low <= number <= high:
+    if not abs(number) < HUGE or not low <= number <= high:
         bounds = f" in [{low:g}, {high:g}]" if low > -math.inf or high < math.inf else ""
         raise ValueError(f"{name} must be a finite number{bounds}, got {number}")
     return number
@@ -99,7 +107,10 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
     """
     if links is None:
         return None
-    mask = np.asarray(links)
+    try:
+        mask = np.asarray(links)
+    except ValueError as error:
+        raise ValueError(f"links must be an array of 0 and 1, got {links!r:.80}") from error
     if mask.shape[-2:] != shape[-2:]:
         raise ValueError(f"links must have shape (..., {shape[-2]}, {shape[-1]}), got {mask.shape}")
     if mask.dtype != np.bool_:
@@ -111,6 +122,6 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
 
 def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) -> str:
     """`value` if it is among `choices`, or a ValueError that lists them."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
     return value

@@ -26,6 +26,8 @@ from rbl_gym.motion import ProcessNoise
 GROUPS = ("link", "anchor", "tag", "common")
 # Nodes of the trapezoid rule on +-9 standard deviations; such integrands converge exponentially.
 _NODES = np.linspace(-9.0, 9.0, 721)
+# Draws, or biases, beyond which no memory suffices.
+_MOST = 10**6
 _ALL_MEASURE = ranging.LinkModel()
 # Links whose integrals are taken at once.
 _BLOCK = 512
@@ -67,6 +69,8 @@ def expected_information(
         As `bounds.range_information`.
     """
     _check_laws(noise, link_model)
+    if nlos_std_m is not None:
+        nlos_std_m = check_number("nlos_std_m", nlos_std_m, low=0.0)
     places = _checked(anchors, tags, rotation, translation)
     distance = ranging.distances(places[0], ranging.tag_positions(places[2], places[3], places[1]))
     share = np.full(distance.shape, 1 - link_model.drop_probability)
@@ -107,8 +111,7 @@ def realised_crb(
     _check_laws(noise, link_model)
     if not isinstance(rng, np.random.Generator):
         raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r:.80}")
-    if isinstance(draws, bool) or not isinstance(draws, int) or draws < 1:
-        raise ValueError(f"draws must be a positive int, got {draws!r}")
+    _check_count("draws", draws)
     places = _checked(anchors, tags, rotation, translation)
     positions = ranging.tag_positions(places[2], places[3], places[1])
     distance = ranging.distances(places[0], positions)
@@ -153,7 +156,7 @@ def nlos_efficiency(
     p = check_number("probability", probability, low=0.0, high=1.0)
     bias_m = check_number("bias_m", bias_m)
     std = check_array("std_m", std_m, ())
-    if (std <= 0).any():
+    if (std < 1e-30).any():
         raise ValueError(f"std_m must be positive, got {std.min()}")
     if bias_std_m is None:
         return np.full(std.shape, 1 - p)
@@ -238,8 +241,7 @@ def with_biases(pose_information: ArrayLike, bias_std_m: float, n_biases: int) -
     """Joint information (..., 6 + G, 6 + G) of a pose's prior and of G independent biases."""
     J = check_array("pose_information", pose_information, (6, 6))
     std = check_number("bias_std_m", bias_std_m, low=1e-12)
-    if isinstance(n_biases, bool) or not isinstance(n_biases, int) or n_biases < 1:
-        raise ValueError(f"n_biases must be a positive int, got {n_biases!r}")
+    _check_count("n_biases", n_biases)
     joint = np.zeros((*J.shape[:-2], 6 + n_biases, 6 + n_biases))
     joint[..., :6, :6] = J
     joint[..., range(6, 6 + n_biases), range(6, 6 + n_biases)] = std**-2
@@ -307,6 +309,8 @@ def posterior_bias_step(
     J = check_array("J", J, ("n", "n"))
     twist = check_array("twist", twist, (6,))
     dt = check_number("dt", dt, low=0.0)
+    if not callable(getattr(process, "covariance", None)):
+        raise ValueError(f"process must be a motion.ProcessNoise, got {process!r:.80}")
     walk = check_number("bias_walk_m", bias_walk_m, low=0.0)
     told = bias_information(anchors, tags, rotation, translation, noise, links, groups=groups)
     n = told.shape[-1]
@@ -342,6 +346,11 @@ def _checked(
         rotations.check_rotation("rotation", rotation),
         check_array("translation", translation, (3,)),
     )
+
+
+def _check_count(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _MOST:
+        raise ValueError(f"{name} must be a positive int up to {_MOST}, got {value!r:.80}")
 
 
 def _check_laws(noise: Any, link_model: Any = _ALL_MEASURE) -> None:

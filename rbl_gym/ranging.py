@@ -331,7 +331,22 @@ def simulate(
     rng: np.random.Generator,
     link_model: LinkModel | None = None,
 ) -> Measurement:
-    """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`."""
+    """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, NaN, or laws and generators that are none.
+    """
+    anchors, tags = check_array("anchors", anchors, ("M", 3)), check_array("tags", tags, ("N", 3))
+    rotation = check_array("rotation", rotation, (3, 3))
+    translation = check_array("translation", translation, (3,))
+    if not callable(getattr(noise, "sample", None)):
+        raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
+    if not isinstance(rng, np.random.Generator):
+        raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r:.80}")
+    if not isinstance(link_model, LinkModel | None):
+        raise ValueError(f"link_model must be a LinkModel or None, got {link_model!r:.80}")
     true = distances(anchors, tag_positions(rotation, translation, tags))
     normals = rng.standard_normal(true.shape)
     uniforms = None
