@@ -29,15 +29,16 @@ LINK_MODEL = ranging.LinkModel(0.1, nlos_probability=0.1)
 def filter_steps(name: str, **options: Any) -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     """The three methods of a filter, with good arguments."""
     filter = estimators.make(name, tags=TAGS, noise=NOISE, process=PROCESS, **options)
+    label = f"{name} {' '.join(options)}".strip()
     prior = {**POSE, "covariance": 0.01 * np.eye(6)}
     state = filter.initial(**prior)
     return {
-        f"{name}.initial": (filter.initial, prior),
-        f"{name}.predict": (
+        f"{label}.initial": (filter.initial, prior),
+        f"{label}.predict": (
             lambda twist, dt: filter.predict(state, twist, dt),
             {key: TWIST[key] for key in ("twist", "dt")},
         ),
-        f"{name}.update": (
+        f"{label}.update": (
             lambda ranges, anchors, links: filter.update(state, ranges, anchors, links),
             {"ranges": RANGES, "anchors": ANCHORS, "links": LINKS},
         ),

@@ -41,7 +41,8 @@ def hard_figure(result: dict[str, Any]) -> Figure:
                           label=f"{label}{start[5:]}", color=_COLOURS[label], ms=4)  # fmt: skip
         axis.set(xlabel="epochs later", ylabel="trials that are back [%]", ylim=(-3, 103))
         axis.set_title(f"{name}: 180 degrees, 10 m off", fontsize=9)
-        axis.legend(frameon=False, fontsize=8, loc="center right")
+    handles = axes[-1].get_legend_handles_labels()
+    lower.legend(*handles, frameon=False, fontsize=9, loc="outside lower center", ncols=6)
     return figure
 
 
