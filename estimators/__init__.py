@@ -8,6 +8,7 @@ from functools import partial
 
 from rbl_gym.estimators.asynchronous import Asynchronous, Stream
 from rbl_gym.estimators.augmented import AugmentedEkf, AugmentedState, iekf_bias, iekf_cv
+from rbl_gym.estimators.bank import IteratedEkfBank
 from rbl_gym.estimators.belief import (
     ENTRY_POINT_GROUP,
     Filter,
@@ -25,6 +26,7 @@ from rbl_gym.estimators.consensus import (
 )
 from rbl_gym.estimators.doa import locate_doa
 from rbl_gym.estimators.doa_filter import DoaEkf, iterated_ekf
+from rbl_gym.estimators.hypotheses import BankState
 from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
@@ -41,16 +43,19 @@ for _name, _constraint in {
 register("iekf", iterated_ekf)
 register("iekf-cv", iekf_cv)
 register("iekf-bias", iekf_bias)
+register("iekf-bank", IteratedEkfBank)
 
 __all__ = [
     "ENTRY_POINT_GROUP",
     "Asynchronous",
     "AugmentedEkf",
     "AugmentedState",
+    "BankState",
     "DoaEkf",
     "Filter",
     "FrameEstimate",
     "IteratedEkf",
+    "IteratedEkfBank",
     "KalmanFamily",
     "KalmanState",
     "PoseBelief",

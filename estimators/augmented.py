@@ -91,9 +91,9 @@ class AugmentedEkf:
         known = self.twist is None
         if twist is None and known:
             raise ValueError("twist must be given to a filter that does not estimate it, got None")
-        if twist is not None and (known or self.sensor is not None):
+        if twist is not None:
             twist = check_array("twist", twist, (6,))
-            if not known:
+            if self.sensor is not None and not known:
                 state = _sensed(state, twist, self.sensor)  # pyright: ignore[reportArgumentType]
         moving: FloatArray = twist if known else state.extra[..., :6]  # pyright: ignore[reportAssignmentType]
         rotation, translation = propagate(state.rotation, state.translation, moving, dt)

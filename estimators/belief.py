@@ -103,7 +103,7 @@ def make(
     ----------
     name
         ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
-        ``"iekf-bias"``; one that a package offers by the entry-point group
+        ``"iekf-bias"``, ``"iekf-bank"``; one that a package offers by the entry-point group
         ``rbl_gym.filters``; or ``"package.module:factory"``, which is imported.
     tags
         (N, 3), places on the body, metres, body frame.

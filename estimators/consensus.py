@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.network_graphs import BASES, check_connected, cycle_matrix
-from rbl_gym.sensing_network import check_edge_values, proj
+from rbl_gym.sensing_network import check_edge_angles, proj
 
 _TURN = 2 * np.pi
 _DENSE = 1500  # cycles up to which all eigenvalues are computed
@@ -199,7 +199,7 @@ def cycle_iteration(
         If the graph is not connected, or kappa is not in ``(0, 2 / lambda_max)``.
     """
     edges = check_connected(edges, n_nodes)
-    psi = check_edge_values("y", y, edges).copy()
+    psi = check_edge_angles(y, edges).copy()
     C = cycle_matrix(edges, n_nodes, check_one_of("cycles", cycles, BASES)) \
         if isinstance(cycles, str) else sp.csr_matrix(cycles)  # fmt: skip
     if C.shape[1] != len(edges):

@@ -22,6 +22,8 @@ from rbl_gym.estimators.localization import Fit, PoseEstimate, covariance_of
 from rbl_gym.estimators.maximum_likelihood import Alternatives, no_alternatives
 from rbl_gym.estimators.swarm import ParticipatorySearch, ParticleSwarm, search_places
 
+# Below it squares of lengths lose themselves in rounding.
+_SMALLEST_BODY_M = 1e-50
 HALF_SPACES: dict[str | None, float | None] = {"y>0": 1.0, "y<0": -1.0, None: None}
 # Trials of a block, of Newton's iteration and of methods with many starts for each trial: their
 # arrays stay in the processor's cache.
@@ -102,6 +104,10 @@ def locate_doa(
     tags = check_array("tags", tags, ("N", 3))
     if tags.shape[-2] < 3 or (spanned_dimensions(tags) < 2).any():
         raise ValueError(f"tags must be at least 3 and not collinear, got shape {tags.shape}")
+    if (np.ptp(tags, axis=-2).max(axis=-1) < _SMALLEST_BODY_M).any():
+        raise ValueError(
+            f"tags must be a body of at least {_SMALLEST_BODY_M:g} m, got {tags!r:.80}"
+        )
     angles = bearing.check_angles(angles, tags.shape[-2])
     where = np.zeros(3) if station is None else check_array("station", station, (3,))
     batch = np.broadcast_shapes(angles.shape[:-2], tags.shape[:-2], where.shape[:-1])

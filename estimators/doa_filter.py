@@ -15,18 +15,16 @@ from rbl_gym.estimators.doa_cost import DoaCost, SumCost
 from rbl_gym.estimators.doa_global import global_search
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.manifold import (
-    HUBER,
     IteratedEkf,
     MapProblem,
     PoseState,
-    best_start,
-    global_start,
-    is_vague,
     map_problem,
     posterior,
     update_in_blocks,
 )
 from rbl_gym.estimators.range_cost import Index, RangeCost, huber
+from rbl_gym.estimators.robust_update import HUBER
+from rbl_gym.estimators.vague_start import best_start, global_start, is_vague
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
 
@@ -70,8 +68,8 @@ class DoaEkf(IteratedEkf):
     ) -> PoseState:
         """State after one epoch of directions of arrival, and of ranges where there are any.
 
-        A prior whose rotation is vaguer than `manifold.VAGUE_ROTATION_RAD` starts from the global
-        solution of the angles and its alternatives besides; of mirror images the prior decides.
+        A prior whose rotation is vague (`vague_start`) starts from the global solution of the
+        angles and its alternatives besides; of mirror images the prior decides.
 
         Parameters
         ----------

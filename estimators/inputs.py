@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import (
-    LARGEST,
+    HUGE,
     BoolArray,
     FloatArray,
     check_array,
@@ -59,7 +59,12 @@ def check_epoch(
     mask = check_links(links, shape)
     ranges = check_shape("ranges", ranges, shape)
     if mask is not None:
-        ranges = np.where(mask, ranges, 0.0)
+        try:
+            ranges = np.where(mask, ranges, 0.0)
+        except ValueError as error:
+            raise ValueError(
+                f"links and ranges must broadcast, got {mask.shape} and {ranges.shape}"
+            ) from error
         if mask.all():
             mask = None
     if values or mask is not None:
@@ -81,7 +86,7 @@ def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
 def are_positive(values: FloatArray) -> bool:
     """Whether all are positive and finite, without a mask of them: NaN fails both comparisons."""
     if values.size <= _PART or not values.flags.c_contiguous:
-        return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) <= LARGEST)
+        return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < HUGE)
     flat = values.reshape(-1)
     return all(are_positive(flat[k : k + _PART]) for k in range(0, flat.size, _PART))
 

@@ -10,6 +10,9 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.components import exp, first, last, product, solve
 
+# No step is longer (rad, m) on any axis.
+_LONGEST = 1e12
+
 
 class Linearization(NamedTuple):
     """Cost (...), gradient (..., 6) and Gauss-Newton Hessian (..., 6, 6) by (w, v) at a pose."""
@@ -60,7 +63,8 @@ def minimize_pose(
     converged = np.zeros(batch, bool)
     for _ in range(iterations):
         gradient = first(at.gradient, 1)
-        step = -solve(first(at.hessian, 2), gradient, damping)
+        # Where next to nothing is determined a step may be too long for its own square.
+        step = np.clip(-solve(first(at.hessian, 2), gradient, damping), -_LONGEST, _LONGEST)
         turned = product(exp(step[:3]), first(rotation, 2))
         candidate = last(turned, 2), translation + last(step[3:], 1)
         new = linearize(*candidate)

@@ -238,7 +238,7 @@ def _epoch(
         weights = np.where(mask, weights, 0.0)
         flat_mask = flat(mask)
     stat = statistic(flat(ranges), flat(anchors), flat(tags), flat(1 / squared), flat_mask)
-    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0)
+    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
     return Epoch(flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m), batch
 
 

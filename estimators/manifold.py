@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, rotations
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.components import (
     exp_and_left_jacobian,
     first,
@@ -36,22 +36,18 @@ from rbl_gym.estimators.inputs import (
     check_variance,
     spanned_dimensions,
 )
-from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
+from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.range_cost import Index, RangeCost, huber, lift_map, pick
-from rbl_gym.estimators.rotation_net import ROTATION_NET
-from rbl_gym.estimators.squared_range import statistic
+from rbl_gym.estimators.robust_update import HUBER, robust_solution
+from rbl_gym.estimators.vague_start import best_of_net, global_start, is_vague
 from rbl_gym.motion import ProcessNoise, propagate
 from rbl_gym.ranging import NoiseLaw
 
-# Beyond this standard deviation (rad) of the prior rotation, no single linearisation is right.
-VAGUE_ROTATION_RAD = 0.5
-# Whitened innovation at which Huber's loss turns from squares to absolute values.
-HUBER = 1.5
 # At most so many trials, and so many links, are updated at once: the temporaries of a block
 # then stay in the cache.
 _BLOCK, _BLOCK_LINKS = 1024, 32_000
 # Trailing axes of rotation, translation, covariance, ranges, weights, anchors.
-_TRAILING = (2, 1, 2, 2, 2, 2)
+TRAILING = (2, 1, 2, 2, 2, 2)
 
 
 class PoseState(NamedTuple):
@@ -138,10 +134,10 @@ class IteratedEkf:
     ) -> PoseState:
         """State after one epoch of ranges (..., M, N).
 
-        Where the prior rotation is vaguer than `VAGUE_ROTATION_RAD`, the update starts from
-        many poses and keeps the best. Among coplanar anchors the mirror pose may explain the
-        ranges as well: then only a prior that knows the side tells them apart (`locate` lists
-        both).
+        Where the prior rotation is vague (`vague_start`), the update starts from many poses and
+        keeps the best. Among coplanar anchors the mirror pose may explain the ranges as well:
+        then only a prior that knows the side tells them apart (`locate` lists both, ``"iekf-bank"``
+        follows both).
 
         Raises
         ------
@@ -149,30 +145,49 @@ class IteratedEkf:
             On wrong shapes, NaN, ranges that are not positive; and where the prior is vague
             and the anchors or tags cannot determine a pose (the message names the rank).
         """
+        ranges, weights, anchors = self.weighed(ranges, anchors, links)
+        epoch = (*state, ranges, weights, anchors)
+        return update_in_blocks(self._update, epoch, TRAILING, block_size(ranges))
+
+    def weighed(
+        self, ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """A checked epoch as (ranges, weights, anchors): inverse variances, 0 of lost links."""
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
         weights = 1 / check_variance(self.noise.variance(ranges, mask), mask)
         weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
-        if mask is not None:
-            weights = weights * mask
-        epoch = (*state, ranges, weights, anchors)
-        size = min(_BLOCK, 1 + _BLOCK_LINKS // math.prod(ranges.shape[-2:]))
-        return update_in_blocks(self._update, epoch, _TRAILING, size)
+        return ranges, weights if mask is None else weights * mask, anchors
 
     @whole_rows()
     def _update(
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
     ) -> PoseState:
         """The update of one block of trials, links as weights (..., M, N)."""
+        return as_state(self.solve(state, ranges, weights, anchors)[1])
+
+    def solve(
+        self,
+        state: PoseState,
+        ranges: FloatArray,
+        weights: FloatArray,
+        anchors: FloatArray,
+        start: tuple[FloatArray, FloatArray] | None = None,
+    ) -> tuple[MapProblem, Solution]:
+        """The problem of an update and its solution near a start, None: near the prior."""
         loss = huber(HUBER) if self.robust else None
         data = RangeCost(ranges, weights, anchors, self.tags, loss, lift=self._lift)
         problem = map_problem(state, data)
-        start = problem.prior.rotation, problem.prior.translation
-        vague = is_vague(state.covariance)
-        if vague.any():
-            _check_determined(anchors, self.tags)
-            batch = np.broadcast_shapes(vague.shape, ranges.shape[:-2], anchors.shape[:-2])
-            start = global_start(problem, vague, batch, _best_of_net)
-        return posterior(problem, *start, self.iterations)
+        if start is None:
+            start = problem.prior.rotation, problem.prior.translation
+            vague = is_vague(state.covariance)
+            if vague.any():
+                _check_determined(anchors, self.tags)
+                batch = np.broadcast_shapes(vague.shape, ranges.shape[:-2], anchors.shape[:-2])
+                start = global_start(problem, vague, batch, best_of_net)
+        found = (robust_solution if self.robust else minimize_pose)(
+            problem, *start, self.iterations
+        )
+        return problem, found
 
     def belief(self, state: PoseState) -> PoseBelief:
         """The state as a belief (copies)."""
@@ -207,12 +222,12 @@ def _predict_many(
 
 
 def update_in_blocks(
-    update: Callable[..., PoseState],
+    update: Callable[..., Any],
     epoch: Sequence[FloatArray],
     trailing: Sequence[int],
     size: int,
-) -> PoseState:
-    """`update` (state, arrays ...) over at most `size` trials at once.
+) -> Any:
+    """`update` (state, arrays ...) over at most `size` trials at once; returns what it returns.
 
     `epoch`: the state's arrays and those of the measurements, each with so many `trailing` axes.
     """
@@ -227,12 +242,17 @@ def update_in_blocks(
         block = [a if len(a) == 1 else a[start : start + size] for a in flat]
         parts.append(update(PoseState(*block[:3]), *block[3:]))
     joined = (np.concatenate(fields) for fields in zip(*parts, strict=True))
-    return PoseState(*(a.reshape((*batch, *a.shape[1:])) for a in joined))
+    return type(parts[0])(*(a.reshape((*batch, *a.shape[1:])) for a in joined))
+
+
+def block_size(ranges: FloatArray) -> int:
+    """How many trials of ranges (..., M, N) to update at once."""
+    return min(_BLOCK, 1 + _BLOCK_LINKS // math.prod(ranges.shape[-2:]))
 
 
 def map_problem(state: PoseState, data: Any) -> MapProblem:
     """The problem of an update: a prior and the cost of what was measured."""
-    prior = PoseState(*(trials_last(a, n) for a, n in zip(state, _TRAILING[:3], strict=True)))
+    prior = PoseState(*(trials_last(a, n) for a, n in zip(state, TRAILING[:3], strict=True)))
     return MapProblem(prior, last(inverse(first(prior.covariance, 2)), 2), data)
 
 
@@ -240,7 +260,11 @@ def posterior(
     problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
 ) -> PoseState:
     """The most likely pose near a start, with the covariance there."""
-    found = minimize_pose(problem, rotation, translation, iterations=iterations)
+    return as_state(minimize_pose(problem, rotation, translation, iterations=iterations))
+
+
+def as_state(found: Solution) -> PoseState:
+    """A solution with the covariance there."""
     covariance = last(inverse(first(found.at.hessian, 2)), 2)
     fields = found.rotation, found.translation, covariance
     return PoseState(*(np.array(field, order="C") for field in fields))
@@ -293,20 +317,10 @@ class MapProblem:
             pick(self.prior.translation, batch, where, 1),
             pick(self.prior.covariance, batch, where, 2),
         )
-        prior = PoseState(*(trials_last(a, n) for a, n in zip(prior, _TRAILING[:3], strict=True)))
+        prior = PoseState(*(trials_last(a, n) for a, n in zip(prior, TRAILING[:3], strict=True)))
         information = trials_last(pick(self.prior_information, batch, where, 2), 2)
         data = self.data.each(lambda array, trailing: pick(array, batch, where, trailing))
         return MapProblem(prior, information, data)
-
-
-def is_vague(covariance: FloatArray) -> BoolArray:
-    """Where (...) the rotation's largest variance is above that of `VAGUE_ROTATION_RAD`."""
-    limit = VAGUE_ROTATION_RAD**2
-    # The trace bounds the largest eigenvalue: most priors need no more.
-    vague = np.asarray(np.einsum("...ii->...", covariance[..., :3, :3]) > limit)
-    if vague.any():
-        vague[vague] = np.linalg.eigvalsh(covariance[vague, :3, :3])[..., -1] > limit
-    return vague
 
 
 def _flatten(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
@@ -315,88 +329,6 @@ def _flatten(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatA
     if array.ndim == trailing:
         return array[None]
     return np.broadcast_to(array, (*batch, *shape)).reshape((-1, *shape))
-
-
-_NET = rotations.log(ROTATION_NET)
-
-
-def global_start(
-    problem: MapProblem,
-    vague: BoolArray,
-    batch: tuple[int, ...],
-    best_of: Callable[..., tuple[FloatArray, FloatArray]],
-) -> tuple[FloatArray, FloatArray]:
-    """Poses to start from: for vague priors what `best_of` finds, else the prior.
-
-    `best_of` takes the problem, the batch, and where in it the trials stand.
-    """
-    # A trial alone has no axis to index: it gets one for the search.
-    axes = batch or (1,)
-    rotation = np.broadcast_to(problem.prior.rotation, (*axes, 3, 3)).copy()
-    translation = np.broadcast_to(problem.prior.translation, (*axes, 3)).copy()
-    trials = np.broadcast_to(vague, axes).nonzero()
-    size = 1 + _BLOCK // len(_NET)
-    for start in range(0, len(trials[0]), size):
-        where = tuple(axis[start : start + size] for axis in trials)
-        rotation[where], translation[where] = best_of(problem, axes, where)
-    return rotation.reshape((*batch, 3, 3)), translation.reshape((*batch, 3))
-
-
-def _best_of_net(
-    problem: MapProblem, batch: tuple[int, ...], where: Index
-) -> tuple[FloatArray, FloatArray]:
-    """The best local solve (K, 3, 3), (K, 3) of the trials at an index into the batch.
-
-    The net is 24 rotations spread as far as the prior is wide on each axis; every one gets
-    the translation that the squared ranges and the prior imply (a linear problem), then a few
-    Gauss-Newton steps on the full cost.
-    """
-    part = problem.take(batch, where)
-    rotation = _spread(part.prior)
-    translation = _translation_given(rotation, part)
-    return best_start(problem, batch, where, rotation, translation)
-
-
-def best_start(
-    problem: MapProblem,
-    batch: tuple[int, ...],
-    where: Index,
-    rotation: FloatArray,
-    translation: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """The best local solve (K, 3, 3), (K, 3) from S starts (K, S, 3, 3), (K, S, 3) each."""
-    count = rotation.shape[1]
-    # Every start is a trial of its own, so that calls run over all of them.
-    starts = problem.take(batch, tuple(np.repeat(axis, count) for axis in where))
-    solution = minimize_pose(
-        starts, rotation.reshape(-1, 3, 3), translation.reshape(-1, 3), 12, tolerance=1e-3
-    )
-    cost = solution.at.cost.reshape(-1, count)
-    best = np.arange(len(cost)) * count + np.argmin(cost, axis=1)
-    return solution.rotation[best], solution.translation[best]
-
-
-def _spread(prior: PoseState) -> FloatArray:
-    """Rotations (K, 24, 3, 3) around priors (K, ...), on each axis as far as it is uncertain."""
-    values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
-    reach = np.minimum(np.sqrt(values) / VAGUE_ROTATION_RAD, 1.0)
-    shape = (vectors * reach[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return rotations.exp(_NET @ shape) @ prior.rotation[:, None]
-
-
-def _translation_given(rotation: FloatArray, problem: MapProblem) -> FloatArray:
-    """Translations (K, 24, 3) of the linear squared-range model with its prior, given rotations."""
-    data = problem.data
-    # To first order var(r^2) = 4 r^2 var(r).
-    scale = 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
-    stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale)
-    information = np.linalg.inv(problem.prior.covariance[..., 3:, 3:])
-    turned = data.tags @ np.swapaxes(rotation, -1, -2)
-    per_tag = stat.b[:, None] - (stat.G[:, None] @ turned[..., None])[..., 0]
-    held = information @ problem.prior.translation[..., None]
-    right = held + np.swapaxes(per_tag.sum(axis=-2), -1, -2)
-    solved = np.linalg.solve(information + stat.G.sum(axis=-3), right)
-    return np.swapaxes(solved, -1, -2)
 
 
 def _check_determined(anchors: FloatArray, tags: FloatArray) -> None:

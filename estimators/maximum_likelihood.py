@@ -15,7 +15,7 @@ from rbl_gym import bounds, ranging
 from rbl_gym.checks import BoolArray, FloatArray, are_finite, kernel
 from rbl_gym.estimators.least_squares import points_fit
 from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
-from rbl_gym.estimators.range_cost import RangeCost, geman_mcclure, huber
+from rbl_gym.estimators.range_cost import RangeCost, geman_mcclure, huber, squared_residuals
 from rbl_gym.estimators.rotation_net import ROTATION_NET
 from rbl_gym.estimators.squared_range import statistic
 
@@ -204,7 +204,8 @@ def _positions(part: RangeCost) -> FloatArray:
     values, axes = np.linalg.eigh(np.swapaxes(spread, -1, -2) @ spread)
     pull = -0.5 * np.einsum("kmi,km->ki", spread, d)
     along = np.einsum("kij,ki->kj", axes, pull)
-    along = np.where(values > 1e-9 * values[:, 2:], along / np.maximum(values, 1e-300), 0.0)
+    known = values > 1e-9 * values[:, 2:]
+    along = np.where(known, along / np.where(known, values, 1.0), 0.0)
     flat = along * [0, 1, 1]
     # What is left of the squared ranges in the plane is the squared height over it.
     in_plane = (axes @ flat[..., None])[..., 0]
@@ -231,7 +232,8 @@ def rivals(tags: FloatArray, solutions: Solution) -> Alternatives:
     """Distinct minima (K, S) that are about as cheap as the best; tags (K, 1, N, 3)."""
     size = len(solutions.at.cost)
     result = no_alternatives(size)
-    order = np.argsort(solutions.at.cost, axis=-1)
+    # Stable: of exact mirror images `cheapest` takes the first too.
+    order = np.argsort(solutions.at.cost, axis=-1, kind="stable")
     rotation = np.take_along_axis(solutions.rotation, order[..., None, None], axis=1)
     translation = np.take_along_axis(solutions.translation, order[..., None], axis=1)
     cost = np.take_along_axis(solutions.at.cost, order, axis=1)
@@ -301,22 +303,15 @@ def robust(
 
 def _inliers(cost: RangeCost, solution: Solution) -> BoolArray:
     """Links (..., M, N) within 4 standard deviations of a solution."""
-    squared = _squared_residuals(cost, solution.rotation, solution.translation)
+    squared = squared_residuals(cost, solution.rotation, solution.translation)
     return (squared < 16.0) & (cost.weights > 0)
-
-
-def _squared_residuals(
-    cost: RangeCost, rotation: FloatArray, translation: FloatArray
-) -> FloatArray:
-    positions = _TAG_POSITIONS(rotation, translation, cost.tags)
-    return cost.weights * (_DISTANCES(cost.anchors, positions) - cost.ranges) ** 2
 
 
 def _narrow(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray, widest: float
 ) -> Solution:
     """Geman-McClure from the quantile `widest` of the residuals to 3 standard deviations."""
-    residuals = np.sqrt(_squared_residuals(cost, rotation, translation))
+    residuals = np.sqrt(squared_residuals(cost, rotation, translation))
     scale = np.maximum(np.quantile(residuals, widest, axis=(-2, -1)), 3.0)
     while True:
         narrowed = dataclasses.replace(cost, loss=geman_mcclure(scale[..., None, None]))
@@ -339,4 +334,12 @@ def _without_pairs_of_anchors(part: RangeCost) -> tuple[FloatArray, FloatArray]:
     kept = np.ones((len(pairs), n_anchors, 1), bool)
     kept[np.arange(len(pairs))[:, None], pairs, 0] = False
     squared = part.weights / (4 * np.where(part.weights > 0, part.ranges, 1.0) ** 2)
-    return points_fit(statistic(part.ranges, part.anchors, part.tags, squared * kept))
+    rotation, translation = points_fit(
+        statistic(part.ranges, part.anchors, part.tags, squared * kept)
+    )
+    # The anchors that are left may lie in a plane: then there is no linear solution.
+    known = are_finite(translation, 1) & are_finite(rotation, 2)
+    return (
+        np.where(known[..., None, None], rotation, np.eye(3)),
+        np.where(known[..., None], translation, part.anchors.mean(axis=-2)),
+    )

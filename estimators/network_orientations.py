@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators.consensus import cycle_consensus
 from rbl_gym.network_graphs import check_connected, spanning_tree, sum_to_root
-from rbl_gym.sensing_network import IntArray, check_edge_values, proj
+from rbl_gym.sensing_network import IntArray, check_edge_angles, proj
 
 # A step is exact to rounding once no residual wraps: the next one is far below this.
 _SETTLED_RAD = 1e-10
@@ -63,7 +63,7 @@ def orientations(
     """
     check_one_of("method", method, tuple(METHODS))
     edges = check_connected(edges, n_nodes)
-    y = check_edge_values("y", y, edges)
+    y = check_edge_angles(y, edges)
     if options and method != "cycle":
         raise ValueError(f"options are of the method 'cycle' only, got {sorted(options)}")
     return proj(METHODS[method](edges, y, n_nodes, **options))
@@ -170,7 +170,7 @@ def chordal_optimum(
         (n,) radians; None: the maximum-likelihood orientations.
     """
     edges = check_connected(edges, n_nodes)
-    y = check_edge_values("y", y, edges)
+    y = check_edge_angles(y, edges)
     if n_nodes == 1:
         return ChordalOptimum(np.zeros(1), 0.0, True)
     theta = maximum_likelihood(edges, y, n_nodes) if start is None else np.asarray(start, float)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rbl_gym import bounds
+from rbl_gym import bounds, ranging
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.components import cross, first, last, trials_last
 from rbl_gym.estimators.levenberg_marquardt import Linearization
@@ -31,6 +31,17 @@ def huber(threshold: float) -> Loss:
         weight = threshold / np.sqrt(np.maximum(squared, threshold**2))
         # x^2 / 2 inside, k x - k^2 / 2 outside, with weight = min(1, k / x).
         return weight * squared * (1 - 0.5 * weight), weight
+
+    return loss
+
+
+def cut_huber(threshold: float, cutoff: FloatArray | float) -> Loss:
+    """Huber's loss up to `cutoff` standard deviations, constant beyond: what is farther is out."""
+    inner, limit = huber(threshold), np.square(cutoff)
+
+    def loss(squared: FloatArray) -> tuple[FloatArray, FloatArray]:
+        cost, weight = inner(np.minimum(squared, limit))
+        return cost, np.where(squared <= limit, weight, 0.0)
 
     return loss
 
@@ -207,6 +218,12 @@ class RangeCost:
             tags=function(self.tags, 2) if self.lift is None else self.tags,
             tag_unit=None if self.tag_unit is None else function(self.tag_unit, 3),
         )
+
+
+def squared_residuals(cost: RangeCost, rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Squared whitened residuals (..., M, N) of a cost's ranges at a pose."""
+    positions = ranging.tag_positions(rotation, translation, cost.tags)
+    return cost.weights * (ranging.distances(cost.anchors, positions) - cost.ranges) ** 2
 
 
 def pick(array: FloatArray, batch: tuple[int, ...], where: Index, trailing: int) -> FloatArray:

@@ -18,6 +18,8 @@ from rbl_gym.ranging import tag_positions
 
 # What the angles cannot tell apart.
 MIRROR = np.array([1.0, -1.0, 1.0])
+# As near to the station (m) no direction is one: its gradient counts as zero.
+_NOWHERE = 1e-50
 _AXES = (0, 2)
 
 
@@ -83,8 +85,8 @@ def linearize(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     for row, (k, (along, across)) in enumerate(zip(_AXES, _along_and_across(x), strict=True)):
         np.arctan2(across, along, out=found[row])
         scale = squared * across
-        np.multiply(x, along / np.where(scale > 0, scale, np.inf), out=gradient[row])
-        gradient[row, k] = -across / np.where(squared > 0, squared, np.inf)
+        np.multiply(x, along / np.where(scale > _NOWHERE**3, scale, np.inf), out=gradient[row])
+        gradient[row, k] = -across / np.where(squared > _NOWHERE**2, squared, np.inf)
     return found, gradient
 
 

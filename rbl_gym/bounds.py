@@ -364,7 +364,7 @@ def posterior_crb_step(
     if (check_array("dt", dt, ()) < 0).any():
         raise ValueError(f"dt must not be negative, got {dt}")
     if not callable(getattr(process, "covariance", None)):
-        raise ValueError(f"process must be a ProcessNoise, got {process!r:.80}")
+        raise ValueError(f"process must be a motion.ProcessNoise, got {process!r:.80}")
     predicted = predict_information(J, twist, dt, process)
     return predicted + range_information(anchors, tags, rotation, translation, noise, links)
 

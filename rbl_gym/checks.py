@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 # float64 throughout; numpy's own stubs promise no more than this of most functions.
 FloatArray = NDArray[np.floating[Any]]
 BoolArray = NDArray[np.bool_]
-# No length, time or variance is larger; beyond it squares and products would overflow.
-LARGEST = 1e30
+# No length, time or rate is as large; its powers still are finite numbers.
+HUGE = 1e50
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -80,8 +80,8 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
     Raises
     ------
     ValueError
-        If `value` is not numeric, has other trailing axes, or holds NaN, inf, or what is
-        larger than `LARGEST`.
+        If `value` is not numeric, has other trailing axes, is empty, or holds NaN, inf, or
+        what is as large as `HUGE`.
     """
     return check_finite(name, check_shape(name, value, shape))
 
@@ -113,12 +113,16 @@ def as_float(name: str, value: Any) -> FloatArray:
 
 
 def check_finite(name: str, array: FloatArray) -> FloatArray:
-    """`array` unchanged, or a ValueError with the first entry that is NaN, inf or too large."""
-    sound = np.abs(array) <= LARGEST
-    if not sound.all():
-        index = tuple(int(i) for i in np.argwhere(~sound)[0])
-        what = "of at most 1e30" if np.isfinite(array[index]) else "finite"
-        raise ValueError(f"{name} must be {what}, got {array[index]} at index {index}")
+    """`array` unchanged, or a ValueError with the first entry that is NaN, inf or `HUGE`."""
+    # False of NaN too.
+    if not (array.min(initial=0.0) > -HUGE and array.max(initial=0.0) < HUGE):
+        if np.isfinite(array).all():
+            index = tuple(int(i) for i in np.argwhere(np.abs(array) >= HUGE)[0])
+            raise ValueError(
+                f"{name} must be below {HUGE:g} in magnitude, got {array[index]} at index {index}"
+            )
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name} must be finite, got {array[index]} at index {index}")
     return array
 
 
@@ -135,7 +139,7 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} must be a number, got {value!r:.80}") from error
-    if not abs(number) <= LARGEST or not low <= number <= high:
+    if not abs(number) < HUGE or not low <= number <= high:
         bounds = f" in [{low:g}, {high:g}]" if low > -math.inf or high < math.inf else ""
         raise ValueError(f"{name} must be a finite number{bounds}, got {number}")
     return number

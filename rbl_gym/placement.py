@@ -137,6 +137,8 @@ def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0)
         On an unknown scene, racks outside a room, a number that is none.
     """
     scene = scenes.get(scene)
+    if isinstance(racks, bool) or not isinstance(racks, int):
+        raise ValueError(f"racks must be an int, got {racks!r:.80}")
     usual = scene.n_anchors - bool(racks)
     return PlacementTask(scene, usual if n_anchors is None else n_anchors, racks)
 

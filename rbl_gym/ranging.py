@@ -348,8 +348,18 @@ def simulate(
     rng: np.random.Generator,
     link_model: LinkModel | None = None,
 ) -> Measurement:
-    """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`."""
+    """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, NaN, or laws and generators that are none.
+    """
     check_law("noise", noise)
+    if not isinstance(rng, np.random.Generator):
+        raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r:.80}")
+    if not isinstance(link_model, LinkModel | None):
+        raise ValueError(f"link_model must be a LinkModel or None, got {link_model!r:.80}")
     true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
     normals = rng.standard_normal(true.shape)
     uniforms = None

@@ -23,6 +23,7 @@ from rbl_gym.checks import FloatArray, as_float, check_array, check_finite, chec
 
 IntArray = NDArray[np.intp]
 _MOST_NODES = 10**9
+_LARGEST_ANGLE = 1e6
 _TURN = 2 * np.pi
 
 
@@ -142,6 +143,14 @@ def directions(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
         pair = edges[int(np.argmax(same))].tolist()
         raise ValueError(f"positions must differ along edges, those of nodes {pair} are the same")
     return np.arctan2(apart[:, 1], apart[:, 0])
+
+
+def check_edge_angles(y: ArrayLike, edges: IntArray) -> FloatArray:
+    """Edge angles y (m,), or a ValueError: of much larger ones rounding leaves no angle."""
+    array = check_edge_values("y", y, edges)
+    if (np.abs(array) > _LARGEST_ANGLE).any():
+        raise ValueError(f"y must be angles in radians, got {np.abs(array).max():g}")
+    return array
 
 
 def true_bearings(positions: ArrayLike, orientations: ArrayLike, edges: ArrayLike) -> FloatArray:

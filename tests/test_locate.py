@@ -412,3 +412,18 @@ def test_reference_range_counts_100_db_as_a_millimetre_at_100_m():
     np.testing.assert_allclose(np.sqrt(noise.variance(np.array([[100.0]]))), 1e-3)
     assert noise.reference_tag == 0
     assert ranging.RangeNoise.from_reference_range_db(60, None).reference_tag is None
+
+
+def test_of_exact_mirror_images_the_one_that_is_not_returned_is_the_alternative():
+    """Anchors and tags in planes: costs are equal to the last bit, and either may come first."""
+    anchors = np.array([[0, 0, 0], [9, 0, 0], [9, 7, 0], [0, 7, 0], [4, 3, 0.0]])
+    tags = bodies.plate(1.6, 1.0)
+    noise = ranging.RangeNoise(0.05)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        rotation = rotations.random(rng)
+        ranges = ranging.simulate(anchors, tags, rotation, [4.0, 2, 3], noise, rng).ranges
+        found = estimators.locate(ranges, anchors, tags, noise)
+        other = found.alternatives
+        assert np.isfinite(other.cost[0])
+        np.testing.assert_allclose(other.translation[0], found.translation * [1, 1, -1], atol=1e-4)

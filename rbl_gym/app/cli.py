@@ -92,7 +92,7 @@ def _add_reproduce(commands: Any) -> None:
 
     reproduce = commands.add_parser(
         "reproduce",
-        help="an experiment of a paper: tables, figures, CSV",
+        help="an experiment of a paper, or our own: tables, figures, CSV",
         description="; ".join(f"{name}: {e.summary}" for name, e in experiments().items()),
     )
     reproduce.add_argument("experiment", choices=sorted(experiments()))
@@ -260,6 +260,10 @@ def _reproduce(options: argparse.Namespace) -> int:
         from rbl_gym.app import network_figures
 
         figure = network_figures.network2009_figure(result)
+    elif options.experiment == "hard":
+        from rbl_gym.app import hard_figures
+
+        figure = hard_figures.hard_figure(result)
     else:
         figure = figures.static(result)
     figures.save(figure, plot)
@@ -268,6 +272,8 @@ def _reproduce(options: argparse.Namespace) -> int:
     if write_json(result, options.json):
         if options.experiment == "network2009":
             network_figures.print_network2009(result)
+        elif options.experiment == "hard":
+            hard_figures.print_hard(result)
         else:
             reports.print_experiment(result)
         print(f"picture: {plot}")

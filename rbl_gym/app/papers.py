@@ -1,4 +1,4 @@
-"""What `rbl-gym reproduce` can make: the papers' experiments by their names."""
+"""What `rbl-gym reproduce` can make: the papers' experiments, and our own, by their names."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rbl_gym.app import camsap2013, doa2019, icassp2013, network2009
+from rbl_gym.app import camsap2013, doa2019, hard, icassp2013, network2009
 
 Advance = Callable[[], None]
 
@@ -39,6 +39,11 @@ def experiments() -> dict[str, Experiment]:
             "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
             doa2019.work_units(),
             doa2019.run,
+        ),
+        "hard": Experiment(
+            "hard conditions: lost and reflected links, wrong starts, outages (docs)",
+            hard.work_units(),
+            hard.run,
         ),
         "icassp2013": _static(
             "icassp2013",

@@ -152,7 +152,7 @@ _ANY_TURN, _ANY_SPEED = 1.0, 3.0
 
 def _options(settings: Settings) -> dict[str, Any]:
     """What the settings say to the named filter."""
-    if settings.filter == "iekf":
+    if settings.filter in ("iekf", "iekf-bank"):
         return {"robust": settings.robust}
     if settings.filter == "iekf-bias":
         return {

@@ -1,0 +1,88 @@
+"""Picture and tables of the hard conditions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from rbl_gym.app.figures import new_figure
+from rbl_gym.app.reports import new_console
+
+_COLOURS = {"iekf": "#d1495b", "iekf, robust": "#2e86ab", "bank, robust": "#1b7f5c",
+            "bank": "#2e86ab", "bank, volume": "#1b7f5c"}  # fmt: skip
+
+
+def hard_figure(result: dict[str, Any]) -> Figure:
+    """Translation errors over the bound, and who is back after wrong starts."""
+    figure = new_figure(12, 8)
+    upper, lower = figure.subfigures(2, 1)
+    axes = upper.subplots(1, len(result["links"]), squeeze=False)[0]
+    for axis, (name, conditions) in zip(axes, result["links"].items(), strict=True):
+        filters = list(next(iter(conditions.values()))["filters"])
+        for shift, label in enumerate(filters):
+            ratios = [row["filters"][label]["clean"]["translation"] for row in conditions.values()]
+            axis.bar(np.arange(len(ratios)) + 0.27 * (shift - 1), ratios, 0.25, label=label,
+                     color=_COLOURS[label])  # fmt: skip
+        axis.axhline(1.0, color="k", lw=0.8)
+        axis.set(yscale="log", title=name, ylabel="translation RMSE / clean bound")
+        axis.set_xticks(
+            range(len(conditions)), [label.replace(", ", ",\n") for label in conditions]
+        )
+        axis.legend(frameon=False, loc="upper left")
+    after = result["starts"]["after"]
+    axes = lower.subplots(1, len(result["starts"]["scenes"]), squeeze=False)[0]
+    for axis, (name, starts) in zip(axes, result["starts"]["scenes"].items(), strict=True):
+        for label in starts["wrong"]:
+            for start, style in (("wrong", "o-"), ("wrong, 10 % NLOS", "s:")):
+                axis.plot(after, [100 * share for share in starts[start][label]["back"]], style,
+                          label=f"{label}{start[5:]}", color=_COLOURS[label], ms=4)  # fmt: skip
+        axis.set(xlabel="epochs later", ylabel="trials that are back [%]", ylim=(-3, 103))
+        axis.set_title(f"{name}: 180 degrees, 10 m off", fontsize=9)
+    handles = axes[-1].get_legend_handles_labels()
+    lower.legend(*handles, frameon=False, fontsize=9, loc="outside lower center", ncols=6)
+    return figure
+
+
+def print_hard(result: dict[str, Any]) -> None:
+    """One table of links for each scene, one of starts."""
+    console = new_console()
+    for name, conditions in result["links"].items():
+        table = Table(title=f"{name}, {result['trials']} trials")
+        table.add_column("links", no_wrap=True)
+        table.add_column("filter", no_wrap=True)
+        for heading in ("rot / clean", "pos / clean", "rot / good", "pos / good", "NEES (6)",
+                        "lost last", "ever", "largest (m)", "us / step"):  # fmt: skip
+            table.add_column(heading, justify="right")
+        for condition, row in conditions.items():
+            for label, figures in row["filters"].items():
+                ratios = [figures[b][f] for b in ("clean", "good")
+                          for f in ("rotation", "translation")]  # fmt: skip
+                table.add_row(
+                    condition, label, *(f"{ratio:.3f}" for ratio in ratios),
+                    f"{figures['nees']:.2f}", f"{100 * figures['lost_at_the_end']:.1f} %",
+                    f"{100 * figures['lost_ever']:.1f} %", f"{figures['largest_error_m']:.2f}",
+                    f"{figures['microseconds_per_step']:.0f}",
+                )  # fmt: skip
+            table.add_section()
+        console.print(table)
+    after = result["starts"]["after"]
+    table = Table(title=f"trials that are back so many epochs later, {result['trials']} trials")
+    for heading in ("scene", "start", "filter"):
+        table.add_column(heading)
+    for heading in (*map(str, after), "us / step"):
+        table.add_column(heading, justify="right")
+    for name, starts in result["starts"]["scenes"].items():
+        for start, rows in starts.items():
+            for label, row in rows.items():
+                back = [f"{100 * share:.1f} %" for share in row["back"]]
+                table.add_row(name, start, label, *back, f"{row['microseconds_per_step']:.0f}")
+        table.add_section()
+    console.print(table)
+    console.print(
+        "clean, good: posterior Cramer-Rao bounds of all links on straight paths, and of the\n"
+        "straight ones that were there. Lost, at the last epoch or ever: the square of an error\n"
+        "in the bound's covariance is above 100, where 6 is the mean; back: below it."
+    )
