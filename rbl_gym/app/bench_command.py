@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.backends import BACKENDS
-from rbl_gym.app.terminal import add_json, natural, positive, progress, write_json
+from rbl_gym.app.terminal import add_json, natural, positive, progress, require, write_json
 
 
 def add_bench(commands: Any) -> None:
@@ -32,6 +32,7 @@ def add_bench(commands: Any) -> None:
     bench.add_argument("--out", default="out/bench.jsonl", metavar="F",
                        help="records, one a line; default out/bench.jsonl")  # fmt: skip
     bench.add_argument("--fresh", action="store_true", help="do not take up what F holds")
+    bench.add_argument("--html", metavar="F", help="page: maps, sortable table, self-contained")
     _add_workers(bench)
     add_json(bench)
     bench.set_defaults(run=_bench)
@@ -60,6 +61,8 @@ def _bench(options: argparse.Namespace) -> int:
     from rbl_gym import scenes
     from rbl_gym.app import bench_files, leaderboard
 
+    if options.html:
+        require("plotly", "viz")
     workers = _workers(options)
     tasks = leaderboard.tasks(
         _specs(options.scenes or list(scenes.SCENES)),
@@ -73,11 +76,17 @@ def _bench(options: argparse.Namespace) -> int:
             tasks, Path(options.out), fresh=options.fresh, advance=advance, **workers
         )
     result = leaderboard.summary(records, timings)
+    if options.html:
+        from rbl_gym.app import bench_html, page
+
+        page.write(bench_html.bench(result), options.html)
     if write_json(result, options.json):
         from rbl_gym.app import bench_report
 
         bench_report.print_bench(result)
         print(f"records: {options.out}")
+        if options.html:
+            print(f"page: {options.html}")
     return int(any(row["status"] == "failed" for row in result["rows"]))
 
 

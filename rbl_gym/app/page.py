@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +61,6 @@ document.querySelectorAll("table.sortable").forEach(table => {
   });
 });
 """
-_UNITS = ("m", "deg", "rad", "s", "us", "hz")
 # Tables of more rows than this get a field that filters them.
 _MANY = 12
 
@@ -139,41 +138,6 @@ def _number(value: Any) -> float | None:
         except ValueError:
             return None
     return float(value) if abs(value) < float("inf") else None
-
-
-def leaderboard_page(
-    rows: Sequence[Mapping[str, Any]], title: str = "leaderboard", notes: Iterable[str] = ()
-) -> str:
-    """A page of one sortable table: a row for each dict, a column for each of their keys.
-
-    Parameters
-    ----------
-    rows
-        Dicts of numbers, texts, booleans or None; what a row lacks is shown as "-".
-    title
-        Of the page.
-    notes
-        Remarks below the table.
-
-    Raises
-    ------
-    ValueError
-        If there are no rows.
-    """
-    if not rows:
-        raise ValueError("rows must hold at least one row, got none")
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    cells = [[row.get(key) for key in keys] for row in rows]
-    shown = table(f"{len(rows)} rows", [_heading(key) for key in keys], cells)
-    return document(title, [shown, *map(note, notes)])
-
-
-def _heading(key: str) -> str:
-    """A key as people read it: ``position_rmse_m`` is "position rmse (m)"."""
-    name, _, unit = key.rpartition("_")
-    return (
-        f"{name.replace('_', ' ')} ({unit})" if name and unit in _UNITS else key.replace("_", " ")
-    )
 
 
 def write(text: str, path: str) -> None:

@@ -1,0 +1,107 @@
+"""The page of `rbl-gym bench`: what stress does to every filter, and all rows to sort."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from rbl_gym.app import page
+
+_COLUMNS = 4
+# Ratios to the bound beyond this are one colour: the filter is lost.
+_LOST_RATIO = 30.0
+_HEADINGS = (
+    "scene", "condition", "filter", "position (m)", "rotation (deg)", "tags (m)", "median (m)",
+    "p95 (m)", "x bound", "ANEES", "verdict", "lost (%)", "flipped (%)", "triggered (%)",
+    "us / step", "remark",
+)  # fmt: skip
+
+
+def bench(result: dict[str, Any]) -> str:
+    """The page of a result of `leaderboard.summary`."""
+    rows = [
+        row | {"microseconds_per_step": microseconds}
+        for row, microseconds in zip(result["rows"], result["microseconds_per_step"], strict=True)
+    ]
+    first = rows[0]
+    conditions = "; ".join(f"{name}: {text}" for name, text in result["conditions"].items())
+    return page.document(
+        "Which filter? The leaderboard",
+        [
+            page.note(
+                f"{first['trials']} trials of each row, seed {first['seed']}, the same motion, "
+                "prior and noise for all filters of a scene. Colours and numbers of the maps: "
+                "RMS tag error over the posterior Cramer-Rao bound; 1 is as good as it gets, "
+                "from 30 on a filter is lost."
+            ),
+            page.plot(_maps(rows), "maps"),
+            page.note(f"Conditions. {conditions}."),
+            page.table(f"{len(rows)} rows", _HEADINGS, [_cells(row) for row in rows]),
+            page.note(
+                "Root mean squares over trials and epochs; median and 95th percentile of the tag "
+                "error. ANEES per degree of freedom: 1 is honest, more is optimistic. Times are "
+                "of the machine that ran it."
+            ),
+        ],
+    )
+
+
+def _maps(rows: list[dict[str, Any]]) -> go.Figure:
+    """A map for each scene: filters by conditions, coloured by the ratio to the bound."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    filters = list(dict.fromkeys(row["filter"] for row in rows))[::-1]
+    conditions = list(dict.fromkeys(row["condition"] for row in rows))
+    columns = min(_COLUMNS, len(scenes))
+    lines = -(-len(scenes) // columns)
+    shown = make_subplots(lines, columns, subplot_titles=scenes, shared_yaxes=True,
+                          shared_xaxes="all", horizontal_spacing=0.02,
+                          vertical_spacing=0.3 / (1 + lines))  # fmt: skip
+    for k, scene in enumerate(scenes):
+        ratio = np.full((len(filters), len(conditions)), np.nan)
+        for row in rows:
+            if row["scene"] == scene and "tags_m" in row:
+                at = filters.index(row["filter"]), conditions.index(row["condition"])
+                ratio[at] = row["tags_m"]["to_bound"] or np.nan
+        text = [["" if np.isnan(r) else f"{r:.3g}" for r in line] for line in ratio]
+        shown.add_trace(
+            go.Heatmap(
+                z=np.log10(ratio), x=conditions, y=filters, text=text, texttemplate="%{text}",
+                coloraxis="coloraxis", hoverongaps=False,
+                hovertemplate="%{y}, %{x}: %{text} x bound<extra>" + scene + "</extra>",
+            ),
+            1 + k // columns, 1 + k % columns,
+        )  # fmt: skip
+    ticks = [1, 2, 5, 10, _LOST_RATIO]
+    shown.update_layout(
+        height=90 + lines * (70 + 30 * len(filters)), margin={"l": 10, "r": 10, "t": 50, "b": 10},
+        template="plotly_white", font={"size": 11},
+        coloraxis={
+            "colorscale": [[0, "#e8f4ef"], [0.3, "#f6e3a1"], [0.65, "#e08a4b"], [1, "#9c2f3c"]],
+            "cmin": 0, "cmax": float(np.log10(_LOST_RATIO)),
+            "colorbar": {"title": "x bound", "tickvals": np.log10(ticks).tolist(),
+                         "ticktext": [f"{tick:g}" for tick in ticks], "thickness": 12},
+        },
+    )  # fmt: skip
+    return shown
+
+
+def _cells(row: dict[str, Any]) -> list[Any]:
+    """A row of the table; what a filter could not do is "-", with its remark."""
+    head = [row["scene"], row["condition"], row["filter"]]
+    remark = row["message"] or (f"rank {row['rank']} of {row['states']}"
+                                if row["rank"] != row["states"] else None)  # fmt: skip
+    if "tags_m" not in row:
+        return [*head, *[None] * (len(_HEADINGS) - 4), f"{row['status']}: {remark}"]
+    tags = row["tags_m"]
+    percent = [
+        None if row.get(key) is None else 100 * row[key]
+        for key in ("lost", "flipped", "trigger_rate")
+    ]
+    return [
+        *head, row["position_m"]["rmse"], row["rotation_deg"]["rmse"], tags["rmse"],
+        tags["median"], tags["p95"], tags["to_bound"], row["anees"], row["verdict"], *percent,
+        row["microseconds_per_step"], remark,
+    ]  # fmt: skip
