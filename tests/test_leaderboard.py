@@ -11,6 +11,7 @@ from scipy import stats
 from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
 from rbl_gym.app import bench_figures, bench_files, bench_worlds, leaderboard, replay
 from rbl_gym.app.cli import main
+from rbl_gym.estimators import belief
 from rbl_gym.recordings import read_recording
 
 SHORT = {"name": "uwb_room", "steps": 4}
@@ -500,3 +501,7 @@ def test_a_file_that_is_no_scene_is_refused(tmp_path, recording, text, message, 
     recording.write_text(text)
     assert bench(tmp_path, "--scenes", recording)[0] == 2
     assert message in capsys.readouterr().err
+
+
+def test_every_filter_of_ours_is_known_as_ours():
+    assert {"rbl-gym"} == {leaderboard.source_of(name) for name in belief._FACTORIES}

@@ -30,7 +30,7 @@ from rbl_gym.checks import check_one_of
 
 # Options with which a filter of ours stands in the table besides its plain self.
 VARIANTS = ("iekf/robust=true",)
-_OURS = ("kf", "uc-kf", "et-kf", "kf-ortho", "iekf")
+_OURS = ("kf", "uc-kf", "et-kf", "kf-ortho", "iekf", "iekf-bank", "iekf-bias", "iekf-cv")
 # What makes a record another record; a finished one with the same is not run again.
 KEY = ("scene_hash", "condition", "filter", "filter_source", "trials", "seed", "versions")
 
