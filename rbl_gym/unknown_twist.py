@@ -32,14 +32,15 @@ Axes = float | tuple[float, float, float]
 class WanderingTwist:
     """Law of an unknown twist.
 
+    All fields are a float, or three of them for the world's axes (a planar body has zeros among
+    them).
+
     Parameters
     ----------
     turn_rate_rad_s, speed_m_s
         Standard deviations of the first angular velocity and velocity about zero, per axis.
     turn_acceleration, acceleration
         By how much they wander: standard deviations of their change after 1 s (rad/s, m/s).
-
-    All are a float, or three of them for the world's axes (a planar body has zeros among them).
 
     Raises
     ------
