@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from scipy import stats
 from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
 from rbl_gym.app import bench_figures, bench_files, bench_worlds, leaderboard, replay
 from rbl_gym.app.cli import main
+from rbl_gym.estimators import belief
 from rbl_gym.recordings import read_recording
 
 SHORT = {"name": "uwb_room", "steps": 4}
@@ -500,3 +502,12 @@ def test_a_file_that_is_no_scene_is_refused(tmp_path, recording, text, message, 
     recording.write_text(text)
     assert bench(tmp_path, "--scenes", recording)[0] == 2
     assert message in capsys.readouterr().err
+
+
+def test_a_filter_is_ours_by_where_its_factory_lives(monkeypatch):
+    monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
+    assert {leaderboard.source_of(name) for name in belief._FACTORIES} == {"rbl-gym"}
+    belief.register("mine", lambda tags, noise, process: None)
+    assert leaderboard.source_of("mine") == leaderboard._digest([Path(__file__)])
+    with pytest.raises(ValueError, match="filter must be one of"):
+        leaderboard.source_of("nobody")
