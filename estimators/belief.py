@@ -120,7 +120,7 @@ def make(
     ValueError
         On an unknown name or option, or an argument out of its range.
     """
-    factory = _factory(name)
+    factory = factory_of(name)
     tags = check_array("tags", tags, ("N", 3))
     of_ranges = options.get("measurement", "ranges") == "ranges"
     for label, value, methods in (
@@ -138,7 +138,7 @@ def make(
     return factory(tags=tags, noise=noise, process=process, **options)
 
 
-def _factory(name: str) -> Callable[..., Filter]:
+def factory_of(name: str) -> Callable[..., Filter]:
     """What makes the filters of a name: registered, of an entry point, or to be imported."""
     if isinstance(name, str) and name in _FACTORIES:
         return _FACTORIES[name]

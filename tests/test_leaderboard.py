@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -503,5 +504,10 @@ def test_a_file_that_is_no_scene_is_refused(tmp_path, recording, text, message, 
     assert message in capsys.readouterr().err
 
 
-def test_every_filter_of_ours_is_known_as_ours():
-    assert {"rbl-gym"} == {leaderboard.source_of(name) for name in belief._FACTORIES}
+def test_a_filter_is_ours_by_where_its_factory_lives(monkeypatch):
+    monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
+    assert {leaderboard.source_of(name) for name in belief._FACTORIES} == {"rbl-gym"}
+    belief.register("mine", lambda tags, noise, process: None)
+    assert leaderboard.source_of("mine") == leaderboard._digest([Path(__file__)])
+    with pytest.raises(ValueError, match="filter must be one of"):
+        leaderboard.source_of("nobody")

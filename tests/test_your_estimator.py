@@ -50,7 +50,12 @@ def test_the_template_has_ten_lines_to_write():
     assert len(body) == 10
 
 
-def test_its_commands_bring_it_into_the_table(package, capsys):
+def test_its_commands_bring_it_into_the_table(package, monkeypatch, capsys):
+    # As the installed command starts: its own folder is searched, the working folder is not.
+    monkeypatch.setattr(
+        sys, "path", [entry for entry in sys.path if entry not in ("", str(package))]
+    )
+    monkeypatch.delitem(sys.modules, "my_filters", raising=False)
     lines = blocks("sh")[0].splitlines()
     assert len(lines) == 2
     for line in lines:

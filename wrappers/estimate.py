@@ -124,7 +124,10 @@ def scene_of(env: Any) -> scenes.Scene:
     unwrapped = env.unwrapped
     scene = getattr(unwrapped, "scene", None)
     if not isinstance(scene, scenes.Scene):
-        raise ValueError(f"env must have a rbl_gym Scene as its scene, got {unwrapped!r}")
+        raise ValueError(
+            "env must have a rbl_gym Scene as its scene, as RBL/Tracking-v0 has and tasks with a "
+            f"filter of their own or without one have not, got {unwrapped!r}"
+        )
     if hasattr(unwrapped, "reward_mode"):
         unwrapped.reward_mode = "none"
     return scene

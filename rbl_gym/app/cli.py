@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +24,9 @@ from rbl_gym.app.terminal import (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status (2: what came in is wrong, with a message)."""
     options = _parser().parse_args(arguments)
+    # MODULE:FACTORY may be a file of the working folder, which only `python -m` would search.
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
     try:
         return options.run(options)
     except MissingExtraError as error:
@@ -353,10 +357,6 @@ def _replay(options: argparse.Namespace) -> int:
         track = replay.run(recording, settings, advance)
     found = replay.errors(recording, track, settings)
     result = replay.figures(recording, track, found, settings)
-    if write_json(result, options.json):
-        from rbl_gym.app import reports
-
-        reports.print_replay(result)
     if options.plot:
         from rbl_gym.app import figures
 
@@ -365,6 +365,11 @@ def _replay(options: argparse.Namespace) -> int:
         from rbl_gym.app import page, track_pages
 
         page.write(track_pages.replay(recording, track, result, settings), options.html)
+    if write_json(result, options.json):
+        from rbl_gym.app import reports
+
+        reports.print_replay(result)
+        _print_files(picture=options.plot, page=options.html)
     return 0
 
 

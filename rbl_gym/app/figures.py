@@ -234,7 +234,7 @@ def replay(recording: Recording, track: Track, found: Errors | None) -> Figure:
         true = truth_at(recording.truth, track.times)[1][found.known]
         axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label="truth")
     axes.plot(*track.translation[:, :2].T, color=COLOURS["iterated EKF"], lw=0.8, label="estimate")
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")  # datalim cuts off the label
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(frameon=False, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))

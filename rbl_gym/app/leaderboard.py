@@ -27,10 +27,10 @@ from rbl_gym import estimators, scenes, wrappers
 from rbl_gym.app import bench_figures, bench_recordings, bench_run, bench_worlds, replay
 from rbl_gym.app.bench_worlds import CONDITIONS
 from rbl_gym.checks import check_one_of
+from rbl_gym.estimators.belief import factory_of
 
 # Options with which a filter of ours stands in the table besides its plain self.
 VARIANTS = ("iekf/robust=true",)
-_OURS = ("kf", "uc-kf", "et-kf", "kf-ortho", "iekf", "iekf-bank", "iekf-bias", "iekf-cv")
 # What makes a record another record; a finished one with the same is not run again.
 KEY = ("scene_hash", "condition", "filter", "filter_source", "trials", "seed", "versions")
 
@@ -158,12 +158,16 @@ def _head(task: Task, filter: str) -> dict[str, Any]:
 
 def source_of(name: str) -> str:
     """Where a filter comes from: a package and its version, or the digest of its module's file."""
-    if name in _OURS:
+    factory = factory_of(name)
+    while isinstance(factory, functools.partial):
+        factory = factory.func
+    home = name.partition(":")[0] if ":" in name else factory.__module__
+    if home.startswith("rbl_gym."):
         return "rbl-gym"
     for entry in entry_points(group=estimators.ENTRY_POINT_GROUP):
         if entry.name == name:
             return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
-    module = sys.modules.get(name.partition(":")[0]) or import_module(name.partition(":")[0])
+    module = sys.modules.get(home) or import_module(home)
     file = inspect.getsourcefile(module)
     return _digest([Path(file)]) if file else name
 

@@ -70,6 +70,11 @@ def print_place(result: dict[str, Any]) -> None:
         console.print(note, markup=False)
 
 
+def _digits(value: float, count: int) -> str:
+    """So many significant digits, zeros at the end too."""
+    return f"{value:#.{count}g}".rstrip(".")
+
+
 def _anchors(result: dict[str, Any]) -> Rows:
     rows = [
         [str(index + 1), *(f"{anchor[key]:.3f}" for key in ("x_m", "y_m", "z_m")),
@@ -88,26 +93,30 @@ def _prediction(result: dict[str, Any]) -> Rows:
         figures = result["predicted"][key]
         where = "(" + ", ".join(f"{x:.3g}" for x in figures["worst_at_m"]) + ")"
         rows.append(
-            [label, *(f"{figures[what]:.4g}" for what in ("rms", "median", "p95", "worst")), where]
+            [
+                label,
+                *(_digits(figures[what], 4) for what in ("rms", "median", "p95", "worst")),
+                where,
+            ]
         )
-    headings = ["one sigma", "RMS", "median", "p95", "worst place", "which (m)"]
+    headings = ["one sigma", "RMS", "median", "p95", "worst place", "where (m)"]
     return Rows("predicted over the region", headings, rows)
 
 
 _FIGURES = (
-    ("b (m)", "score_m", ".4g"),
-    ("position (m)", "position_median_m", ".4g"),
-    ("p95", "position_p95_m", ".4g"),
-    ("worst", "position_worst_m", ".4g"),
-    ("orientation (deg)", "rotation_median_deg", ".3g"),
-    ("p95", "rotation_p95_deg", ".3g"),
-    ("worst", "rotation_worst_deg", ".3g"),
+    ("b RMS (m)", "score_m", 4),
+    ("position median (m)", "position_median_m", 4),
+    ("p95", "position_p95_m", 4),
+    ("worst", "position_worst_m", 4),
+    ("rotation median (deg)", "rotation_median_deg", 3),
+    ("p95", "rotation_p95_deg", 3),
+    ("worst", "rotation_worst_deg", 3),
 )
 
 
 def _layouts(layouts: dict[str, dict[str, float]]) -> Rows:
     rows = [
-        [name, *(format(row[key], form) for _, key, form in _FIGURES), f"{row['ratio']:.3f}"]
+        [name, *(_digits(row[key], n) for _, key, n in _FIGURES), f"{row['ratio']:.3f}"]
         for name, row in layouts.items()
     ]
     headings = ["layout", *(heading for heading, _, _ in _FIGURES), "b / designed"]
@@ -118,9 +127,9 @@ def _check(check: dict[str, Any]) -> Rows:
     rows = []
     for name, figures in check["filters"].items():
         row = [name]
-        for quantity, unit, form in (("position", "m", ".4g"), ("rotation", "deg", ".3g")):
+        for quantity, unit, n in (("position", "m", 4), ("rotation", "deg", 3)):
             for key in (f"{quantity}_rmse_{unit}", f"{quantity}_predicted_{unit}"):
-                row.append(format(figures[key], form) if key in figures else "-")
+                row.append(_digits(figures[key], n) if key in figures else "-")
             ratio = f"{quantity}_ratio"
             row.append(f"{figures[ratio]:.3f}" if ratio in figures else "-")
         nees = f"{figures['nees']:.2f}" if "nees" in figures else "-"
@@ -132,7 +141,7 @@ def _check(check: dict[str, Any]) -> Rows:
 
 def _numbers(numbers: list[dict[str, float]]) -> Rows:
     rows = [
-        [str(row["n_anchors"]), *(format(row[key], form) for _, key, form in _FIGURES)]
+        [str(row["n_anchors"]), *(_digits(row[key], n) for _, key, n in _FIGURES)]
         for row in numbers
     ]
     headings = ["anchors", *(heading for heading, _, _ in _FIGURES)]

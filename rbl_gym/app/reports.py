@@ -133,7 +133,7 @@ def print_replay(result: dict[str, Any]) -> None:
     console.print(table)
     console.print(
         f"mean yaw error {result['yaw_mean_deg']:.2f} deg, NEES per degree of freedom "
-        f"{result['anees']:.1f} (1: honest; above: overconfident)"
+        f"{result['anees']:.2f} (1: honest; above: overconfident)"
     )
 
 
