@@ -213,16 +213,18 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"actions must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
             )
-        if not np.isfinite(array).all():
+        if not whole and not np.isfinite(array).all():
             raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
         if isinstance(space, gym.spaces.Box):
             return array.astype(np.float64)
-        dtype = self.action_space.dtype
-        # Binary before the cast: a narrow type would wrap large numbers round into the space.
-        legal = self.action_space.contains(array.astype(dtype)) if whole else np.isin(array, (0, 1))
-        if not np.all(legal):
+        # Before the cast: a narrow type would wrap large numbers round into the space.
+        if isinstance(space, gym.spaces.Discrete):
+            legal = (array >= space.start) & (array < space.start + space.n)
+        else:
+            legal = np.isin(array, (0, 1))
+        if not legal.all():
             raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
-        return array.astype(dtype)
+        return array.astype(self.action_space.dtype)
 
 
 def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
