@@ -22,6 +22,7 @@ from rbl_gym.sensing_network import proj
 from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from rbl_gym.wrappers.estimate_network import consensus
 from tests.helpers import assert_same
+from tests.side_by_side import actions_of
 
 ID = "rbl_gym:RBL/PlanarNetwork-v0"
 MODES = ("NextStep", "SameStep", "Disabled")
@@ -33,10 +34,6 @@ def make(**arguments):
 
 def make_vec(count=3, mode="NextStep", **arguments):
     return gym.make_vec(ID, num_envs=count, autoreset_mode=mode, **arguments)
-
-
-def actions_of(env, rng):
-    return rng.uniform(-1.3, 1.3, env.action_space.shape).astype(np.float32)
 
 
 # --- Gymnasium --------------------------------------------------------------------------------
