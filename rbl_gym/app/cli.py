@@ -12,6 +12,7 @@ from rbl_gym.app import bench_command, learning, replay_command
 from rbl_gym.app.terminal import (
     MissingExtraError,
     add_json,
+    add_seed,
     natural,
     positive,
     progress,
@@ -80,7 +81,7 @@ def _add_place(commands: Any) -> None:
     place.add_argument("--region", type=_region, metavar="x0,y0,z0,x1,y1,z1",
                        help="work region, metres; write --region=-1,... for a minus")  # fmt: skip
     place.add_argument("--trials", type=positive, default=500, help="of the check, default 500")
-    place.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
+    add_seed(place)
     place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
     place.add_argument("--html", metavar="F", help="3-D page with the tables, self-contained")
     add_json(place)
@@ -118,7 +119,7 @@ def _add_network(commands: Any) -> None:
 
 def _add_trials(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trials", type=positive, default=1000, help="default 1000")
-    parser.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
+    add_seed(parser)
 
 
 def _demo(options: argparse.Namespace) -> int:

@@ -30,6 +30,11 @@ def add_json(parser: argparse.ArgumentParser) -> None:
                         "in place of the table")  # fmt: skip
 
 
+def add_seed(parser: argparse.ArgumentParser, of: str = "of all randomness") -> None:
+    """The option --seed."""
+    parser.add_argument("--seed", type=natural, default=0, help=f"{of}, default 0")
+
+
 @contextlib.contextmanager
 def progress(label: str, total: int) -> Iterator[Callable[..., None]]:
     """A progress bar on standard error; yields the function that advances it (by 1)."""
