@@ -16,7 +16,7 @@ from rbl_gym import bearing
 from rbl_gym.checks import FloatArray
 from rbl_gym.components import cross, first, last, trials_last
 from rbl_gym.estimators.levenberg_marquardt import Linearization
-from rbl_gym.estimators.range_cost import Loss
+from rbl_gym.estimators.range_cost import Loss, weighed
 
 
 class Cost(Protocol):
@@ -69,12 +69,7 @@ class DoaCost:
         found, gradient = bearing.linearize(turned + away[:, None])
         root = np.sqrt(first(self.weights, 2, ndim))
         whitened = root * (found - first(self.angles, 2, ndim))
-        if self.loss is None:
-            cost = 0.5 * np.einsum("an...,an...->...", whitened, whitened)
-        else:
-            costs, factor = self.loss(last(np.square(whitened), 2))
-            cost, share = costs.sum(axis=(-2, -1)), np.sqrt(first(factor, 2))
-            root, whitened = root * share, whitened * share
+        cost, root, whitened = weighed(self.loss, root, whitened)
         # A place moves by w x Q c + v: the derivative of an angle is (Q c x g, g).
         rows = np.empty((6, *whitened.shape))
         np.multiply(gradient.swapaxes(0, 1), root, out=rows[3:])

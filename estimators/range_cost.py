@@ -57,6 +57,20 @@ def geman_mcclure(scale: FloatArray | float) -> Loss:
     return loss
 
 
+def weighed(
+    loss: Loss | None, root: FloatArray, whitened: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The cost (...) of whitened residuals (m, n, ...), and roots of weights and residuals in it.
+
+    None: squares, which leave both as they are.
+    """
+    if loss is None:
+        return 0.5 * np.einsum("mn...,mn...->...", whitened, whitened), root, whitened
+    costs, factor = loss(last(np.square(whitened), 2))
+    share = np.sqrt(first(factor, 2))
+    return costs.sum(axis=(-2, -1)), root * share, whitened * share
+
+
 # Rows (i, j) of the sums over anchors that a pose needs of every tag: the information
 # S[i, j] = S[j, i] about its place, and the force on it as S[3, j].
 _SUMS = [(i, j) for j in range(3) for i in range(j, 4)]
@@ -135,12 +149,7 @@ class RangeCost:
         distance = np.sqrt(np.maximum(square, 1e-200, out=square), out=square)
         residual = distance - ranges
         whitened = root * residual
-        if self.loss is None:
-            cost = 0.5 * np.einsum("mn...,mn...->...", whitened, whitened)
-        else:
-            costs, factor = self.loss(last(np.square(whitened), 2))
-            cost, share = costs.sum(axis=(-2, -1)), np.sqrt(first(factor, 2))
-            root, whitened = root * share, whitened * share
+        cost, root, whitened = weighed(self.loss, root, whitened)
         # Every link's row of the whitened problem: direction and residual.
         rows = np.empty((4, *whitened.shape))
         np.multiply(difference, root / distance, out=rows[:3])

@@ -20,7 +20,7 @@ from rbl_gym.checks import (
     checked,
     kernel,
 )
-from rbl_gym.motion import ProcessNoise
+from rbl_gym.motion import ProcessNoise, check_process
 
 # Behind the doors: what comes to these was checked, or made here.
 _HAT, _EXP = kernel(rotations.hat), kernel(rotations.exp)
@@ -363,8 +363,7 @@ def posterior_crb_step(
     twist = check_array("twist", twist, (6,))
     if (check_array("dt", dt, ()) < 0).any():
         raise ValueError(f"dt must not be negative, got {dt}")
-    if not callable(getattr(process, "covariance", None)):
-        raise ValueError(f"process must be a motion.ProcessNoise, got {process!r:.80}")
+    check_process(process)
     predicted = predict_information(J, twist, dt, process)
     return predicted + range_information(anchors, tags, rotation, translation, noise, links)
 

@@ -21,7 +21,7 @@ from rbl_gym.checks import (
     check_number,
     check_one_of,
 )
-from rbl_gym.motion import ProcessNoise
+from rbl_gym.motion import ProcessNoise, check_process
 
 GROUPS = ("link", "anchor", "tag", "common")
 # Nodes of the trapezoid rule on +-9 standard deviations; such integrands converge exponentially.
@@ -316,8 +316,7 @@ def posterior_bias_step(
     J = check_array("J", J, ("n", "n"))
     twist = check_array("twist", twist, (6,))
     dt = check_number("dt", dt, low=0.0)
-    if not callable(getattr(process, "covariance", None)):
-        raise ValueError(f"process must be a motion.ProcessNoise, got {process!r:.80}")
+    check_process(process)
     walk = check_number("bias_walk_m", bias_walk_m, low=0.0)
     told = bias_information(anchors, tags, rotation, translation, noise, links, groups=groups)
     n = told.shape[-1]

@@ -81,6 +81,12 @@ class ProcessNoise:
         return self.std() ** 2
 
 
+def check_process(process: ProcessNoise) -> None:
+    """A ValueError where something else than the noise of a motion came."""
+    if not callable(getattr(process, "covariance", None)):
+        raise ValueError(f"process must be a motion.ProcessNoise, got {process!r:.80}")
+
+
 class Trajectory(NamedTuple):
     """Nominal motion: start rotation (..., 3, 3), translation (..., 3), twists (..., T, 6)."""
 

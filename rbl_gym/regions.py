@@ -201,6 +201,10 @@ class Shell:
         return points / np.where(radius > 0, radius, 1.0) * np.clip(length, 1e-12, 1.0)
 
 
+# The regions by the names that scene files and overrides give them.
+REGIONS = {"box": Box, "walls": Walls, "shell": Shell}
+
+
 def _cut(action: FloatArray) -> FloatArray:
     """The action in [-1, 1]^3, in full precision."""
     return np.clip(action, -1, 1, dtype=np.float64)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping
@@ -14,17 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import bodies, rotations
+from rbl_gym import bodies, overrides, rotations
 from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.obstacles import check_obstacles
 from rbl_gym.ranging import NOISE_LAWS, LinkModel, NoiseLaw, RangeNoise, SquaredRangeNoise
-from rbl_gym.regions import Box, Region, Shell, Walls
+from rbl_gym.regions import REGIONS, Box, Region, Shell, Walls
 
-_REGIONS = {"box": Box, "walls": Walls, "shell": Shell}
 _FIELD_KINDS: dict[str, tuple[type, ...]] = {
     "volume": (Box,),
-    "anchor_region": tuple(_REGIONS.values()),
+    "anchor_region": tuple(REGIONS.values()),
     "noise": tuple(NOISE_LAWS.values()),
     "process": (ProcessNoise,),
     "links": (LinkModel,),
@@ -392,39 +390,4 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
     anchors = changes.get("anchors")
     if anchors is not None:
         changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))
-    return _replace(base, changes, "scene")
-
-
-def _replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
-    fields = {entry.name for entry in dataclasses.fields(base)}
-    values = {}
-    for key, value in changes.items():
-        if key not in fields:
-            raise ValueError(f"{path} has no field {key!r}; it has {', '.join(sorted(fields))}")
-        old = getattr(base, key)
-        if isinstance(value, Mapping):
-            values[key] = _nested(old, value, f"{path}.{key}")
-        elif dataclasses.is_dataclass(old) and not dataclasses.is_dataclass(value):
-            raise ValueError(f"{path}.{key} must be a dict of its fields, got {value!r:.80}")
-        else:
-            values[key] = value
-    try:
-        return dataclasses.replace(base, **values)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
-    unset = {"box": Box} if old is None else {}
-    kinds = next((k for k in (_REGIONS, NOISE_LAWS) if isinstance(old, tuple(k.values()))), unset)
-    if "kind" not in value:
-        if not dataclasses.is_dataclass(old):
-            raise ValueError(f"{path} is not a nested field, got a dict {dict(value)!r:.80}")
-        return _replace(old, value, path)
-    if not kinds:
-        raise ValueError(f"{path} comes in one kind only, got kind {value['kind']!r}")
-    kind = kinds[check_one_of(f"{path}.kind", value["kind"], list(kinds))]
-    try:
-        return kind(**{key: item for key, item in value.items() if key != "kind"})
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+    return overrides.replace(base, changes, "scene")

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bearing, bounds
 from rbl_gym.envs.base_station import BaseStationEnv, BaseStationVectorEnv
 from tests.helpers import assert_same
+from tests.side_by_side import actions_of, assert_steps_alike, peer_of
 
 ID = "rbl_gym:RBL/BaseStation-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -25,13 +27,6 @@ WORLDS: dict[str, dict[str, Any]] = {
     "coarse": {"scene": {"steps": 5}, "angle_std_rad": 0.05, "reward": "none"},
 }
 every_world = pytest.mark.parametrize("kind", WORLDS)
-
-
-def actions_of(env, rng):
-    space = env.single_action_space
-    if isinstance(space, gym.spaces.Discrete):
-        return np.zeros(env.num_envs, dtype=int)
-    return rng.uniform(-1.3, 1.3, env.action_space.shape).astype(np.float32)
 
 
 @every_world
@@ -53,27 +48,9 @@ def test_specs_round_trip(kind):
 @every_world
 def test_world_i_of_a_vector_is_the_scalar_environment_seeded_alike(kind):
     vector = BaseStationVectorEnv(3, **WORLDS[kind])
-    scalars = [BaseStationEnv(**WORLDS[kind]) for _ in range(3)]
-    rng = np.random.default_rng(1)
-    observation, info = vector.reset(seed=7)
-    for i, env in enumerate(scalars):
-        alone, details = env.reset(seed=7 + i)
-        assert_same(alone, {key: value[i] for key, value in observation.items()}, 1e-9, 1e-9)
-        assert_same(details["translation"], info["translation"][i], 1e-9, 1e-9)
-    ended = False
-    for _ in range(9):
-        actions = actions_of(vector, rng)
-        observation, reward, terminated, truncated, info = vector.step(actions)
-        assert not terminated.any()
-        for i, env in enumerate(scalars):
-            if ended:
-                alone, gain, over = env.reset()[0], 0.0, False
-            else:
-                alone, gain, _, over, _ = env.step(actions[i])
-            assert_same(alone, {key: value[i] for key, value in observation.items()}, 1e-9, 1e-9)
-            assert gain == pytest.approx(reward[i], abs=1e-9)
-            assert over == truncated[i]
-        ended = bool(truncated.all())
+    peer = peer_of(BaseStationEnv, AutoresetMode.NEXT_STEP, 3, WORLDS[kind])
+    steps = assert_steps_alike(vector, peer, 9, 7, {"rtol": 1e-9, "atol": 1e-9})
+    assert [truncated.all() for _, _, _, truncated, _ in steps].count(True) == 1
 
 
 def test_angles_and_score_by_hand():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import bounds, placement, scene_files
-from rbl_gym.app import place, place_check, place_figures, place_html, place_report
+from rbl_gym.app import place, place_accuracy, place_check, place_figures, place_html, place_report
 from rbl_gym.app.cli import main
 from tests.test_scene_files import GOOD
 
@@ -20,7 +20,7 @@ N_TRIALS = 60
 @pytest.fixture(autouse=True)
 def short_searches(monkeypatch):
     monkeypatch.setattr(place, "_GENERATIONS", 8)
-    monkeypatch.setattr(place, "_MAP", 12)
+    monkeypatch.setattr(place_accuracy, "_MAP", 12)
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +82,10 @@ def test_predictions_are_the_bound_at_each_place(placed):
     problem, design, _ = placed
     task, scene = problem.task, problem.task.scene
     places = np.array([[2.0, 2.0, 1.0], [6.5, 4.5, 0.5], [3.5, 4.0, 1.0]])
-    found = place.accuracy(problem, design.anchors, places)
+    found = place_accuracy.accuracy(problem, design.anchors, places)
     for index, spot in enumerate(places):
         squares = []
-        for turn in task.poses[0][: place._TURNS]:
+        for turn in task.poses[0][: place_accuracy._TURNS]:
             sight = placement.obstacles.in_sight(design.anchors, spot[None], problem.context.racks)
             information = task.prior_information
             for seen, share in ((sight[0], 1.0), (~sight[0], task.blocked_information)):
@@ -110,10 +110,10 @@ def test_the_search_scores_over_free_poses(with_rack):
 
 def test_maps_leave_obstacles_out_and_agree_with_predictions(placed):
     problem, design, _ = placed
-    plan = place.accuracy_map(problem, design.anchors)
+    plan = place_accuracy.accuracy_map(problem, design.anchors)
     assert plan.at == 1.0
     spot = [plan.columns[0], plan.rows[-1], plan.at]
-    found = place.accuracy(problem, design.anchors, np.array([spot]))
+    found = place_accuracy.accuracy(problem, design.anchors, np.array([spot]))
     assert plan.position[-1, 0] == pytest.approx(found.position[0])
     assert plan.rotation[-1, 0] == pytest.approx(np.rad2deg(found.rotation[0]))
     column, row = (np.abs(axis - x).argmin() for axis, x in ((plan.columns, 3.5), (plan.rows, 2.5)))

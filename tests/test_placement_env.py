@@ -14,12 +14,19 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym import placement
 from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.placement import Context
 from tests.helpers import assert_same
+from tests.side_by_side import (
+    actions_of,
+    assert_masks_alike,
+    assert_mixes_alike,
+    assert_steps_alike,
+    peer_of,
+)
 
 ID = "rbl_gym:RBL/AnchorPlacement-v0"
 WORLDS: dict[str, dict[str, Any]] = {
@@ -35,25 +42,14 @@ WORLDS: dict[str, dict[str, Any]] = {
     "mounts and racks": {"scene": "uwb_room", "mode": "mounts", "racks": 2},
 }
 every_world = pytest.mark.parametrize("kind", WORLDS)
+# Batched arithmetic may turn the last bits.
+TOLERANCE = {"rtol": 1e-9, "atol": 1e-9}
 some_worlds = pytest.mark.parametrize("kind", ["auv", "at once", "mounts and racks"])
 
 
 def batch_of(env: Any) -> Any:
     """The vector environment of one world that a scalar one is."""
     return env.unwrapped._batch
-
-
-def close(got, want):
-    """Equal to the last bits that batched arithmetic may turn."""
-    assert_same(got, want, rtol=1e-9, atol=1e-9)
-
-
-def actions_of(env, rng):
-    """Actions of all worlds, beyond the box too."""
-    space = env.single_action_space
-    if isinstance(space, gym.spaces.Discrete):
-        return rng.integers(space.n, size=env.num_envs)
-    return rng.uniform(-1.3, 1.3, env.action_space.shape).astype(np.float32)
 
 
 def episode(env, seed=0):
@@ -283,87 +279,37 @@ def test_a_mount_twice_adds_a_second_anchor_there():
 def vectors(kind, mode, n=4):
     """The native vector environment, and Gymnasium's own around scalar ones."""
     native = AnchorPlacementVectorEnv(n, **WORLDS[kind], autoreset_mode=mode)
-    makers = [lambda: AnchorPlacementEnv(**WORLDS[kind])] * n
-    return native, SyncVectorEnv(makers, autoreset_mode=mode)
+    return native, peer_of(AnchorPlacementEnv, mode, n, WORLDS[kind])
 
 
 @every_world
 def test_next_step_equals_scalar_environments(kind):
-    native, peer = vectors(kind, AutoresetMode.NEXT_STEP)
-    rng = np.random.default_rng(1)
-    close(native.reset(seed=5), peer.reset(seed=5))
-    ends = 0
-    for _ in range(16):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            close(a, b)
-        assert native.observation_space.contains(got[0])
-        ends += got[2].all()
-    assert ends >= 2
+    steps = assert_steps_alike(*vectors(kind, AutoresetMode.NEXT_STEP), 16, 5, TOLERANCE)
+    assert sum(terminated.all() for _, _, terminated, _, _ in steps) >= 2
 
 
 @every_world
 def test_same_step_equals_scalar_environments_with_final_observation_and_info(kind):
-    native, peer = vectors(kind, AutoresetMode.SAME_STEP)
-    rng = np.random.default_rng(2)
-    close(native.reset(seed=[3, 1, 4, 1]), peer.reset(seed=[3, 1, 4, 1]))
-    seen = 0
-    for _ in range(12):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            close(a, b)
-        if "final_obs" in got[4]:
-            seen += 1
-            assert (got[4]["final_info"]["score_m"] > 0).all()
-            assert not got[4]["score_m"].any()
-    assert seen >= 2
+    both = vectors(kind, AutoresetMode.SAME_STEP)
+    steps = assert_steps_alike(*both, 12, [3, 1, 4, 1], TOLERANCE)
+    ends = [info for *_, info in steps if "final_obs" in info]
+    assert len(ends) >= 2
+    for info in ends:
+        assert (info["final_info"]["score_m"] > 0).all()
+        assert not info["score_m"].any()
 
 
 @every_world
 def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(kind):
-    native, peer = vectors(kind, AutoresetMode.DISABLED)
-    rng = np.random.default_rng(3)
-    close(native.reset(seed=7), peer.reset(seed=7))
-    for step in range(1, 14):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            close(a, b)
-        mask = got[2].copy()
-        if step == 2:
-            mask[[1, 3]] = True  # in mid-episode: from here on the clocks differ
-        if mask.any():
-            a, info = native.reset(options={"reset_mask": mask.copy()})
-            b, peer_info = peer.reset(options={"reset_mask": mask.copy()})
-            close(a, b)
-            for key in ("region", "racks", "anchors"):
-                close(info[key][mask], peer_info[key][mask])
+    both = vectors(kind, AutoresetMode.DISABLED)
+    assert_masks_alike(*both, 14, ("region", "racks", "anchors"), TOLERANCE)
 
 
-def test_next_step_with_clocks_that_differ_mixes_resets_and_steps():
+@pytest.mark.parametrize("kind", ["auv", "mounts and racks"])
+def test_next_step_with_clocks_that_differ_mixes_resets_and_steps(kind):
     """Worlds that were reset half way stand at other anchors of the sequence."""
-    for kind in ("auv", "mounts and racks"):
-        native, peer = vectors(kind, AutoresetMode.NEXT_STEP)
-        rng = np.random.default_rng(4)
-        native.reset(seed=1)
-        peer.reset(seed=1)
-        native.step(actions := actions_of(native, rng))
-        peer.step(actions)
-        # By hand what both offer only without autoreset: worlds 0 and 2 begin again.
-        chosen = np.array([True, False, True, False])
-        native._begin(chosen)
-        for i in np.flatnonzero(chosen):
-            peer.envs[i].reset()
-        kinds = set()
-        for _ in range(12):
-            actions = actions_of(native, rng)
-            got, want = native.step(actions), peer.step(actions)
-            for a, b in zip(got[:4], want[:4], strict=True):
-                close(a, b)
-            kinds.add(tuple(got[2].tolist()))
-        assert tuple(chosen.tolist()) in kinds
+    steps = assert_mixes_alike(*vectors(kind, AutoresetMode.NEXT_STEP), 12, TOLERANCE)
+    assert [True, False, True, False] in [step[2].tolist() for step in steps]
 
 
 @some_worlds

@@ -15,7 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bounds, estimators, motion, scenes, simulation
 from rbl_gym.ranging import LinkNoise
@@ -27,6 +27,13 @@ from rbl_gym.wrappers.tasks import (
     MobileAnchorsVectorEnv,
 )
 from tests.helpers import assert_same, share_by_hand
+from tests.side_by_side import (
+    actions_of,
+    assert_masks_alike,
+    assert_mixes_alike,
+    assert_steps_alike,
+    peer_of,
+)
 
 MOBILE, SELECTION = "rbl_gym:RBL/MobileAnchors-v0", "rbl_gym:RBL/AnchorSelection-v0"
 LOSSY = {"drop_probability": 0.2}
@@ -41,6 +48,8 @@ WORLDS: dict[str, tuple[str, dict[str, Any]]] = {
     "priced, lossy": (SELECTION, {"mode": "priced", "scene": {"name": "hall", "links": LOSSY}}),
 }
 every_world = pytest.mark.parametrize("kind", WORLDS)
+# What a filter leaves of rounding.
+TOLERANCE = {"rtol": 2e-5, "atol": 2e-6}
 CLASSES = {
     MOBILE: (MobileAnchorsEnv, MobileAnchorsVectorEnv),
     SELECTION: (AnchorSelectionEnv, AnchorSelectionVectorEnv),
@@ -57,17 +66,6 @@ def short(kind: str, steps: int = 4) -> tuple[type, type, dict[str, Any]]:
     env_id, arguments = WORLDS[kind]
     scene = arguments.get("scene", {"name": "auv_craft" if env_id == MOBILE else "hall"})
     return *CLASSES[env_id], {**arguments, "scene": {**scene, "steps": steps}}
-
-
-def actions_of(env, rng):
-    if isinstance(env.single_action_space, gym.spaces.MultiBinary):
-        return rng.integers(0, 2, env.action_space.shape).astype(np.int8)
-    return rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
-
-
-def close(got, want):
-    """Equal at the precision that a filter's rounding leaves."""
-    assert_same(got, want, rtol=2e-5, atol=2e-6)
 
 
 def run(env, n, seed=0):
@@ -173,66 +171,26 @@ def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
 
 def vectors(kind, mode, n=3):
     scalar, vector, arguments = short(kind)
-    peer = SyncVectorEnv([lambda: scalar(**arguments)] * n, autoreset_mode=mode)
-    return vector(n, **arguments, autoreset_mode=mode), peer
+    return vector(n, **arguments, autoreset_mode=mode), peer_of(scalar, mode, n, arguments)
 
 
 @every_world
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_equals_scalar_environments(kind, mode):
-    native, peer = vectors(kind, mode)
-    rng = np.random.default_rng(1)
-    close(native.reset(seed=[5, 3, 8]), peer.reset(seed=[5, 3, 8]))
-    ends = 0
-    for _ in range(12):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            close(a, b)
-        assert native.observation_space.contains(got[0])
-        ends += got[3].all()
-    assert ends >= 2
+    steps = assert_steps_alike(*vectors(kind, mode), 12, [5, 3, 8], TOLERANCE)
+    assert sum(truncated.all() for _, _, _, truncated, _ in steps) >= 2
 
 
 @every_world
 def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(kind):
-    native, peer = vectors(kind, AutoresetMode.DISABLED)
-    rng = np.random.default_rng(3)
-    close(native.reset(seed=7), peer.reset(seed=7))
-    for step in range(1, 13):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            close(a, b)
-        mask = got[3].copy()
-        if step == 2:
-            mask[1] = True  # in mid-episode: from here on the clocks differ
-        if mask.any():
-            got = native.reset(options={"reset_mask": mask.copy()})
-            want = peer.reset(options={"reset_mask": mask.copy()})
-            close(got[0], want[0])
-            close(got[1]["score_m"][mask], want[1]["score_m"][mask])
+    assert_masks_alike(*vectors(kind, AutoresetMode.DISABLED), 13, ("score_m",), TOLERANCE)
 
 
 @every_world
 def test_next_step_mixes_resets_and_steps(kind):
-    """Worlds whose clocks differ: one begins anew while the others go on."""
-    native, peer = vectors(kind, AutoresetMode.NEXT_STEP)
-    rng = np.random.default_rng(4)
-    native.reset(seed=1)
-    peer.reset(seed=1)
-    actions = actions_of(native, rng)
-    native.step(actions)
-    peer.step(actions)
-    native._begin(np.array([False, True, False]))
-    peer.envs[1].reset()
-    for step in range(12):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got[1:4], want[1:4], strict=True):
-            close(a, b)
-        close(got[0], want[0])
-        assert got[3].any() == (step % 5 in (2, 3))
+    steps = assert_mixes_alike(*vectors(kind, AutoresetMode.NEXT_STEP), 12, TOLERANCE)
+    for step, (_, _, _, truncated, _) in enumerate(steps):
+        assert truncated.any() == (step % 5 in (2, 3))
 
 
 @every_world

@@ -8,92 +8,62 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode
 
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.scenes import SCENES
-from tests.helpers import assert_same
+from tests.side_by_side import (
+    assert_masks_alike,
+    assert_mixes_alike,
+    assert_steps_alike,
+    peer_of,
+)
 
 ID = "rbl_gym:RBL/Tracking-v0"
 LOSSY = {"drop_probability": 0.2, "nlos_probability": 0.1, "reach_m": 500.0}
+
+# Batched arithmetic may turn the last bits.
+TOLERANCE = {"rtol": 1e-9, "atol": 1e-9}
 
 
 def short(name, steps=5, **fields):
     return {"name": name, "steps": steps, **fields}
 
 
-def assert_equal(got, want):
-    """Equal to the last bits that batched arithmetic may turn."""
-    assert_same(got, want, rtol=1e-9, atol=1e-9)
-
-
 def vectors(scene, mode, n=4, reward="bound"):
     """The native vector environment, and Gymnasium's own around scalar ones."""
-    native = TrackingVectorEnv(n, scene, reward, autoreset_mode=mode)
-    makers = [lambda: TrackingEnv(scene, reward)] * n
-    return native, SyncVectorEnv(makers, autoreset_mode=mode)
-
-
-def actions_of(env, rng):
-    if isinstance(env.single_action_space, gym.spaces.Discrete):
-        return np.zeros(env.num_envs, dtype=np.int64)
-    return rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+    arguments = {"scene": scene, "reward": reward}
+    native = TrackingVectorEnv(n, **arguments, autoreset_mode=mode)
+    return native, peer_of(TrackingEnv, mode, n, arguments)
 
 
 @pytest.mark.parametrize("name", list(SCENES))
 @pytest.mark.parametrize("links", [{}, LOSSY], ids=["all links", "lossy"])
 def test_next_step_equals_scalar_environments_episode_after_episode(name, links):
-    native, peer = vectors(short(name, links=links), AutoresetMode.NEXT_STEP)
-    rng = np.random.default_rng(1)
-    assert_equal(native.reset(seed=5), peer.reset(seed=5))
-    for _ in range(14):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got[:4], want[:4], strict=True):
-            assert_equal(a, b)
-        assert_equal(got[4], want[4])
-        assert native.observation_space.contains(got[0])
+    both = vectors(short(name, links=links), AutoresetMode.NEXT_STEP)
+    assert_steps_alike(*both, 14, 5, TOLERANCE)
 
 
 @pytest.mark.parametrize("name", ["uwb_room", "auv_buoys", "camsap2013"])
 @pytest.mark.parametrize("reward", ["bound", "none"])
 def test_same_step_equals_scalar_environments_with_final_observation_and_info(name, reward):
-    native, peer = vectors(short(name), AutoresetMode.SAME_STEP, reward=reward)
-    rng = np.random.default_rng(2)
-    assert_equal(native.reset(seed=[3, 1, 4, 1]), peer.reset(seed=[3, 1, 4, 1]))
-    seen = 0
-    for _ in range(12):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            assert_equal(a, b)
-        seen += "final_obs" in got[4]
-    assert seen == 2
+    both = vectors(short(name), AutoresetMode.SAME_STEP, reward=reward)
+    steps = assert_steps_alike(*both, 12, [3, 1, 4, 1], TOLERANCE)
+    assert sum("final_obs" in info for *_, info in steps) == 2
 
 
 @pytest.mark.parametrize("name", ["drone_yard", "satellite"])
 def test_disabled_resets_what_the_mask_says_and_clocks_may_differ(name):
-    native, peer = vectors(short(name, 6), AutoresetMode.DISABLED)
-    rng = np.random.default_rng(3)
-    assert_equal(native.reset(seed=7), peer.reset(seed=7))
-    for step in range(1, 16):
-        actions = actions_of(native, rng)
-        got, want = native.step(actions), peer.step(actions)
-        for a, b in zip(got, want, strict=True):
-            assert_equal(a, b)
-        mask = got[3].copy()
-        if step == 2:
-            mask[[1, 3]] = True  # in mid-episode: from here on the clocks differ
-        if mask.any():
-            a, info = native.reset(options={"reset_mask": mask.copy()})
-            b, peer_info = peer.reset(options={"reset_mask": mask.copy()})
-            assert_equal(a, b)
-            for key in ("prior_rotation", "prior_translation", "prior_covariance"):
-                assert_equal(info[key], peer_info[key])
-                np.testing.assert_array_equal(info[f"_{key}"], mask)
-            for key in ("rotation", "epoch", "score_m"):
-                assert_equal(info[key][mask], peer_info[key][mask])
+    both = vectors(short(name, 6), AutoresetMode.DISABLED)
+    priors = ("prior_rotation", "prior_translation", "prior_covariance")
+    assert_masks_alike(*both, 16, ("rotation", "epoch", "score_m"), TOLERANCE, priors)
+
+
+@pytest.mark.parametrize("name", ["uwb_room", "auv_buoys"])
+def test_next_step_mixes_resets_and_steps(name):
+    steps = assert_mixes_alike(*vectors(short(name), AutoresetMode.NEXT_STEP), 12, TOLERANCE)
+    assert [True, False, True, False] in [step[3].tolist() for step in steps]
 
 
 def test_disabled_refuses_to_step_past_the_end():
@@ -173,5 +143,5 @@ def test_bad_calls_are_named():
         env.reset(options={"reset_mask": np.zeros(2, bool)})
     fixed = TrackingVectorEnv(2, "uwb_room")
     fixed.reset(seed=1)
-    with pytest.raises(ValueError, match="actions must be 2 zeros"):
+    with pytest.raises(ValueError, match="actions must lie in"):
         fixed.step(np.ones(2, int))

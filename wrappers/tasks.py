@@ -13,146 +13,18 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bounds, metrics, rendering, scenes, simulation
+from rbl_gym import rendering, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
-from rbl_gym.envs.batch import BatchEnv, ScalarEnv
-from rbl_gym.envs.episodes import EpisodeStore
-from rbl_gym.estimators import PoseBelief
-from rbl_gym.estimators.manifold import IteratedEkf, PoseState
-from rbl_gym.wrappers.estimate import update
+from rbl_gym.envs.batch import ScalarEnv
+from rbl_gym.wrappers.filter_loop import FilterLoop
 
 # An observation is of order one; what is far outside says no more than that.
 _LIMIT = 10.0
-# Iterations of the filter; two are as good as four here, and faster.
-_ITERATIONS = 2
 DIFFICULTIES: dict[str, dict[str, Any]] = {
     "easy": {"n_anchors": 3, "anchor_speed_m_s": 4.0},
     "hard": {"n_anchors": 2, "anchor_speed_m_s": 2.0},
 }
 SELECTIONS = ("top-k", "priced")
-
-
-class FilterLoop(BatchEnv):
-    """Worlds of a scene with an iterated EKF behind their ranges.
-
-    Attributes
-    ----------
-    scene
-        The world.
-    state
-        The filter's state after the last update.
-    anchors
-        (B, M, 3), where they stand now.
-    """
-
-    def _configure_loop(self, scene: scenes.Scene, num_envs: int) -> None:
-        self.scene = scene
-        self.filter = IteratedEkf(
-            np.asarray(scene.tags), scene.noise, scene.process, iterations=_ITERATIONS
-        )
-        self._tags = np.asarray(scene.tags)
-        self._episodes = EpisodeStore(scene, num_envs)
-        self.anchors = np.zeros((num_envs, scene.n_anchors, 3))
-        self.state = PoseState(
-            np.tile(np.eye(3), (num_envs, 1, 1)),
-            np.zeros((num_envs, 3)),
-            np.tile(np.eye(6), (num_envs, 1, 1)),
-        )
-
-    def _start(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        """New episodes of some worlds; their state is the prior."""
-        start = self._episodes.begin(chosen, generators)
-        self.anchors[chosen] = start["anchors"]
-        prior = self.filter.initial(
-            *(start[f"prior_{name}"] for name in ("rotation", "translation", "covariance"))
-        )
-        for field, new in zip(self.state, prior, strict=True):
-            field[chosen] = new
-
-    @property
-    def at(self) -> simulation.Epoch:
-        """The true worlds now: what a policy must not see."""
-        return self._episodes.at(self._epochs)
-
-    @property
-    def twist(self) -> FloatArray:
-        """Known twist (B, 6) of the interval that ended now."""
-        return self.at.twist
-
-    def _predict(self, rows: np.ndarray) -> None:
-        """Predict some worlds to their epochs."""
-        state = PoseState(*(field[rows] for field in self.state))
-        self._put(rows, self.filter.predict(state, self.at.twist[rows], self.scene.dt))
-
-    def _update(self, rows: np.ndarray, chosen: BoolArray | None = None) -> None:
-        """Update some worlds with their ranges; `chosen` (B, M): which anchors measure."""
-        at = simulation.Epoch(*(None if field is None else field[rows] for field in self.at))  # pyright: ignore[reportArgumentType]
-        anchors = self.anchors[rows]
-        quality = None
-        if self.scene.obstacles:
-            quality = simulation.link_quality(self.scene, at, anchors)
-        measured = simulation.measure(self.scene, at, anchors, quality=quality)
-        links = measured.links if chosen is None else measured.links & chosen[rows, :, None]
-        epoch = {"ranges": measured.ranges, "links": links, "anchors": anchors}
-        if quality is not None:
-            epoch["quality"] = quality
-        state = PoseState(*(field[rows] for field in self.state))
-        self._put(rows, update(self.filter, state, epoch, self.scene))
-
-    def _put(self, rows: np.ndarray, state: PoseState) -> None:
-        if len(rows) == self.num_envs:
-            self.state = state
-        else:
-            self.state = PoseState(*(field.copy() for field in self.state))
-            for field, new in zip(self.state, state, strict=True):
-                field[rows] = new
-
-    @property
-    def belief(self) -> PoseBelief:
-        """The beliefs now."""
-        return self.filter.belief(self.state)
-
-    @property
-    def score_m(self) -> FloatArray:
-        """b (B,) of the beliefs, metres."""
-        return bounds.score(self.state.covariance, self.state.rotation, self._tags)
-
-    def _inform(self) -> dict[str, np.ndarray]:
-        at, state = self.at, self.state
-        error = metrics.pose_error(state.rotation, state.translation, at.rotation, at.translation)
-        truth = at.rotation, at.translation
-        return {
-            "score_m": self.score_m,
-            "rotation_error_rad": np.linalg.norm(error[..., :3], axis=-1),
-            "position_error_m": np.linalg.norm(error[..., 3:], axis=-1),
-            "tag_error_m": metrics.tag_error(state.rotation, state.translation, *truth, self._tags),
-            "nees": metrics.nees(error, state.covariance),
-            "epoch": self._epochs.copy(),
-        }
-
-    def _measuring(self) -> BoolArray:
-        """Which anchors (B, M) measured last."""
-        return np.ones(self.anchors.shape[:2], dtype=np.bool_)
-
-    def _shot(self) -> tuple[Any, rendering.Pose]:
-        at, links = self.at, self._measuring()[..., None]
-        shot = rendering.shot(links, self.anchors, at.rotation, at.translation)
-        return shot, rendering.Pose(*self.state[:3])
-
-    def _log_std(self) -> FloatArray:
-        """Logarithms (B, 6) of the standard deviations, less that of their usual size."""
-        std = np.sqrt(np.diagonal(self.state.covariance, axis1=-2, axis2=-1))
-        prior = np.sqrt(np.diagonal(self.scene.prior_covariance))
-        return np.log(np.maximum(std, 1e-12) / prior) + 1.0
-
-    def _velocity(self) -> FloatArray:
-        """Commanded velocities (B, 3) over the speed."""
-        speed = max(self.scene.speed_m_s, float(np.abs(self.scene.twist[3:]).max()), 1e-3)
-        return self.twist[:, 3:] / speed
-
-    def _columns(self) -> FloatArray:
-        """The first two columns (B, 6) of the estimated rotation."""
-        return np.swapaxes(self.state.rotation, -1, -2)[:, :2].reshape(-1, 6)
 
 
 def _world(scene: Any, **defaults: Any) -> scenes.Scene:

@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.backends import BACKENDS
-from rbl_gym.app.terminal import add_json, natural, positive, progress, require, write_json
+from rbl_gym.app.terminal import (
+    add_json,
+    natural,
+    positive,
+    print_files,
+    progress,
+    require,
+    write_json,
+)
 
 
 def add_bench(commands: Any) -> None:
@@ -84,9 +92,7 @@ def _bench(options: argparse.Namespace) -> int:
         from rbl_gym.app import bench_report
 
         bench_report.print_bench(result)
-        print(f"records: {options.out}")
-        if options.html:
-            print(f"page: {options.html}")
+        print_files(records=options.out, page=options.html)
     return int(any(row["status"] == "failed" for row in result["rows"]))
 
 

@@ -9,12 +9,14 @@ from collections.abc import Sequence
 from typing import Any
 
 from rbl_gym import __version__
-from rbl_gym.app import bench_command, learning
+from rbl_gym.app import bench_command, learning, replay_command
 from rbl_gym.app.terminal import (
     MissingExtraError,
     add_json,
+    add_seed,
     natural,
     positive,
+    print_files,
     progress,
     require,
     write_json,
@@ -49,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_transfer(commands)
     bench_command.add_bench(commands)
     bench_command.add_rerun(commands)
-    _add_replay(commands)
+    replay_command.add_replay(commands)
     _add_reproduce(commands)
     _add_network(commands)
     return parser
@@ -84,7 +86,7 @@ def _add_place(commands: Any) -> None:
     place.add_argument("--region", type=_region, metavar="x0,y0,z0,x1,y1,z1",
                        help="work region, metres; write --region=-1,... for a minus")  # fmt: skip
     place.add_argument("--trials", type=positive, default=500, help="of the check, default 500")
-    place.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
+    add_seed(place)
     place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
     place.add_argument("--html", metavar="F", help="3-D page with the tables, self-contained")
     add_json(place)
@@ -122,102 +124,7 @@ def _add_network(commands: Any) -> None:
 
 def _add_trials(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--trials", type=positive, default=1000, help="default 1000")
-    parser.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
-
-
-def _add_replay(commands: Any) -> None:
-    replay = commands.add_parser(
-        "replay",
-        help="a recording of ranges through a filter",
-        description="Track a recorded body; with --truth, the errors. All files are CSV; "
-        "see docs/recordings.md for their columns.",
-    )
-    for name, text in (
-        ("ranges", "t,anchor,tag,range[,std,valid] or t,a0t0,a0t1,..."),
-        ("anchors", "anchor,x,y,z"),
-        ("tags", "tag,x,y,z"),
-    ):
-        replay.add_argument(f"--{name}", required=True, metavar="F", help=text)
-    replay.add_argument("--truth", metavar="F", help="t,x,y,z,qw,qx,qy,qz or t,x,y[,z],yaw_deg")
-    replay.add_argument("--calibration", metavar="F", help="anchor,tag,bias_m,slope")
-    replay.add_argument("--planar", action="store_true", help="hold height, roll and pitch")
-    replay.add_argument(
-        "--height-offset-m",
-        type=float,
-        default=0.0,
-        metavar="X",
-        help="of the tags' plane below the anchors', with --planar",
-    )
-    replay.add_argument(
-        "--yaw-offset-deg",
-        type=float,
-        default=0.0,
-        metavar="X",
-        help="yaw error = estimate - (truth + offset)",
-    )
-    replay.add_argument("--filter", metavar="NAME", help="default iekf, iekf-bias with a bias")
-    replay.add_argument(
-        "--range-std-m",
-        type=float,
-        metavar="X",
-        help="of a range; default the recording's own, else 0.12",
-    )
-    replay.add_argument(
-        "--walk-m",
-        type=float,
-        default=0.1,
-        metavar="X",
-        help="random walk of the position after 1 s, default 0.1",
-    )
-    replay.add_argument(
-        "--walk-deg",
-        type=float,
-        default=7.0,
-        metavar="X",
-        help="random walk of the rotation after 1 s, default 7",
-    )
-    replay.add_argument(
-        "--bias-std-m",
-        type=float,
-        metavar="X",
-        help="filter iekf-bias: of a link's bias, default 0.02, with --raw 0.05",
-    )
-    replay.add_argument(
-        "--bias-time-s",
-        type=float,
-        metavar="X",
-        help="how long a bias lasts, default 3, with --raw for ever",
-    )
-    replay.add_argument(
-        "--bias-common-m",
-        type=float,
-        metavar="X",
-        help="of the bias that all links have in common, default 0, with --raw 0.1",
-    )
-    replay.add_argument(
-        "--raw",
-        action="store_true",
-        help="ranges of radios that nobody calibrated: iekf-bias learns the biases that stay",
-    )
-    replay.add_argument(
-        "--accel-m",
-        type=float,
-        default=0.5,
-        metavar="X",
-        help="filter iekf-cv: change of the speed (m/s) after 1 s, default 0.5",
-    )
-    replay.add_argument(
-        "--accel-deg",
-        type=float,
-        default=30.0,
-        metavar="X",
-        help="filter iekf-cv: change of the turn rate (deg/s) after 1 s, default 30",
-    )
-    replay.add_argument("--no-robust", action="store_true", help="squares in place of Huber's loss")
-    replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")
-    replay.add_argument("--html", metavar="F", help="3-D page of the track with charts and tables")
-    add_json(replay)
-    replay.set_defaults(run=_replay)  # fmt: skip
+    add_seed(parser)
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -237,14 +144,8 @@ def _demo(options: argparse.Namespace) -> int:
         page.write(track_pages.demo(result, example), options.html)
     if write_json(result, options.json):
         reports.print_camsap2013(result)
-        _print_files(picture=options.plot, page=options.html)
+        print_files(picture=options.plot, page=options.html)
     return 0
-
-
-def _print_files(**files: str | None) -> None:
-    for label, path in files.items():
-        if path:
-            print(f"{label}: {path}")
 
 
 def _reproduce(options: argparse.Namespace) -> int:
@@ -280,7 +181,7 @@ def _reproduce(options: argparse.Namespace) -> int:
             hard_figures.print_hard(result)
         else:
             reports.print_experiment(result)
-        print(f"picture: {plot}")
+        print_files(picture=plot)
     return 0
 
 
@@ -296,7 +197,7 @@ def _network(options: argparse.Namespace) -> int:
         from rbl_gym.app import network_figures
 
         network_figures.print_network(solved.result)
-        _print_files(picture=options.plot)
+        print_files(picture=options.plot)
     return 0
 
 
@@ -327,67 +228,8 @@ def _place(options: argparse.Namespace) -> int:
         from rbl_gym.app import place_report
 
         place_report.print_place(placed.result)
-        _print_files(picture=options.plot, page=options.html)
+        print_files(picture=options.plot, page=options.html)
     return 0
-
-
-def _replay(options: argparse.Namespace) -> int:
-    from rbl_gym import recordings
-    from rbl_gym.app import replay
-
-    if options.html:
-        require("plotly", "viz")
-    settings = replay.Settings(
-        **_bias(options),
-        range_std_m=options.range_std_m,
-        walk_m=options.walk_m,
-        walk_deg=options.walk_deg,
-        accel_m=options.accel_m,
-        accel_deg=options.accel_deg,
-        robust=not options.no_robust,
-        planar=options.planar,
-        height_offset_m=options.height_offset_m,
-        yaw_offset_deg=options.yaw_offset_deg,
-    )
-    recording = recordings.read_recording(
-        options.ranges, options.anchors, options.tags, options.truth, options.calibration
-    )
-    replay.make_filter(recording, settings)  # a wrong name is said before the work begins
-    with progress("replay", len(recording.times)) as advance:
-        track = replay.run(recording, settings, advance)
-    found = replay.errors(recording, track, settings)
-    result = replay.figures(recording, track, found, settings)
-    if options.plot:
-        from rbl_gym.app import figures
-
-        figures.save(figures.replay(recording, track, found), options.plot)
-    if options.html:
-        from rbl_gym.app import page, track_pages
-
-        page.write(track_pages.replay(recording, track, result, settings), options.html)
-    if write_json(result, options.json):
-        from rbl_gym.app import reports
-
-        reports.print_replay(result)
-        _print_files(picture=options.plot, page=options.html)
-    return 0
-
-
-def _bias(options: argparse.Namespace) -> dict[str, Any]:
-    """The filter's name and the law of the biases, from what was said of either."""
-    given = {
-        name: getattr(options, name)
-        for name in ("bias_std_m", "bias_time_s", "bias_common_m")
-        if getattr(options, name) is not None
-    }
-    if options.raw:
-        if options.calibration:
-            raise ValueError("--raw means ranges without --calibration")
-        given = {"bias_std_m": 0.05, "bias_time_s": None, "bias_common_m": 0.1, **given}
-    name = options.filter or ("iekf-bias" if given else "iekf")
-    if given and name != "iekf-bias":
-        raise ValueError(f"{name} knows no biases: --raw and --bias-... are of iekf-bias")
-    return {"filter": name, **given}
 
 
 def _numbers(text: str) -> range:

@@ -10,7 +10,7 @@ from rbl_gym.app.rl_tasks import TASKS, rl_task
 from rbl_gym.app.terminal import (
     MissingExtraError,
     add_json,
-    natural,
+    add_seed,
     positive,
     progress,
     require,
@@ -27,7 +27,7 @@ def add_train(commands: Any) -> None:
     )
     train.add_argument("task", choices=sorted(TASKS))
     train.add_argument("--steps", type=positive, help="default: what the task's figures took")
-    train.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
+    add_seed(train)
     train.add_argument("--out", metavar="F", help="default out/TASK-SEED.npz")
     add_json(train)
     train.set_defaults(run=_train)
@@ -41,12 +41,8 @@ def add_evaluate(commands: Any) -> None:
         description="Score policies against the references on held-out worlds, with 95 % "
         "intervals of the paired bootstrap.",
     )
-    evaluate.add_argument("task", choices=sorted(TASKS))
-    evaluate.add_argument("--policy", action="append", default=[], metavar="F",
-                          help="of rbl-gym train; may be given again")  # fmt: skip
+    _add_players(evaluate, list(TASKS), worlds=256)
     evaluate.add_argument("--references", metavar="A,B", help="default all of the task's")
-    evaluate.add_argument("--worlds", type=positive, default=256, help="default 256")
-    evaluate.add_argument("--seed", type=natural, default=0, help="which worlds, default 0")
     add_json(evaluate)
     evaluate.set_defaults(run=_evaluate)
 
@@ -60,15 +56,20 @@ def add_transfer(commands: Any) -> None:
         "what is good by the bound track well?",
     )
     placements = [name for name, task in TASKS.items() if task.env_id == "RBL/AnchorPlacement-v0"]
-    transfer.add_argument("task", choices=sorted(placements))
-    transfer.add_argument("--policy", action="append", default=[], metavar="F",
-                          help="of rbl-gym train; may be given again")  # fmt: skip
-    transfer.add_argument("--worlds", type=positive, default=48, help="default 48")
+    _add_players(transfer, placements, worlds=48)
     transfer.add_argument("--repeats", type=positive, default=16,
                           help="bodies in each world, default 16")  # fmt: skip
-    transfer.add_argument("--seed", type=natural, default=0, help="which worlds, default 0")
     add_json(transfer)
     transfer.set_defaults(run=_transfer)
+
+
+def _add_players(parser: argparse.ArgumentParser, tasks: list[str], worlds: int) -> None:
+    """The task, the policies that play it, and the worlds they play it in."""
+    parser.add_argument("task", choices=sorted(tasks))
+    parser.add_argument("--policy", action="append", default=[], metavar="F",
+                        help="of rbl-gym train; may be given again")  # fmt: skip
+    parser.add_argument("--worlds", type=positive, default=worlds, help=f"default {worlds}")
+    add_seed(parser, "which worlds")
 
 
 def _train(options: argparse.Namespace) -> int:

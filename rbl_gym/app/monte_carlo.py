@@ -41,9 +41,8 @@ class Trace(NamedTuple):
         Pose error of the belief (K, B, 6).
     nees, score
         Of the belief: ``e^T P^-1 e``; b in metres.
-    own_rotation, own_translation
-        Variances the filter claims in its own state: of the rotation's Frobenius error, and
-        of the translation.
+    own_rotation
+        Variance of the rotation's Frobenius error that the filter claims in its own state.
     constrained
         Whether the update put the rotation back onto SO(3).
     seconds
@@ -56,7 +55,6 @@ class Trace(NamedTuple):
     nees: FloatArray
     score: FloatArray
     own_rotation: FloatArray
-    own_translation: FloatArray
     constrained: FloatArray
     seconds: float
 
@@ -139,7 +137,7 @@ def run(
                 error,
                 metrics.nees(error, belief.covariance),
                 bounds.score(belief.covariance, belief.rotation, tags),
-                *_own_variances(state.covariance),
+                _own_variance(state.covariance),
                 getattr(state, "constrained", np.zeros(len(error))),
             )
         )
@@ -149,12 +147,12 @@ def run(
     return Trace._make([*columns, seconds / columns[0].size])
 
 
-def _own_variances(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _own_variance(covariance: FloatArray) -> FloatArray:
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     if variance.shape[-1] == 12:
-        return variance[..., :9].sum(-1), variance[..., 9:].sum(-1)
+        return variance[..., :9].sum(-1)
     # |exp(w) Q - Q|_F^2 = 2 |w|^2 to first order.
-    return 2 * variance[..., :3].sum(-1), variance[..., 3:6].sum(-1)
+    return 2 * variance[..., :3].sum(-1)
 
 
 def rms(values: FloatArray, axis: int | None = None) -> Any:

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from rbl_gym.app.place import Map, Placed, accuracy_map
+from rbl_gym.app.place import Placed
+from rbl_gym.app.place_accuracy import Map, accuracy_map
 from rbl_gym.checks import FloatArray
 from rbl_gym.regions import Shell
 

@@ -11,7 +11,8 @@ import numpy as np
 import plotly.graph_objects as go
 
 from rbl_gym.app import page, solids
-from rbl_gym.app.place import Map, Placed, level_maps
+from rbl_gym.app.place import Placed
+from rbl_gym.app.place_accuracy import Map, level_maps
 from rbl_gym.app.place_report import notes, tables
 from rbl_gym.regions import Shell
 

@@ -30,6 +30,11 @@ def add_json(parser: argparse.ArgumentParser) -> None:
                         "in place of the table")  # fmt: skip
 
 
+def add_seed(parser: argparse.ArgumentParser, of: str = "of all randomness") -> None:
+    """The option --seed."""
+    parser.add_argument("--seed", type=natural, default=0, help=f"{of}, default 0")
+
+
 @contextlib.contextmanager
 def progress(label: str, total: int) -> Iterator[Callable[..., None]]:
     """A progress bar on standard error; yields the function that advances it (by 1)."""
@@ -76,3 +81,10 @@ def natural(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"must be a whole number, not negative, got {text!r}")
     return value
+
+
+def print_files(**files: str | None) -> None:
+    """Where what was written stands, a line each: ``picture: out/x.png``."""
+    for label, path in files.items():
+        if path:
+            print(f"{label}: {path}")

@@ -80,8 +80,12 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
 
     # --- what a world is --------------------------------------------------------------------
 
-    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        """Start new episodes of the worlds with these indices."""
+    def _restart(
+        self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
+    ) -> dict[str, np.ndarray] | None:
+        """Start new episodes of the worlds with these indices.
+
+        May return infos of these worlds that only the start of an episode has."""
         raise NotImplementedError
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
@@ -91,11 +95,13 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         raise NotImplementedError
 
     def _observe(self) -> Observation:
-        """Observations of all worlds, in memory of their own."""
+        """Observations of all worlds; what is returned is the caller's.
+
+        Asked for once after each `_restart` or `_advance`, as `_inform`."""
         raise NotImplementedError
 
     def _inform(self) -> dict[str, np.ndarray]:
-        """Infos of all worlds, in memory of their own."""
+        """Infos of all worlds; what is returned is the caller's."""
         raise NotImplementedError
 
     def _shot(self) -> tuple[Any, Any]:
@@ -121,9 +127,9 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             for i in np.flatnonzero(mask):
                 if seeds[i] is not None:
                     self._generators[i] = seeding.np_random(seeds[i])[0]
-        self._begin(mask)
+        start = self._begin(mask)
         self._shoot()
-        return self._observe(), self._masked_info()
+        return self._observe(), {**self._masked_info(), **start}
 
     def step(
         self, actions: ArrayLike
@@ -145,19 +151,19 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             reward, terminated = np.where(moving, advanced, 0.0), over & moving
         truncated = moving & ~terminated & (self._epochs >= self.steps_limit)
         self._done = terminated | truncated
-        if ended.any():
-            self._begin(ended)
+        start = self._begin(ended) if ended.any() else {}
         self._shoot()
         if self.autoreset_mode is not AutoresetMode.SAME_STEP or not self._done.any():
-            return self._observe(), reward, terminated, truncated, self._masked_info()
+            info = {**self._masked_info(), **start}
+            return self._observe(), reward, terminated, truncated, info
         last = self._done.copy()
         final = {
             "final_obs": _rows_as_objects(self._observe(), last),
             "final_info": self._masked_info(last),
         }
-        self._begin(last)
+        start = self._begin(last)
         self._shoot()
-        info = self._masked_info()
+        info = {**self._masked_info(), **start}
         for name, value in final.items():
             info[name], info[f"_{name}"] = value, last.copy()
         return self._observe(), reward, terminated, truncated, info
@@ -170,11 +176,18 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         if self.film is not None:
             self.film.take(self._epochs, *self._shot())
 
-    def _begin(self, mask: BoolArray) -> None:
+    def _begin(self, mask: BoolArray) -> dict[str, np.ndarray]:
+        """Start new episodes where the mask says; infos of their start with their masks."""
         chosen = np.flatnonzero(mask)
         self._epochs[chosen] = 0
         self._done[chosen] = False
-        self._restart(chosen, [self._generators[i] for i in chosen])
+        info: dict[str, np.ndarray] = {}
+        told = self._restart(chosen, [self._generators[i] for i in chosen])
+        for name, value in (told or {}).items():
+            info[name] = np.zeros((self.num_envs, *value.shape[1:]), value.dtype)
+            info[name][chosen] = value
+            info[f"_{name}"] = mask.copy()
+        return info
 
     def _masked_info(self, where: BoolArray | None = None) -> dict[str, Any]:
         """Infos with Gymnasium's masks ``_key`` beside them; zeros outside of `where`."""
@@ -200,16 +213,18 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"actions must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
             )
-        if not np.isfinite(array).all():
+        if not whole and not np.isfinite(array).all():
             raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
         if isinstance(space, gym.spaces.Box):
             return array.astype(np.float64)
-        dtype = self.action_space.dtype
-        # Binary before the cast: a narrow type would wrap large numbers round into the space.
-        legal = self.action_space.contains(array.astype(dtype)) if whole else np.isin(array, (0, 1))
-        if not np.all(legal):
+        # Before the cast: a narrow type would wrap large numbers round into the space.
+        if isinstance(space, gym.spaces.Discrete):
+            legal = (array >= space.start) & (array < space.start + space.n)
+        else:
+            legal = np.isin(array, (0, 1))
+        if not legal.all():
             raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
-        return array.astype(dtype)
+        return array.astype(self.action_space.dtype)
 
 
 def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:

@@ -71,7 +71,7 @@ def _frame(
     if belief is not None:
         headline += f", error {errors[0, -1]:.2f}°"
     picture, left, upper, lower = panels.empty()
-    _plan(side_m, n_nodes, source).paint(last, belief, headline, left)
+    _plan(side_m, n_nodes).paint(last, belief, headline, left)
     _legend(source).paint([], upper)
     strips = panels.strips(
         steps, (limits_of(bands[0], errors[0]),), ("orientation [deg]",),
@@ -88,7 +88,7 @@ def _rms(angles: FloatArray) -> float:
 class _Plan:
     """The network from above."""
 
-    def __init__(self, side_m: float, n_nodes: int, source: str) -> None:
+    def __init__(self, side_m: float, n_nodes: int) -> None:
         self.panel = panel = Panel(panels.LEFT, panels.HEIGHT)
         axes: Any = panel.figure.add_axes((0.085, 0.075, 0.84, 0.8))
         margin = 0.12 * side_m
