@@ -147,9 +147,8 @@ class TrackingVectorEnv(BatchEnv):
         information, prior = self._information, self._prior_covariance
         if len(rows) < self.num_envs:
             at = simulation.Epoch(*(None if field is None else field[rows] for field in at))  # pyright: ignore[reportArgumentType]
-            anchors, links, information, prior = (
-                field[rows] for field in (anchors, links, information, prior)
-            )
+            anchors, links = anchors[rows], links[rows]
+            information, prior = information[rows], prior[rows]
         information, score_m = simulation.posterior_step(
             self.scene, at, anchors, links, None if started else information, prior
         )
