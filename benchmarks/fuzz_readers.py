@@ -3,7 +3,7 @@
 Every input must be read, or be refused by a ValueError that names the file (`tests/fuzz_files.py`,
 which also has the good files to begin with). A crash is printed with its input.
 
-    python -m pip install atheris
+    python -m pip install -e ".[fuzz]"
     python -m benchmarks.fuzz_readers [NAME ...] [--seconds 60]
 """
 

@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import soak_environments
 from gymnasium.vector import AutoresetMode
 
-import soak_environments
 from rbl_gym import scenes
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.wrappers import VectorEstimatePose

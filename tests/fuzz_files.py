@@ -95,9 +95,9 @@ def _recording(part: str, path: Path) -> Any:
 def _policy() -> bytes:
     stream = io.BytesIO()
     meta = np.array(json.dumps({"kind": "box", "task": "mobile", "seed": 0}))
-    arrays: dict[str, Any] = {"weight_0": np.ones((2, 3), "f4"), "bias_0": np.zeros(2, "f4"),
-                              "weight_1": np.ones((1, 2), "f4"), "bias_1": np.zeros(1, "f4")}  # fmt: skip
-    np.savez(stream, **arrays, meta=meta)
+    weights: Any = {"weight_0": np.ones((2, 3), "f4"), "weight_1": np.ones((1, 2), "f4")}
+    biases: Any = {"bias_0": np.zeros(2, "f4"), "bias_1": np.zeros(1, "f4")}
+    np.savez(stream, **weights, **biases, meta=meta)
     return stream.getvalue()
 
 

