@@ -3,11 +3,13 @@
 Vector environments with the iterated EKF and the KF family behind them, scenes changed at random
 (links lost, reflections, noise, trajectories), random actions, resets by every autoreset mode.
 Every step of every body is checked. Worlds whose filters are cheap run longest.
+`--filters none`: the environments alone, all ids, see `soak_environments.py`.
 
 World k is a function of the seed and k alone: after a stop or a failure `--start-at k` goes on
 from there.
 
-    python benchmarks/soak.py [--body-steps 1e6] [--minutes 60] [--start-at 0] [--seed 0] [--json F]
+    python benchmarks/soak.py [--body-steps 1e6] [--minutes 60] [--cpu-minutes 60] [--start-at 0]
+        [--seed 0] [--filters all] [--json F]
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import soak_environments
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym import scenes
@@ -63,6 +66,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--body-steps", type=float, default=1e6)
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long")
+    parser.add_argument("--cpu-minutes", type=float, default=math.inf, help="the same, of CPU time")
+    parser.add_argument("--filters", choices=["all", "none"], default="all")
     parser.add_argument("--start-at", type=int, default=0, metavar="K", help="first world")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", metavar="F")
@@ -71,12 +76,17 @@ def main() -> None:
     counts: dict[str, int] = defaultdict(int)
     index, done, memory = options.start_at, 0, []
     while True:
-        world, steps = run(options.seed, index)
-        counts[f"{world.scene['name']} {world.filter}"] += steps
+        if options.filters == "none":
+            label, steps = soak_environments.run(options.seed, index)
+        else:
+            world, steps = run(options.seed, index)
+            label = f"{world.scene['name']} {world.filter}"
+        counts[label] += steps
         index, done = index + 1, done + steps
         memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
         seconds = time.perf_counter() - begin
         over = done >= options.body_steps or seconds >= 60 * options.minutes
+        over = over or time.process_time() - cpu >= 60 * options.cpu_minutes
         if over or seconds > told + 10:
             told = seconds
             rate = done / (time.process_time() - cpu)

@@ -112,6 +112,14 @@ def as_float(name: str, value: Any) -> FloatArray:
         raise ValueError(f"{name} must be an array of real numbers, got {value!r:.80}") from error
 
 
+def as_array(name: str, value: Any) -> NDArray[Any]:
+    """An array of anything, or a ValueError that names it: ragged lists are none."""
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise ValueError(f"{name} must be an array, got {value!r:.80}") from error
+
+
 def check_finite(name: str, array: FloatArray) -> FloatArray:
     """`array` unchanged, or a ValueError with the first entry that is NaN, inf or `HUGE`."""
     # False of NaN too.

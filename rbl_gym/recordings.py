@@ -26,6 +26,8 @@ _Log = tuple[FloatArray, FloatArray, FloatArray | None]  # times, ranges (0: no 
 
 _MAX_RANGE_M = 10e3
 _MAX_COORDINATE_M = 100e3
+_MAX_TIME_S = 1e11  # the year 5138
+_MAX_YAW_DEG = 1e6
 _MAX_SCALE_RATIO = 50.0
 _TOO_LONG = f"must be at most {_MAX_RANGE_M:.0f} m (looks like millimetres?)"
 _TOO_FAR = f"must be at most {_MAX_COORDINATE_M:.0f} m (looks like millimetres?)"
@@ -177,6 +179,8 @@ class _Table(NamedTuple):
     def times(self, *, may_repeat: bool = False) -> FloatArray:
         """(rows,) column `t`, increasing."""
         times = self.numbers("t")
+        too_late = f"must be at most {_MAX_TIME_S:g} s (looks like milliseconds?)"
+        self.check(np.abs(times) <= _MAX_TIME_S, "t", too_late)
         step = np.diff(times, prepend=-np.inf)
         ok, must = (step >= 0, "not decrease") if may_repeat else (step > 0, "increase")
         self.check(ok, "t", f"time must {must} from row to row")
@@ -296,6 +300,7 @@ def _read_long(table: _Table, ids: _Ids) -> _Log:
     if "std" in table.columns:
         std = table.numbers("std", may_be_empty=True)
         table.check((std > 0) | (measured == 0), "std", "must be positive")
+        table.check((std <= _MAX_RANGE_M) | (measured == 0), "std", _TOO_LONG)
         range_std = np.zeros_like(ranges)
         range_std[cells] = np.where(measured > 0, std, 0.0)
     return times[starts], ranges, range_std
@@ -310,7 +315,10 @@ def _calibrated(
     table.check(slope > -1, "slope", "must be above -1")
     bias, scale = np.zeros(ranges.shape[1:]), np.ones(ranges.shape[1:])
     bias[link], scale[link] = table.numbers("bias_m"), 1 + slope
-    corrected = (ranges - bias) / scale
+    with np.errstate(over="ignore"):
+        corrected = (ranges - bias) / scale
+    too_long = f"corrected ranges {_TOO_LONG}"
+    table.check(corrected.max(axis=0)[link] <= _MAX_RANGE_M, "bias_m", too_long)
     links = (ranges > 0) & (corrected > 0)
     std = None if std is None else np.where(links, std / scale, 0.0)
     return np.where(links, corrected, 0.0), std
@@ -331,7 +339,10 @@ def _check_scale(path: str, measured: FloatArray, anchors: FloatArray) -> None:
 def _read_truth(table: _Table) -> Truth:
     if "yaw_deg" in table.columns:
         table.check_columns(("t", "x", "y", "yaw_deg"), ("z",))
-        rotation = rotations.exp(np.radians(table.numbers("yaw_deg"))[:, None] * (0.0, 0.0, 1.0))
+        yaw = table.numbers("yaw_deg")
+        must = f"must be at most {_MAX_YAW_DEG:g} in magnitude"
+        table.check(np.abs(yaw) <= _MAX_YAW_DEG, "yaw_deg", must)
+        rotation = rotations.exp(np.radians(yaw)[:, None] * (0.0, 0.0, 1.0))
         translation = table.points(axis for axis in "xyz" if axis in table.columns)
         missing = 3 - translation.shape[1]
         return Truth(table.times(), rotation, np.pad(translation, ((0, 0), (0, missing))))
@@ -339,6 +350,7 @@ def _read_truth(table: _Table) -> Truth:
     names = ("qw", "qx", "qy", "qz")
     table.check_columns(("t", "x", "y", "z", *names))
     q = np.stack([table.numbers(name) for name in names], axis=-1)
-    norm = np.linalg.norm(q, axis=-1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(q, axis=-1)
     table.check(np.abs(norm - 1) <= 1e-2, "qw", "quaternion norm must be 1 within 0.01", got=norm)
     return Truth(table.times(), rotations.from_quaternion(q), table.points("xyz"))

@@ -88,7 +88,11 @@ def problem(
     if Path(scene).suffix.lower() in (".toml", ".json"):
         if racks:
             raise ValueError(f"racks must be 0 with a file, got {racks}: list them as obstacles")
-        return of_mapping(load(scene), n_anchors, region, name=Path(scene).stem)
+        tables = load(scene)
+        try:
+            return of_mapping(tables, n_anchors, region, name=Path(scene).stem)
+        except ValueError as error:
+            raise ValueError(f"{scene}: {error}") from error
     known = scenes.get(check_one_of("scene", scene, list(scenes.SCENES)))
     task = placement.task(known, n_anchors, racks)
     context = placement.whole_volume(task)
@@ -99,10 +103,12 @@ def problem(
 
 def load(path: str) -> dict[str, Any]:
     """The tables of a TOML or JSON file; a ValueError names the file and what is wrong in it."""
-    text = Path(path).read_text(encoding="utf-8")
+    data = Path(path).read_bytes()
     try:
+        text = data.decode("utf-8")
         found = tomllib.loads(text) if path.lower().endswith(".toml") else json.loads(text)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+    # Both parsers recurse into what is nested.
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from error
     return _table(found, path)
 
@@ -328,8 +334,8 @@ def _corner(name: str, value: Any) -> tuple[float, ...]:
 
 
 def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError(f"name must be a text, got {value!r:.80}")
+    if not isinstance(value, str) or not value or not value.isprintable():
+        raise ValueError(f"name must be a printable text, got {value!r:.80}")
     return value
 
 

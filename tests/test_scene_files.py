@@ -192,7 +192,7 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("noise.blocked_information", 2, "noise.blocked_information must be a finite number"),
         ("prior.position_m", 0, "prior.position_m must be a finite number"),
         ("prior.angle", 0, "prior has an unknown key 'angle'"),
-        ("name", 3, "name must be a text"),
+        ("name", 3, "name must be a printable text"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_in_a_file_is_named(path, value, message):

@@ -135,12 +135,16 @@ def scene_of(env: Any) -> scenes.Scene:
 
 def make_filter(scene: scenes.Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
     """A named filter that knows the scene's tags and laws."""
+    if options is not None and not (
+        isinstance(options, Mapping) and all(isinstance(key, str) for key in options)
+    ):
+        raise ValueError(f"options must be a dict by names, or None, got {options!r:.80}")
     return estimators.make(
         name,
         tags=np.asarray(scene.tags),
         noise=scene.noise,
         process=scene.process,
-        **(options or {}),
+        **({} if options is None else options),
     )
 
 

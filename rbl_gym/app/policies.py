@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,24 +74,20 @@ def load(path: str | Path) -> Policy:
     ValueError
         If the file is no policy.
     """
+    # Read first: an OSError from here on is the archive's.
+    data = Path(path).read_bytes()
     try:
-        # numpy leaves a file open that is no archive.
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
             meta = json.loads(str(file[_META]))
             n_layers = sum(name.startswith("weight_") for name in file.files)
             weights = tuple(file[f"weight_{k}"].astype(float) for k in range(n_layers))
             biases = tuple(file[f"bias_{k}"].astype(float) for k in range(n_layers))
         policy = Policy(weights, biases, check_one_of("kind", meta.pop("kind"), KINDS), meta)
         _check_layers(policy)
-    except _BROKEN as error:
+    # What zipfile and numpy raise of a broken archive has no common kind but this.
+    except Exception as error:
         raise ValueError(f"{path} is no policy of rbl-gym: {error}") from error
     return policy
-
-
-# What reading a file raises that holds something else, or half of it.
-_BROKEN = (
-    AttributeError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
 
 
 def _check_layers(policy: Policy) -> None:

@@ -6,7 +6,7 @@ same code with one world, so that the scalar environment and world i of a vector
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -17,9 +17,11 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from rbl_gym import rendering
-from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, as_array, check_one_of
 
 Observation = Any
+# More than any machine holds.
+MOST_ENVS = 10**8
 
 
 class BatchEnv(VectorEnv[Any, Any, Any]):
@@ -51,15 +53,10 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         max_episode_steps: int | None,
         autoreset_mode: str | AutoresetMode,
     ) -> None:
-        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or num_envs < 1:
-            raise ValueError(f"num_envs must be a positive int, got {num_envs!r}")
+        check_count("num_envs", num_envs, most=MOST_ENVS)
         rendering.check_mode(render_mode)
-        if max_episode_steps is not None and (
-            isinstance(max_episode_steps, bool)
-            or not isinstance(max_episode_steps, int)
-            or max_episode_steps < 1
-        ):
-            raise ValueError(f"max_episode_steps must be a positive int, got {max_episode_steps!r}")
+        if max_episode_steps is not None:
+            check_count("max_episode_steps", max_episode_steps)
         modes = [mode.value for mode in AutoresetMode]
         if not isinstance(autoreset_mode, AutoresetMode):
             autoreset_mode = AutoresetMode(check_one_of("autoreset_mode", autoreset_mode, modes))
@@ -204,7 +201,7 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
     def _checked(self, actions: ArrayLike) -> np.ndarray:
         """Actions as an array that fits the action space in shape and is finite."""
         space = self.single_action_space
-        array = np.asarray(actions)
+        array = as_array("actions", actions)
         shape = (self.num_envs, *(space.shape or ()))
         # Learners hand on binary choices as floating-point zeros and ones.
         whole = isinstance(space, gym.spaces.Discrete)
@@ -227,11 +224,25 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         return array.astype(self.action_space.dtype)
 
 
+def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
+    """A whole number from `least` to `most`, or a ValueError that names it."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        wanted = "a positive int" if least == 1 else f"an int of at least {least}"
+        raise ValueError(f"{name} must be {wanted}, got {value!r:.80}")
+    if most is not None and value > most:
+        raise ValueError(f"{name} must be at most {most}, got {value!r:.80}")
+    return value
+
+
 def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
     """Which worlds ``options={"reset_mask": mask}`` resets, all without it; or a ValueError."""
-    if options is None or "reset_mask" not in options:
+    if options is None:
         return np.ones(num_envs, dtype=np.bool_)
-    mask = np.asarray(options["reset_mask"])
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options must be a dict or None, got {options!r:.80}")
+    if "reset_mask" not in options:
+        return np.ones(num_envs, dtype=np.bool_)
+    mask = as_array("reset_mask", options["reset_mask"])
     if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
         raise ValueError(
             f"reset_mask must be ({num_envs},) booleans, at least one True, "
@@ -245,10 +256,18 @@ def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int
     if seed is None:
         return [None] * num_envs
     if isinstance(seed, int | np.integer):
-        return [int(seed) + i for i in range(num_envs)]
-    if len(seed) != num_envs:
-        raise ValueError(f"seed must hold {num_envs} seeds, got {len(seed)}")
-    return list(seed)
+        return [_seed(int(seed) + i) for i in range(num_envs)]
+    if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str | bytes):
+        raise ValueError(f"seed must be an int, a list of ints or None, got {seed!r:.80}")
+    if np.shape(seed)[:1] != (num_envs,) if isinstance(seed, np.ndarray) else len(seed) != num_envs:
+        raise ValueError(f"seed must hold {num_envs} seeds, got {seed!r:.80}")
+    return [_seed(one) for one in seed]
+
+
+def _seed(seed: Any) -> int | None:
+    if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
+        raise ValueError(f"seed must be an int that is not negative, or None, got {seed!r:.80}")
+    return None if seed is None else int(seed)
 
 
 def _rows_as_objects(observation: Observation, where: BoolArray) -> np.ndarray:
@@ -308,7 +327,7 @@ class ScalarEnv(gym.Env[Any, Any]):
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step."""
         observation, reward, terminated, truncated, info = self._batch.step(
-            np.asarray(action)[None]
+            as_array("action", action)[None]
         )
         return (
             _row(observation, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]),

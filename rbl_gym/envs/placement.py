@@ -46,7 +46,9 @@ class AnchorPlacementVectorEnv(BatchEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         self.task = placement.task(scene, n_anchors, racks)
-        self.mirror = bool(mirror) and is_symmetric(self.task)
+        if not isinstance(mirror, bool):
+            raise ValueError(f"mirror must be True or False, got {mirror!r:.80}")
+        self.mirror = mirror and is_symmetric(self.task)
         self.mode = check_one_of("mode", mode, MODES)
         self.single_action_space = self._action_space()
         size = observation_size(self.task, self.mode)

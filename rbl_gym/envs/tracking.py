@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike
 
 from rbl_gym import posterior, ranging, rendering, scenes, simulation
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, as_array, check_array, check_one_of
 
 REWARDS = ("bound", "none")
 OBSERVATIONS = ("ranges", "statistic")
@@ -156,7 +156,7 @@ class TrackingEnv(gym.Env[Any, Any]):
         if self.scene.anchor_speed_m_s > 0:
             velocities = check_action(action, 3 * self.scene.n_anchors)
             self._anchors = simulation.move_anchors(self.scene, self._anchors, velocities)
-        elif not are_zeros(np.asarray(action), ()):
+        elif not are_zeros(as_array("action", action), ()):
             raise ValueError(f"action must be 0 where the anchors are fixed, got {action!r:.80}")
         self._epoch += 1
         observation, info, reward = self._observe()

@@ -19,7 +19,9 @@ _SPARE = 50
 
 def check_mode(render_mode: str | None) -> str | None:
     """The render mode, or a ValueError."""
-    if render_mode is not None and render_mode not in RENDER_MODES:
+    if render_mode is not None and not (
+        isinstance(render_mode, str) and render_mode in RENDER_MODES
+    ):
         raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
     return render_mode
 

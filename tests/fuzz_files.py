@@ -1,0 +1,168 @@
+"""Readers of files and good files for them, which `test_fuzz_readers.py` and
+`benchmarks/fuzz_readers.py` spoil; and what may come of it."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.app import bench_command, bench_files, policies
+from rbl_gym.g2o import read_graph
+from rbl_gym.recordings import read_recording
+from rbl_gym.scene_files import problem
+
+
+class Reader(NamedTuple):
+    """A reader of one file, good files for it, and words that mutations are made of."""
+
+    file: str
+    read: Callable[[Path], Any]
+    seeds: tuple[bytes, ...]
+    words: tuple[bytes, ...]
+
+
+ANCHORS = b"anchor,x,y,z\nA,0,0,1\nB,4,0,1\nC,0,4,2\n"
+TAGS = b"tag,x,y,z\n1,0.1,0,0\nleft,-0.1,0.1,0\n"
+LONG = (b"t,anchor,tag,range,std,valid\n0.0,A,1,2.5,0.1,1\n0.0,A,left,2.25,0.1,1\n"
+        b"0.0,B,1,-1,,0\n0.0,C,1,3.0,0.2,1\n0.1,A,1,70000,0,0\n0.1,B,left,1.5,0.1,1\n")  # fmt: skip
+WIDE = b"# log\nt,aAt1,aAtleft,aCt1,aBtleft\n0.0,2.5,2.25,3.0,\n0.1,,,,1.5\n"
+TRUTH = b"t,x,y,z,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1,2,2,3,0.6,0,0,0.8\n"
+PLANAR = b"t,x,y,yaw_deg\n0,1,2,90\n1,2,2,180\n"
+CALIBRATION = b"anchor,tag,bias_m,slope,sigma_m\nA,1,0.5,0.25,0.01\nC,1,3.5,0,\n"
+G2O = (b"VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1.0 0.0 0.1 500 0 0 500 0 5000\n# x\n"
+       b"EDGE_SE2 1 7 1.0 0.5 -3.0 500 0 0 500 0 5000\nFIX 0\n")  # fmt: skip
+SCENE = {
+    "name": "hall",
+    "anchors": {"kind": "room", "low": [0, 0, 0.5], "high": [10, 8, 3], "number": 6},
+    "region": {"low": [1, 1, 0.5], "high": [9, 7, 2]},
+    "obstacles": [{"low": [4, 3, 0], "high": [5, 5, 2]}],
+    "body": {"shape": "octahedron", "size_m": 0.8},
+    "noise": {"floor_m": 0.1, "proportional": 0.001, "blocked_information": 0.01},
+    "prior": {"rotation_deg": 10.0, "position_m": 0.5},
+}
+SHELL = SCENE | {
+    "anchors": {"kind": "shell", "inner_m": 50, "outer_m": 300, "number": 5},
+    "body": {"tags": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]},
+}
+TOML = b"""name = "hall"
+[anchors]
+kind = "box"
+low = [0, 0, 0]
+high = [10, 8, 0]
+number = 4
+[region]
+low = [1, 1, -5]
+high = [9, 7, -1]
+[body]
+shape = "plate"
+size_m = 1.5
+[noise]
+floor_m = 0.1
+[[obstacles]]
+low = [4, 3, -3]
+high = [5, 5, -2]
+"""
+RECORD = {
+    "scene": "uwb_room", "spec": "uwb_room", "scene_hash": "0a", "condition": "nominal",
+    "filter": "iekf", "filter_source": "rbl-gym", "trials": 2, "seed": 0,
+    "versions": {"numpy": "2"}, "nees": 6.0, "per_trial": {"position_m": [0.1, 0.2]},
+}  # fmt: skip
+NUMBERS = (b"nan", b"inf", b"-1", b"0", b"1e308", b"-1e308", b"1e-320", b"1e400", b"9" * 40, b"",
+           b"9" * 5000, b"1_0", b"true", b"\xc3\xa9", b"\xff", b"\0", b"\r", b"\x85")  # fmt: skip
+MARKS = (b",", b"\n", b" ", b'"', b"#", b"\xef\xbb\xbf", b"\t", b";", b"-", b".")
+JSON = (b"{", b"}", b"[", b"]", b":", b"null", b"NaN", b"Infinity", b"[" * 3000, b'{"a":' * 3000,
+        b'"\\ud800"', b'""')  # fmt: skip
+
+
+def _recording(part: str, path: Path) -> Any:
+    files = {"ranges": LONG, "anchors": ANCHORS, "tags": TAGS, "truth": TRUTH,
+             "calibration": CALIBRATION} | {part: None}  # fmt: skip
+    for name, data in files.items():
+        beside = path.with_name(f"good_{name}.csv")
+        if data is not None and not beside.exists():
+            beside.write_bytes(data)
+    paths = {name: path.with_name(f"good_{name}.csv") for name in files} | {part: path}
+    return read_recording(**paths)
+
+
+def _policy() -> bytes:
+    stream = io.BytesIO()
+    meta = np.array(json.dumps({"kind": "box", "task": "mobile", "seed": 0}))
+    weights: Any = {"weight_0": np.ones((2, 3), "f4"), "weight_1": np.ones((1, 2), "f4")}
+    biases: Any = {"bias_0": np.zeros(2, "f4"), "bias_1": np.zeros(1, "f4")}
+    np.savez(stream, **weights, **biases, meta=meta)
+    return stream.getvalue()
+
+
+def _policy_packed() -> bytes:
+    stream = io.BytesIO()
+    meta = np.array(json.dumps({"kind": "discrete", "task": "mounts"}))
+    np.savez_compressed(stream, weight_0=np.ones((4, 2), "f4"), bias_0=np.zeros(4, "f4"), meta=meta)
+    return stream.getvalue()
+
+
+_json = tuple(json.dumps(scene, indent=1).encode() for scene in (SCENE, SHELL))
+_lines = "".join(json.dumps(RECORD | {"filter": name}) + "\n" for name in ("kf", "iekf")).encode()
+_times = b'{"scene": "u", "scene_hash": "0a", "condition": "nominal", "filter": "kf", ' \
+         b'"microseconds_per_step": 1.5}\n' * 2  # fmt: skip
+READERS = {
+    "ranges": Reader("ranges.csv", partial(_recording, "ranges"), (LONG, WIDE), NUMBERS + MARKS),
+    **{
+        part: Reader(f"{part}.csv", partial(_recording, part), seeds, NUMBERS + MARKS)
+        for part, seeds in (("anchors", (ANCHORS,)), ("tags", (TAGS,)), ("truth", (TRUTH, PLANAR)),
+                            ("calibration", (CALIBRATION,)))
+    },
+    "g2o": Reader("graph.g2o", read_graph, (G2O,), NUMBERS + MARKS),
+    "edges": Reader(
+        "graph.csv", read_graph, (b"i,j,dtheta\n0,1,0.5\n1,2,0.1\n", b"i,j,a,b\n0,1,0.5,-2\n"),
+        NUMBERS + MARKS,
+    ),
+    "scene-json": Reader("scene.json", lambda path: problem(str(path)), _json, NUMBERS + JSON),
+    "scene-toml": Reader(
+        "scene.toml", lambda path: problem(str(path)), (TOML,), NUMBERS + MARKS + JSON
+    ),
+    "policy": Reader("policy.npz", policies.load, (_policy(), _policy_packed()), NUMBERS),
+    "bench-spec": Reader(
+        "spec.json", bench_command._from_file,
+        (b'{"name": "uwb_room", "steps": 9}', b'{"ranges": "r.csv", "anchors": "a.csv"}'),
+        NUMBERS + JSON,
+    ),
+    "bench-lines": Reader("bench.jsonl", bench_files.read, (_lines,), NUMBERS + JSON),
+    "bench-timings": Reader(
+        "bench.timings.jsonl",
+        lambda path: bench_files.read_timings(path.with_name("bench.jsonl")), (_times,),
+        NUMBERS + JSON,
+    ),
+}  # fmt: skip
+
+
+def check(name: str, data: bytes, folder: Path) -> str:
+    """What the reader made of the bytes: "read", or the message; an AssertionError if neither."""
+    reader = READERS[name]
+    path = folder / reader.file
+    path.write_bytes(data)
+    try:
+        found = reader.read(path)
+    except ValueError as error:
+        text = str(error)
+        # Ids that do not fit may be laid to the file that uses them.
+        files = [file.name for file in folder.iterdir()]
+        assert any(file in text for file in files), f"does not name the file: {text}"
+        return re.sub(r"\d+", "0", text.replace(str(folder), ""))
+    assert _is_finite(found), "read numbers that are none"
+    return "read"
+
+
+def _is_finite(found: Any) -> bool:
+    if isinstance(found, tuple):
+        return all(map(_is_finite, found))
+    if isinstance(found, np.ndarray) and found.dtype.kind == "f":
+        return bool(np.isfinite(found).all())
+    return True
