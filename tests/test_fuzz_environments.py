@@ -33,11 +33,8 @@ WORLDS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 BATCH = {"num_envs": 2, "max_episode_steps": 2, "autoreset_mode": "NextStep"}
 COMMON: dict[str, Any] = {"render_mode": None}
-# Found, and not mended yet: see docs/fuzzing.md.
-OPEN = pytest.mark.xfail(strict=False, reason="TrackingVectorEnv: types of three arguments")
 CASES = [
-    pytest.param(name, vector, id=f"{name}-{'vector' if vector else 'scalar'}",
-                 marks=OPEN if (name, vector) == ("Tracking", True) else ())
+    pytest.param(name, vector, id=f"{name}-{'vector' if vector else 'scalar'}")
     for name in WORLDS for vector in (False, True)
 ]  # fmt: skip
 ACTIONS = [*WRONG, *SIZES, np.zeros(3), np.full((2, 8), np.nan), np.ones((2, 8), complex), 2**70]

@@ -140,10 +140,10 @@ def _specs(names: list[str]) -> dict[str, Any]:
 
 def _from_file(path: Path) -> dict[str, Any]:
     """A mapping for `scenes.get`, or one of a recording, its files found beside this one."""
-    text = path.read_text(encoding="utf-8")
     try:
+        text = path.read_text(encoding="utf-8")
         spec = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-    except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from error
     if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
         raise ValueError(f"{path}: must have the name of a scene, or the files of a recording")

@@ -117,14 +117,14 @@ def read(path: Path) -> Records:
         On any other line that is not a record, with its number.
     """
     records: Records = []
-    lines = path.read_text(encoding="utf-8").split("\n")
+    lines = _text(path).split("\n")
     for number, line in enumerate(lines, start=1):
         if not line:
             continue
         try:
             record = json.loads(line)
             leaderboard.key_of(record)
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
             if number == len(lines):
                 break
             raise ValueError(f"{path}, line {number}: no record of rbl-gym bench") from error
@@ -138,13 +138,20 @@ def read_timings(path: Path) -> dict[tuple[str, ...], float]:
     times: dict[tuple[str, ...], float] = {}
     if not file.exists():
         return times
-    for line in file.read_text(encoding="utf-8").splitlines():
+    for line in _text(file).splitlines():
         try:
             row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        times[leaderboard.timing_key(row)] = row["microseconds_per_step"]
+            times[leaderboard.timing_key(row)] = row["microseconds_per_step"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue  # a time that cannot be read is no time
     return times
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is not text in UTF-8: {error}") from error
 
 
 def _timing(record: Mapping[str, Any], microseconds: float | None) -> dict[str, Any]:
