@@ -255,7 +255,7 @@ class IteratedEkfBank:
             out = self._is_outside(leader.translation, leader.covariance) & np.isfinite(best)
             odds -= np.where(out, best, 0.0)[trial]
         odds[odds < _BEATEN] = -np.inf
-        return with_best(state, rows, known.nonzero(), known.shape[1], after, odds)
+        return with_best(state, rows, np.nonzero(known), known.shape[1], after, odds)
 
     def _candidates(self, epoch: _Epoch) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Poses (R, C, 3, 3), (R, C, 3) that explain an epoch's ranges, and which there are."""

@@ -55,19 +55,15 @@ _FIELDS = (2, 1, 2, 3, 2, 3, 1, 0, 0)
 def alone(leader: PoseState) -> BankState:
     """The state of a leader without rivals."""
     batch = leader.translation.shape[:-1]
-    return BankState(
-        *leader,
-        *(np.broadcast_to(a, (*batch, *a.shape)).copy() for a in EMPTY),
-        np.full((*batch, RIVALS), -np.inf),
-        np.zeros(batch),
-        np.zeros(batch),
-    )
+    rivals = (np.broadcast_to(a, (*batch, *a.shape)).copy() for a in EMPTY)
+    odds = np.full((*batch, RIVALS), -np.inf)
+    return BankState._make([*leader, *rivals, odds, np.zeros(batch), np.zeros(batch)])
 
 
 def with_best(
     state: BankState,
     rows: np.ndarray,
-    place: tuple[np.ndarray, np.ndarray],
+    place: tuple[np.ndarray, ...],
     candidates: int,
     found: PoseState,
     odds: FloatArray,

@@ -51,7 +51,7 @@ def checked(
                     continue
                 if not (optional and held[key] is None):  # pyright: ignore[reportArgumentType, reportCallIssue]
                     held[key] = check_array(name, held[key], shape)  # pyright: ignore
-            return function(*values, **kwargs)
+            return function(*values, **kwargs)  # pyright: ignore[reportCallIssue]
 
         door.kernel = function  # pyright: ignore[reportAttributeAccessIssue]
         return door

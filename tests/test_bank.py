@@ -1,5 +1,6 @@
 """The bank of iterated EKFs: it starts from nothing, follows mirror poses, comes back when lost."""
 
+# pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
 import pickle

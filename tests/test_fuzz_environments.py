@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs import registration
 
 import rbl_gym  # noqa: F401 (registers the ids)
 from rbl_gym import wrappers
@@ -44,7 +45,7 @@ SEEDS = [*WRONG, -1, 2**70, 1.5, float("nan"), [0], [0, -1], ["a", "b"], [None, 
 def made(name: str, vector: bool, **arguments: Any) -> Any:
     spec = gym.spec(f"RBL/{name}-v0")
     entry: Any = spec.vector_entry_point if vector else spec.entry_point
-    return gym.envs.registration.load_env_creator(entry)(**arguments)
+    return registration.load_env_creator(entry)(**arguments)
 
 
 def good(name: str, vector: bool) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Bounds of links that are lost, reflected or biased: by differences, integrals, Monte Carlo."""
 
+# pyright: reportCallIssue=false
 from __future__ import annotations
 
 import numpy as np

@@ -16,7 +16,8 @@ from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.ranging import SquaredRangeNoise
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
-from tests.test_tracking_vector_env import ID, actions_of, short
+from tests.side_by_side import actions_of
+from tests.test_tracking_vector_env import ID, short
 
 FIXED = short("camsap2013", 6)
 MOVABLE = short("camsap2013", 6, anchor_speed_m_s=20.0)

@@ -11,7 +11,8 @@ from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
-from tests.test_tracking_vector_env import ID, actions_of, short
+from tests.side_by_side import actions_of
+from tests.test_tracking_vector_env import ID, short
 
 LOSSY = {"drop_probability": 0.2}
 

@@ -57,8 +57,7 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
     columns = min(_COLUMNS, len(scenes))
     lines = -(-len(scenes) // columns)
     shown = make_subplots(lines, columns, subplot_titles=scenes, shared_yaxes=True,
-                          shared_xaxes="all", horizontal_spacing=0.02,
-                          vertical_spacing=0.3 / (1 + lines))  # fmt: skip
+                          horizontal_spacing=0.02, vertical_spacing=0.3 / (1 + lines))  # fmt: skip
     for k, scene in enumerate(scenes):
         ratio = np.full((len(filters), len(conditions)), np.nan)
         for row in rows:

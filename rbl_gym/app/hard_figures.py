@@ -18,7 +18,7 @@ _COLOURS = {"iekf": "#d1495b", "iekf, robust": "#2e86ab", "bank, robust": "#1b7f
 def hard_figure(result: dict[str, Any]) -> Figure:
     """Translation errors over the bound, and who is back after wrong starts."""
     figure = new_figure(12, 8)
-    upper, lower = figure.subfigures(2, 1)
+    upper, lower = figure.subfigures(2, 1, squeeze=False)[:, 0]
     axes = upper.subplots(1, len(result["links"]), squeeze=False)[0]
     for axis, (name, conditions) in zip(axes, result["links"].items(), strict=True):
         filters = list(next(iter(conditions.values()))["filters"])
