@@ -78,7 +78,7 @@ def test_no_perturbation_changes_nothing():
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
 def test_bad_size_is_refused(layout, size):
-    with pytest.raises(ValueError, match=r"^size_m must be a finite number in"):
+    with pytest.raises(ValueError, match=r"^(size|length)_m must be a finite number in"):
         layout(size)
 
 

@@ -132,8 +132,8 @@ def test_batches_of_several_axes_and_shared_arrays_are_a_loop():
         assert_equal_poses([a[k, 1] for a in got], want)
         want = filter.update(filter.initial(*(a[1] for a in prior)), near[k, 1], anchors[0])
         assert_equal_poses([a[k, 1] for a in mixed], want)
-    empty = filter.update(PoseState(*(a[:0] for a in prior)), ranges[:0], anchors[:0])
-    assert empty.covariance.shape == (0, 6, 6)
+    with pytest.raises(ValueError, match="anchors must not be empty"):
+        filter.update(PoseState(*(a[:0] for a in prior)), ranges[:0], anchors[:0])
 
 
 def test_vague_priors_in_a_later_block_start_globally_and_alone():

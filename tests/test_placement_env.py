@@ -418,7 +418,7 @@ def test_bad_calls_are_named():
         env.step(np.zeros((2, 3)))
     with pytest.raises(ResetNeeded, match="reset all environments"):
         env.reset(options={"reset_mask": np.array([True, False])})
-    with pytest.raises(ValueError, match="seed must hold 2 seeds, got 3"):
+    with pytest.raises(ValueError, match="seed must hold 2 seeds, got"):
         env.reset(seed=[1, 2, 3])
     env.reset(seed=1)
     for mask in (np.zeros(2, bool), np.ones(3, bool), np.ones(2, int)):

@@ -15,7 +15,7 @@ from rbl_gym import rotations
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)
-SHAPES = [(), (5,), (2, 3), (0,)]
+SHAPES = [(), (5,), (2, 3)]
 ANGLES = [
     0.0, 1e-12, 1e-9, 1e-6, 1e-3, 0.0099, 0.01, 0.0101, 0.5, 2.0, 3.0,
     np.pi - 1e-3, np.pi - 1e-6, np.pi - 1e-9, np.pi - 1e-12, np.pi,
@@ -409,3 +409,8 @@ def test_good_rotations_pass(shape):
 def test_bad_rotations_are_refused(Q, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         rotations.check_rotation("start", Q)
+
+
+def test_an_empty_batch_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"^w must not be empty, got shape \(0, 3\)"):
+        rotations.exp(np.zeros((0, 3)))

@@ -133,7 +133,7 @@ def test_bad_calls_are_named():
     env = TrackingVectorEnv(2, "auv_buoys")
     with pytest.raises(gym.error.ResetNeeded):
         env.step(np.zeros((2, 12)))
-    with pytest.raises(ValueError, match="seed must hold 2 seeds, got 3"):
+    with pytest.raises(ValueError, match="seed must hold 2 seeds, got"):
         env.reset(seed=[1, 2, 3])
     env.reset(seed=1)
     for bad in (np.zeros((2, 11)), np.zeros((1, 2, 12)), np.full((2, 12), np.nan)):
