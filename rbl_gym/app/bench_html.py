@@ -57,7 +57,7 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
     columns = min(_COLUMNS, len(scenes))
     lines = -(-len(scenes) // columns)
     shown = make_subplots(lines, columns, subplot_titles=scenes, shared_yaxes=True,
-                          horizontal_spacing=0.02, vertical_spacing=0.3 / (1 + lines))  # fmt: skip
+                          horizontal_spacing=0.02, vertical_spacing=0.36 / lines)  # fmt: skip
     for k, scene in enumerate(scenes):
         ratio = np.full((len(filters), len(conditions)), np.nan)
         for row in rows:
@@ -75,7 +75,7 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
         )  # fmt: skip
     ticks = [1, 2, 5, 10, _LOST_RATIO]
     shown.update_layout(
-        height=90 + lines * (70 + 30 * len(filters)), margin={"l": 10, "r": 10, "t": 50, "b": 10},
+        height=90 + lines * (110 + 30 * len(filters)), margin={"l": 10, "r": 10, "t": 50, "b": 10},
         template="plotly_white", font={"size": 11},
         coloraxis={
             "colorscale": [[0, "#e8f4ef"], [0.3, "#f6e3a1"], [0.65, "#e08a4b"], [1, "#9c2f3c"]],
