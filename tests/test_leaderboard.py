@@ -511,3 +511,9 @@ def test_a_filter_is_ours_by_where_its_factory_lives(monkeypatch):
     assert leaderboard.source_of("mine") == leaderboard._digest([Path(__file__)])
     with pytest.raises(ValueError, match="filter must be one of"):
         leaderboard.source_of("nobody")
+
+
+def test_filters_made_for_other_worlds_run_when_they_are_named():
+    assert set(leaderboard.ELSEWHERE) < set(estimators.names())
+    assert set(leaderboard.default_filters()) & set(leaderboard.ELSEWHERE) == set()
+    assert {"iekf", "kf", *leaderboard.VARIANTS} <= set(leaderboard.default_filters())

@@ -30,7 +30,8 @@ def add_bench(commands: Any) -> None:
         "stopped goes on where it was. See docs/leaderboard.md.",
     )
     bench.add_argument("--filters", type=_names, metavar="A,B",
-                       help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all")  # fmt: skip
+                       help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all but "
+                       "iekf-bank, iekf-bias and iekf-cv")  # fmt: skip
     bench.add_argument("--scenes", type=_names, metavar="A,B",
                        help="names, or files .toml or .json: a scene with changes, or a "
                        "recording; default all named ones")  # fmt: skip
