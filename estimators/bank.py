@@ -42,9 +42,10 @@ from rbl_gym.ranging import LinkNoise, NoiseLaw
 
 # What a window of epochs forgets with each new one: about three of them count.
 _FORGET = 0.3
-# Squared whitened innovation per link, over the window, above which the leader is doubted; an
-# honest one has 1, and with a fifth of its ranges wrong 2.8.
-_STRAIN = 4.0
+# Squared whitened innovation per link, over the window, above which a leader is doubted: an honest
+# one has 1, within so many standard deviations of it; with a fifth of the ranges wrong, which a
+# robust one bears, it has 2.8.
+_DEVIATIONS, _MOST_STRAIN = 6.0, 4.0
 # Log of the odds that a filter is lost at a given epoch, before the ranges are looked at.
 _LOST = -10.0
 # Rivals less likely than this against their leader (log odds) have lost.
@@ -152,7 +153,7 @@ class IteratedEkfBank:
             links=(1 - _FORGET) * prior.links + count,
         )
         state = self._weigh_rivals(prior, state, led, epoch)
-        strained = state.nis > _STRAIN * state.links
+        strained = state.nis > self._bearable(state.links)
         if self.volume is not None:
             strained |= self._is_outside(led.translation, led.covariance)
         vague = is_vague(prior.covariance)
@@ -169,6 +170,11 @@ class IteratedEkfBank:
         """Probability (..., 1 + K) of the leader and of each rival."""
         odds = np.exp(np.concatenate([np.zeros_like(state.nis)[..., None], state.log_odds], -1))
         return odds / odds.sum(axis=-1, keepdims=True)
+
+    def _bearable(self, links: FloatArray) -> FloatArray:
+        """Sums (...) of so many squared whitened innovations that a leader may have."""
+        most = _MOST_STRAIN * links
+        return most if self.robust else np.minimum(most, links + _DEVIATIONS * np.sqrt(2 * links))
 
     def _scored(
         self,

@@ -227,8 +227,9 @@ def test_filter_errors_by_hand(name):
 
 
 def test_filters_and_references_by_task():
-    assert transfer.filters(rl_task("auv_buoys")) == ["iekf", "iekf, reflections"]
-    assert transfer.filters(rl_task("mounts")) == ["iekf", "iekf, reflections", "uc-kf"]
+    assert transfer.filters(rl_task("auv_buoys")) == ["iekf", "iekf-bank", "iekf, reflections"]
+    everywhere = transfer.filters(rl_task("auv_buoys"))
+    assert transfer.filters(rl_task("mounts")) == [*everywhere, "uc-kf"]
     assert transfer.references(rl_task("mounts")) == ["random", "greedy-swaps"]
     assert transfer.references(rl_task("satellite"))[-1] == "cma-es"
 
@@ -269,7 +270,7 @@ def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     arguments = ["transfer", "mounts", "--worlds", "1", "--repeats", "1", "--policy", str(path)]
     assert main([*arguments, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert list(result["filters"]) == ["iekf", "iekf, reflections", "uc-kf"]
+    assert list(result["filters"]) == ["iekf", "iekf-bank", "iekf, reflections", "uc-kf"]
     for rows in result["filters"].values():
         assert list(rows) == ["random", "greedy-swaps", "mine"]
         assert rows["mine"]["correlation"] is None

@@ -45,6 +45,7 @@ class FilterLoop(BatchEnv):
             np.zeros((num_envs, 3)),
             np.tile(np.eye(6), (num_envs, 1, 1)),
         )
+        self._score_m: FloatArray | None = None
 
     def _start(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
         """New episodes of some worlds; their state is the prior."""
@@ -55,6 +56,7 @@ class FilterLoop(BatchEnv):
         )
         for field, new in zip(self.state, prior, strict=True):
             field[chosen] = new
+        self._score_m = None
 
     @property
     def at(self) -> simulation.Epoch:
@@ -87,6 +89,7 @@ class FilterLoop(BatchEnv):
         self._put(rows, update(self.filter, state, epoch, self.scene))
 
     def _put(self, rows: np.ndarray, state: PoseState) -> None:
+        self._score_m = None
         if len(rows) == self.num_envs:
             self.state = state
         else:
@@ -102,7 +105,9 @@ class FilterLoop(BatchEnv):
     @property
     def score_m(self) -> FloatArray:
         """b (B,) of the beliefs, metres."""
-        return bounds.score(self.state.covariance, self.state.rotation, self._tags)
+        if self._score_m is None:
+            self._score_m = bounds.score(self.state.covariance, self.state.rotation, self._tags)
+        return self._score_m.copy()
 
     def _inform(self) -> dict[str, np.ndarray]:
         at, state = self.at, self.state
