@@ -152,8 +152,6 @@ def range_information(
         per_tag = of_tag(anchors, positions, noise, mask)
         damping = np.eye(3) + tag_std_m**2 * per_tag
         information = lift(tag_jacobian(rotation, tags), np.linalg.solve(damping, per_tag))
-    if not np.isfinite(information).all():
-        raise ValueError("an anchor stands on a tag, where this noise law has no variance")
     return information
 
 
@@ -167,13 +165,24 @@ def information_at(
 ) -> FloatArray:
     """`range_information` on arrays that are known to be good (the environment's inner loop)."""
     distance, J = range_jacobian(anchors, tags, rotation, translation)
-    # Where an anchor stands on a tag the range has no gradient: that link tells nothing.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        weight = np.where(distance > 0, 1 / noise.variance(distance), 0.0)
+    weight = _inverse(noise.variance(distance), distance)
     if links is not None:
         weight = weight * links
     flat = weight.reshape((*weight.shape[:-2], 1, -1))
     return (J * flat) @ np.swapaxes(J, -1, -2)
+
+
+def _inverse(variance: FloatArray, distance: FloatArray) -> FloatArray:
+    """Weights (..., M, N) of ranges, squared or not: what an anchor on a tag measures has none.
+
+    There the range has no gradient: that link tells nothing.
+    """
+    with np.errstate(divide="ignore"):
+        weight = np.where(distance > 0, 1 / variance, 0.0)
+    if not np.isfinite(weight).all():
+        where = np.broadcast_to(distance, weight.shape)[~np.isfinite(weight)][0]
+        raise ValueError(f"noise must have a variance at every distance, got 0 at {where:g} m")
+    return weight
 
 
 def _raw_tag_information(
@@ -181,7 +190,7 @@ def _raw_tag_information(
 ) -> FloatArray:
     """Information (..., N, 3, 3) of the ranges about the place of each tag."""
     distance, unit = directions(anchors, positions)
-    weight = 1 / np.broadcast_to(noise.variance(distance), distance.shape)
+    weight = _inverse(noise.variance(distance), distance)
     weight = weight if links is None else weight * links
     return np.einsum("...mni,...mnj->...nij", weight[..., None] * unit, unit)
 
@@ -191,7 +200,7 @@ def _squared_tag_information(
 ) -> FloatArray:
     """Information ``4 A Pi_n A^T`` (..., N, 3, 3) about each tag, |s|^2 projected out."""
     distance = _DISTANCES(anchors, positions)
-    weight = 1 / np.broadcast_to(noise.squared_range_variance(distance), distance.shape)
+    weight = _inverse(noise.squared_range_variance(distance), distance)
     weight = weight if links is None else weight * links
     spread, weighted = weighted_spread(anchors, weight)
     return 4 * np.swapaxes(weighted, -1, -2) @ spread

@@ -399,7 +399,6 @@ def test_order_does_not_matter_and_gaps_are_links(tmp_path_factory, data):
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"the real measurements are not at {DATA}")
 def test_real_recording():
-    start = time.perf_counter()
     log = read_recording(
         DATA / "dynamic_fast_ranges.csv",
         DATA / "anchors_8_14.csv",
@@ -407,7 +406,6 @@ def test_real_recording():
         DATA / "dynamic_fast_truth.csv",
         DATA / "calibration_8_14.csv",
     )
-    assert time.perf_counter() - start < 3.0  # 0.2 s on a quiet machine
     assert log.ranges.shape == (13_481, 8, 3)
     assert log.links.any(axis=0).all()
     step = np.diff(log.times)

@@ -1,0 +1,166 @@
+"""Refusals of the world's functions that no other test meets, each by its message."""
+
+# pyright: reportArgumentType=false
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym import (
+    bodies,
+    bounds,
+    estimators,
+    link_bounds,
+    motion,
+    placement,
+    posterior,
+    ranging,
+    rigidity,
+    scene_files,
+    scenes,
+)
+from rbl_gym.app import bench_command, bench_worlds, place, replay
+from rbl_gym.recordings import Recording, Truth
+
+TAGS = bodies.pyramid()
+ANCHORS = np.array([[0, 0, 0], [9, 0, 1], [0, 9, 2], [9, 9, 3.0]])
+PLACE = TAGS, np.eye(3), np.array([3.0, 4.0, 1.0])
+
+
+def test_filters_need_a_name_and_a_factory():
+    for name, factory in (("", dict), (7, dict), ("mine", None)):
+        with pytest.raises(ValueError, match="name and factory must be a string and a callable"):
+            estimators.register(name, factory)
+
+
+def test_links_and_ranges_of_other_batches():
+    filter = estimators.make(
+        "iekf", tags=TAGS, noise=ranging.RangeNoise(0.1), process=motion.ProcessNoise(0.1, 0.1)
+    )
+    state = filter.initial(np.eye(3), PLACE[2], 0.1 * np.eye(6))
+    ranges = np.ones((2, 4, 5))
+    with pytest.raises(ValueError, match=r"links and ranges must broadcast, got \(3, 4, 5\) and"):
+        filter.update(state, ranges, ANCHORS, np.ones((3, 4, 5), dtype=bool))
+
+
+BOUNDS = {
+    "raw": bounds.range_information,
+    "uncertain tags": lambda *a: bounds.range_information(*a, tag_std_m=0.01),
+    "squared": lambda *a: bounds.range_information(*a, model="squared"),
+    "lost links": lambda *a: link_bounds.expected_information(*a, ranging.LinkModel()),
+}
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_an_anchor_on_a_tag(name):
+    # Coordinates without rounding, so that the distance is exactly zero.
+    tags = bodies.octahedron(0.5)
+    body = tags, np.eye(3), -tags[0]
+    on_tag = np.vstack([ANCHORS, np.zeros(3)])
+    noise = ranging.RangeNoise(0.1)
+    links = np.ones((5, 6), dtype=bool)
+    links[4, 0] = False
+    # A range without a gradient tells nothing: what is left is what the others tell.
+    told = BOUNDS[name](on_tag, *body, noise)
+    assert np.isfinite(told).all()
+    if name != "lost links":
+        without = {"uncertain tags": {"tag_std_m": 0.01}, "squared": {"model": "squared"}}
+        expected = bounds.range_information(on_tag, *body, noise, links, **without.get(name, {}))
+        np.testing.assert_allclose(told, expected, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_laws_without_a_variance(name):
+    with pytest.raises(ValueError, match="noise must have a variance at every distance, got 0 at"):
+        BOUNDS[name](ANCHORS, *PLACE, ranging.LinkNoise(np.full((4, 5), 1e-200)))
+
+
+def test_biases_of_an_anchor_on_a_tag():
+    tags = bodies.octahedron(0.5)
+    with pytest.raises(ValueError, match="an anchor stands on a tag, where a range has no deriv"):
+        link_bounds.bias_information(
+            np.zeros((1, 3)), tags, np.eye(3), -tags[0], ranging.RangeNoise(0.1)
+        )
+
+
+def test_lost_links_out_of_reach_are_drawn_as_lost():
+    noise, rng = ranging.RangeNoise(0.1), np.random.default_rng(0)
+    near = link_bounds.realised_crb(
+        ANCHORS, *PLACE, noise, ranging.LinkModel(reach_m=8.0), rng, draws=2
+    )
+    distance = ranging.distances(ANCHORS, ranging.tag_positions(*PLACE[1:], TAGS))
+    assert (distance > 8).any()
+    expected = bounds.pose_crb(ANCHORS, *PLACE, noise, links=distance <= 8)
+    np.testing.assert_allclose(near, expected, rtol=1e-10)
+
+
+def test_the_bound_of_a_scene_whose_prior_is_not_positive():
+    with pytest.raises(ValueError, match="information about the pose is singular or not finite"):
+        posterior.update(-np.eye(6), np.eye(6))
+
+
+def test_ranges_are_simulated_by_generators_and_link_models():
+    noise = ranging.RangeNoise(0.1)
+    with pytest.raises(ValueError, match=r"rng must be a numpy\.random\.Generator, got 7"):
+        ranging.simulate(ANCHORS, *PLACE, noise, 7)
+    with pytest.raises(ValueError, match=r"link_model must be a LinkModel or None, got 0\.5"):
+        ranging.simulate(ANCHORS, *PLACE, noise, np.random.default_rng(0), 0.5)
+
+
+def test_noise_of_every_link_keeps_ranges_positive():
+    law = ranging.LinkNoise(np.array([[0.1, 5.0]]))
+    drawn = law.sample(np.array([[1.0, 1.0]]), np.array([[1.0, -1.0]]))
+    np.testing.assert_allclose(drawn, [[1.1, 0.0]])
+
+
+def test_directions_of_length_zero():
+    with pytest.raises(ValueError, match="u_ij must be one vector that is not zero"):
+        rigidity.feasible_rotations(np.zeros(3), np.eye(3)[0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"start_volume": [1, 2, 3]}, "start_volume must be a Box or None"),
+        (
+            {"trajectory": "orbit", "volume": {"kind": "box", "low": [1, 1, 1], "high": [1, 3, 3]}},
+            "volume must have an extent in x and y for 'orbit'",
+        ),
+    ],
+)
+def test_scenes(changes, message):
+    with pytest.raises(ValueError, match=message):
+        scenes.get({"name": "uwb_room", **changes})
+
+
+def test_replays():
+    with pytest.raises(ValueError, match="height_offset_m means nothing without planar"):
+        replay.Settings(height_offset_m=0.1)
+    times = np.arange(3.0)
+    truth = Truth(times + 100, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
+    links = np.ones((3, 4, 5), dtype=bool)
+    recording = Recording(
+        times, links * 5.0, links, None, ANCHORS, TAGS, tuple("abcd"), tuple("vwxyz"), truth
+    )
+    track = replay.Track(times, truth.rotation, truth.translation, np.tile(np.eye(6), (3, 1, 1)))
+    with pytest.raises(ValueError, match="truth shares no time with the ranges: ranges 0 to 2 s"):
+        replay.truth_of(recording, track, replay.Settings())
+
+
+def test_benchmarks():
+    with pytest.raises(ValueError, match="condition noise-x2 cannot double"):
+        bench_worlds._noisier(ranging.LinkModel(), 2.0)
+    with pytest.raises(Exception, match="must be different names with commas, got 'kf,,iekf'"):
+        bench_command._names("kf,,iekf")
+    with pytest.raises(ValueError, match="--scenes: two are named 'hall': rename a file"):
+        bench_command._specs(["hall", "hall"])
+
+
+def test_rooms_full_of_obstacles():
+    low, high = np.array(scenes.get("uwb_room").anchor_region.bounds())
+    full = np.concatenate([0.5 * (low + high), (high - low)])
+    task = placement.task("uwb_room")
+    context = placement.whole_volume(task)._replace(racks=full[None])
+    problem = scene_files.Problem(task, context)
+    with pytest.raises(ValueError, match="anchors have no legal place: obstacles cover all"):
+        place.free_candidates(problem, np.random.default_rng(0), 10)
