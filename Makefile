@@ -2,13 +2,17 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test coverage lint format types docs dist clean
+.PHONY: demo test test-long coverage lint format types docs dist clean
 
 demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png --html out/demo.html
 
 test: .venv/dev.stamp
 	$(BIN)/python -m pytest -n 2
+
+# What `test` leaves out: whole recordings, more trials.
+test-long: .venv/dev.stamp
+	$(BIN)/python -m pytest -n 2 -m long
 
 # Twice as long as `test`; lines that no test reaches, and a failure below 95 %.
 coverage: .venv/dev.stamp

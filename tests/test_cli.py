@@ -149,6 +149,7 @@ def test_replay_without_truth_prints_no_errors(files, capsys):
 
 
 @pytest.mark.skipif(not LIAS.is_dir(), reason="the LIAS recording is not on this machine")
+@pytest.mark.long
 def test_replay_of_a_real_planar_recording(tmp_path):
     """The defaults reach 0.033 m and 3.8 degrees over the whole run, causally."""
     files = {"ranges": LIAS / "dynamic_fast_ranges.csv", "anchors": LIAS / "anchors_8_14.csv",
@@ -231,6 +232,7 @@ def lias(calibrated: bool, folder: Path) -> dict[str, str]:
     ],
     ids=["calibrated", "raw"],
 )
+@pytest.mark.long
 def test_biases_of_a_real_recording(calibrated, options, limits, tmp_path, capsys):
     """At a quarter of the rate, hence half the standard deviation of a range."""
     planar = ["--planar", "--height-offset-m", "0.08", "--yaw-offset-deg", "7", "--json"]
@@ -243,8 +245,9 @@ def test_biases_of_a_real_recording(calibrated, options, limits, tmp_path, capsy
 
 
 @pytest.mark.skipif(not LIAS.is_dir(), reason="the LIAS recording is not on this machine")
-def test_static_runs_of_a_real_recording(tmp_path):
-    """30 poses, each from nothing: at most 0.035 m over every fourth epoch of all runs."""
+@pytest.mark.parametrize("every", [16, pytest.param(4, marks=pytest.mark.long)])
+def test_static_runs_of_a_real_recording(every, tmp_path):
+    """30 poses, each from nothing: at most 0.035 m over all runs, thinned by so much."""
     settings = replay.Settings(
         filter="iekf-bias", planar=True, height_offset_m=0.08, yaw_offset_deg=5.6, range_std_m=0.06
     )
@@ -261,7 +264,7 @@ def test_static_runs_of_a_real_recording(tmp_path):
         place = [truth[run][key] for key in ("x", "y", "yaw_deg")]
         ends = [[cells[k][0], *place] for k in (0, -1)]
         recording = recordings.read_recording(
-            write(tmp_path / "ranges.csv", header[1:], cells[::4]),
+            write(tmp_path / "ranges.csv", header[1:], cells[::every]),
             LIAS / "anchors_8_14.csv",
             LIAS / "tags_8_14.csv",
             write(tmp_path / "truth.csv", ["t", "x", "y", "yaw_deg"], ends),

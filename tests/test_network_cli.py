@@ -82,7 +82,8 @@ def test_manhattan(capsys):
     assert result["cost_rad2"] == pytest.approx(1.02062, rel=1e-5)
 
 
-def test_reproduce_network2009(tmp_path, capsys):
+def test_reproduce_network2009(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(network2009, "_NETWORKS", 8)
     picture, table, figures = (tmp_path / f"x.{kind}" for kind in ("png", "csv", "json"))
     arguments = ["reproduce", "network2009", "--trials", "5", "--plot", str(picture)]
     assert main([*arguments, "--csv", str(table), "--json", str(figures)]) == 0
@@ -104,6 +105,7 @@ def test_reproduce_network2009(tmp_path, capsys):
 
 def test_the_same_seed_gives_the_same_figures(monkeypatch):
     monkeypatch.setattr(network2009, "_NETWORKS", 2)
+    monkeypatch.setattr(network2009, "BASES", network2009.BASES[:1])
     monkeypatch.setattr(network2009, "LOOPS", network2009.LOOPS[:1])
     results = [network2009.run(2, seed, lambda: None) for seed in (3, 3, 4)]
     assert results[0] == results[1] != results[2]
