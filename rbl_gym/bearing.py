@@ -16,6 +16,11 @@ from numpy.typing import ArrayLike
 from rbl_gym.checks import FloatArray, check_array, check_finite, check_number, check_shape, checked
 from rbl_gym.ranging import tag_positions
 
+__all__ = [
+    "AngleNoise", "angles", "curvature", "directions", "information", "jacobian", "linearize",
+    "seen", "simulate",
+]  # fmt: skip
+
 # What the angles cannot tell apart.
 MIRROR = np.array([1.0, -1.0, 1.0])
 # As near to the station (m) no direction is one: its gradient counts as zero.

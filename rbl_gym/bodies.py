@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_number
 
+__all__ = ["centred", "cube", "doa2019", "icassp2013", "octahedron", "perturb", "plate", "pyramid"]
+
 
 def centred(tags: ArrayLike) -> FloatArray:
     """The tags (..., N, 3) moved so that their mean is the origin."""

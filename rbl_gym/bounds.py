@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym import bearing, ranging, rotations
+from rbl_gym import ranging, rotations
 from rbl_gym.checks import (
     BoolArray,
     FloatArray,
@@ -21,6 +21,12 @@ from rbl_gym.checks import (
     kernel,
 )
 from rbl_gym.motion import ProcessNoise, check_process
+
+__all__ = [
+    "directions", "information_rank", "lift", "pose_crb",
+    "posterior_crb_step", "predict_covariance", "predict_information", "range_information",
+    "range_jacobian", "score", "symmetric", "tag_jacobian",
+]  # fmt: skip
 
 # Behind the doors: what comes to these was checked, or made here.
 _HAT, _EXP = kernel(rotations.hat), kernel(rotations.exp)
@@ -246,10 +252,10 @@ def pose_crb(
     )
     if prior_information is not None:
         information = information + check_array("prior_information", prior_information, (6, 6))
-    return _covariance(information, "anchors or tags")
+    return inverted(information, "anchors or tags")
 
 
-def _covariance(information: FloatArray, more: str) -> FloatArray:
+def inverted(information: FloatArray, more: str) -> FloatArray:
     """Inverse of a pose's information, or a ValueError that names its rank and what it lacks."""
     rank = information_rank(information)
     if (rank < 6).any():
@@ -259,67 +265,6 @@ def _covariance(information: FloatArray, more: str) -> FloatArray:
             f"of 6 at batch index {where}; add {more}, or prior_information"
         )
     return np.linalg.inv(information)
-
-
-def doa_information(
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: bearing.AngleNoise,
-    station: ArrayLike | None = None,
-) -> FloatArray:
-    """Fisher information (..., 6, 6) of one epoch of directions of arrival about the pose.
-
-    Parameters
-    ----------
-    tags, rotation, translation
-        (..., N, 3), (..., 3, 3), (..., 3); metres.
-    noise
-        Law of the angles.
-    station
-        Place (..., 3) of the base station; None: the origin.
-    """
-    tags = check_array("tags", tags, ("N", 3))
-    rotation = rotations.check_rotation("rotation", rotation)
-    translation = check_array("translation", translation, (3,))
-    if not isinstance(noise, bearing.AngleNoise):
-        raise ValueError(f"noise must be a bearing.AngleNoise, got {noise!r:.80}")
-    if station is not None:
-        translation = translation - check_array("station", station, (3,))
-    return doa_information_at(tags, rotation, translation, noise)
-
-
-def doa_information_at(
-    tags: FloatArray, rotation: FloatArray, translation: FloatArray, noise: bearing.AngleNoise
-) -> FloatArray:
-    """`doa_information` on arrays that are known to be good, seen from the origin."""
-    positions = _TAG_POSITIONS(rotation, translation, tags)
-    return lift(tag_jacobian(rotation, tags), bearing.information(positions, noise))
-
-
-def doa_crb(
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: bearing.AngleNoise,
-    prior_information: ArrayLike | None = None,
-    station: ArrayLike | None = None,
-) -> FloatArray:
-    """Constrained Cramer-Rao bound (..., 6, 6) of the pose from directions of arrival.
-
-    On the pose error (w, v) the constraint ``R^T R = I`` is built in: ``sqrt(2 tr P_w)`` bounds
-    the Frobenius RMSE of R and ``sqrt(tr P_v)`` the RMSE of t, as the DOA paper has them.
-    Arguments as `doa_information`, and `prior_information` (..., 6, 6).
-
-    Raises
-    ------
-    ValueError
-        As `doa_information`, and where the information is singular, with its rank.
-    """
-    information = doa_information(tags, rotation, translation, noise, station)
-    if prior_information is not None:
-        information = information + check_array("prior_information", prior_information, (6, 6))
-    return _covariance(information, "tags")
 
 
 def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.ndarray:

@@ -18,6 +18,8 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.sensing_network import IntArray, edge_angles, proj
 
+__all__ = ["PoseGraph", "read_graph"]
+
 _G2O_EDGE = ("i", "j", "dx", "dy", "dtheta", "I11", "I12", "I13", "I22", "I23", "I33")
 _INFORMATION = _G2O_EDGE[5:]
 _PASSED_OVER = ("VERTEX_SE2", "FIX")

@@ -15,6 +15,8 @@ from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.layouts import Layout
 from rbl_gym.placement import Context, PlacementTask, information, score, score_of
 
+__all__ = ["SEARCHES", "best_of_random", "cma_es", "greedy", "greedy_swaps", "shared_layout"]
+
 
 def best_of_random(
     task: PlacementTask, context: Context, rng: np.random.Generator, tries: int = 100

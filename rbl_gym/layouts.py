@@ -16,6 +16,8 @@ from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.regions import Shell
 
+__all__ = ["LAYOUTS", "corners", "grid", "layout", "perimeter", "random", "ring"]
+
 Layout = Callable[[PlacementTask, Context, np.random.Generator], FloatArray]
 
 # Radius of the ring about the work region: shares of the region's half width and of the height

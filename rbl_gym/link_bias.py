@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_number
 
+__all__ = ["LinkBias", "simulate"]
+
 
 @dataclass(frozen=True)
 class LinkBias:

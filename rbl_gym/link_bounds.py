@@ -23,6 +23,11 @@ from rbl_gym.checks import (
 )
 from rbl_gym.motion import ProcessNoise, check_process
 
+__all__ = [
+    "GROUPS", "bias_information", "expected_information", "marginal_information",
+    "nlos_efficiency", "posterior_bias_step", "realised_crb", "with_biases",
+]  # fmt: skip
+
 GROUPS = ("link", "anchor", "tag", "common")
 # Nodes of the trapezoid rule on +-9 standard deviations; such integrands converge exponentially.
 _NODES = np.linspace(-9.0, 9.0, 721)

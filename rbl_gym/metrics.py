@@ -8,6 +8,11 @@ from scipy import special
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, checked
 
+__all__ = [
+    "expected_mean_angular_error", "length", "mean_angular_error", "nees", "pose_error",
+    "tag_error",
+]  # fmt: skip
+
 
 @checked(rotation_hat=(3, 3), translation_hat=(3,), rotation=(3, 3), translation=(3,))
 def pose_error(

@@ -18,6 +18,11 @@ from numpy.typing import ArrayLike
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, check_array, check_number, checked, kernel
 
+__all__ = [
+    "Path", "ProcessNoise", "Trajectory", "constant_twist", "interpolate", "lawn_mower_points",
+    "orbit", "propagate", "random_twist", "recorded", "simulate", "twists_between", "waypoints",
+]  # fmt: skip
+
 _MOST_STEPS = 10**9
 # Behind the doors: what comes to these was checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)

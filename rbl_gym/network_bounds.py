@@ -16,6 +16,8 @@ from rbl_gym.checks import BoolArray, FloatArray, check_number
 from rbl_gym.network_graphs import check_connected, incidence
 from rbl_gym.sensing_network import IntArray, check_edges, check_pair, check_positions, directions
 
+__all__ = ["bearing_jacobian", "frame_covariance", "orientation_covariance", "range_jacobian"]
+
 
 def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
     """Bound (n - 1, n - 1) of orientations 1 to n - 1 from edge angles of variance 2 sigma^2."""

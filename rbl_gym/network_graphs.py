@@ -15,6 +15,8 @@ from scipy.sparse import csgraph
 from rbl_gym.checks import check_one_of
 from rbl_gym.sensing_network import IntArray, check_edges
 
+__all__ = ["BASES", "SpanningTree", "cycle_matrix", "incidence", "spanning_tree"]
+
 BASES = ("bfs", "paton", "minimum")
 _NAMED = 8  # nodes of a component that a message lists
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, as_float, check_array
 
+__all__ = ["in_sight"]
+
 
 def check_obstacles(obstacles: object) -> FloatArray:
     """Obstacles (K, 6) as an array, K may be 0; or a ValueError."""

@@ -32,6 +32,12 @@ from rbl_gym.regions import Walls
 from rbl_gym.scenes import Scene
 from rbl_gym.shared_poses import SharedPoses
 
+__all__ = [
+    "Context", "Criteria", "PlacementTask", "criteria", "draw_contexts",
+    "information", "is_legal", "mounts", "positions", "score", "score_of", "sight_fractions",
+    "task", "whole_volume",
+]  # fmt: skip
+
 # Anchors of a task where nothing else is said: the scenes' own, and one fewer beside racks.
 MAX_RACKS = 2
 # Rotation of the prior that regularises the bound.

@@ -18,6 +18,11 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, checked, kernel
 
+__all__ = [
+    "NOISE_LAWS", "LinkModel", "LinkNoise", "Measurement", "NoiseLaw", "RangeNoise",
+    "SquaredRangeNoise", "distances", "measure", "reference_range", "simulate", "tag_positions",
+]  # fmt: skip
+
 
 class NoiseLaw(Protocol):
     """What every noise law offers; ranges (..., M, N) in metres, links the mask beside them."""

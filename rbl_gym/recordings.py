@@ -19,6 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from rbl_gym import motion, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
+__all__ = ["Recording", "Truth", "read_recording", "truth_at"]
+
 AnyPath = str | os.PathLike[str]
 IntArray = NDArray[np.intp]
 _Ids = tuple[tuple[str, ...], tuple[str, ...]]  # of the anchors, of the tags

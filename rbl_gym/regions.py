@@ -13,6 +13,8 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_array, check_number
 
+__all__ = ["REGIONS", "Box", "Region", "Shell", "Walls"]
+
 Triple = tuple[float, float, float]
 
 

@@ -22,6 +22,11 @@ from rbl_gym.network_bounds import bearing_jacobian, range_jacobian
 from rbl_gym.network_graphs import check_connected, components
 from rbl_gym.sensing_network import check_edges, check_positions, directions
 
+__all__ = [
+    "Freedom", "Localizability", "feasible_rotations", "freedom", "localizability",
+    "parallel_rigidity_matrix", "parallel_rigidity_rank", "triangle_rotation",
+]  # fmt: skip
+
 # Eigenvalues of a Gram matrix of unit rows below this are zero.
 _ZERO = 1e-10
 _DENSE = 400

@@ -15,6 +15,12 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, checked, kernel
 
+__all__ = [
+    "angle_between", "error", "exp", "from_euler_zyx", "from_quaternion", "hat",
+    "left_jacobian", "left_jacobian_inverse", "log", "nearest", "quaternion", "random", "vee",
+    "yaw",
+]  # fmt: skip
+
 # Above this squared angle the closed forms are exact enough.
 _SMALL_SQUARED_ANGLE = 1e-4
 # Up to this squared angle the Taylor series below are exact to rounding, and take less time.

@@ -25,6 +25,8 @@ from rbl_gym.ranging import RangeNoise
 from rbl_gym.regions import Box, Shell, Walls
 from rbl_gym.scenes import Scene
 
+__all__ = ["Problem", "free_points", "inside", "load", "of_mapping", "problem", "with_anchors"]
+
 REGIONS = {"room": Walls, "box": Box, "shell": Shell}
 BODIES = {"octahedron": bodies.octahedron, "pyramid": bodies.pyramid, "cube": bodies.cube,
           "plate": lambda size_m: bodies.plate(size_m, size_m)}  # fmt: skip

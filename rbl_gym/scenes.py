@@ -20,6 +20,8 @@ from rbl_gym.obstacles import check_obstacles
 from rbl_gym.ranging import NOISE_LAWS, LinkModel, NoiseLaw, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import REGIONS, Box, Region, Shell, Walls
 
+__all__ = ["SCENES", "Scene", "get"]
+
 _FIELD_KINDS: dict[str, tuple[type, ...]] = {
     "volume": (Box,),
     "anchor_region": tuple(REGIONS.values()),

@@ -21,6 +21,11 @@ from scipy.spatial import cKDTree
 
 from rbl_gym.checks import FloatArray, as_float, check_array, check_finite, check_number
 
+__all__ = [
+    "SensingNetwork", "directions", "edge_angles", "measure", "proj", "random_network",
+    "true_bearings", "unit_disk_edges",
+]  # fmt: skip
+
 IntArray = NDArray[np.intp]
 _MOST_NODES = 10**9
 _LARGEST_ANGLE = 1e6

@@ -17,6 +17,11 @@ from rbl_gym.obstacles import in_sight
 from rbl_gym.scenes import Scene
 from rbl_gym.statistic import EpochStatistic
 
+__all__ = [
+    "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure",
+    "measure_statistic", "move_anchors", "posterior_information", "posterior_step",
+]  # fmt: skip
+
 # Behind the doors: what comes to these was checked, or made here.
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 

@@ -21,6 +21,8 @@ from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.ranging import NoiseLaw, SquaredRangeNoise
 
+__all__ = ["EpochStatistic", "measure_statistic", "simulate_statistic"]
+
 # A pivot this small beside its diagonal is rounding: the matrix has no rank there.
 _NO_PIVOT = 1e-14
 # Numbers of anchor coordinates that are worked on at a time: they stay in the cache.

@@ -42,6 +42,8 @@ from rbl_gym.conformance import (
     trial,
 )
 
+__all__ = ["check_filter", "check_locator"]
+
 _EPOCHS, _TRIALS = 12, 64
 
 

@@ -24,6 +24,11 @@ from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.components import exp_and_left_jacobian, first, last, product
 from rbl_gym.motion import ProcessNoise
 
+__all__ = [
+    "FRAMES", "TwistSensor", "WanderingPath", "WanderingTwist", "posterior_crb_step",
+    "predict_covariance", "simulate",
+]  # fmt: skip
+
 FRAMES = ("world", "body")
 Axes = float | tuple[float, float, float]
 

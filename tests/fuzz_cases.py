@@ -11,6 +11,7 @@ from rbl_gym import (
     bearing,
     bodies,
     bounds,
+    doa_bounds,
     estimators,
     link_bounds,
     metrics,
@@ -97,7 +98,7 @@ case(bearing.AngleNoise, std_rad=0.1)
 case(bearing.angles, positions=ANCHORS)
 case(bearing.simulate, tags=TAGS, **POSE, noise=ANGLE_NOISE, rng=Rng)
 case(bounds.pose_crb, anchors=ANCHORS, tags=TAGS, **POSE, noise=NOISE)
-case(bounds.doa_crb, tags=CORNER, rotation=Q, translation=np.array([5, 5, 3.0]),
+case(doa_bounds.doa_crb, tags=CORNER, rotation=Q, translation=np.array([5, 5, 3.0]),
      noise=ANGLE_NOISE)  # fmt: skip
 case(bounds.posterior_crb_step, J=np.eye(6), anchors=ANCHORS, tags=TAGS, **POSE, noise=NOISE,
      twist=TWIST, dt=0.1, process=PROCESS)  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bearing, bodies, bounds, estimators, metrics, ranging, rotations
+from rbl_gym import bearing, bodies, doa_bounds, estimators, metrics, ranging, rotations
 from rbl_gym.estimators.doa_cost import DoaCost, SumCost
 from rbl_gym.estimators.doa_global import three_point_depths
 from rbl_gym.estimators.doa_newton import newton_iteration, unit_quaternion
@@ -34,7 +34,7 @@ def trials(count, sigma_deg, seed=0, turned=True, tags=TAGS, scale=1.0):
 def ratios(found, rotation, noise, scale=1.0):
     """RMSE over the bound of rotation and translation."""
     error = metrics.pose_error(found.rotation, found.translation, rotation, scale * T)
-    P = bounds.doa_crb(scale * TAGS, rotation, scale * T, noise)
+    P = doa_bounds.doa_crb(scale * TAGS, rotation, scale * T, noise)
     variance = np.diagonal(P, axis1=-2, axis2=-1)
     return [
         np.sqrt((error[:, block] ** 2).sum(-1).mean() / variance[:, block].sum(-1).mean())
@@ -266,7 +266,7 @@ def test_derivatives_of_the_costs_by_finite_differences():
             )
     true = bearing.angles(ranging.tag_positions(rotation[0], T, TAGS), station)
     exact = DoaCost(true, doa.weights, TAGS, station)(rotation[0], T)
-    information = bounds.doa_information(
+    information = doa_bounds.doa_information(
         TAGS, rotation[0], T, bearing.AngleNoise(50**-0.5), station
     )
     np.testing.assert_allclose(exact.hessian, information, rtol=1e-9)

@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import bearing, bodies, bounds, estimators, metrics, motion, ranging, rotations
+from rbl_gym import (
+    bearing,
+    bodies,
+    bounds,
+    doa_bounds,
+    estimators,
+    metrics,
+    motion,
+    ranging,
+    rotations,
+)
 from rbl_gym.envs.base_station import BaseStationVectorEnv
 
 TAGS = bodies.doa2019()
@@ -46,7 +56,7 @@ def tracked():
         pose, station = (info["rotation"], info["translation"]), observation["station"]
         anchors = station[:, None]
         ranges = ranging.simulate(anchors, tags, *pose, RANGES, rng).ranges
-        of_angles = bounds.doa_information(tags, *pose, env.noise, station)
+        of_angles = doa_bounds.doa_information(tags, *pose, env.noise, station)
         of_ranges = bounds.range_information(anchors, tags, *pose, RANGES)
         for name, filter in filters.items():
             state = states[name]

@@ -16,6 +16,11 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.motion import propagate
 from rbl_gym.wrappers.tasks import AnchorSelectionVectorEnv, MobileAnchorsVectorEnv
 
+__all__ = [
+    "MOBILE", "SELECTION", "greedy_blind", "greedy_with_map", "nearest", "orbit",
+    "receding_horizon", "ring",
+]  # fmt: skip
+
 Controller = Callable[[Any, np.random.Generator], np.ndarray]
 
 # Radius of ring and orbit in units of the vehicle's depth, and the angle between two craft (more

@@ -10,6 +10,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices  # pyright: ignore[reportMissingImports]
 
+__all__ = ["Sb3VecEnv"]
+
 
 class Sb3VecEnv(VecEnv):
     """Adapter of a `gymnasium.vector.VectorEnv` with autoreset mode SAME_STEP.

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import bearing, bodies, bounds, estimators, metrics, rotations
+from rbl_gym import bearing, bodies, doa_bounds, estimators, metrics, rotations
 from rbl_gym.app.monte_carlo import rms
 from rbl_gym.checks import FloatArray
 
@@ -71,7 +71,7 @@ def _noise(
     if label == "random R":
         rotation = rotations.random(rng, (trials,))
     angles = bearing.simulate(tags, rotation, TRANSLATION, noise, rng)
-    bound = _of_covariance(bounds.doa_crb(tags, rotation, TRANSLATION, noise))
+    bound = _of_covariance(doa_bounds.doa_crb(tags, rotation, TRANSLATION, noise))
     rows: dict[str, dict[str, float]] = {
         "bound": {
             "rotation_rmse": float(rms(bound[0])),

@@ -12,6 +12,8 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_array, check_finite, check_one_of
 
+__all__ = ["KINDS", "Policy", "load", "save"]
+
 _META = "meta"
 KINDS = ("box", "discrete", "multi-binary")
 

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bearing, bodies, bounds, ranging, rendering, scenes, simulation
+from rbl_gym import bearing, bodies, bounds, doa_bounds, ranging, rendering, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.envs.episodes import EpisodeStore
@@ -137,7 +137,7 @@ class BaseStationVectorEnv(BatchEnv):
         seen = bearing.angles(ranging.tag_positions(at.rotation, away, self._tags))
         self._angles[rows] = self.noise.sample(seen, self._normals[rows, self._epochs[rows]])
         if self.reward_mode == "bound":
-            self._information[rows] += bounds.doa_information_at(
+            self._information[rows] += doa_bounds.doa_information_at(
                 self._tags, at.rotation, away, self.noise
             )
             covariance = np.linalg.inv(self._information[rows])

@@ -1,0 +1,80 @@
+"""The public names: listed in the reference, documented, and used by a test or an example."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
+# The pictures are drawn by the environments: `render_mode`.
+OWN = {"rbl_gym.rendering"}
+PAGES = [(ROOT / "README.md"), *(ROOT / "docs").rglob("*.md")]
+LISTED = {
+    name for page in PAGES for name in re.findall(r"^::: (\S+)", page.read_text(), re.MULTILINE)
+}
+
+
+def public_modules():
+    """Modules that say what of them is public."""
+    for folder, package in FOLDERS.items():
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            if "\n__all__ = " in path.read_text():
+                parts = path.relative_to(ROOT / folder).with_suffix("").parts
+                yield ".".join([package, *(part for part in parts if part != "__init__")])
+
+
+MODULES = sorted(set(public_modules()) - OWN)
+
+
+def used_words():
+    """Words of all tests, examples and blocks of code on pages."""
+    here = Path(__file__)
+    code = [
+        path.read_text()
+        for folder in ("tests", "examples")
+        for path in (ROOT / folder).rglob("*.py")
+        if path != here
+    ]
+    for page in PAGES:
+        code += re.findall(r"```python(.*?)```", page.read_text(), re.DOTALL)
+    return set(re.findall(r"\w+", "\n".join(code)))
+
+
+WORDS = used_words()
+
+
+def imported(name):
+    """The module, or a skip where an extra that it stands on is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        pytest.skip(f"{error.name} is not installed")
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_public_names_are_documented_listed_and_used(name):
+    module = imported(name)
+    assert module.__all__, "a module without public names needs no __all__"
+    for public in module.__all__:
+        value = getattr(module, public)
+        if callable(value):
+            assert inspect.getdoc(value), f"{name}.{public} has no docstring"
+        assert public in WORDS, f"no test and no example uses {name}.{public}"
+        whole = name in LISTED
+        assert whole or f"{name}.{public}" in LISTED, f"{name}.{public} is in no reference"
+
+
+def test_the_reference_lists_public_names_only():
+    for name in LISTED:
+        owner = name if name in MODULES else name.rpartition(".")[0]
+        if owner != name:
+            module = imported(owner)
+            public = name.rpartition(".")[2]
+            # Environments are registered by id: their modules name nothing else.
+            assert public in getattr(module, "__all__", [public]), name
+            assert hasattr(module, public), name

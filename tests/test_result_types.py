@@ -1,0 +1,83 @@
+"""Functions return the NamedTuples that their documentation names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym import (
+    bodies,
+    estimators,
+    g2o,
+    motion,
+    network_graphs,
+    ranging,
+    rigidity,
+    scenes,
+    sensing_network,
+    simulation,
+    statistic,
+    unknown_twist,
+)
+
+SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4.0]])
+EDGES = np.array([[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
+RNG = np.random.default_rng(0)
+
+
+def graph_file(folder):
+    path = folder / "two.g2o"
+    path.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0.5\nEDGE_SE2 0 1 1 0 0.5 1 0 0 1 0 1\n")
+    return path
+
+
+def wandering():
+    law, process = unknown_twist.WanderingTwist(), motion.ProcessNoise()
+    return unknown_twist.simulate(np.eye(3), np.zeros(3), law, process, 0.1, 3, RNG)
+
+
+def told():
+    noise = ranging.SquaredRangeNoise()
+    anchors = np.array([[9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 9, 9.0]])
+    body = bodies.pyramid(), np.eye(3), np.zeros(3)
+    return statistic.simulate_statistic(anchors, *body, noise, RNG)
+
+
+def first_state():
+    filter = estimators.make(
+        "iekf-bank", tags=bodies.pyramid(), noise=ranging.RangeNoise(0.1),
+        process=motion.ProcessNoise(0.1, 0.1),
+    )  # fmt: skip
+    return filter.initial(np.eye(3), np.zeros(3), np.eye(6))
+
+
+CASES = {
+    "bank": (lambda _: first_state(), estimators.BankState),
+    "g2o": (lambda folder: g2o.read_graph(graph_file(folder)), g2o.PoseGraph),
+    "tree": (lambda _: network_graphs.spanning_tree(EDGES, 4), network_graphs.SpanningTree),
+    "freedom": (lambda _: rigidity.freedom(np.eye(4)[:, :3], EDGES), rigidity.Freedom),
+    "localizability": (lambda _: rigidity.localizability(SQUARE, EDGES), rigidity.Localizability),
+    "network": (
+        lambda _: sensing_network.random_network(12, 6, 0.1, RNG), sensing_network.SensingNetwork,
+    ),
+    "path": (lambda _: wandering(), unknown_twist.WanderingPath),
+    "statistic": (lambda _: told(), statistic.EpochStatistic),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_results_have_their_types(name, tmp_path):
+    make, expected = CASES[name]
+    result = make(tmp_path)
+    assert type(result) is expected
+    for field in result._fields:
+        assert getattr(result, field) is not None
+
+
+def test_the_quality_of_links_is_one_in_sight_and_a_fraction_behind_a_rack():
+    scene = scenes.get("hall")
+    episode = simulation.draw_episode(scene, np.random.default_rng(1))
+    at = simulation.epoch_of(episode, 0)
+    quality = simulation.link_quality(scene, at, np.array(scene.anchors))
+    assert quality.shape == (scene.n_anchors,)
+    assert set(quality) == {scene.blocked_information, 1.0}
