@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import (
+    bearing,
     bodies,
     estimators,
     g2o,
@@ -22,6 +23,8 @@ from rbl_gym import (
 
 SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4.0]])
 EDGES = np.array([[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
+TAGS = bodies.pyramid()
+PROCESS = motion.ProcessNoise(0.1, 0.1)
 RNG = np.random.default_rng(0)
 
 
@@ -44,19 +47,37 @@ def told():
 
 
 def first_state():
-    filter = estimators.make(
-        "iekf-bank", tags=bodies.pyramid(), noise=ranging.RangeNoise(0.1),
-        process=motion.ProcessNoise(0.1, 0.1),
+    filter: estimators.Filter = estimators.make(
+        "iekf-bank", tags=TAGS, noise=ranging.RangeNoise(0.1),
+        process=PROCESS,
     )  # fmt: skip
     return filter.initial(np.eye(3), np.zeros(3), np.eye(6))
 
 
+def stream():
+    filter = estimators.make("iekf", tags=TAGS, noise=ranging.RangeNoise(0.1), process=PROCESS)
+    links = estimators.Asynchronous(filter, np.eye(3), len(TAGS))
+    return links.start(filter.initial(np.eye(3), np.zeros(3), np.eye(6)), time=0.0)
+
+
 CASES = {
+    "stream": (lambda _: stream(), estimators.Stream),
     "bank": (lambda _: first_state(), estimators.BankState),
     "g2o": (lambda folder: g2o.read_graph(graph_file(folder)), g2o.PoseGraph),
     "tree": (lambda _: network_graphs.spanning_tree(EDGES, 4), network_graphs.SpanningTree),
     "freedom": (lambda _: rigidity.freedom(np.eye(4)[:, :3], EDGES), rigidity.Freedom),
     "localizability": (lambda _: rigidity.localizability(SQUARE, EDGES), rigidity.Localizability),
+    "locate": (
+        lambda _: estimators.locate(
+            np.full((4, 5), 3.0), np.diag([3.0, 4, 5, 6])[:, :3], bodies.pyramid(),
+            ranging.RangeNoise(0.1),
+        ),
+        estimators.PoseEstimate,
+    ),
+    "frames": (
+        lambda _: estimators.frames([[0, 1]], [[0.5, -2.0]], 2, (0, 1), 3.0),
+        estimators.FrameEstimate,
+    ),
     "network": (
         lambda _: sensing_network.random_network(12, 6, 0.1, RNG), sensing_network.SensingNetwork,
     ),
@@ -81,3 +102,40 @@ def test_the_quality_of_links_is_one_in_sight_and_a_fraction_behind_a_rack():
     quality = simulation.link_quality(scene, at, np.array(scene.anchors))
     assert quality.shape == (scene.n_anchors,)
     assert set(quality) == {scene.blocked_information, 1.0}
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "expected"),
+    [
+        ("kf", {}, estimators.KalmanFamily),
+        ("iekf", {}, estimators.IteratedEkf),
+        ("iekf", {"measurement": "doa"}, estimators.DoaEkf),
+        ("iekf-bank", {}, estimators.IteratedEkfBank),
+        ("iekf-cv", {}, estimators.AugmentedEkf),
+    ],
+)
+def test_filters_have_their_types(name, options, expected):
+    noise = bearing.AngleNoise() if options else ranging.RangeNoise(0.1)
+    filter: estimators.Filter = estimators.make(
+        name, tags=TAGS, noise=noise, process=PROCESS, **options
+    )
+    assert type(filter) is expected
+
+
+@pytest.mark.parametrize("name", ["kf", "iekf", "iekf-cv", "iekf-bias"])
+def test_filters_take_another_noise(name):
+    first, second = ranging.RangeNoise(0.1), ranging.RangeNoise(0.3)
+    filter = estimators.make(name, tags=TAGS, noise=first, process=PROCESS)
+    other = estimators.with_noise(filter, second)
+    state = filter.initial(np.eye(3), np.array([1, 2, 3.0]), 0.01 * np.eye(6))
+    anchors = np.array([[9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 9, 9.0]])
+    epoch = ranging.distances(anchors, TAGS + [1, 2, 3.0]), anchors
+    direct = estimators.make(name, tags=TAGS, noise=second, process=PROCESS)
+    assert other is not None
+    found, expected = (one.belief(one.update(state, *epoch)) for one in (other, direct))
+    np.testing.assert_array_equal(found.covariance, expected.covariance)
+    assert (found.covariance != filter.belief(filter.update(state, *epoch)).covariance).any()
+
+
+def test_a_filter_that_takes_no_noise_says_so():
+    assert estimators.with_noise(object(), ranging.RangeNoise(0.1)) is None  # pyright: ignore[reportArgumentType]
