@@ -18,7 +18,8 @@ from rbl_gym.estimators.doa_cost import DoaCost
 from rbl_gym.estimators.doa_global import global_search
 from rbl_gym.estimators.doa_newton import newton_iteration, unit_quaternion
 from rbl_gym.estimators.inputs import spanned_dimensions
-from rbl_gym.estimators.localization import Fit, PoseEstimate, covariance_of
+from rbl_gym.estimators.localization import PoseEstimate
+from rbl_gym.estimators.locators import Fit, covariance_of
 from rbl_gym.estimators.maximum_likelihood import Alternatives, no_alternatives
 from rbl_gym.estimators.swarm import ParticipatorySearch, ParticleSwarm, search_places
 

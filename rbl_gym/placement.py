@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, obstacles, ranging, rotations, scenes
+from rbl_gym import obstacles, rotations, scenes
 from rbl_gym.checks import (
     BoolArray,
     FloatArray,
@@ -33,7 +33,7 @@ from rbl_gym.scenes import Scene
 from rbl_gym.shared_poses import SharedPoses
 
 __all__ = [
-    "Context", "Criteria", "PlacementTask", "criteria", "draw_contexts",
+    "Context", "PlacementTask", "draw_contexts",
     "information", "is_legal", "mounts", "positions", "score", "score_of", "sight_fractions",
     "task", "whole_volume",
 ]  # fmt: skip
@@ -248,7 +248,7 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
     coincident anchors from winning.
     """
-    anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
+    anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
     prior = task.prior_information[..., None, None]
     square = _in_blocks(
         lambda *some: task.shared.mean_square(_information(task, *some) + prior),
@@ -276,7 +276,7 @@ def _in_blocks(
     return result.reshape((*batch, *shape))
 
 
-def _checked(context: Context) -> Context:
+def checked_context(context: Context) -> Context:
     """The context with finite arrays of the right shapes, or a ValueError."""
     centre, half = (check_array(name, getattr(context, name), (3,)) for name in ("centre", "half"))
     racks = check_finite("racks", as_float("racks", context.racks))
@@ -306,82 +306,6 @@ def _root(square: FloatArray) -> FloatArray:
     if not np.isfinite(square).all():
         raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
     return np.sqrt(square)
-
-
-class Criteria(NamedTuple):
-    """What a layout is worth by other measures, each (...); all small is good.
-
-    Attributes
-    ----------
-    score_m
-        `score`.
-    position_m, rotation_rad
-        Root mean square over the poses of ``sqrt(tr P)`` of translation and rotation.
-    d_optimal_m
-        Geometric mean of the six standard deviations, the rotation in metres at the tags.
-    e_optimal_m
-        Root mean square over the poses of the largest of the six.
-    worst_m
-        b of the worst pose.
-    conditioning
-        Geometric mean over the poses of the condition number of Abar, the weighted anchors less
-        their mean (static paper, Remark 1): large where the linear estimators lose a direction.
-    """
-
-    score_m: FloatArray
-    position_m: FloatArray
-    rotation_rad: FloatArray
-    d_optimal_m: FloatArray
-    e_optimal_m: FloatArray
-    worst_m: FloatArray
-    conditioning: FloatArray
-
-
-def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Criteria:
-    """All criteria of layouts (..., M, 3)."""
-    anchors, context = check_array("anchors", anchors, ("M", 3)), _checked(context)
-    covariance = np.linalg.inv(information(task, context, anchors) + task.prior_information)
-    tags, rotation = np.asarray(task.scene.tags), task.poses[0]
-    b = bounds.score(covariance, rotation, tags)
-    # The pose error (w, v) in metres at the tags: C^T (w, v).
-    C = np.moveaxis(task.shared.spread, -1, 0)
-    values = np.maximum(np.linalg.eigvalsh(np.swapaxes(C, -1, -2) @ covariance @ C), 1e-300)
-    of_position, of_rotation = (
-        np.sqrt(np.einsum("...ii->...", covariance[..., part, part]).mean(axis=-1))
-        for part in (slice(3, 6), slice(3))
-    )
-    return Criteria(
-        np.sqrt((b**2).mean(axis=-1)),
-        of_position,
-        of_rotation,
-        np.exp(0.5 * np.log(values).mean(axis=(-1, -2))),
-        np.sqrt(values[..., -1].mean(axis=-1)),
-        b.max(axis=-1),
-        _conditioning(_weighted_anchors(task, context, anchors)),
-    )
-
-
-def _conditioning(spread: FloatArray) -> FloatArray:
-    """Geometric mean (...) of the condition numbers of Abar (..., P, M, 3); fewer than 4: inf."""
-    if spread.shape[-2] < 4:
-        return np.full(spread.shape[:-3], np.inf)
-    singular = np.linalg.svd(spread, compute_uv=False)
-    least = np.maximum(singular[..., 2], 1e-12 * singular[..., 0])
-    # Anchors that all coincide leave nothing at all.
-    ratio = np.divide(singular[..., 0], least, out=np.full(least.shape, 1e12), where=least > 0)
-    return np.exp(np.log(ratio).mean(axis=-1))
-
-
-def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """Abar (..., P, M, 3): anchors less their weighted mean, by the root of the weights."""
-    places = positions(task, context)
-    distance = ranging.distances(anchors[..., None, :, :], places[..., None, :])
-    weight = 1 / task.scene.noise.squared_range_variance(np.maximum(distance, 1e-6))
-    if context.racks.shape[-2]:
-        sight = obstacles.in_sight(anchors, places, context.racks)[..., None]
-        weight = np.where(sight, weight, task.blocked_information * weight)
-    mean = (weight * anchors[..., None, :, :]).sum(axis=-2) / weight.sum(axis=-2)
-    return np.sqrt(weight) * (anchors[..., None, :, :] - mean[..., None, :])
 
 
 # --- mounts ----------------------------------------------------------------------------------

@@ -356,13 +356,9 @@ def posterior_information(
         predicted = np.linalg.inv(prior_covariance)
     else:
         predicted = bounds.predict_information(previous, at.twist, scene.dt, scene.process)
+    share = shares(scene, at, anchors, links)
     return predicted + bounds.information_at(
-        anchors,
-        np.asarray(scene.tags),
-        at.rotation,
-        at.translation,
-        scene.noise,
-        shares(scene, at, anchors, links),
+        anchors, np.asarray(scene.tags), at.rotation, at.translation, scene.noise, share
     )
 
 

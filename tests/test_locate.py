@@ -372,7 +372,7 @@ def test_a_trial_whose_links_are_too_few_is_marked_and_spoils_no_other():
 
 
 def test_a_package_adds_its_method_by_an_entry_point(monkeypatch):
-    entry = EntryPoint("mine", "rbl_gym.estimators.localization:_cls", "rbl_gym.locators")
+    entry = EntryPoint("mine", "rbl_gym.estimators.locators:_cls", "rbl_gym.locators")
     monkeypatch.setattr(door, "entry_points", lambda group: [entry])
     assert "mine" in estimators.methods()
     rng = np.random.default_rng(13)

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, placement, scene_files
+from rbl_gym import bounds, layout_criteria, placement, scene_files
 from rbl_gym.app import place, place_accuracy, place_check, place_figures, place_html, place_report
 from rbl_gym.app.cli import main
 from tests.test_scene_files import GOOD
@@ -199,7 +199,7 @@ def test_the_figures_have_these_names(placed):
         figures = result["predicted"][name]
         assert set(figures) == {"rms", "median", "p95", "worst", "worst_at_m"}
         assert figures["median"] <= figures["p95"] <= figures["worst"]
-    assert set(result["criteria"]) == set(placement.Criteria._fields)
+    assert set(result["criteria"]) == set(layout_criteria.Criteria._fields)
     assert set(result["check"]) == {"trials", "prior_rotation_deg", "prior_position_m", "filters"}
     assert set(result["check"]["filters"]["iterated EKF"]) == {
         "lost", "nees", "position_rmse_m", "position_predicted_m", "position_ratio",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rbl_gym import placement, rotations, scenes
+from rbl_gym import layout_criteria, placement, rotations, scenes
 from rbl_gym.placement import Context, PlacementTask
 from tests.test_obstacles import depth_by_sampling
 
@@ -167,7 +167,7 @@ def test_score_and_criteria_against_the_textbook(kind):
     task = make(kind)
     context, anchors = problem(task, 5, (2,))
     scores = placement.score(task, context, anchors)
-    criteria = placement.criteria(task, context, anchors)
+    criteria = layout_criteria.criteria(task, context, anchors)
     for i in range(2):
         one = Context(*(field[i] for field in context))
         P, b, W = textbook(task, one, anchors[i])
@@ -198,7 +198,7 @@ def test_conditioning_is_that_of_the_weighted_anchors_less_their_mean():
         weights = 1 / (4 * r**2 * (0.1**2 + (0.001 * r) ** 2))
         mean = weights @ anchors / weights.sum()
         logs.append(math.log(np.linalg.cond(np.sqrt(weights)[:, None] * (anchors - mean))))
-    got = placement.criteria(task, context, anchors).conditioning
+    got = layout_criteria.criteria(task, context, anchors).conditioning
     np.testing.assert_allclose(got, math.exp(np.mean(logs)), rtol=1e-9)
 
 
@@ -206,7 +206,7 @@ def test_conditioning_is_that_of_the_weighted_anchors_less_their_mean():
 def test_conditioning_of_too_few_anchors_is_infinite(n_anchors):
     task = placement.task("auv_buoys", n_anchors)
     context, anchors = problem(task, 7, (2,))
-    criteria = placement.criteria(task, context, anchors)
+    criteria = layout_criteria.criteria(task, context, anchors)
     assert np.isposinf(criteria.conditioning).all()
     assert all(np.isfinite(value).all() for value in criteria[:-1])
 
@@ -215,9 +215,9 @@ def test_conditioning_of_flat_and_of_coincident_anchors_is_huge_but_a_number():
     task = placement.task("drone_yard", 5)
     context, anchors = problem(task, 8)
     flat = anchors * [1, 1, 0]
-    assert placement.criteria(task, context, flat).conditioning > 1e11
+    assert layout_criteria.criteria(task, context, flat).conditioning > 1e11
     same = np.broadcast_to(anchors[:1], anchors.shape)
-    criteria = placement.criteria(task, context, same)
+    criteria = layout_criteria.criteria(task, context, same)
     assert all(np.isfinite(value) for value in criteria)
 
 
@@ -225,7 +225,7 @@ def test_tags_on_a_line_have_criteria_too():
     scene = scenes.get({"name": "drone_yard", "tags": [[-1, 0, 0], [0, 0, 0], [1, 0, 0]]})
     task = placement.task(scene)
     context, anchors = problem(task, 9)
-    criteria = placement.criteria(task, context, anchors)
+    criteria = layout_criteria.criteria(task, context, anchors)
     assert np.isfinite(criteria).all()
     np.testing.assert_allclose(criteria.score_m, placement.score(task, context, anchors))
 
@@ -262,14 +262,14 @@ def test_batches_are_loops(kind):
     task = make(kind)
     context, anchors = problem(task, 12, (2, 3), (4,))
     scores = placement.score(task, context, anchors)
-    criteria = placement.criteria(task, context, anchors)
+    criteria = layout_criteria.criteria(task, context, anchors)
     assert scores.shape == (4, 2, 3)
     for index in np.ndindex(scores.shape):
         one = Context(*(field[index[1:]] for field in context))
         np.testing.assert_allclose(
             scores[index], placement.score(task, one, anchors[index]), rtol=1e-9
         )
-        alone = placement.criteria(task, one, anchors[index])
+        alone = layout_criteria.criteria(task, one, anchors[index])
         for a, b in zip(criteria, alone, strict=True):
             np.testing.assert_allclose(a[index], b, rtol=1e-6)
     # One layout for all contexts, and many layouts of one context.
@@ -449,7 +449,7 @@ def test_bad_fields_are_refused(fields, message):
         dataclasses.replace(placement.task("uwb_room"), **fields)
 
 
-@pytest.mark.parametrize("function", [placement.score, placement.criteria])
+@pytest.mark.parametrize("function", [placement.score, layout_criteria.criteria])
 @pytest.mark.parametrize(
     ("change", "message"),
     [

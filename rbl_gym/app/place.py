@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import layout_search, layouts, placement, scene_files
+from rbl_gym import layout_criteria, layout_search, layouts, placement, scene_files
 from rbl_gym.app import place_check
 from rbl_gym.app.place_accuracy import accuracy, free_grid, free_sample
 from rbl_gym.checks import FloatArray
@@ -291,7 +291,7 @@ def comparison(problem: Problem, found: Design, seed: int) -> dict[str, dict[str
 
 def _criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> dict[str, Any]:
     """The criteria as numbers; None where there is none (conditioning of coplanar anchors)."""
-    values = placement.criteria(task, context, anchors)._asdict()
+    values = layout_criteria.criteria(task, context, anchors)._asdict()
     numbers = {name: float(value) for name, value in values.items()}
     if _is_flat(anchors):
         numbers["conditioning"] = math.inf
