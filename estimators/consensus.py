@@ -139,6 +139,8 @@ def cycle_consensus(
 ) -> FloatArray:
     """Consistent edge angles psi (m,) by the cycle iteration (14); `cycle_iteration`'s `psi`.
 
+    Arguments as `cycle_iteration`.
+
     Raises
     ------
     ValueError
@@ -178,8 +180,9 @@ def cycle_iteration(
     kappa
         Step; None or a rule of `step_size`. Asynchronous: a number, or None for one over the
         length of the cycle, which no cycle has to ask another for.
-    tol
-        It ends when the cycles' remaining ``proj(C psi)`` has a norm of at most `tol`.
+    tol, max_steps
+        It ends when the cycles' remaining ``proj(C psi)`` has a norm of at most `tol`, or after
+        so many steps.
     history
         Whether to keep all psi on the way.
     order

@@ -152,7 +152,17 @@ def simulate(
     rng: np.random.Generator,
     station: ArrayLike | None = None,
 ) -> FloatArray:
-    """Noisy angles (..., 2, N) of bodies at given poses."""
+    """Noisy angles (..., 2, N) of bodies at given poses.
+
+    Parameters
+    ----------
+    tags, rotation, translation
+        (..., N, 3), (..., 3, 3), (..., 3); metres.
+    noise, rng
+        Law of the angles, and where its normals come from.
+    station
+        Place (..., 3) of the base station; None: the origin.
+    """
     if not isinstance(noise, AngleNoise):
         raise ValueError(f"noise must be an AngleNoise, got {noise!r:.80}")
     true = angles(tag_positions(rotation, translation, tags), station)

@@ -74,6 +74,8 @@ def range_jacobian(
 
     The derivative of a distance by (w, v) is ``(Q c x u, u)``, u the unit vector from anchor to
     tag (zero where both coincide). Components come first, so that every step runs along memory.
+
+    Arguments as `range_information`.
     """
     if anchors.ndim == tags.ndim == rotation.ndim == 2 and translation.ndim == 1:
         return _one_range_jacobian(anchors, tags, rotation, translation)
@@ -242,6 +244,8 @@ def pose_crb(
     The inverse of `range_information` plus the prior information (..., 6, 6), if any. Never a
     pseudo-inverse: it would reward anchors that see nothing.
 
+    Arguments as `range_information`, and `prior_information` (..., 6, 6).
+
     Raises
     ------
     ValueError
@@ -325,7 +329,10 @@ def posterior_crb_step(
 def predict_information(
     J: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
 ) -> FloatArray:
-    """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J."""
+    """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J.
+
+    Arguments as `predict_covariance`, with information J (..., 6, 6) for P.
+    """
     turned = _turn(J, twist, dt)
     Q = process.covariance(twist, dt)
     return symmetric(np.linalg.solve(_EYE + turned @ Q, turned))
@@ -334,7 +341,15 @@ def predict_information(
 def predict_covariance(
     P: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
 ) -> FloatArray:
-    """Pose covariance after a step of motion, ``F P F^T + Q``, ``F = blkdiag(exp(w dt), I)``."""
+    """Pose covariance after a step of motion, ``F P F^T + Q``, ``F = blkdiag(exp(w dt), I)``.
+
+    Parameters
+    ----------
+    P, twist
+        (..., 6, 6) and (..., 6).
+    dt, process
+        Seconds, and the noise of the motion.
+    """
     return _turn(P, twist, dt) + process.covariance(twist, dt)
 
 

@@ -21,7 +21,10 @@ __all__ = ["SEARCHES", "best_of_random", "cma_es", "greedy", "greedy_swaps", "sh
 def best_of_random(
     task: PlacementTask, context: Context, rng: np.random.Generator, tries: int = 100
 ) -> FloatArray:
-    """The best of `tries` random layouts."""
+    """The best of `tries` random layouts.
+
+    Arguments as `cma_es`.
+    """
     check_number("tries", tries, low=1)
     batch = context.centre.shape[:-1]
     drawn = task.scene.anchor_region.draw(rng.random((*batch, tries, task.n_anchors, 3)))
@@ -114,6 +117,8 @@ def cma_es(
 
     Parameters
     ----------
+    task, context, rng
+        The problem, contexts (...), and the source of all randomness.
     generations, population
         Their product is the number of layouts scored for each context.
     sigma
@@ -164,7 +169,10 @@ def shared_layout(
     population: int = 16,
     sigma: float = 0.6,
 ) -> FloatArray:
-    """One layout (M, 3) for all contexts (C,): CMA-ES on the mean log score."""
+    """One layout (M, 3) for all contexts (C,): CMA-ES on the mean log score.
+
+    Arguments as `cma_es`.
+    """
     if contexts.centre.ndim != 2:
         raise ValueError(f"contexts must have one batch axis, got {contexts.centre.shape[:-1]}")
     size = 3 * task.n_anchors

@@ -85,6 +85,8 @@ def ring(
 
     Its radius is `width` times the region's mean half width plus `height` times how far the
     region's middle lies above or below the anchors.
+
+    Arguments as `layout`.
     """
     if isinstance(task.scene.anchor_region, Shell):
         return _everywhere(task, context, _sphere(task.n_anchors))
@@ -113,6 +115,13 @@ def layout(
     name: str, task: PlacementTask, context: Context, rng: np.random.Generator
 ) -> FloatArray:
     """The named layout (..., M, 3) of a problem.
+
+    Parameters
+    ----------
+    name
+        Of `LAYOUTS`.
+    task, context, rng
+        The problem, contexts (...), and the source of what is drawn.
 
     Raises
     ------

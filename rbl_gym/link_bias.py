@@ -57,7 +57,15 @@ def simulate(
     rng: np.random.Generator,
     batch: tuple[int, ...] = (),
 ) -> FloatArray:
-    """Biases (..., K, links) in metres at times (K,), drawn from the law."""
+    """Biases (..., K, links) in metres at times (K,), drawn from the law.
+
+    Parameters
+    ----------
+    law, times, links
+        `LinkBias`, seconds (K,) that do not decrease, and how many links there are.
+    rng, batch
+        Source of the normals, and the leading axes.
+    """
     times = check_array("times", times, ("K",))
     if times.ndim != 1 or (np.diff(times) < 0).any():
         raise ValueError("times must be (K,) and not decrease")

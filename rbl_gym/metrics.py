@@ -21,7 +21,13 @@ def pose_error(
     rotation: FloatArray,
     translation: FloatArray,
 ) -> FloatArray:
-    """Error (..., 6) = (w, v): ``Q_hat = exp(w) Q`` in radians, ``t_hat = t + v`` in metres."""
+    """Error (..., 6) = (w, v): ``Q_hat = exp(w) Q`` in radians, ``t_hat = t + v`` in metres.
+
+    Parameters
+    ----------
+    rotation_hat, translation_hat, rotation, translation
+        Estimate and truth: (..., 3, 3), (..., 3), (..., 3, 3), (..., 3); metres.
+    """
     turn = rotations.error(rotation_hat, rotation)
     shift = np.asarray(translation_hat) - np.asarray(translation)
     return np.concatenate(np.broadcast_arrays(turn, shift), axis=-1)
@@ -37,7 +43,15 @@ def tag_error(
     translation: FloatArray,
     tags: FloatArray,
 ) -> FloatArray:
-    """Root mean square (...) over the tags of their displacement, metres."""
+    """Root mean square (...) over the tags of their displacement, metres.
+
+    Parameters
+    ----------
+    rotation_hat, translation_hat, rotation, translation
+        Estimate and truth: (..., 3, 3), (..., 3), (..., 3, 3), (..., 3); metres.
+    tags
+        (..., N, 3), metres, body frame.
+    """
     turned = np.asarray(tags) @ np.swapaxes(np.asarray(rotation_hat) - rotation, -1, -2)
     shift = (np.asarray(translation_hat) - translation)[..., None, :]
     displacement = turned + shift

@@ -111,7 +111,7 @@ class Path(NamedTuple):
 def propagate(
     rotation: FloatArray, translation: FloatArray, twist: FloatArray, dt: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """The pose one step of `dt` seconds later under a constant twist."""
+    """`rotation` (..., 3, 3), `translation` (..., 3) after `dt` s of the same `twist` (..., 6)."""
     dt = np.asarray(dt, dtype=np.float64)[..., None]
     return _EXP(twist[..., :3] * dt) @ rotation, translation + twist[..., 3:] * dt
 
@@ -193,7 +193,7 @@ def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike)
 def constant_twist(
     rotation: ArrayLike, translation: ArrayLike, twist: ArrayLike, steps: int
 ) -> Trajectory:
-    """The same twist at every step (the tracking paper's motion)."""
+    """The same `twist` for `steps` from `rotation`, `translation` on: the tracking paper's."""
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     twist = check_array("twist", twist, (6,))
@@ -214,6 +214,8 @@ def random_twist(
 
     Speed and turn rate are exact (directions are uniform on the sphere), so that the reach of
     the body stays bounded by ``speed * time``.
+
+    From a pose (`rotation`, `translation`) on, at `speed_m_s` and `turn_rate_rad_s`; `rng` draws.
     """
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
@@ -317,7 +319,10 @@ def orbit(
     steps: int,
     phase: ArrayLike = 0.0,
 ) -> Trajectory:
-    """A horizontal circle, the body's x axis along the motion; `phase` (rad) may be batched."""
+    """A horizontal circle, the body's x axis along the motion; `phase` (rad) may be batched.
+
+    `centre` (..., 3), `radius_m`, `speed_m_s`; `steps` of `dt` seconds.
+    """
     centre = check_array("centre", centre, (3,))
     radius_m = check_number("radius_m", radius_m, low=1e-9)
     dt = check_number("dt", dt, low=1e-12)
@@ -367,7 +372,10 @@ def recorded(
 def interpolate(
     times: FloatArray, rotation: FloatArray, translation: FloatArray, at: FloatArray
 ) -> Path:
-    """Poses at the times `at`, linear in position, geodesic in rotation; the ends are held."""
+    """Poses at the times `at`, linear in position, geodesic in rotation; the ends are held.
+
+    The known ones: `times` (K,), `rotation` (K, 3, 3), `translation` (K, 3).
+    """
     final = len(times) - 1
     before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, final)
     after = np.minimum(before + 1, final)

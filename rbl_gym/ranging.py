@@ -355,6 +355,15 @@ def simulate(
 ) -> Measurement:
     """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`.
 
+    Parameters
+    ----------
+    anchors, tags, rotation, translation
+        (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3); metres.
+    noise, link_model
+        Laws of the ranges, and of what happens to links (None: nothing).
+    rng
+        Source of all randomness.
+
     Raises
     ------
     ValueError

@@ -206,6 +206,13 @@ def triangle_rotation(
     turn stays free. With noise, the line of sight is kept and the normals agree as nearly as
     they can.
 
+    Parameters
+    ----------
+    u_ij, u_ik
+        Directions (3,) in which i sees j and k, in the frame of i.
+    u_ji, u_jk
+        The same of j.
+
     Raises
     ------
     ValueError

@@ -121,7 +121,7 @@ def of_mapping(
     region: tuple[ArrayLike, ArrayLike] | None = None,
     name: str = "file",
 ) -> Problem:
-    """The problem that the tables of a file describe; arguments as for `problem`."""
+    """The problem that the tables of a file describe. Arguments as `problem`."""
     _check_keys(tables, "the file", _KEYS["the file"], ("anchors", "region", "body", "noise"))
     parts = {
         key: _table(tables.get(key, {}), key)
@@ -178,7 +178,10 @@ def check_n_anchors(number: Any) -> int:
 
 
 def free_points(low: FloatArray, high: FloatArray, obstacles: FloatArray, count: int) -> FloatArray:
-    """Up to `count` points (n, 3) spread evenly over a box, those inside obstacles left out."""
+    """Up to `count` points (n, 3) spread evenly over a box, those inside obstacles left out.
+
+    The box from `low` to `high` (3,), `obstacles` (K, 6) as centres and half sizes; metres.
+    """
     points = low + _cube(4 * count if len(obstacles) else count) * (high - low)
     return points[~inside(points, obstacles)][:count]
 

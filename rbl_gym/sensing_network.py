@@ -216,6 +216,13 @@ def random_network(
 
     The nodes outside of the largest connected component are left out, so that a few of
     `n_nodes` can be missing.
+
+    Parameters
+    ----------
+    n_nodes, mean_degree
+        How many, and how many neighbours each has on average.
+    bearing_std_rad, rng
+        Noise of the measured bearings, and where all that is drawn comes from.
     """
     from rbl_gym.network_graphs import components
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, motion, posterior, ranging, rotations, statistic
+from rbl_gym import bounds, motion, ranging, rotations, statistic
 from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.obstacles import in_sight
 from rbl_gym.scenes import Scene
@@ -19,7 +19,7 @@ from rbl_gym.statistic import EpochStatistic
 
 __all__ = [
     "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure",
-    "measure_statistic", "move_anchors", "posterior_information", "posterior_step",
+    "measure_statistic", "move_anchors",
 ]  # fmt: skip
 
 # Behind the doors: what comes to these was checked, or made here.
@@ -126,6 +126,13 @@ def draw_episode(
     """An episode of a scene, or a batch of independent ones.
 
     Anchors that the scene leaves open are drawn anew for every episode of the batch.
+
+    Parameters
+    ----------
+    scene, rng, batch
+        The world, the source of all randomness, and the leading axes.
+    statistic
+        Whether the observations are `statistic` alone, which takes other numbers.
     """
     return build_episode(scene, draw(scene, rng, batch, statistic), statistic)
 
@@ -264,6 +271,8 @@ def measure(
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
 
     `positions` of the tags (..., N, 3) and `quality` (`link_quality`): where known already.
+
+    `at` is of an episode of the `scene`.
     """
     if positions is None:
         positions = _TAG_POSITIONS(at.rotation, at.translation, scene.tags)
@@ -337,62 +346,3 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
     moved = velocity * reach[..., None]
     moved += anchors
     return scene.anchor_region.project(moved)
-
-
-def posterior_information(
-    scene: Scene,
-    at: Epoch,
-    anchors: FloatArray,
-    links: BoolArray,
-    previous: FloatArray | None,
-    prior_covariance: FloatArray,
-) -> FloatArray:
-    """Posterior Cramer-Rao information (..., 6, 6) at the true pose of an epoch.
-
-    From that of the epoch before, or from the prior at epoch 0 (`previous` None). Links that
-    gave nothing tell nothing.
-    """
-    if previous is None:
-        predicted = np.linalg.inv(prior_covariance)
-    else:
-        predicted = bounds.predict_information(previous, at.twist, scene.dt, scene.process)
-    share = shares(scene, at, anchors, links)
-    return predicted + bounds.information_at(
-        anchors, np.asarray(scene.tags), at.rotation, at.translation, scene.noise, share
-    )
-
-
-def posterior_step(
-    scene: Scene,
-    at: Epoch,
-    anchors: FloatArray,
-    links: BoolArray,
-    previous: FloatArray | None,
-    prior_covariance: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """`posterior_information` (B, 6, 6) of B worlds, fast, and the score (B,) of its inverse."""
-    interval = None
-    if previous is not None:
-        interval = posterior.Interval(at.twist, scene.dt, scene.process)
-    return posterior.step_many(
-        np.linalg.inv(prior_covariance) if previous is None else previous,
-        interval,
-        anchors,
-        scene.tags,
-        at.rotation,
-        at.translation,
-        scene.noise,
-        shares(scene, at, anchors, links),
-    )
-
-
-def posterior_course(scene: Scene, episode: Episode) -> posterior.Course:
-    """What the bound of one episode needs and no action changes."""
-    return posterior.course(
-        episode.rotation,
-        ranging.tag_positions(episode.rotation, episode.translation, scene.tags),
-        episode.twists,
-        np.asarray(scene.tags),
-        scene.dt,
-        scene.process,
-    )

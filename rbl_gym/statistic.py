@@ -86,7 +86,10 @@ def measure_statistic(
     noise: NoiseLaw,
     normals: FloatArray,
 ) -> EpochStatistic:
-    """`simulate_statistic` of given standard normals (..., 3, 4); shapes are taken as they come."""
+    """`simulate_statistic` of given standard normals (..., 3, 4); shapes are taken as they come.
+
+    Arguments as `simulate_statistic`.
+    """
     if not isinstance(noise, SquaredRangeNoise):
         raise ValueError(f"noise must be a SquaredRangeNoise to have a statistic, got {noise!r}")
     batch = np.broadcast_shapes(_batch(anchors, tags, rotation, translation), normals.shape[:-2])

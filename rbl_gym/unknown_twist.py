@@ -152,7 +152,19 @@ def simulate(
     steps: int,
     rng: np.random.Generator,
 ) -> WanderingPath:
-    """Trajectories drawn from the law, one for each start (..., 3, 3), (..., 3)."""
+    """Trajectories drawn from the law, one for each start (..., 3, 3), (..., 3).
+
+    Parameters
+    ----------
+    rotation, translation
+        The starts (..., 3, 3), (..., 3).
+    law, process
+        Of the twist, and what comes on top of the pose.
+    dt, steps
+        Seconds of a step, and how many.
+    rng
+        Source of all randomness.
+    """
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     dt = check_number("dt", dt, low=1e-12)
@@ -193,6 +205,7 @@ def predict_covariance(
 
     ``F P F^T + Q`` where F takes ``(w, v)`` to ``(exp(W dt) w + dt Jl dW, v + dt dV)``; states
     beyond the twelve stand still. Without a law the twist is known: all beyond six stand still.
+    `process` adds its noise to the pose.
     """
     batch = np.broadcast_shapes(P.shape[:-2], twist.shape[:-1])
     ndim = len(batch)

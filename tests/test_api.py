@@ -78,3 +78,29 @@ def test_the_reference_lists_public_names_only():
             # Environments are registered by id: their modules name nothing else.
             assert public in getattr(module, "__all__", [public]), name
             assert hasattr(module, public), name
+
+
+def parameters_section(doc):
+    found = re.search(
+        r"^Parameters\n-+\n(.*?)(?=^\S[^\n]*\n-+\n|\Z)", doc, re.MULTILINE | re.DOTALL
+    )
+    return found.group(1) if found else ""
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_docstrings_name_the_arguments_that_there_are(name):
+    for public in imported(name).__all__:
+        value = getattr(imported(name), public)
+        doc = inspect.getdoc(value) or ""
+        if not callable(value) or re.search(r"Arguments\s+as", doc):
+            continue
+        try:
+            arguments = set(inspect.signature(value).parameters) - {"self", "args", "kwargs"}
+        except ValueError:  # of a type written in C
+            continue
+        heads = re.findall(r"^(\S.*)$", parameters_section(doc), re.MULTILINE)
+        told = {word.split(":")[0].strip(" *`") for head in heads for word in head.split(",")}
+        assert told <= arguments, f"{name}.{public} has no {told - arguments}"
+        if told or (inspect.isfunction(value) and len(arguments) > 3):
+            silent = {word for word in arguments if not re.search(rf"\b{word}\b", doc)}
+            assert not silent, f"{name}.{public} does not say what {silent} is"

@@ -15,7 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics, TimeLimit
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import estimators, simulation
+from rbl_gym import estimators, scene_bounds
 from rbl_gym.ranging import LinkNoise
 from rbl_gym.scenes import SCENES
 from rbl_gym.wrappers import EstimatePose
@@ -141,7 +141,7 @@ def test_environments_own_reward_is_switched_off(monkeypatch):
     def refuse(*_: Any) -> None:
         raise AssertionError("the bound was computed")
 
-    monkeypatch.setattr(simulation, "posterior_course", refuse)
+    monkeypatch.setattr(scene_bounds, "posterior_course", refuse)
     with pytest.raises(AssertionError, match="the bound"):
         raw(short("uwb_room"), reward="bound").reset(seed=0)
     assert len(rollout(wrapped(short("uwb_room")))) == 13

@@ -22,7 +22,8 @@ SHORT = {"name": "uwb_room", "steps": 3}
 WORLDS: dict[str, dict[str, Any]] = {
     "Tracking": {"scene": SHORT, "reward": "bound", "observation": "ranges"},
     "AnchorPlacement": {
-        "scene": SHORT, "mode": "sequential", "racks": 0, "n_anchors": 4, "mirror": True,
+        "scene": SHORT, "mode": "sequential", "racks": 1, "n_anchors": 4, "mirror": True,
+        "sight": True,
     },
     "MobileAnchors": {"difficulty": "easy", "scene": "auv_craft", "sort_craft": True},
     "AnchorSelection": {"mode": "top-k", "k": 3, "price": 0.05, "scene": SHORT},

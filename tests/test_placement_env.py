@@ -38,6 +38,8 @@ WORLDS: dict[str, dict[str, Any]] = {
     "own scene": {"scene": {"name": "icassp2013", "noise": {"floor_m": 0.1}}, "n_anchors": 3},
     "at once": {"scene": "uwb_room", "mode": "one-shot", "racks": 1},
     "at once, auv": {"mode": "one-shot"},
+    "sight": {"scene": "uwb_room", "racks": 2, "sight": True},
+    "sight at once": {"scene": "uwb_room", "mode": "one-shot", "racks": 1, "sight": True},
     "mounts": {"scene": "uwb_room", "mode": "mounts", "n_anchors": 3},
     "mounts and racks": {"scene": "uwb_room", "mode": "mounts", "racks": 2},
 }
@@ -223,10 +225,11 @@ def test_observations_by_hand(kind, mirror, seed):
             done = np.zeros((m, 3))
             done[:k] = np.array(actions[:k]).reshape(-1, 3)
             parts.append(done.ravel())
-        if mode == "mounts":
+        if mode == "mounts" or WORLDS[kind].get("sight"):
             # Mount k of the observation is the one that the mirror takes mount k to.
             mounts = middle + sign * (placement.mounts(task) - middle)
             parts.append(placement.sight_fractions(task, context_of(info), mounts))
+        if mode == "mounts":
             taken = np.zeros(57)
             taken[np.array(actions[:k], int)] = 1
             parts.append(taken)
@@ -354,6 +357,8 @@ def test_contexts_are_those_in_info():
         ({"mode": "all"}, "mode must be one of 'sequential', 'one-shot', 'mounts', got 'all'"),
         ({"mode": "mounts"}, "scene must have walls for mount points, got 'auv_buoys'"),
         ({"racks": 1}, "racks must be 0 in a scene without walls"),
+        ({"sight": True}, "sight must be False without racks, which alone block it, got racks=0"),
+        ({"sight": 1}, "sight must be True or False, got 1"),
         ({"racks": 1.5}, "racks must be an int, got 1.5"),
         ({"n_anchors": 0}, "n_anchors must be"),
         ({"n_anchors": "four"}, "n_anchors must be an int, got 'four'"),

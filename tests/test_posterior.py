@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, posterior, rotations, scenes, simulation
+from rbl_gym import bounds, posterior, rotations, scene_bounds, scenes, simulation
 from rbl_gym.motion import ProcessNoise
 
 NAMES = sorted(scenes.SCENES)
@@ -24,14 +24,14 @@ def test_steps_of_many_worlds_and_of_one_equal_the_plain_recursion(name, links):
     scene = scenes.get({"name": name, "links": links, "steps": 6})
     episode = simulation.draw_episode(scene, np.random.default_rng(1), (7,))
     alone = simulation.Episode(*(None if field is None else field[2] for field in episode))  # pyright: ignore[reportArgumentType]
-    course = simulation.posterior_course(scene, alone)
+    course = scene_bounds.posterior_course(scene, alone)
     want, got, P = None, None, alone.prior_covariance
     for k in range(scene.steps + 1):
         at = simulation.epoch_of(episode, k)
         seen = simulation.measure(scene, at, episode.anchors).links
         rest = at, episode.anchors, seen
-        want = simulation.posterior_information(scene, *rest, want, episode.prior_covariance)
-        got, score = simulation.posterior_step(scene, *rest, got, episode.prior_covariance)
+        want = scene_bounds.posterior_information(scene, *rest, want, episode.prior_covariance)
+        got, score = scene_bounds.posterior_step(scene, *rest, got, episode.prior_covariance)
         assert_close(got, want, 1e-9)
         plain = bounds.score(np.linalg.inv(want), at.rotation, scene.tags)
         np.testing.assert_allclose(score, plain, rtol=1e-9)

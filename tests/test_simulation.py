@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import bounds, scenes, simulation
+from rbl_gym import bounds, scene_bounds, scenes, simulation
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box
@@ -589,7 +589,7 @@ def test_posterior_information_equals_a_naive_recursion_and_that_of_bounds(name)
             P = predicted_covariance(scene, P, twist)
         P = np.linalg.inv(np.linalg.inv(P) + information_by_hand(scene, episode, k, anchors, links))
         pose = episode.rotation[k], episode.translation[k]
-        J = simulation.posterior_information(
+        J = scene_bounds.posterior_information(
             scene, simulation.epoch_of(episode, k), anchors, links, J, episode.prior_covariance
         )
         law = law_by_hand(scene, anchors, *pose)
@@ -613,7 +613,7 @@ def test_links_that_gave_nothing_tell_nothing(name):
     scene = change(name, steps=2)
     episode = draw(scene, 20)
     none = np.zeros((scene.n_anchors, len(scene.tags)), bool)
-    J = simulation.posterior_information(
+    J = scene_bounds.posterior_information(
         scene,
         simulation.epoch_of(episode, 0),
         episode.anchors,
@@ -628,17 +628,17 @@ def test_information_of_a_batch_equals_its_episodes_one_by_one():
     scene = change("auv_buoys", steps=2)
     batch = draw(scene, 21, (3,))
     links = np.ones((3, scene.n_anchors, len(scene.tags)), bool)
-    first = simulation.posterior_information(
+    first = scene_bounds.posterior_information(
         scene, simulation.epoch_of(batch, 0), batch.anchors, links, None, batch.prior_covariance
     )
-    second = simulation.posterior_information(
+    second = scene_bounds.posterior_information(
         scene, simulation.epoch_of(batch, 1), batch.anchors, links, first, batch.prior_covariance
     )
     for b in range(3):
         alone = Episode(*(None if array is None else array[b] for array in batch))  # type: ignore[arg-type]
         J = None
         for k in (0, 1):
-            J = simulation.posterior_information(
+            J = scene_bounds.posterior_information(
                 scene,
                 simulation.epoch_of(alone, k),
                 alone.anchors,

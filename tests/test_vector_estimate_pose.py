@@ -70,12 +70,12 @@ def test_disabled_restarts_only_what_the_mask_says():
 def test_wraps_what_make_vec_gives_and_its_own_reward_is_off(monkeypatch):
     envs = gym.make_vec(ID, num_envs=4, scene="uwb_room")
     wrapped = VectorEstimatePose(envs, "iekf")
-    from rbl_gym import simulation
+    from rbl_gym import scene_bounds
 
     def refuse(*_):
         raise AssertionError("the bound was computed")
 
-    monkeypatch.setattr(simulation, "posterior_step", refuse)
+    monkeypatch.setattr(scene_bounds, "posterior_step", refuse)
     wrapped.reset(seed=1)
     _, reward, _, _, info = wrapped.step(np.zeros(4, int))
     np.testing.assert_allclose(reward, -np.log(info["score_m"]))

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, simulation
+from rbl_gym import bounds, scene_bounds, simulation
 from rbl_gym.checks import FloatArray
 from rbl_gym.scenes import Scene
 
@@ -85,7 +85,7 @@ def simulate(scene: Scene, condition: str, trials: int, seed: int) -> World:
     for epoch in range(true.steps + 1):
         at = simulation.epoch_of(episode, epoch)
         measured = simulation.measure(true, at, episode.anchors)
-        information, _ = simulation.posterior_step(
+        information, _ = scene_bounds.posterior_step(
             true, at, episode.anchors, measured.links, information, episode.prior_covariance
         )
         seen = {"ranges": measured.ranges, "links": measured.links, "anchors": anchors}

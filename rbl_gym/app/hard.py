@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import ranging, rotations, scenes, simulation
+from rbl_gym import ranging, rotations, scene_bounds, scenes, simulation
 from rbl_gym.app import monte_carlo
 from rbl_gym.app.monte_carlo import World
 from rbl_gym.checks import FloatArray
@@ -131,7 +131,7 @@ def _bound(world: World, links: list[Any]) -> FloatArray:
     episode, rows, information = world.episode, [], None
     for epoch, mask in enumerate(links):
         at = simulation.epoch_of(episode, epoch)
-        information = simulation.posterior_information(
+        information = scene_bounds.posterior_information(
             world.scene, at, episode.anchors, mask, information, episode.prior_covariance
         )
         rows.append(np.linalg.inv(information))

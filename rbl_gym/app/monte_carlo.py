@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, estimators, metrics, ranging, scenes, simulation
+from rbl_gym import bounds, estimators, metrics, ranging, scene_bounds, scenes, simulation
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.statistic import EpochStatistic, simulate_statistic
 
@@ -83,7 +83,7 @@ def simulate_world(
         else:
             measured = simulation.measure(scene, at, episode.anchors)
             links = measured.links
-        information = simulation.posterior_information(
+        information = scene_bounds.posterior_information(
             scene, at, episode.anchors, links, information, episode.prior_covariance
         )
         measurements.append(measured)

@@ -41,6 +41,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
         racks: int = 0,
         n_anchors: int | None = None,
         mirror: bool = True,
+        sight: bool = False,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -50,8 +51,9 @@ class AnchorPlacementVectorEnv(BatchEnv):
             raise ValueError(f"mirror must be True or False, got {mirror!r:.80}")
         self.mirror = mirror and is_symmetric(self.task)
         self.mode = check_one_of("mode", mode, MODES)
+        self.sight = check_sight(sight, self.task) or mode == "mounts"
         self.single_action_space = self._action_space()
-        size = observation_size(self.task, self.mode)
+        size = observation_size(self.task, self.mode, self.sight)
         self.single_observation_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
         steps = 1 if mode == "one-shot" else self.task.n_anchors
         self.film = rendering.film_of(render_mode, self.task)
@@ -66,11 +68,12 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self._actions = np.zeros((num_envs, self.task.n_anchors, 3))
         self._anchors = np.zeros((num_envs, self.task.n_anchors, 3))
         self._score_m = np.zeros(num_envs)
-        if self.mode == "mounts":
+        if self.sight:
             self._mounts = placement.mounts(self.task)
             self._mirrored = mirrored_mounts(self.task, self._mounts)
+            self._seen = np.zeros((num_envs, len(self._mounts)))
+        if self.mode == "mounts":
             self._taken = np.zeros((num_envs, len(self._mounts)), dtype=np.bool_)
-            self._sight = np.zeros((num_envs, len(self._mounts)))
             self._information = np.zeros((num_envs, self.task.n_poses, 6, 6))
             self._log_score = np.zeros(num_envs)
 
@@ -103,9 +106,10 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self._actions[chosen] = 0.0
         self._anchors[chosen] = 0.0
         self._score_m[chosen] = 0.0
+        if self.sight:
+            self._seen[chosen] = placement.sight_fractions(self.task, fresh, self._mounts)
         if self.mode == "mounts":
             self._taken[chosen] = False
-            self._sight[chosen] = placement.sight_fractions(self.task, fresh, self._mounts)
             self._information[chosen] = 0.0
             self._log_score[chosen] = math.log(_EMPTY_SCORE_M)
 
@@ -154,9 +158,10 @@ class AnchorPlacementVectorEnv(BatchEnv):
         parts = [self._features]
         if self.mode == "sequential":
             parts.append(self._actions.reshape(self.num_envs, -1))
+        if self.sight:
+            parts.append(np.take_along_axis(self._seen, self._shown(), axis=-1))
         if self.mode == "mounts":
-            shown = self._shown()
-            parts += [np.take_along_axis(a, shown, axis=-1) for a in (self._sight, self._taken)]
+            parts.append(np.take_along_axis(self._taken, self._shown(), axis=-1))
         if self.mode != "one-shot":
             parts.append(self._epochs[:, None] == np.arange(self.task.n_anchors))
         return np.concatenate(parts, axis=-1, dtype=np.float32)
@@ -194,8 +199,9 @@ class AnchorPlacementEnv(ScalarEnv):
     ## Observation space
     ``Box(-1, 1, (n,), float32)``, in order: the region's centre and size, scaled to the volume
     (6); of each rack its place and half size, scaled to the room (6 each); sequential: the
-    actions so far (3 M); mounts: the share of the poses that each mount sees, and whether it
-    is taken (57 + 57); except in one-shot the one-hot number of the next anchor (M). Where the
+    actions so far (3 M); with ``sight=True`` and in mounts: the share of the poses that each
+    mount of `rbl_gym.placement.mounts` sees (57); mounts: whether it is taken (57); except in
+    one-shot the one-hot number of the next anchor (M). Where the
     legal space and the volume have one centre, problems are shown mirrored in x and y, so that
     the region lies towards +x and +y, racks in the order of x, and actions are mirrored back;
     ``mirror=False`` shows them as they are.
@@ -219,7 +225,7 @@ class AnchorPlacementEnv(ScalarEnv):
     ```python
     import gymnasium as gym
 
-    env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", racks=2)
+    env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", racks=2, sight=True)
     env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", mode="mounts", n_anchors=4)
     ```
 
@@ -236,20 +242,33 @@ class AnchorPlacementEnv(ScalarEnv):
         racks: int = 0,
         n_anchors: int | None = None,
         mirror: bool = True,
+        sight: bool = False,
         render_mode: str | None = None,
     ) -> None:
         self._configure(
-            render_mode, scene=scene, mode=mode, racks=racks, n_anchors=n_anchors, mirror=mirror
-        )
+            render_mode, scene=scene, mode=mode, racks=racks, n_anchors=n_anchors, mirror=mirror,
+            sight=sight,
+        )  # fmt: skip
 
 
-def observation_size(task: placement.PlacementTask, mode: str) -> int:
+def check_sight(sight: bool, task: placement.PlacementTask) -> bool:
+    """Whether the sight of the mount points is observed: only where racks can block it."""
+    if not isinstance(sight, bool):
+        raise ValueError(f"sight must be True or False, got {sight!r:.80}")
+    if sight and not task.racks:
+        raise ValueError("sight must be False without racks, which alone block it, got racks=0")
+    return sight
+
+
+def observation_size(task: placement.PlacementTask, mode: str, sight: bool) -> int:
     """Length of the observation."""
     size = 6 + 6 * task.racks
-    if mode == "one-shot":
-        return size
-    middle = 3 * task.n_anchors if mode == "sequential" else 2 * len(placement.mounts(task))
-    return size + middle + task.n_anchors
+    if mode != "one-shot":
+        size += task.n_anchors
+    if mode == "sequential":
+        size += 3 * task.n_anchors
+    of_mounts = sight + (mode == "mounts")
+    return size + of_mounts * len(placement.mounts(task)) if of_mounts else size
 
 
 def is_symmetric(task: placement.PlacementTask) -> bool:

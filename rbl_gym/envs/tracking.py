@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from rbl_gym import posterior, ranging, rendering, scenes, simulation
+from rbl_gym import posterior, ranging, rendering, scene_bounds, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, as_array, check_array, check_one_of
 
 REWARDS = ("bound", "none")
@@ -197,7 +197,7 @@ class TrackingEnv(gym.Env[Any, Any]):
 
     def _start_bound(self, episode: simulation.Episode) -> None:
         """All of the bound that no action of the episode changes."""
-        self._course = simulation.posterior_course(self.scene, episode)
+        self._course = scene_bounds.posterior_course(self.scene, episode)
         self._informations: FloatArray | None = None
         if self._measured is not None:
             links = links_of(self._measured, self.scene, (self.scene.steps + 1,))

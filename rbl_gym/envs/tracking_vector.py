@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import rendering, scenes, simulation
+from rbl_gym import rendering, scene_bounds, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.components import whole_rows
 from rbl_gym.envs.batch import BatchEnv
@@ -149,7 +149,7 @@ class TrackingVectorEnv(BatchEnv):
             at = simulation.Epoch(*(None if field is None else field[rows] for field in at))  # pyright: ignore[reportArgumentType]
             anchors, links = anchors[rows], links[rows]
             information, prior = information[rows], prior[rows]
-        information, score_m = simulation.posterior_step(
+        information, score_m = scene_bounds.posterior_step(
             self.scene, at, anchors, links, None if started else information, prior
         )
         if len(rows) < self.num_envs:
