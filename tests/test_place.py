@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, placement, scene_files
+from rbl_gym import bounds, layouts, placement, scene_files
 from rbl_gym.app import place, place_accuracy, place_check, place_figures, place_html, place_report
 from rbl_gym.app.cli import main
 from tests.test_scene_files import GOOD
@@ -49,8 +49,7 @@ def test_the_design_is_legal_and_no_usual_layout_is_better(placed):
     assert list(result["layouts"]) == sorted(
         result["layouts"], key=lambda name: result["layouts"][name]["score_m"]
     )
-    assert set(result["layouts"]) == {"designed", "greedy with swaps", "corners", "grid",
-                                      "perimeter", "ring", "random"}  # fmt: skip
+    assert set(result["layouts"]) == {"designed", "greedy with swaps", *layouts.LAYOUTS}
     assert min(row["ratio"] for row in result["layouts"].values()) == 1
     assert result["layouts"]["random"]["ratio"] > 1.1
 
