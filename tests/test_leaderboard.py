@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
-from rbl_gym.app import bench_figures, bench_files, bench_worlds, leaderboard, replay
+from rbl_gym.app import bench_figures, bench_files, bench_report, bench_worlds, leaderboard, replay
 from rbl_gym.app.cli import main
 from rbl_gym.estimators import belief
 from rbl_gym.recordings import read_recording
@@ -472,7 +472,37 @@ def test_a_recording_is_a_scene(tmp_path, recording, capsys):
         assert tags[condition, "iekf"] > 1.2 * tags["nominal", "iekf"]
     assert found["noise-x2", "iekf"]["anees"] > 2 * first["anees"]
     assert 0 < found["nlos", "et-kf"]["trigger_rate"] <= 1
-    assert "walk, stress" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "walk, a recording, seed 0" in shown
+    assert "walk, stress" in shown
+
+
+def test_a_recording_has_a_page_without_colours(tmp_path, recording, short):
+    pytest.importorskip("plotly", reason="needs the extra viz")
+    path = tmp_path / "page.html"
+    for names, words in ((f"{recording}", "a recording of"),
+                         (f"{short},{recording}", "6 trials or a recording of")):  # fmt: skip
+        status, _ = bench(tmp_path, "--scenes", names, "--filters", "iekf,kf", "--fresh",
+                          "--conditions", "nominal", "--html", path)  # fmt: skip
+        assert status == 0
+        text = path.read_text()
+        assert words in text
+        assert ('id="maps"' in text) == (short in names)
+
+
+@pytest.mark.parametrize(
+    ("column", "shown"),
+    [
+        ([0.995, 1.0, 26.0], ["0.995", "1.000", "26.000"]),
+        ([3.41, 15.0, None], ["3.41", "15.00", "-"]),
+        ([-0.000986, 0.0, 0.00473], ["-0.000986", "0.000000", "0.004730"]),
+        ([544.0, 15.6e6], ["544", "1.56e+07"]),
+        ([None], ["-"]),
+        ([], []),
+    ],
+)
+def test_a_column_has_one_number_of_decimals(column, shown):
+    assert bench_report.fixed(column) == shown
 
 
 def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, capsys):

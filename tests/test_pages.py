@@ -287,6 +287,6 @@ def test_a_bench_writes_its_page(tmp_path, capsys):
     figures = {(r["scene"], r["condition"], r["filter"]): r for r in records if "tags_m" in r}
     for row in rows[1:]:
         ratio = figures[row[0], row[1], row[2]]["tags_m"]["to_bound"]
-        assert row[rows[0].index("x bound")] == f"{ratio:.4g}"
+        assert row[rows[0].index("x bound")] == f"{ratio:#.4g}"
     if BROWSER is not None:
         assert "heatmap" in opened(path)
