@@ -171,6 +171,17 @@ def test_the_page_of_the_demo_opens_and_its_slider_moves_body_and_cursor(demo, t
     assert len(re.findall(r'class="[^"]*scatterlayer', elements)) >= 3
 
 
+def test_logarithmic_axes_are_labelled_with_whole_numbers():
+    shown = track_pages._curves(camsap2013.run(20, 1))
+    axes = [axis for axis in shown.select_yaxes() if axis.type == "log"]
+    assert len(axes) == 4
+    for axis in axes:
+        assert [float(text) for text in axis.ticktext] == list(axis.tickvals)
+    assert track_pages._ticks(0.013, 0.2)["ticktext"] == [
+        "0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5",
+    ]  # fmt: skip
+
+
 def test_a_page_needs_no_network_and_is_the_same_for_the_same_result(demo):
     result = camsap2013.run(20, 1)
     again = track_pages.demo(result, camsap2013.example(1))

@@ -243,7 +243,7 @@ def test_coplanar_anchors_are_warned_of():
         (["--region", "0,0,0,20,1,1"], "region must lie inside the room"),
         (["--racks", "9"], "racks must be a finite number in [0, 2]"),
         (["--scene", "nowhere"], "scene must be one of"),
-        (["--scene", "nowhere.toml"], "nowhere.toml"),
+        (["--scene", "nowhere.toml"], "rbl-gym place: nowhere.toml: No such file or directory"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_with_status_2(options, message, capsys):
