@@ -180,6 +180,8 @@ def test_logarithmic_axes_are_labelled_with_whole_numbers():
     assert track_pages._ticks(0.013, 0.2)["ticktext"] == [
         "0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5",
     ]  # fmt: skip
+    short = track_pages._ticks(0.016, 0.031)["tickvals"]
+    assert [mark for mark in short if 0.016 <= mark <= 0.031] == [0.02, 0.025, 0.03]
 
 
 def test_a_page_needs_no_network_and_is_the_same_for_the_same_result(demo):

@@ -111,9 +111,10 @@ def _curves(result: dict[str, Any]) -> go.Figure:
 
 
 def _ticks(low: float, high: float) -> dict[str, Any]:
-    """1, 2 and 5 of every decade: plotly's own labels of a logarithmic axis are bare digits."""
+    """1, 2 and 5 of every decade, or more of a short axis; plotly's own labels are bare digits."""
+    digits = (1, 2, 5) if high > 5 * low else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    marks = [float(f"{digit}e{decade}") for decade in decades for digit in (1, 2, 5)]
+    marks = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
     return {"tickvals": marks, "ticktext": [f"{mark:g}" for mark in marks]}
 
 
