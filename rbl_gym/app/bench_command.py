@@ -129,6 +129,8 @@ def _names(text: str) -> list[str]:
 
 def _specs(names: list[str]) -> dict[str, Any]:
     """Scenes by label: names, changes of scenes and recordings from files that can be read."""
+    from rbl_gym.app import leaderboard
+
     specs: dict[str, Any] = {}
     for name in names:
         path = Path(name)
@@ -136,6 +138,11 @@ def _specs(names: list[str]) -> dict[str, Any]:
         if label in specs:
             raise ValueError(f"--scenes: two are named {label!r}: rename a file")
         specs[label] = name if label == name else _from_file(path)
+        if label != name:
+            try:
+                leaderboard.digest_of(specs[label])
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{path}: {error}") from error
     return specs
 
 
@@ -148,15 +155,11 @@ def _from_file(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: {error}") from error
     if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
         raise ValueError(f"{path}: must have the name of a scene, or the files of a recording")
-    from rbl_gym.app import bench_recordings, leaderboard
+    from rbl_gym.app.bench_recordings import FILES
 
-    try:
-        for key in bench_recordings.FILES if "ranges" in spec else ():
-            if not isinstance(spec.get(key, ""), str):
-                raise ValueError(f"{key} must be the name of a file, got {spec[key]!r:.80}")
-            if key in spec:
-                spec[key] = str(path.parent / spec[key])
-        leaderboard.digest_of(spec)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: {error}") from error
+    for key in FILES if "ranges" in spec else ():
+        if not isinstance(spec.get(key, ""), str):
+            raise ValueError(f"{path}: {key} must be the name of a file, got {spec[key]!r:.80}")
+        if key in spec:
+            spec[key] = str(path.parent / spec[key])
     return spec
