@@ -87,8 +87,11 @@ def _worse(ran: dict[str, dict[str, Any]]) -> list[str]:
     """Intervals of what each filter's tag error is above the best one's."""
     parts = {name: row["difference"].get("tags_m") for name, row in ran.items()}
     shown = {name: part for name, part in parts.items() if part and part["best"] != name}
-    ends = [fixed([part[end] for part in shown.values()], 2) for end in ("low", "high")]
-    texts = dict(zip(shown, map(" to ".join, zip(*ends, strict=True)), strict=True))
+    decimals = decimals_of([part["high"] for part in shown.values()], 2)
+    texts = {
+        name: f"{part['low']:.{decimals}f} to {part['high']:.{decimals}f}"
+        for name, part in shown.items()
+    }
     return [texts.get(name, "-") for name in ran]
 
 
@@ -159,14 +162,19 @@ def _number(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
 
 
-def fixed(column: Sequence[float | None], digits: int = 3) -> list[str]:
-    """Numbers with as many decimals as the `digits` of the smallest take; None is "-"."""
-    sizes = [abs(value) for value in column if value]
-    decimals = max(0, digits - 1 - math.floor(math.log10(min(sizes)))) if sizes else 0
+def fixed(column: Sequence[float | None]) -> list[str]:
+    """Numbers with as many decimals as three digits of the smallest take; None is "-"."""
+    decimals = decimals_of(column, 3)
     return [
         "-" if value is None else f"{value:.2e}" if abs(value) >= _HUGE else f"{value:.{decimals}f}"
         for value in column
     ]
+
+
+def decimals_of(column: Sequence[float | None], digits: int) -> int:
+    """Decimals that show so many digits of the smallest number, zeros apart."""
+    sizes = [abs(value) for value in column if value]
+    return max(0, digits - 1 - math.floor(math.log10(min(sizes)))) if sizes else 0
 
 
 def trials(row: Mapping[str, Any]) -> str:
