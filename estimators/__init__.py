@@ -4,10 +4,11 @@
 change of name.
 """
 
-from functools import partial
+from importlib import import_module
+from pkgutil import iter_modules
 
 from rbl_gym.estimators.asynchronous import Asynchronous, Stream
-from rbl_gym.estimators.augmented import AugmentedEkf, AugmentedState, iekf_bias, iekf_cv
+from rbl_gym.estimators.augmented import AugmentedEkf, AugmentedState
 from rbl_gym.estimators.bank import IteratedEkfBank
 from rbl_gym.estimators.belief import (
     ENTRY_POINT_GROUP,
@@ -25,7 +26,7 @@ from rbl_gym.estimators.consensus import (
     ring_least_squares,
 )
 from rbl_gym.estimators.doa import locate_doa
-from rbl_gym.estimators.doa_filter import DoaEkf, iterated_ekf
+from rbl_gym.estimators.doa_filter import DoaEkf
 from rbl_gym.estimators.hypotheses import BankState
 from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.localization import PoseEstimate, locate, methods
@@ -33,17 +34,9 @@ from rbl_gym.estimators.manifold import IteratedEkf, PoseState
 from rbl_gym.estimators.network_frames import FrameEstimate, frames
 from rbl_gym.estimators.network_orientations import chordal_optimum, orientations
 
-for _name, _constraint in {
-    "kf": "none",
-    "uc-kf": "newton",
-    "et-kf": "threshold",
-    "kf-ortho": "always",
-}.items():
-    register(_name, partial(KalmanFamily, constraint=_constraint))
-register("iekf", iterated_ekf)
-register("iekf-cv", iekf_cv)
-register("iekf-bias", iekf_bias)
-register("iekf-bank", IteratedEkfBank)
+# A filter is known by the `register` at the end of its own module; no list names the modules.
+for _module in iter_modules(__path__):
+    import_module(f"{__name__}.{_module.name}")
 
 __all__ = [
     "ENTRY_POINT_GROUP",

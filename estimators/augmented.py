@@ -20,7 +20,7 @@ from rbl_gym import ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log, product
 from rbl_gym.estimators import bias_cost
-from rbl_gym.estimators.belief import PoseBelief
+from rbl_gym.estimators.belief import PoseBelief, register
 from rbl_gym.estimators.bias_cost import AugmentedState
 from rbl_gym.estimators.inputs import check_epoch, check_variance
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState, is_vague
@@ -311,3 +311,7 @@ def iekf_bias(
     """
     pose = IteratedEkf(tags, noise, process, iterations, robust)
     return AugmentedEkf(pose, biases=(LinkBias(bias_std_m, bias_time_s, common_std_m),))
+
+
+register("iekf-cv", iekf_cv)
+register("iekf-bias", iekf_bias)

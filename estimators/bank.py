@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array
-from rbl_gym.estimators.belief import PoseBelief
+from rbl_gym.estimators.belief import PoseBelief, register
 from rbl_gym.estimators.hypotheses import (
     SAME,
     BankState,
@@ -339,3 +339,6 @@ def _log_likelihood(before: FloatArray, scored: _Scored) -> FloatArray:
     """Log evidence (...) of an epoch by Laplace's method, but for what all hypotheses share."""
     determinants = [np.linalg.slogdet(P)[1] for P in (scored.covariance, before)]
     return -scored.cost + 0.5 * (determinants[0] - determinants[1])
+
+
+register("iekf-bank", IteratedEkfBank)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import bearing
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
+from rbl_gym.estimators.belief import register
 from rbl_gym.estimators.doa_cost import DoaCost, SumCost
 from rbl_gym.estimators.doa_global import global_search
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
@@ -212,3 +213,6 @@ def iterated_ekf(
     if range_noise is not None:
         raise ValueError("range_noise must be None where noise is the law of the ranges")
     return IteratedEkf(tags, noise, process, iterations, robust)
+
+
+register("iekf", iterated_ekf)

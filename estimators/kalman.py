@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import rotations
 from rbl_gym.bounds import symmetric
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of, kernel
-from rbl_gym.estimators.belief import PoseBelief, inverse
+from rbl_gym.estimators.belief import PoseBelief, inverse, register
 from rbl_gym.estimators.engines import ENGINES, FEW_TRIALS, Epoch, Prediction
 from rbl_gym.estimators.four_filters import (
     Frame,
@@ -380,3 +380,12 @@ def expand_covariance(covariance: FloatArray) -> FloatArray:
     expanded[..., index, index] = (2 / 3) * trace[..., None]
     expanded[..., 9:, 9:] = covariance[..., 3:, 3:]
     return expanded
+
+
+for _name, _constraint in {
+    "kf": "none",
+    "uc-kf": "newton",
+    "et-kf": "threshold",
+    "kf-ortho": "always",
+}.items():
+    register(_name, partial(KalmanFamily, constraint=_constraint))

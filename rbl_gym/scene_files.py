@@ -21,7 +21,7 @@ from rbl_gym import bodies, placement, scenes
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.placement import Context, PlacementTask
-from rbl_gym.ranging import RangeNoise
+from rbl_gym.ranging import NOISE_LAWS, NoiseLaw
 from rbl_gym.regions import Box, Shell, Walls
 from rbl_gym.scenes import Scene
 
@@ -32,12 +32,11 @@ BODIES = {"octahedron": bodies.octahedron, "pyramid": bodies.pyramid, "cube": bo
           "plate": lambda size_m: bodies.plate(size_m, size_m)}  # fmt: skip
 # Fewer anchors never tell a pose; three leave its mirror image in their plane.
 MIN_ANCHORS, MAX_ANCHORS = 3, 64
-# Keys of each table of a file; those of [anchors] also depend on its kind.
+# Keys of each table of a file; those of [anchors] and [noise] depend on their kind.
 _KEYS = {
     "the file": ("name", "anchors", "region", "obstacles", "body", "noise", "prior"),
     "region": ("low", "high"),
     "body": ("shape", "size_m", "tags"),
-    "noise": ("floor_m", "proportional", "blocked_information"),
     "prior": ("rotation_deg", "position_m"),
 }
 # What is known before the first range where a file does not say.
@@ -127,12 +126,9 @@ def of_mapping(
         key: _table(tables.get(key, {}), key)
         for key in ("anchors", "region", "body", "noise", "prior")
     }
-    for key in ("region", "body", "noise", "prior"):
+    for key in ("region", "body", "prior"):
         _check_keys(parts[key], key, _KEYS[key], ("low", "high") if key == "region" else ())
-    noise = dict(parts["noise"])
-    blocked = check_number(
-        "noise.blocked_information", noise.pop("blocked_information", 0.01), low=0.0, high=1.0
-    )
+    noise, blocked = _noise(parts["noise"])
     prior = parts["prior"]
     number = parts["anchors"].get("number") if n_anchors is None else n_anchors
     if number is None:
@@ -144,7 +140,7 @@ def of_mapping(
         anchor_region=_anchor_region(parts["anchors"]),
         n_anchors=check_n_anchors(number),
         tags=_tags(parts["body"]),
-        noise=_named("noise", RangeNoise, **noise),
+        noise=noise,
         process=ProcessNoise(),
         dt=1.0,
         initial_rotation_rad=math.radians(
@@ -276,6 +272,17 @@ def _anchor_region(table: dict[str, Any]) -> Walls | Box | Shell:
     if kind is Shell:
         return _named("anchors", Shell, **{key: table[key] for key in sizes})
     return _named("anchors", kind, **{key: _corner(f"anchors.{key}", table[key]) for key in sizes})
+
+
+def _noise(table: dict[str, Any]) -> tuple[NoiseLaw, float]:
+    """The law of the ranges, and what is left of a link's information without sight."""
+    law = NOISE_LAWS[check_one_of("noise.kind", table.get("kind", "range"), list(NOISE_LAWS))]
+    sizes = [field.name for field in dataclasses.fields(law)]  # pyright: ignore[reportArgumentType]
+    _check_keys(table, "noise", (*sizes, "kind", "blocked_information"))
+    blocked = check_number(
+        "noise.blocked_information", table.get("blocked_information", 0.01), low=0.0, high=1.0
+    )
+    return _named("noise", law, **{key: table[key] for key in sizes if key in table}), blocked
 
 
 def _tags(table: dict[str, Any]) -> Any:

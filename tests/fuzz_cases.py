@@ -87,8 +87,8 @@ case(motion.constant_twist, **POSE, twist=TWIST, steps=3)
 case(motion.random_twist, **POSE, turn_rate_rad_s=0.1, speed_m_s=1.0, steps=3, rng=Rng)
 case(motion.waypoints, rotation=Q, points=ANCHORS, speed_m_s=1.0, dt=0.1, steps=5)
 case(motion.orbit, centre=T, radius_m=2.0, speed_m_s=1.0, dt=0.1, steps=4, phase=0.0)
-case(ranging.RangeNoise, floor_m=0.1, proportional=0.1)
-case(ranging.SquaredRangeNoise, sigma_m=0.1)
+for _law in ranging.NOISE_LAWS.values():
+    case(_law, **{key: value for key, value in vars(_law()).items() if value is not None})
 case(ranging.LinkNoise, std_m=np.ones((5, 6)))
 case(ranging.LinkModel, drop_probability=0.1, nlos_probability=0.1, nlos_bias_m=1.0, reach_m=3.0)
 case(ranging.simulate, anchors=ANCHORS, tags=TAGS, **POSE, noise=NOISE, rng=Rng)
@@ -121,7 +121,7 @@ for _method in ("ml", "nia"):
     case(estimators.locate_doa, _method, angles=ANGLES, tags=CORNER, noise=ANGLE_NOISE,
          method=_method)  # fmt: skip
 case(estimators.make, name="iekf", tags=TAGS, noise=NOISE, process=PROCESS)
-for _name in ("kf", "uc-kf", "et-kf", "kf-ortho", "iekf", "iekf-cv", "iekf-bias", "iekf-bank"):
+for _name in estimators.names():
     _filter = estimators.make(_name, tags=PYRAMID, noise=NOISE, process=PROCESS)
     _state = _filter.initial(Q, T, P)
     _ranges = {**EPOCH, "ranges": RANGES[:, :5], "links": np.ones((5, 5), dtype=np.bool_)}

@@ -78,6 +78,11 @@ def pyproject() -> dict:
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
+def test_importing_the_estimators_imports_every_module_that_may_register_a_filter():
+    lines = run_python("import sys, rbl_gym.estimators\nprint(*sys.modules, sep='\\n')")
+    assert set(modules_of("rbl_gym.estimators")) <= set(lines)
+
+
 # --- packages ---------------------------------------------------------------------------------
 
 

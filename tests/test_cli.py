@@ -7,11 +7,12 @@ import json
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, motion, ranging, recordings, rotations
+from rbl_gym import bodies, estimators, motion, ranging, recordings, rotations
 from rbl_gym.app import camsap2013, replay
 from rbl_gym.app.cli import main
 from tests.helpers import ROOT
@@ -279,6 +280,44 @@ def test_static_runs_of_a_real_recording(every, tmp_path):
     assert 0.5 < np.mean(nees) < 2
 
 
+@pytest.mark.parametrize(("filter", "used"), [("iekf", "recorded"), ("tests.test_cli:rigid", 0.12)])
+def test_replay_says_which_deviation_of_a_range_it_took(files, filter, used, capsys):
+    def settings():
+        assert main([*arguments(files), "--filter", filter, "--json"]) == 0
+        return json.loads(capsys.readouterr().out)["settings"]
+
+    assert settings()["range_std_m"] == 0.12
+    rows = [["t", "anchor", "tag", "range", "std"]]
+    header, first, *_ = csv.reader(Path(files["ranges"]).read_text().splitlines())
+    rows += [[first[0], *name[1:].split("t"), r, 0.05]
+             for name, r in zip(header[1:], first[1:], strict=True)]  # fmt: skip
+    Path(files["ranges"]).write_text("\n".join(",".join(map(str, row)) for row in rows))
+    assert settings()["range_std_m"] == used
+
+
+def rigid(tags, noise, process):
+    """A filter whose law of the ranges cannot be changed."""
+    inner = estimators.make("iekf", tags=tags, noise=noise, process=process)
+    names = ("initial", "predict", "update", "belief")
+    return SimpleNamespace(**{name: getattr(inner, name) for name in names})
+
+
+@pytest.mark.parametrize("offset", [None, "0", "0.2"])
+def test_planar_among_anchors_at_different_heights_needs_the_tags_height(raw_files, offset, capsys):
+    rows = Path(raw_files["anchors"]).read_text().splitlines()
+    rows[1] = rows[1].replace(",1.0", ",1.4")
+    Path(raw_files["anchors"]).write_text("\n".join(rows))
+    options = ["--planar", "--json"] + ([] if offset is None else ["--height-offset-m", offset])
+    status = main([*arguments(raw_files), *options])
+    said = capsys.readouterr()
+    if offset is None:
+        assert status == 2
+        assert "height_offset_m must be given for anchors at heights of 1 to 1.4 m" in said.err
+    else:
+        assert status == 0
+        assert json.loads(said.out)["settings"]["height_offset_m"] == float(offset)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -288,6 +327,7 @@ def test_static_runs_of_a_real_recording(every, tmp_path):
         (["--bias-std-m", "-1"], "std_m must be a finite number"),
         (["--accel-m", "-1"], "accel_m must be a finite number"),
         (["--ranges", "nowhere.csv"], "nowhere.csv"),
+        (["--height-offset-m", "0.1"], "height_offset_m means nothing without planar"),
         (["--filter", "magic"], "filter must be one of"),
         (["--walk-m", "-1"], "walk_m must be a finite number"),
         (["--range-std-m", "0"], "range_std_m must be a finite number"),

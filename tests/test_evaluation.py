@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rbl_gym import estimators, layouts, placement, ranging
+from rbl_gym import estimators, layout_search, layouts, placement, ranging
 from rbl_gym.app import evaluation, policies, training, transfer
 from rbl_gym.app.cli import main
 from rbl_gym.app.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
@@ -234,6 +235,12 @@ def test_filters_and_references_by_task():
     assert transfer.references(rl_task("satellite"))[-1] == "cma-es"
 
 
+def test_the_strongest_search_stays_the_one_that_counts_as_1(monkeypatch):
+    monkeypatch.setitem(layout_search.SEARCHES, "later", layout_search.best_of_random)
+    names = evaluation.references(rl_task("auv_buoys"))
+    assert names[-2:] == ["later", "cma-es"]
+
+
 def test_correlations_need_three():
     assert transfer._correlation(np.array([1.0]), np.array([2.0])) is None
     values = np.array([1.0, 2.0, 4.0])
@@ -277,8 +284,10 @@ def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
         assert abs(rows["random"]["correlation"]) <= 1
         assert rows["greedy-swaps"]["score_m"] < rows["random"]["score_m"]
         assert all(row["tag_rmse_m"] > 0 for row in rows.values())
-    assert main(arguments) == 0
-    assert "correlation" in capsys.readouterr().out
+    assert main([*arguments, "--references", "greedy"]) == 0
+    table = capsys.readouterr().out
+    assert "correlation" in table
+    assert re.findall("greedy\\S*|random", table) == ["greedy"] * 3
 
 
 def test_errors_are_one_line(tmp_path, capsys):
@@ -290,6 +299,7 @@ def test_errors_are_one_line(tmp_path, capsys):
     for arguments, message in (
         (["evaluate", "selection", "--references", "best"], "reference must be one of 'random'"),
         (["evaluate", "selection", "--references", "random,"], "got ''"),
+        (["transfer", "mounts", "--references", "ring"], "reference must be one of 'random', 'gr"),
         (["evaluate", "auv_buoys", "--policy", str(good)], "policy 'mine' does not fit"),
         (["evaluate", "selection", "--policy", str(good), "--policy", str(same)],
          "two files are named 'mine'"),

@@ -10,7 +10,15 @@ import pytest
 from scipy import stats
 
 from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
-from rbl_gym.app import bench_figures, bench_files, bench_worlds, leaderboard, replay
+from rbl_gym.app import (
+    bench_figures,
+    bench_files,
+    bench_report,
+    bench_worlds,
+    leaderboard,
+    replay,
+    terminal,
+)
 from rbl_gym.app.cli import main
 from rbl_gym.estimators import belief
 from rbl_gym.recordings import read_recording
@@ -306,7 +314,7 @@ def test_event_triggered_filters_say_how_often(tmp_path, short):
         (["--filters", "iekf/robust"], "must be name/option=value"),
         (["--filters", "iekf/gain=2"], "filter 'iekf' has no option 'gain'"),
         (["--scenes", "moon"], "scene must be one of"),
-        (["--scenes", "nowhere.toml"], "nowhere.toml"),
+        (["--scenes", "nowhere.toml"], "rbl-gym bench: nowhere.toml: No such file or directory"),
         (["--conditions", "rain"], "condition must be one of"),
         (["--address", "tcp://127.0.0.1:1"], "--address needs --backend dask or ray"),
     ],
@@ -418,6 +426,14 @@ def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
     assert "holds no record" in capsys.readouterr().err
 
 
+def test_a_missing_library_is_said_before_a_bar_is_drawn(tmp_path, short, capsys, monkeypatch):
+    monkeypatch.setattr(terminal.importlib.util, "find_spec", lambda name: None)
+    status, data = bench(tmp_path, "--scenes", short, "--jobs", "2")
+    assert (status, data) == (2, b"")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "rbl-gym: this command needs the extra parallel: pip install 'rbl-gym[parallel]'"
+
+
 # --- recordings -----------------------------------------------------------------------------
 
 
@@ -472,7 +488,37 @@ def test_a_recording_is_a_scene(tmp_path, recording, capsys):
         assert tags[condition, "iekf"] > 1.2 * tags["nominal", "iekf"]
     assert found["noise-x2", "iekf"]["anees"] > 2 * first["anees"]
     assert 0 < found["nlos", "et-kf"]["trigger_rate"] <= 1
-    assert "walk, stress" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "walk, a recording, seed 0" in shown
+    assert "walk, stress" in shown
+
+
+def test_a_recording_has_a_page_without_colours(tmp_path, recording, short):
+    pytest.importorskip("plotly", reason="needs the extra viz")
+    path = tmp_path / "page.html"
+    for names, words in ((f"{recording}", "a recording of"),
+                         (f"{short},{recording}", "6 trials or a recording of")):  # fmt: skip
+        status, _ = bench(tmp_path, "--scenes", names, "--filters", "iekf,kf", "--fresh",
+                          "--conditions", "nominal", "--html", path)  # fmt: skip
+        assert status == 0
+        text = path.read_text()
+        assert words in text
+        assert ('id="maps"' in text) == (short in names)
+
+
+@pytest.mark.parametrize(
+    ("column", "shown"),
+    [
+        ([0.995, 1.0, 26.0], ["0.995", "1.000", "26.000"]),
+        ([3.41, 15.0, None], ["3.41", "15.00", "-"]),
+        ([-0.000986, 0.0, 0.00473], ["-0.000986", "0.000000", "0.004730"]),
+        ([544.0, 15.6e6], ["544", "1.56e+07"]),
+        ([None], ["-"]),
+        ([], []),
+    ],
+)
+def test_a_column_has_one_number_of_decimals(column, shown):
+    assert bench_report.fixed(column) == shown
 
 
 def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, capsys):
@@ -493,8 +539,10 @@ def test_a_recording_that_was_changed_is_named_by_rerun(tmp_path, recording, cap
     [
         ('name = "uwb_room"\nranges = "x.csv"', "must have the name of a scene, or the files of"),
         ("steps = 3", "must have the name of a scene, or the files of"),
-        ('ranges = "ranges.csv"\nspeed = 3', "a recording has no 'speed'"),
-        ('ranges = "ranges.csv"\nanchors = "a.csv"', "a recording needs 'tags'"),
+        ('ranges = "ranges.csv"\nspeed = 3', "walk.toml: a recording has no 'speed'"),
+        ('ranges = "ranges.csv"\nanchors = "a.csv"', "walk.toml: a recording needs 'tags'"),
+        ("ranges = 3", "walk.toml: ranges must be the name of a file, got 3"),
+        ('name = "uwb_room"\nstep = 3', "walk.toml: scene has no field 'step'"),
         ("ranges = ", "walk.toml: Invalid value"),
     ],
 )

@@ -171,6 +171,19 @@ def test_the_page_of_the_demo_opens_and_its_slider_moves_body_and_cursor(demo, t
     assert len(re.findall(r'class="[^"]*scatterlayer', elements)) >= 3
 
 
+def test_logarithmic_axes_are_labelled_with_whole_numbers():
+    shown = track_pages._curves(camsap2013.run(20, 1))
+    axes = [axis for axis in shown.select_yaxes() if axis.type == "log"]
+    assert len(axes) == 4
+    for axis in axes:
+        assert [float(text) for text in axis.ticktext] == list(axis.tickvals)
+    assert track_pages._ticks(0.013, 0.2)["ticktext"] == [
+        "0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5",
+    ]  # fmt: skip
+    short = track_pages._ticks(0.016, 0.031)["tickvals"]
+    assert [mark for mark in short if 0.016 <= mark <= 0.031] == [0.02, 0.025, 0.03]
+
+
 def test_a_page_needs_no_network_and_is_the_same_for_the_same_result(demo):
     result = camsap2013.run(20, 1)
     again = track_pages.demo(result, camsap2013.example(1))
@@ -287,6 +300,6 @@ def test_a_bench_writes_its_page(tmp_path, capsys):
     figures = {(r["scene"], r["condition"], r["filter"]): r for r in records if "tags_m" in r}
     for row in rows[1:]:
         ratio = figures[row[0], row[1], row[2]]["tags_m"]["to_bound"]
-        assert row[rows[0].index("x bound")] == f"{ratio:.4g}"
+        assert row[rows[0].index("x bound")] == f"{ratio:#.4g}"
     if BROWSER is not None:
         assert "heatmap" in opened(path)

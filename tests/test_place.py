@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, layout_criteria, placement, scene_files
+from rbl_gym import bounds, layout_criteria, layouts, placement, scene_files
 from rbl_gym.app import place, place_accuracy, place_check, place_figures, place_html, place_report
 from rbl_gym.app.cli import main
 from tests.test_scene_files import GOOD
@@ -49,8 +49,7 @@ def test_the_design_is_legal_and_no_usual_layout_is_better(placed):
     assert list(result["layouts"]) == sorted(
         result["layouts"], key=lambda name: result["layouts"][name]["score_m"]
     )
-    assert set(result["layouts"]) == {"designed", "greedy with swaps", "corners", "grid",
-                                      "perimeter", "ring", "random"}  # fmt: skip
+    assert set(result["layouts"]) == {"designed", "greedy with swaps", *layouts.LAYOUTS}
     assert min(row["ratio"] for row in result["layouts"].values()) == 1
     assert result["layouts"]["random"]["ratio"] > 1.1
 
@@ -244,7 +243,7 @@ def test_coplanar_anchors_are_warned_of():
         (["--region", "0,0,0,20,1,1"], "region must lie inside the room"),
         (["--racks", "9"], "racks must be a finite number in [0, 2]"),
         (["--scene", "nowhere"], "scene must be one of"),
-        (["--scene", "nowhere.toml"], "nowhere.toml"),
+        (["--scene", "nowhere.toml"], "rbl-gym place: nowhere.toml: No such file or directory"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line_with_status_2(options, message, capsys):

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, scene_files
-from rbl_gym.ranging import RangeNoise
+from rbl_gym import bodies, layouts, placement, scene_files
+from rbl_gym.ranging import NOISE_LAWS, RangeNoise
 from rbl_gym.regions import Box, Shell, Walls
 from tests.helpers import ROOT
 
@@ -113,6 +113,15 @@ def test_other_regions_bodies_and_priors():
     assert scene_files.of_mapping(tables).task.scene.anchor_region == Box((0, 0, 0), (5, 5, 0))
 
 
+@pytest.mark.parametrize(("kind", "law"), NOISE_LAWS.items())
+def test_every_law_of_the_ranges_has_its_kind(kind, law):
+    problem = scene_files.of_mapping(changed("noise", {"kind": kind, "blocked_information": 0.5}))
+    assert problem.task.scene.noise == law()
+    assert problem.task.blocked_information == 0.5
+    anchors = layouts.corners(problem.task, problem.context, np.random.default_rng(0))
+    assert np.isfinite(placement.score(problem.task, problem.context, anchors))
+
+
 def test_arguments_go_before_the_file(tmp_path):
     problem = scene_files.of_mapping(GOOD, n_anchors=7, region=([2, 2, 1], [3, 3, 1]))
     assert problem.task.n_anchors == problem.task.scene.n_anchors == 7
@@ -188,7 +197,9 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("noise.floor_m", -0.1, "noise: floor_m must be a finite number"),
         ("noise.proportional", -0.1, "noise: proportional must be a finite number"),
         ("noise.floor_m", 0, "noise: floor_m and proportional must not both be zero"),
-        ("noise.std", 0.1, "noise has an unknown key 'std'"),
+        ("noise.std", 0.1, "noise has an unknown key 'std'; it may have floor_m, proportional"),
+        ("noise.kind", "loud", "noise.kind must be one of 'range', 'squared-range'"),
+        ("noise.kind", "squared-range", "noise has an unknown key 'floor_m'; it may have sigma_m"),
         ("noise.blocked_information", 2, "noise.blocked_information must be a finite number"),
         ("prior.position_m", 0, "prior.position_m must be a finite number"),
         ("prior.angle", 0, "prior has an unknown key 'angle'"),

@@ -43,19 +43,26 @@ def each(
         When workers die again and again on the same tasks; a worker that dies otherwise loses
         nothing but time: its tasks are run again.
     """
+    check(jobs, backend)
     if backend is None and jobs == 1:
         yield from ((index, function(task)) for index, task in enumerate(tasks))
-        return
-    backend = backend or "loky"
-    require("joblib", "parallel")
-    if backend == "loky":
+    elif backend in (None, "loky"):
         yield from _surviving(function, tasks, jobs)
     elif backend == "dask":
-        require("distributed", "parallel")
         yield from _dask(function, tasks, jobs, address)
     else:
-        require("ray", "parallel", "ray")
         yield from _ray(function, tasks, jobs, address)
+
+
+def check(jobs: int, backend: str | None) -> None:
+    """A MissingExtraError where `each` lacks what it needs."""
+    if backend is None and jobs == 1:
+        return
+    require("joblib", "parallel")
+    if backend == "dask":
+        require("distributed", "parallel")
+    elif backend == "ray":
+        require("ray", "parallel", "ray")
 
 
 def _surviving(

@@ -8,14 +8,15 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.app.backends import BACKENDS
+from rbl_gym.app import backends
 from rbl_gym.app.terminal import (
+    add_html,
     add_json,
-    natural,
+    add_trials,
+    check_html,
     positive,
     print_files,
     progress,
-    require,
     write_json,
 )
 
@@ -36,12 +37,11 @@ def add_bench(commands: Any) -> None:
                        help="names, or files .toml or .json: a scene with changes, or a "
                        "recording; default all named ones")  # fmt: skip
     bench.add_argument("--conditions", type=_names, metavar="A,B", help="default all")
-    bench.add_argument("--trials", type=positive, default=200, help="default 200")
-    bench.add_argument("--seed", type=natural, default=0, help="of all randomness, default 0")
+    add_trials(bench, 200)
     bench.add_argument("--out", default="out/bench.jsonl", metavar="F",
                        help="records, one a line; default out/bench.jsonl")  # fmt: skip
     bench.add_argument("--fresh", action="store_true", help="do not take up what F holds")
-    bench.add_argument("--html", metavar="F", help="page: maps, sortable table, self-contained")
+    add_html(bench, "page: maps, sortable table")
     _add_workers(bench)
     add_json(bench)
     bench.set_defaults(run=_bench)
@@ -62,7 +62,7 @@ def add_rerun(commands: Any) -> None:
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=positive, default=1, help="processes, default 1")
-    parser.add_argument("--backend", choices=BACKENDS, help="of joblib, default loky")
+    parser.add_argument("--backend", choices=backends.BACKENDS, help="of joblib, default loky")
     parser.add_argument("--address", metavar="A", help="of an existing dask or ray cluster")
 
 
@@ -70,8 +70,7 @@ def _bench(options: argparse.Namespace) -> int:
     from rbl_gym import scenes
     from rbl_gym.app import bench_files, leaderboard
 
-    if options.html:
-        require("plotly", "viz")
+    check_html(options)
     workers = _workers(options)
     tasks = leaderboard.tasks(
         _specs(options.scenes or list(scenes.SCENES)),
@@ -117,6 +116,7 @@ def _rerun(options: argparse.Namespace) -> int:
 def _workers(options: argparse.Namespace) -> dict[str, Any]:
     if options.address and options.backend not in ("dask", "ray"):
         raise ValueError(f"--address needs --backend dask or ray, got {options.backend}")
+    backends.check(options.jobs, options.backend)
     return {"jobs": options.jobs, "backend": options.backend, "address": options.address}
 
 
@@ -128,7 +128,9 @@ def _names(text: str) -> list[str]:
 
 
 def _specs(names: list[str]) -> dict[str, Any]:
-    """Scenes by label: names, changes of scenes and recordings from files."""
+    """Scenes by label: names, changes of scenes and recordings from files that can be read."""
+    from rbl_gym.app import leaderboard
+
     specs: dict[str, Any] = {}
     for name in names:
         path = Path(name)
@@ -136,6 +138,11 @@ def _specs(names: list[str]) -> dict[str, Any]:
         if label in specs:
             raise ValueError(f"--scenes: two are named {label!r}: rename a file")
         specs[label] = name if label == name else _from_file(path)
+        if label != name:
+            try:
+                leaderboard.digest_of(specs[label])
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"{path}: {error}") from error
     return specs
 
 
@@ -148,8 +155,11 @@ def _from_file(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: {error}") from error
     if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
         raise ValueError(f"{path}: must have the name of a scene, or the files of a recording")
-    if "ranges" in spec:
-        from rbl_gym.app.bench_recordings import FILES
+    from rbl_gym.app.bench_recordings import FILES
 
-        spec |= {key: str(path.parent / spec[key]) for key in FILES if key in spec}
+    for key in FILES if "ranges" in spec else ():
+        if not isinstance(spec.get(key, ""), str):
+            raise ValueError(f"{path}: {key} must be the name of a file, got {spec[key]!r:.80}")
+        if key in spec:
+            spec[key] = str(path.parent / spec[key])
     return spec

@@ -8,7 +8,8 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from rbl_gym.app import page
+from rbl_gym.app import bench_report, page
+from rbl_gym.app.leaderboard import is_recording
 
 _COLUMNS = 4
 # Ratios to the bound beyond this are one colour: the filter is lost.
@@ -27,17 +28,19 @@ def bench(result: dict[str, Any]) -> str:
         for row, microseconds in zip(result["rows"], result["microseconds_per_step"], strict=True)
     ]
     first = rows[0]
+    # A recording has no bound, hence no colours.
+    simulated = [row for row in rows if not is_recording(row["spec"])]
     conditions = "; ".join(f"{name}: {text}" for name, text in result["conditions"].items())
     return page.document(
         "Which filter? The leaderboard",
         [
             page.note(
-                f"{first['trials']} trials of each row, seed {first['seed']}, the same motion, "
+                f"{_trials(rows)} of each row, seed {first['seed']}, the same motion, "
                 "prior and noise for all filters of a scene. Colours and numbers of the maps: "
                 "RMS tag error over the posterior Cramer-Rao bound; 1 is as good as it gets, "
                 "from 30 on a filter is lost."
             ),
-            page.plot(_maps(rows), "maps"),
+            *([page.plot(_maps(simulated), "maps")] if simulated else []),
             page.note(f"Conditions. {conditions}."),
             page.table(f"{len(rows)} rows", _HEADINGS, [_cells(row) for row in rows]),
             page.note(
@@ -47,6 +50,11 @@ def bench(result: dict[str, Any]) -> str:
             ),
         ],
     )
+
+
+def _trials(rows: list[dict[str, Any]]) -> str:
+    """What stands behind the rows: trials of scenes, recordings, or both."""
+    return " or ".join(dict.fromkeys(bench_report.trials(row) for row in rows))
 
 
 def _maps(rows: list[dict[str, Any]]) -> go.Figure:
@@ -63,8 +71,8 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
         for row in rows:
             if row["scene"] == scene and "tags_m" in row:
                 at = filters.index(row["filter"]), conditions.index(row["condition"])
-                ratio[at] = row["tags_m"]["to_bound"] or np.nan
-        text = [["" if np.isnan(r) else f"{r:.3g}" for r in line] for line in ratio]
+                ratio[at] = row["tags_m"].get("to_bound") or np.nan
+        text = [["" if np.isnan(r) else page.digits(r, 3) for r in line] for line in ratio]
         shown.add_trace(
             go.Heatmap(
                 z=np.log10(ratio), x=conditions, y=filters, text=text, texttemplate="%{text}",
@@ -99,8 +107,9 @@ def _cells(row: dict[str, Any]) -> list[Any]:
         None if row.get(key) is None else 100 * row[key]
         for key in ("lost", "flipped", "trigger_rate")
     ]
-    return [
-        *head, row["position_m"]["rmse"], row["rotation_deg"]["rmse"], tags["rmse"],
-        tags["median"], tags["p95"], tags["to_bound"], row["anees"], row["verdict"], *percent,
-        row["microseconds_per_step"], remark,
+    figures = [
+        row["position_m"]["rmse"], row["rotation_deg"]["rmse"], tags["rmse"],
+        tags["median"], tags["p95"], tags.get("to_bound"), row["anees"],
     ]  # fmt: skip
+    shown = [None if figure is None else page.digits(figure, 4) for figure in figures]
+    return [*head, *shown, row["verdict"], *percent, row["microseconds_per_step"], remark]

@@ -65,11 +65,15 @@ def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...
     """`load` of a checked mapping; the stamps tell files that were written again."""
     spec = dict(items)
     paths = {key: spec[key] for key in FILES if key in spec}
+    recording = read_recording(**paths)
     settings = replay.Settings(**{key: spec[key] for key in SETTINGS if key in spec})
+    # Said once and for all: a condition may put an anchor at another height.
+    offset = replay.height_offset(recording, settings)
+    settings = dataclasses.replace(settings, height_offset_m=offset)
     digest = hashlib.sha256(repr(settings).encode())
     for key in sorted(paths):
         digest.update(key.encode() + Path(paths[key]).read_bytes())
-    return Log(read_recording(**paths), settings, digest.hexdigest()[:16])
+    return Log(recording, settings, digest.hexdigest()[:16])
 
 
 class Stressed(NamedTuple):

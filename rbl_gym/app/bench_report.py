@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
 
+from rbl_gym.app.leaderboard import is_recording
 from rbl_gym.app.reports import new_console
 
 _HEADINGS = (
     "filter", "position (m)", "rotation (deg)", "tags (m)", "median", "p95", "x bound",
     "ANEES", "lost", "flipped", "worse than best, 95 %", "us / step",
 )  # fmt: skip
+# From here on a column would show nothing but digits.
+_HUGE = 1e4
 _STRESS = ("nlos", "lost-links", "noise-x2", "anchor-off", "tag-off")
 
 
@@ -44,34 +49,50 @@ def print_bench(result: dict[str, Any]) -> None:
 
 
 def _nominal(scene: str, first: dict[str, Any], by_filter: dict[str, dict[str, Any]]) -> Table:
-    table = Table(title=f"{scene}, {first['trials']} trials, seed {first['seed']}")
+    table = Table(title=f"{scene}, {trials(first)}, seed {first['seed']}")
     for heading in _HEADINGS:
         table.add_column(heading, justify="left" if heading == "filter" else "right")
-    bound = None
-    for name, conditions in sorted(by_filter.items(), key=lambda item: _tags(item[1], "nominal")):
-        row = conditions["nominal"]
-        if "tags_m" not in row:
+    order = sorted(by_filter.items(), key=lambda item: _tags(item[1], "nominal"))
+    ran = {name: rows["nominal"] for name, rows in order if "tags_m" in rows["nominal"]}
+    bounds = [row for row in ran.values() if "bound" in row["tags_m"]][-1:]
+    columns = [
+        fixed(
+            [*(row[part]["rmse"] for row in ran.values()), *(row[part]["bound"] for row in bounds)]
+        )
+        for part in ("position_m", "rotation_deg", "tags_m")
+    ]
+    columns += [fixed([row["tags_m"][key] for row in ran.values()]) for key in ("median", "p95")]
+    columns += [
+        [_number(row["tags_m"].get("to_bound"), "{:.3f}") for row in ran.values()],
+        _anees(list(ran.values())),
+        *([_percent(row.get(key)) for row in ran.values()] for key in ("lost", "flipped")),
+        _worse(ran),
+        [_number(row["microseconds_per_step"], "{:.1f}") for row in ran.values()],
+    ]
+    for k, (name, row) in enumerate(ran.items()):
+        style = "dim" if row["status"] == "unobservable" else None
+        table.add_row(name, *(column[k] for column in columns), style=style)
+    for name, rows in order:
+        if name not in ran:
+            row = rows["nominal"]
             table.add_row(name, f"{row['status']}, {_rank(row)}", style="dim")
-            continue
-        bound = row
-        tags, part = row["tags_m"], row["difference"].get("tags_m")
+    if bounds:
         table.add_row(
-            name,
-            _number(row["position_m"]["rmse"]), _number(row["rotation_deg"]["rmse"]),
-            *(_number(tags[key]) for key in ("rmse", "median", "p95")),
-            _number(tags.get("to_bound"), "{:.3f}"),
-            _anees(row), _percent(row.get("lost")), _percent(row.get("flipped")),
-            "-" if part is None or part["best"] == name else
-            f"{_number(part['low'])} to {_number(part['high'])}",
-            _number(row["microseconds_per_step"], "{:.1f}"),
-            style="dim" if row["status"] == "unobservable" else None,
-        )  # fmt: skip
-    if bound is not None and "bound" in bound["tags_m"]:
-        values = [
-            _number(bound[part]["bound"]) for part in ("position_m", "rotation_deg", "tags_m")
-        ]
-        table.add_row("bound", *values, "", "", "1", style="bold")
+            "bound", *(column[-1] for column in columns[:3]), "", "", "1.000", style="bold"
+        )
     return table
+
+
+def _worse(ran: dict[str, dict[str, Any]]) -> list[str]:
+    """Intervals of what each filter's tag error is above the best one's."""
+    parts = {name: row["difference"].get("tags_m") for name, row in ran.items()}
+    shown = {name: part for name, part in parts.items() if part and part["best"] != name}
+    decimals = decimals_of([part["high"] for part in shown.values()], 2)
+    texts = {
+        name: f"{part['low']:.{decimals}f} to {part['high']:.{decimals}f}"
+        for name, part in shown.items()
+    }
+    return [texts.get(name, "-") for name in ran]
 
 
 def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str]) -> Table:
@@ -80,19 +101,24 @@ def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str
     for heading in stress:
         table.add_column(heading, justify="right")
     order = "nominal" if any("nominal" in rows for rows in by_filter.values()) else stress[0]
-    for name, conditions in sorted(by_filter.items(), key=lambda item: _tags(item[1], order)):
-        cells = []
-        for condition in stress:
-            row = conditions[condition]
-            if "tags_m" not in row:
-                cells.append(row["status"])
-                continue
-            lost = row.get("lost")
-            more = f" {_percent(lost)} lost" if lost else ""
-            cells.append(f"{_number(row['tags_m']['rmse'])}  {_anees(row)}{more}")
-        unobservable = any(row["status"] == "unobservable" for row in conditions.values())
+    names = sorted(by_filter, key=lambda name: _tags(by_filter[name], order))
+    columns = [_stress([by_filter[name][condition] for name in names]) for condition in stress]
+    for name, *cells in zip(names, *columns, strict=True):
+        unobservable = any(row["status"] == "unobservable" for row in by_filter[name].values())
         table.add_row(name, *cells, style="dim" if unobservable else None)
     return table
+
+
+def _stress(rows: list[dict[str, Any]]) -> list[str]:
+    """A column: tag error, ANEES, trials lost; or why there are none."""
+    ran = [row for row in rows if "tags_m" in row]
+    pairs = zip(fixed([row["tags_m"]["rmse"] for row in ran]), _anees(ran), strict=True)
+    texts = iter([f"{error}  {honesty}" for error, honesty in pairs])
+    return [
+        row["status"] if "tags_m" not in row
+        else next(texts) + (f" {_percent(row['lost'])} lost" if row.get("lost") else "")
+        for row in rows
+    ]  # fmt: skip
 
 
 def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
@@ -121,17 +147,39 @@ def _rank(row: dict[str, Any]) -> str:
     return "" if row["rank"] is None else f"rank {row['rank']} of {row['states']}"
 
 
-def _anees(row: dict[str, Any]) -> str:
-    mark = {"optimistic": "+", "pessimistic": "-", "consistent": ""}[row["verdict"]]
-    return f"{_number(row['anees'], '{:.3g}')}{mark}"
+def _anees(rows: list[dict[str, Any]]) -> list[str]:
+    """A column with its verdicts as marks, or a space where there is none."""
+    marks = {"optimistic": "+", "pessimistic": "-", "consistent": " "}
+    texts = fixed([row["anees"] for row in rows])
+    return [text + marks[row["verdict"]] for text, row in zip(texts, rows, strict=True)]
 
 
 def _percent(share: float | None) -> str:
-    return "" if share is None else f"{100 * share:.3g} %"
+    return "" if share is None else f"{100 * share:.1f} %"
 
 
-def _number(value: float | None, form: str = "{:.3g}") -> str:
+def _number(value: float | None, form: str) -> str:
     return "-" if value is None else form.format(value)
+
+
+def fixed(column: Sequence[float | None]) -> list[str]:
+    """Numbers with as many decimals as three digits of the smallest take; None is "-"."""
+    decimals = decimals_of(column, 3)
+    return [
+        "-" if value is None else f"{value:.2e}" if abs(value) >= _HUGE else f"{value:.{decimals}f}"
+        for value in column
+    ]
+
+
+def decimals_of(column: Sequence[float | None], digits: int) -> int:
+    """Decimals that show so many digits of the smallest number, zeros apart."""
+    sizes = [abs(value) for value in column if value]
+    return max(0, digits - 1 - math.floor(math.log10(min(sizes)))) if sizes else 0
+
+
+def trials(row: Mapping[str, Any]) -> str:
+    """How many trials stand behind a row: of a recording there is one."""
+    return "a recording" if is_recording(row["spec"]) else f"{row['trials']} trials"
 
 
 def print_rerun(result: dict[str, Any]) -> None:

@@ -12,8 +12,10 @@ from rbl_gym import __version__
 from rbl_gym.app import bench_command, learning, replay_command
 from rbl_gym.app.terminal import (
     MissingExtraError,
+    add_html,
     add_json,
-    add_seed,
+    add_trials,
+    check_html,
     natural,
     positive,
     print_files,
@@ -33,7 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return options.run(options)
     except MissingExtraError as error:
         print(f"rbl-gym: {error}", file=sys.stderr)
-    except (ValueError, OSError) as error:
+    except OSError as error:
+        said = f"{error.filename}: {error.strerror}" if error.filename else error
+        print(f"rbl-gym {options.command}: {said}", file=sys.stderr)
+    except ValueError as error:
         print(f"rbl-gym {options.command}: {error}", file=sys.stderr)
     return 2
 
@@ -63,9 +68,9 @@ def _add_demo(commands: Any) -> None:
         help="the tracking paper's experiment: five filters against the bound",
         description="Monte-Carlo tracking of a rigid body (CAMSAP 2013): a table, a picture.",
     )
-    _add_trials(demo)
+    add_trials(demo)
     demo.add_argument("--plot", default="out/demo.png", metavar="F", help="default out/demo.png")
-    demo.add_argument("--html", metavar="F", help="3-D page of a trial, charts and tables")
+    add_html(demo, "3-D page of a trial, charts and tables")
     add_json(demo)
     demo.set_defaults(run=_demo)
 
@@ -85,10 +90,9 @@ def _add_place(commands: Any) -> None:
                        help="random boxes that block sight in a named room, default 0")  # fmt: skip
     place.add_argument("--region", type=_region, metavar="x0,y0,z0,x1,y1,z1",
                        help="work region, metres; write --region=-1,... for a minus")  # fmt: skip
-    place.add_argument("--trials", type=positive, default=500, help="of the check, default 500")
-    add_seed(place)
+    add_trials(place, 500, "of the check, ")
     place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
-    place.add_argument("--html", metavar="F", help="3-D page with the tables, self-contained")
+    add_html(place, "3-D page with the tables")
     add_json(place)
     place.set_defaults(run=_place)
 
@@ -102,7 +106,7 @@ def _add_reproduce(commands: Any) -> None:
         description="; ".join(f"{name}: {e.summary}" for name, e in experiments().items()),
     )
     reproduce.add_argument("experiment", choices=sorted(experiments()))
-    _add_trials(reproduce)
+    add_trials(reproduce)
     reproduce.add_argument("--plot", metavar="F", help="default out/EXPERIMENT.png")
     reproduce.add_argument("--csv", metavar="F", help="every figure as a row")
     add_json(reproduce)
@@ -122,16 +126,10 @@ def _add_network(commands: Any) -> None:
     network.set_defaults(run=_network)
 
 
-def _add_trials(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--trials", type=positive, default=1000, help="default 1000")
-    add_seed(parser)
-
-
 def _demo(options: argparse.Namespace) -> int:
     from rbl_gym.app import camsap2013
 
-    if options.html:
-        require("plotly", "viz")
+    check_html(options)
     with progress("tracking", camsap2013.work_units()) as advance:
         result = camsap2013.run(options.trials, options.seed, advance)
     from rbl_gym.app import figures, reports
@@ -203,8 +201,7 @@ def _network(options: argparse.Namespace) -> int:
 
 def _place(options: argparse.Namespace) -> int:
     require("cmaes", "placement")
-    if options.html:
-        require("plotly", "viz")
+    check_html(options)
     from rbl_gym import scene_files
     from rbl_gym.app import place
 

@@ -23,6 +23,8 @@ from rbl_gym.wrappers import controllers
 
 # The reference that is one layout for all contexts, and the contexts it is optimised over.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
+# The search that counts as 1.
+_STRONGEST = "cma-es"
 # Random layouts of each context; and generations of CMA-ES that refine a policy's proposal.
 _RANDOM_TRIES = 8
 REFINE_GENERATIONS = 12
@@ -35,7 +37,8 @@ def references(task: RlTask) -> list[str]:
     if task.env_id == "RBL/AnchorPlacement-v0":
         if task.arguments.get("mode") == "mounts":
             return ["random", "greedy", "greedy-swaps"]
-        return [*layouts.LAYOUTS, _ONE_LAYOUT, *layout_search.SEARCHES]
+        searches = sorted(layout_search.SEARCHES, key=lambda name: name == _STRONGEST)
+        return [*layouts.LAYOUTS, _ONE_LAYOUT, *searches]
     return list(_controllers(task))
 
 
@@ -62,7 +65,7 @@ def evaluate(
         By the label they are to have. In a placement task each also comes refined by a few
         generations of CMA-ES, ``LABEL + cma-es``.
     names
-        Of `references`; ``random`` and the strongest are always among them.
+        Of `references`; ``random`` and the strongest come in any case.
     worlds, seed
         How many, and which.
     advance
@@ -134,6 +137,28 @@ def _held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str,
     return env, *env.reset(seed=HELD_OUT_SEED + SEED_STRIDE * seed)
 
 
+def _of_all(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    seed: int,
+    advance: Callable[[], None],
+    of_reference: Callable[[str, np.random.Generator], FloatArray],
+    of_policy: Callable[[Policy], FloatArray],
+) -> dict[str, FloatArray]:
+    """What two functions give of references, each with a generator of its own, and of policies."""
+    _check_policies(task, policies)
+    found = {}
+    for name in names:
+        rng = np.random.default_rng([seed, references(task).index(name)])
+        found[name] = of_reference(name, rng)
+        advance()
+    for label, policy in policies.items():
+        found[label] = of_policy(policy)
+        advance()
+    return found
+
+
 # --- tasks played step by step ----------------------------------------------------------------
 
 
@@ -145,17 +170,14 @@ def _loop_losses(
     seed: int,
     advance: Callable[[], None],
 ) -> dict[str, FloatArray]:
-    _check_policies(task, policies)
-    losses = {}
-    for name in names:
-        rng = np.random.default_rng([seed, references(task).index(name)])
+    def reference(name: str, rng: np.random.Generator) -> FloatArray:
         controller = _controllers(task)[name]
-        losses[name] = _rollout(task, lambda env, _, c=controller, r=rng: c(env, r), worlds, seed)
-        advance()
-    for label, policy in policies.items():
-        losses[label] = _rollout(task, lambda _, seen, p=policy: p(seen), worlds, seed)
-        advance()
-    return losses
+        return _rollout(task, lambda env, _: controller(env, rng), worlds, seed)
+
+    def policy(played: Policy) -> FloatArray:
+        return _rollout(task, lambda _, seen: played(seen), worlds, seed)
+
+    return _of_all(task, policies, names, seed, advance, reference, policy)
 
 
 def _rollout(
@@ -205,16 +227,12 @@ def layouts_of(
 
     The random ones are (C, 8, M, 3).
     """
-    _check_policies(task, policies)
     env, _, _ = _held_out(task, worlds, seed)
-    found = {}
-    for name in names:
-        rng = np.random.default_rng([seed, references(task).index(name)])
-        found[name] = _reference_layout(task, env, name, rng)
-        advance()
-    for label, policy in policies.items():
-        found[label] = _policy_layout(task, policy, worlds, seed)
-        advance()
+    found = _of_all(
+        task, policies, names, seed, advance,
+        lambda name, rng: _reference_layout(task, env, name, rng),
+        lambda policy: _policy_layout(task, policy, worlds, seed),
+    )  # fmt: skip
     return env.task, env.contexts, found
 
 

@@ -16,6 +16,7 @@ from rbl_gym.app.terminal import (
     require,
     write_json,
 )
+from rbl_gym.checks import check_one_of
 
 
 def add_train(commands: Any) -> None:
@@ -41,8 +42,7 @@ def add_evaluate(commands: Any) -> None:
         description="Score policies against the references on held-out worlds, with 95 % "
         "intervals of the paired bootstrap.",
     )
-    _add_players(evaluate, list(TASKS), worlds=256)
-    evaluate.add_argument("--references", metavar="A,B", help="default all of the task's")
+    _add_players(evaluate, list(TASKS), worlds=256, references="all of the task's")
     add_json(evaluate)
     evaluate.set_defaults(run=_evaluate)
 
@@ -56,18 +56,21 @@ def add_transfer(commands: Any) -> None:
         "what is good by the bound track well?",
     )
     placements = [name for name, task in TASKS.items() if task.env_id == "RBL/AnchorPlacement-v0"]
-    _add_players(transfer, placements, worlds=48)
+    _add_players(transfer, placements, worlds=48, references="random, ring, greedy-swaps, cma-es")
     transfer.add_argument("--repeats", type=positive, default=16,
                           help="bodies in each world, default 16")  # fmt: skip
     add_json(transfer)
     transfer.set_defaults(run=_transfer)
 
 
-def _add_players(parser: argparse.ArgumentParser, tasks: list[str], worlds: int) -> None:
-    """The task, the policies that play it, and the worlds they play it in."""
+def _add_players(
+    parser: argparse.ArgumentParser, tasks: list[str], worlds: int, references: str
+) -> None:
+    """The task, the policies and references that play it, and the worlds they play it in."""
     parser.add_argument("task", choices=sorted(tasks))
     parser.add_argument("--policy", action="append", default=[], metavar="F",
                         help="of rbl-gym train; may be given again")  # fmt: skip
+    parser.add_argument("--references", metavar="A,B", help=f"default {references}")
     parser.add_argument("--worlds", type=positive, default=worlds, help=f"default {worlds}")
     add_seed(parser, "which worlds")
 
@@ -99,7 +102,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
     task = rl_task(options.task)
     loaded = _policies(options.policy)
-    names = options.references.split(",") if options.references else evaluation.references(task)
+    names = _references(options, evaluation.references(task))
     units = evaluation.work_units(task, names, len(loaded))
     try:
         with progress(options.task, units) as advance:
@@ -121,7 +124,7 @@ def _transfer(options: argparse.Namespace) -> int:
     task = rl_task(options.task)
     loaded = _policies(options.policy)
     filters = transfer.filters(task)
-    references = transfer.references(task)
+    references = _references(options, transfer.references(task))
     units = (len(filters) + 1) * (len(references) + len(loaded))
     with progress(options.task, units) as advance:
         problem, contexts, layouts = evaluation.layouts_of(
@@ -136,6 +139,15 @@ def _transfer(options: argparse.Namespace) -> int:
 
         reports.print_transfer(result)
     return 0
+
+
+def _references(options: argparse.Namespace, default: list[str]) -> list[str]:
+    """Names of references of the task, each once; without the option, the default ones."""
+    from rbl_gym.app import evaluation
+
+    known = evaluation.references(rl_task(options.task))
+    names = options.references.split(",") if options.references else default
+    return list(dict.fromkeys(check_one_of("reference", name, known) for name in names))
 
 
 def _policies(paths: list[str]) -> dict[str, Any]:

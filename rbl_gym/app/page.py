@@ -113,6 +113,11 @@ def table(title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]]) ->
     )
 
 
+def digits(value: float, count: int) -> str:
+    """So many significant digits, zeros at the end too."""
+    return f"{value:#.{count}g}".rstrip(".")
+
+
 def _cell(value: Any, kind: str) -> str:
     number = _number(value)
     data = "" if number is None else f' data-value="{json.dumps(number)}"'

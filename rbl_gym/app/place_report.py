@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
+
+from rbl_gym.app.page import digits
 
 
 class Rows(NamedTuple):
@@ -35,7 +38,7 @@ def notes(result: dict[str, Any]) -> list[str]:
         "Predicted: Cramer-Rao bound of one epoch of ranges, one sigma of all three axes together, "
         "averaged over turns of the body; b is the root mean square tag error.",
         f"Criteria: position {criteria['position_m']:.4g} m, rotation "
-        f"{57.29577951308232 * criteria['rotation_rad']:.3g} deg, D-optimal "
+        f"{math.degrees(criteria['rotation_rad']):.3g} deg, D-optimal "
         f"{criteria['d_optimal_m']:.4g} m, E-optimal {criteria['e_optimal_m']:.4g} m, conditioning "
         + ("infinite (coplanar)." if conditioning is None else f"{conditioning:.3g}."),
         f"Check: {check['trials']} bodies at random poses in the region; the EKF starts from a "
@@ -70,11 +73,6 @@ def print_place(result: dict[str, Any]) -> None:
         console.print(note, markup=False)
 
 
-def _digits(value: float, count: int) -> str:
-    """So many significant digits, zeros at the end too."""
-    return f"{value:#.{count}g}".rstrip(".")
-
-
 def _anchors(result: dict[str, Any]) -> Rows:
     rows = [
         [str(index + 1), *(f"{anchor[key]:.3f}" for key in ("x_m", "y_m", "z_m")),
@@ -95,7 +93,7 @@ def _prediction(result: dict[str, Any]) -> Rows:
         rows.append(
             [
                 label,
-                *(_digits(figures[what], 4) for what in ("rms", "median", "p95", "worst")),
+                *(digits(figures[what], 4) for what in ("rms", "median", "p95", "worst")),
                 where,
             ]
         )
@@ -116,7 +114,7 @@ _FIGURES = (
 
 def _layouts(layouts: dict[str, dict[str, float]]) -> Rows:
     rows = [
-        [name, *(_digits(row[key], n) for _, key, n in _FIGURES), f"{row['ratio']:.3f}"]
+        [name, *(digits(row[key], n) for _, key, n in _FIGURES), f"{row['ratio']:.3f}"]
         for name, row in layouts.items()
     ]
     headings = ["layout", *(heading for heading, _, _ in _FIGURES), "b / designed"]
@@ -129,7 +127,7 @@ def _check(check: dict[str, Any]) -> Rows:
         row = [name]
         for quantity, unit, n in (("position", "m", 4), ("rotation", "deg", 3)):
             for key in (f"{quantity}_rmse_{unit}", f"{quantity}_predicted_{unit}"):
-                row.append(_digits(figures[key], n) if key in figures else "-")
+                row.append(digits(figures[key], n) if key in figures else "-")
             ratio = f"{quantity}_ratio"
             row.append(f"{figures[ratio]:.3f}" if ratio in figures else "-")
         nees = f"{figures['nees']:.2f}" if "nees" in figures else "-"
@@ -141,8 +139,7 @@ def _check(check: dict[str, Any]) -> Rows:
 
 def _numbers(numbers: list[dict[str, float]]) -> Rows:
     rows = [
-        [str(row["n_anchors"]), *(_digits(row[key], n) for _, key, n in _FIGURES)]
-        for row in numbers
+        [str(row["n_anchors"]), *(digits(row[key], n) for _, key, n in _FIGURES)] for row in numbers
     ]
     headings = ["anchors", *(heading for heading, _, _ in _FIGURES)]
     return Rows("against the number of anchors", headings, rows)

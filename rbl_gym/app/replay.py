@@ -16,6 +16,8 @@ from rbl_gym.recordings import Recording
 
 # What the planar constraint leaves to height (m), roll and pitch (rad).
 _PLANAR_STD = 1e-3
+# Heights of anchors within this much are one plane.
+_PLANE_M = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Settings:
     planar
         Hold height, roll and pitch by a tight prior.
     height_offset_m
-        How far the tags' plane lies below the anchors' mean height (planar only).
+        How far the tags' mean height lies below the anchors' (planar only). None: the same height,
+        which anchors in one plane alone can mean.
     yaw_offset_deg
         Constant turn of the tag table against the truth's body frame: the yaw error is
         estimate - (truth + offset).
@@ -57,7 +60,7 @@ class Settings:
     accel_m: float = 0.5
     accel_deg: float = 30.0
     planar: bool = False
-    height_offset_m: float = 0.0
+    height_offset_m: float | None = None
     yaw_offset_deg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -68,7 +71,7 @@ class Settings:
         LinkBias(self.bias_std_m, self.bias_time_s, self.bias_common_m)
         check_number("accel_m", self.accel_m, low=0.0)
         check_number("accel_deg", self.accel_deg, low=0.0)
-        if check_number("height_offset_m", self.height_offset_m) != 0 and not self.planar:
+        if check_number("height_offset_m", self.height_offset_m or 0.0) != 0 and not self.planar:
             raise ValueError("height_offset_m means nothing without planar")
         check_number("yaw_offset_deg", self.yaw_offset_deg)
 
@@ -116,6 +119,17 @@ def steps(
         state = filter.update(state, recording.ranges[k], recording.anchors, recording.links[k])
         yield state, filter.belief(state)
         before = now
+
+
+def range_std_of(recording: Recording, settings: Settings) -> float | str:
+    """The standard deviation of a range [m], or ``"recorded"`` where each has its own."""
+    if settings.range_std_m is not None:
+        return settings.range_std_m
+    if recording.range_std is None:
+        return DEFAULT_RANGE_STD_M
+    law = ranging.LinkNoise(recording.range_std[0])
+    takes_it = estimators.with_noise(make_filter(recording, settings), law) is not None
+    return "recorded" if takes_it else DEFAULT_RANGE_STD_M
 
 
 def track_of(recording: Recording, beliefs: list[estimators.PoseBelief]) -> Track:
@@ -179,9 +193,20 @@ def _prior(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatA
     extent = max(float(np.ptp(recording.anchors, axis=0).max()), 1.0)
     std = np.array([math.pi] * 3 + [extent] * 3)
     if settings.planar:
-        centre[2] -= settings.height_offset_m + recording.tags[:, 2].mean()
+        centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
         std[[0, 1, 5]] = _PLANAR_STD
     return np.eye(3), centre, np.diag(std**2)
+
+
+def height_offset(recording: Recording, settings: Settings) -> float:
+    """How far the tags lie below the anchors [m]; a ValueError where that has to be said."""
+    heights = recording.anchors[:, 2]
+    if settings.planar and settings.height_offset_m is None and np.ptp(heights) > _PLANE_M:
+        raise ValueError(
+            f"height_offset_m must be given for anchors at heights of {heights.min():g} to "
+            f"{heights.max():g} m: how far the tags lie below the anchors' mean height"
+        )
+    return settings.height_offset_m or 0.0
 
 
 class Errors(NamedTuple):
@@ -254,7 +279,10 @@ def figures(
 ) -> dict[str, Any]:
     """The figures of a run as plain numbers; those of errors are absent without truth."""
     result: dict[str, Any] = {
-        "settings": dataclasses.asdict(settings),
+        "settings": {
+            **dataclasses.asdict(settings),
+            "range_std_m": range_std_of(recording, settings),
+        },
         "epochs": len(track.times),
         "duration_s": float(track.times[-1] - track.times[0]),
         "links": int(recording.links.sum()),

@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 from typing import Any
 
-from rbl_gym.app.terminal import add_json, print_files, progress, require, write_json
+from rbl_gym.app.terminal import (
+    add_html,
+    add_json,
+    check_html,
+    print_files,
+    progress,
+    write_json,
+)
 
 
 def add_replay(commands: Any) -> None:
@@ -28,9 +36,9 @@ def add_replay(commands: Any) -> None:
     replay.add_argument(
         "--height-offset-m",
         type=float,
-        default=0.0,
         metavar="X",
-        help="of the tags' plane below the anchors', with --planar",
+        help="of the tags' mean height below the anchors', with --planar; default 0 where the "
+        "anchors stand at one height",
     )
     replay.add_argument(
         "--yaw-offset-deg",
@@ -99,7 +107,7 @@ def add_replay(commands: Any) -> None:
     )
     replay.add_argument("--no-robust", action="store_true", help="squares in place of Huber's loss")
     replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")
-    replay.add_argument("--html", metavar="F", help="3-D page of the track with charts and tables")
+    add_html(replay, "3-D page of the track with charts and tables")
     add_json(replay)
     replay.set_defaults(run=_replay)  # fmt: skip
 
@@ -108,8 +116,7 @@ def _replay(options: argparse.Namespace) -> int:
     from rbl_gym import recordings
     from rbl_gym.app import replay
 
-    if options.html:
-        require("plotly", "viz")
+    check_html(options)
     settings = replay.Settings(
         **_bias(options),
         range_std_m=options.range_std_m,
@@ -125,7 +132,10 @@ def _replay(options: argparse.Namespace) -> int:
     recording = recordings.read_recording(
         options.ranges, options.anchors, options.tags, options.truth, options.calibration
     )
-    replay.make_filter(recording, settings)  # a wrong name is said before the work begins
+    # What is wrong is said before the work begins.
+    offset = replay.height_offset(recording, settings)
+    settings = dataclasses.replace(settings, height_offset_m=offset)
+    replay.make_filter(recording, settings)
     with progress("replay", len(recording.times)) as advance:
         track = replay.run(recording, settings, advance)
     found = replay.errors(recording, track, settings)

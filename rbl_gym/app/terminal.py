@@ -35,6 +35,23 @@ def add_seed(parser: argparse.ArgumentParser, of: str = "of all randomness") -> 
     parser.add_argument("--seed", type=natural, default=0, help=f"{of}, default 0")
 
 
+def add_trials(parser: argparse.ArgumentParser, default: int = 1000, of: str = "") -> None:
+    """The options --trials and --seed."""
+    parser.add_argument("--trials", type=positive, default=default, help=f"{of}default {default}")
+    add_seed(parser)
+
+
+def add_html(parser: argparse.ArgumentParser, shows: str) -> None:
+    """The option --html; `check_html` says before the work whether it can be served."""
+    parser.add_argument("--html", metavar="F", help=f"{shows}; one file, no network")
+
+
+def check_html(options: argparse.Namespace) -> None:
+    """A MissingExtraError where a page is asked for and its library is missing."""
+    if options.html:
+        require("plotly", "viz")
+
+
 @contextlib.contextmanager
 def progress(label: str, total: int) -> Iterator[Callable[..., None]]:
     """A progress bar on standard error; yields the function that advances it (by 1)."""

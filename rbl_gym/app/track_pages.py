@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -89,14 +90,16 @@ def _curves(result: dict[str, Any]) -> go.Figure:
                     row=row, col=column,
                 )  # fmt: skip
             if key != "nees":
+                drawn = [*data["bound"][key], *(value for line in lines.values() for value in line)]
+                shown.update_yaxes(
+                    type="log", **_ticks(min(drawn), max(drawn)), row=row, col=column
+                )
                 shown.add_trace(
                     go.Scatter(x=steps, y=data["bound"][key], name="posterior CRB", mode="markers",
                                legendgroup="bound", showlegend=row == column == 1,
                                marker={"color": "#222222", "size": 5}),
                     row=row, col=column,
                 )  # fmt: skip
-        for column in (1, 2):
-            shown.update_yaxes(type="log", dtick="D2", row=row, col=column)
         shown.update_xaxes(range=[0.5, steps[-1] + 0.5], row=row)
         shown.add_hrect(low, high, row=row, col=3, line_width=0, fillcolor="#868e96", opacity=0.25)  # pyright: ignore[reportArgumentType]
     shown.update_xaxes(title_text="step", title_standoff=4)
@@ -105,6 +108,14 @@ def _curves(result: dict[str, Any]) -> go.Figure:
     shown.update_layout(height=320 * len(readings) + 40, template="plotly_white", legend=legend,
                         margin={"l": 50, "r": 10, "t": 60, "b": 40})  # fmt: skip
     return shown
+
+
+def _ticks(low: float, high: float) -> dict[str, Any]:
+    """1, 2 and 5 of every decade, or more of a short axis; plotly's own labels are bare digits."""
+    digits = (1, 2, 5) if high > 5 * low else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    marks = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
+    return {"tickvals": marks, "ticktext": [f"{mark:g}" for mark in marks]}
 
 
 def replay(recording: Recording, track: Track, result: dict[str, Any], settings: Settings) -> str:
