@@ -29,7 +29,7 @@ from rbl_gym.checks import (
     check_number,
 )
 from rbl_gym.regions import Walls
-from rbl_gym.scenes import Scene
+from rbl_gym.scene import Scene
 from rbl_gym.shared_poses import SharedPoses
 
 __all__ = [

@@ -6,7 +6,7 @@ import numpy as np
 
 from rbl_gym import bounds, posterior, ranging, simulation
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.scenes import Scene
+from rbl_gym.scene import Scene
 
 __all__ = ["posterior_information", "posterior_step"]
 

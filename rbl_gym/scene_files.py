@@ -23,7 +23,7 @@ from rbl_gym.motion import ProcessNoise
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.ranging import NOISE_LAWS, NoiseLaw
 from rbl_gym.regions import Box, Shell, Walls
-from rbl_gym.scenes import Scene
+from rbl_gym.scene import Scene
 
 __all__ = ["Problem", "free_points", "inside", "load", "of_mapping", "problem", "with_anchors"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from rbl_gym import bounds, motion, ranging, rotations, statistic
 from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.obstacles import in_sight
-from rbl_gym.scenes import Scene
+from rbl_gym.scene import Scene
 from rbl_gym.statistic import EpochStatistic
 
 __all__ = [

@@ -16,6 +16,7 @@ from rbl_gym import ranging, regions, scenes
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box, Shell, Walls
+from rbl_gym.scene import Scene
 
 every_scene = pytest.mark.parametrize("name", scenes.SCENES)
 
@@ -148,7 +149,7 @@ KINDS: dict[type, str] = {
 }  # fmt: skip
 
 
-def as_overrides(scene: scenes.Scene) -> dict[str, Any]:
+def as_overrides(scene: Scene) -> dict[str, Any]:
     """Every field of a scene as JSON-able overrides; regions and noises with their kind."""
 
     def plain(value: Any) -> Any:
@@ -286,7 +287,7 @@ def test_bad_override_is_refused(overrides, message):
 # --- the limit of the ranges ------------------------------------------------------------------
 
 
-def longest_range(scene: scenes.Scene) -> float:
+def longest_range(scene: Scene) -> float:
     """From the farthest corner of the anchors' region to that of the volume, at the start."""
     corners = [np.array(np.meshgrid(*np.transpose(r.bounds()))).reshape(3, -1).T
                for r in (scene.anchor_region, scene.volume)]  # fmt: skip

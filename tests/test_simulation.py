@@ -12,7 +12,8 @@ from rbl_gym import bounds, scene_bounds, scenes, simulation
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box
-from rbl_gym.scenes import SCENES, Scene
+from rbl_gym.scene import Scene
+from rbl_gym.scenes import SCENES
 from rbl_gym.simulation import Episode
 from tests.helpers import law_by_hand, share_by_hand
 

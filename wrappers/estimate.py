@@ -10,9 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from rbl_gym import bounds, estimators, metrics, rendering, scenes, simulation
+from rbl_gym import bounds, estimators, metrics, rendering, simulation
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief, with_noise
+from rbl_gym.scene import Scene
 
 REWARDS = ("belief", "error")
 OBSERVATIONS = ("dict", "flat")
@@ -119,11 +120,11 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return present(self._kind, observation, belief, self._scene)
 
 
-def scene_of(env: Any) -> scenes.Scene:
+def scene_of(env: Any) -> Scene:
     """The scene of an environment, its own reward switched off; or a ValueError."""
     unwrapped = env.unwrapped
     scene = getattr(unwrapped, "scene", None)
-    if not isinstance(scene, scenes.Scene):
+    if not isinstance(scene, Scene):
         raise ValueError(
             "env must have a rbl_gym Scene as its scene, as RBL/Tracking-v0 has and tasks with a "
             f"filter of their own or without one have not, got {unwrapped!r}"
@@ -133,7 +134,7 @@ def scene_of(env: Any) -> scenes.Scene:
     return scene
 
 
-def make_filter(scene: scenes.Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
+def make_filter(scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
     """A named filter that knows the scene's tags and laws."""
     if options is not None and not (
         isinstance(options, Mapping) and all(isinstance(key, str) for key in options)
@@ -154,9 +155,7 @@ def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {key: observation[key] for key in keys if key in observation}
 
 
-def update(
-    filter: Filter, state: Any, observation: Mapping[str, np.ndarray], scene: scenes.Scene
-) -> Any:
+def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], scene: Scene) -> Any:
     """The filter's state after the measurements of an epoch, with their `quality` if it is told.
 
     A filter learns of the quality by its noise law, if it takes one (`estimators.with_noise`).
@@ -188,7 +187,7 @@ def judge(
 
 
 def present(
-    kind: str, observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: scenes.Scene
+    kind: str, observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: Scene
 ) -> Any:
     """The observation with the belief: a dict, or flat for a policy."""
     if kind == "flat":
@@ -202,7 +201,7 @@ def present(
 
 
 def observation_space(
-    kind: str, inner: spaces.Space[Any], scene: scenes.Scene, filter: Filter
+    kind: str, inner: spaces.Space[Any], scene: Scene, filter: Filter
 ) -> spaces.Space[Any]:
     """The space of `present`, from that of one raw environment which the filter can read."""
     keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
@@ -229,7 +228,7 @@ def observation_space(
 
 
 def flat_observation(
-    observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: scenes.Scene
+    observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: Scene
 ) -> np.ndarray:
     """Belief and anchors as one float32 vector (..., 21 + 4 M), relative and of order one.
 

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import bounds, metrics, rendering, scenes, simulation
+from rbl_gym import bounds, metrics, rendering, simulation
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
+from rbl_gym.scene import Scene
 from rbl_gym.wrappers.estimate import update
 
 # Iterations of the filter; two are as good as four here, and faster.
@@ -32,7 +33,7 @@ class FilterLoop(BatchEnv):
         (B, M, 3), where they stand now.
     """
 
-    def _configure_loop(self, scene: scenes.Scene, num_envs: int) -> None:
+    def _configure_loop(self, scene: Scene, num_envs: int) -> None:
         self.scene = scene
         self.filter = IteratedEkf(
             np.asarray(scene.tags), scene.noise, scene.process, iterations=_ITERATIONS

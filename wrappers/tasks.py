@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym import rendering, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import ScalarEnv
+from rbl_gym.scene import Scene
 from rbl_gym.wrappers.filter_loop import FilterLoop
 
 # An observation is of order one; what is far outside says no more than that.
@@ -27,7 +28,7 @@ DIFFICULTIES: dict[str, dict[str, Any]] = {
 SELECTIONS = ("top-k", "priced")
 
 
-def _world(scene: Any, **defaults: Any) -> scenes.Scene:
+def _world(scene: Any, **defaults: Any) -> Scene:
     """The scene; `defaults` stand where it says nothing of its own."""
     changes = {"name": scene} if isinstance(scene, str) else scene
     return scenes.get({**defaults, **changes} if isinstance(changes, Mapping) else changes)

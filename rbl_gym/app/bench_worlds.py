@@ -16,7 +16,7 @@ import numpy as np
 
 from rbl_gym import bounds, scene_bounds, simulation
 from rbl_gym.checks import FloatArray
-from rbl_gym.scenes import Scene
+from rbl_gym.scene import Scene
 
 NLOS_PROBABILITY, DROP_PROBABILITY = 0.1, 0.5
 NOISE_FACTOR, ANCHOR_ERROR_M, TAG_ERROR_M = 2.0, 0.5, 0.05

@@ -17,6 +17,7 @@ from rbl_gym.app import monte_carlo
 from rbl_gym.app.monte_carlo import Trace, World, rms
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import PoseBelief
+from rbl_gym.scene import Scene
 
 # The paper prints 0.1 deg/s; unconverted it reads 0.1 rad/s, and only so do all of its worded
 # claims come out. Both readings are reported.
@@ -84,7 +85,7 @@ def run(
     return result
 
 
-def _scene(turn_noise_rad: float) -> scenes.Scene:
+def _scene(turn_noise_rad: float) -> Scene:
     changes = {"steps": STEPS - 1, "process": {"rotation_rad": turn_noise_rad}}
     return scenes.get({"name": "camsap2013", **changes})
 

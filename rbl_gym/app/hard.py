@@ -11,7 +11,7 @@ from rbl_gym import ranging, rotations, scene_bounds, scenes, simulation
 from rbl_gym.app import monte_carlo
 from rbl_gym.app.monte_carlo import World
 from rbl_gym.checks import FloatArray
-from rbl_gym.scenes import Scene
+from rbl_gym.scene import Scene
 
 LINK_SCENES = ("uwb_room", "drone_yard")
 CONDITIONS: dict[str, dict[str, float]] = {

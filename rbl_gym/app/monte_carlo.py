@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, estimators, metrics, ranging, scene_bounds, scenes, simulation
+from rbl_gym import bounds, estimators, metrics, ranging, scene_bounds, simulation
 from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.scene import Scene
 from rbl_gym.statistic import EpochStatistic, simulate_statistic
 
 OBSERVATIONS = ("ranges", "statistic")
@@ -22,7 +23,7 @@ class World(NamedTuple):
     is a covariance per epoch and trial, of the ranges in either case.
     """
 
-    scene: scenes.Scene
+    scene: Scene
     episode: simulation.Episode
     measurements: Sequence[ranging.Measurement | EpochStatistic]
     bound: FloatArray
@@ -60,7 +61,7 @@ class Trace(NamedTuple):
 
 
 def simulate_world(
-    scene: scenes.Scene, trials: int, rng: np.random.Generator, observation: str = "ranges"
+    scene: Scene, trials: int, rng: np.random.Generator, observation: str = "ranges"
 ) -> World:
     """Episodes of a scene, with anchors that stay where they start.
 
@@ -91,7 +92,7 @@ def simulate_world(
     return World(scene, episode, measurements, np.array(covariances))
 
 
-def make(scene: scenes.Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
+def make(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
     """A named filter that knows the scene's tags and laws."""
     return estimators.make(
         name, tags=scene.tags, noise=scene.noise, process=scene.process, **options

@@ -16,6 +16,7 @@ from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
 from rbl_gym.ranging import LinkModel
+from rbl_gym.scene import Scene
 
 ANGLE_STD_RAD = math.radians(0.1)
 # The world, as changes of a scene; it keeps the body on the station's side y > 0.
@@ -31,7 +32,7 @@ WORLD: dict[str, Any] = {
 }
 
 
-def world(scene: Mapping[str, Any] | None) -> scenes.Scene:
+def world(scene: Mapping[str, Any] | None) -> Scene:
     """The scene that `WORLD` and these changes of it make.
 
     Raises

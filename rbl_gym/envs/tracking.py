@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import posterior, ranging, rendering, scene_bounds, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, as_array, check_array, check_one_of
+from rbl_gym.scene import Scene
 
 REWARDS = ("bound", "none")
 OBSERVATIONS = ("ranges", "statistic")
@@ -219,7 +220,7 @@ class TrackingEnv(gym.Env[Any, Any]):
         return self._course.score(k, self._covariance)
 
 
-def is_statistic(observation: str, scene: scenes.Scene) -> bool:
+def is_statistic(observation: str, scene: Scene) -> bool:
     """Whether the statistic is to be observed, or a ValueError where the scene has none."""
     if check_one_of("observation", observation, OBSERVATIONS) == "ranges":
         return False
@@ -228,7 +229,7 @@ def is_statistic(observation: str, scene: scenes.Scene) -> bool:
 
 
 def measure(
-    scene: scenes.Scene,
+    scene: Scene,
     statistic: bool,
     at: simulation.Epoch,
     anchors: FloatArray,
@@ -250,7 +251,7 @@ def measure(
 
 
 def links_of(
-    told: Mapping[str, np.ndarray], scene: scenes.Scene, batch: tuple[int, ...] = ()
+    told: Mapping[str, np.ndarray], scene: Scene, batch: tuple[int, ...] = ()
 ) -> BoolArray:
     """Links (..., M, N) of what `measure` told: all of them where it is the statistic."""
     if "links" in told:
@@ -276,7 +277,7 @@ def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
     return action.shape == shape and action.dtype.kind in "iub" and not action.any()
 
 
-def observation_space(scene: scenes.Scene, statistic: bool = False) -> spaces.Dict:
+def observation_space(scene: Scene, statistic: bool = False) -> spaces.Dict:
     """Finite bounds of a scene's observations."""
     links = (scene.n_anchors, len(scene.tags))
     low, high = scene.anchor_region.bounds()
@@ -306,7 +307,7 @@ def observation_space(scene: scenes.Scene, statistic: bool = False) -> spaces.Di
     return spaces.Dict(keys)
 
 
-def _statistic_limits(scene: scenes.Scene) -> tuple[float, float]:
+def _statistic_limits(scene: Scene) -> tuple[float, float]:
     """Numbers that no entry of G or B exceeds.
 
     ``tr G <= 4 sum_m |a_m - s_1|^2 / var_m = 4 M / sigma^2``; of ``G [Q t] S + L Z F^T``,
@@ -320,7 +321,7 @@ def _statistic_limits(scene: scenes.Scene) -> tuple[float, float]:
     return G, G * S * math.sqrt(3 + place**2) + math.sqrt(G * S) * 10 * math.sqrt(12)
 
 
-def action_space(scene: scenes.Scene) -> spaces.Space[Any]:
+def action_space(scene: Scene) -> spaces.Space[Any]:
     """Velocities of movable anchors, or the one action of fixed ones."""
     if scene.anchor_speed_m_s > 0:
         return spaces.Box(-1.0, 1.0, (3 * scene.n_anchors,), np.float32)
