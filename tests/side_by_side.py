@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+import json
+import pickle
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import SyncVectorEnv
 
 from tests.helpers import assert_same
@@ -97,3 +101,53 @@ def assert_mixes_alike(
         results.append(native.step(actions))
         assert_same(results[-1][:4], peer.step(actions)[:4], **tolerance)
     return results
+
+
+def of_its_spec(env: Any) -> Any:
+    """The environment that the JSON of a spec makes, which says the same of itself."""
+    text = env.spec.to_json()
+    again = gym.make(EnvSpec.from_json(text))
+    assert again.spec is not None
+    assert json.loads(again.spec.to_json()) == json.loads(text)
+    return again
+
+
+def assert_twins_go_on_alike(env: Any, steps: int) -> None:
+    """Copies and pickles of a vector environment in mid-episode do as it does."""
+    rng = np.random.default_rng(1)
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    for _ in range(steps):
+        actions = actions_of(env, rng)
+        want = env.step(actions)
+        for twin in twins:
+            assert_same(twin.step(actions), want)
+
+
+def spoil(value: Any) -> None:
+    """Write ones all over the arrays in a result."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        value[...] = 1
+    elif not isinstance(value, str):
+        for item in value if isinstance(value, list | tuple | np.ndarray) else []:
+            spoil(item)
+
+
+def assert_memory_is_not_shared(make: Any, steps: int) -> None:
+    """The same seed gives the same bytes, also where the caller writes into what it was given."""
+    last = []
+    for spoiled in (False, True):
+        env, rng = make(), np.random.default_rng(2)
+        results: list[Any] = [env.reset(seed=9)]
+        for _ in range(steps):
+            if spoiled:
+                spoil(results[-1])
+            results.append(env.step(actions_of(env, rng)))
+        last.append(results[-1])
+    first, second = last
+    parts = [one[0] if isinstance(one[0], dict) else {"": one[0]} for one in last]
+    for key in parts[0]:
+        assert parts[0][key].tobytes() == parts[1][key].tobytes()
+    assert first[1].tobytes() == second[1].tobytes()
+    assert_same(first, second)

@@ -287,7 +287,7 @@ def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     assert main([*arguments, "--references", "greedy"]) == 0
     table = capsys.readouterr().out
     assert "correlation" in table
-    assert re.findall("greedy\\S*|random", table) == ["greedy"] * 3
+    assert re.findall("greedy\\S*|random", table) == ["greedy"] * 4
 
 
 def test_errors_are_one_line(tmp_path, capsys):

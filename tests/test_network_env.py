@@ -5,15 +5,11 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
-import copy
-import json
-import pickle
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from rbl_gym.envs.network import PRIOR_STD_RAD, PlanarNetworkEnv, PlanarNetworkVectorEnv
@@ -22,7 +18,7 @@ from rbl_gym.sensing_network import proj
 from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from rbl_gym.wrappers.estimate_network import consensus
 from tests.helpers import assert_same
-from tests.side_by_side import actions_of
+from tests.side_by_side import actions_of, assert_twins_go_on_alike, of_its_spec
 
 ID = "rbl_gym:RBL/PlanarNetwork-v0"
 MODES = ("NextStep", "SameStep", "Disabled")
@@ -46,26 +42,17 @@ def test_gymnasiums_checker_has_no_complaint(arguments):
 
 def test_specs_round_trip_with_the_wrapper():
     env = EstimateNetwork(make(n_nodes=5, steps=4), reward="error")
-    assert env.spec is not None
-    text = env.spec.to_json()
-    again = gym.make(EnvSpec.from_json(text))
-    assert json.loads(again.spec.to_json()) == json.loads(text)
+    again = of_its_spec(env)
     action = np.full(10, 0.3, np.float32)
     assert_same(again.reset(seed=2), env.reset(seed=2))
     assert_same(again.step(action), env.step(action))
 
 
-@pytest.mark.parametrize("twin_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
-                         ids=["copy", "pickle"])  # fmt: skip
-def test_twins_in_mid_episode_go_on_alike(twin_of):
+def test_twins_in_mid_episode_go_on_alike():
     env = PlanarNetworkVectorEnv(2, n_nodes=6)
-    rng = np.random.default_rng(0)
     env.reset(seed=1)
-    env.step(actions_of(env, rng))
-    twin = twin_of(env)
-    for _ in range(3):
-        actions = actions_of(env, rng)
-        assert_same(twin.step(actions), env.step(actions))
+    env.step(actions_of(env, np.random.default_rng(0)))
+    assert_twins_go_on_alike(env, 3)
 
 
 def test_observations_are_in_their_spaces_and_memory_is_never_shared():

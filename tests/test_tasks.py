@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-import json
 import math
-import pickle
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
@@ -30,8 +26,11 @@ from tests.helpers import assert_same, share_by_hand
 from tests.side_by_side import (
     actions_of,
     assert_masks_alike,
+    assert_memory_is_not_shared,
     assert_mixes_alike,
     assert_steps_alike,
+    assert_twins_go_on_alike,
+    of_its_spec,
     peer_of,
 )
 
@@ -87,55 +86,24 @@ def test_gymnasiums_checker_has_no_complaint(kind):
 def test_specs_round_trip(kind):
     env_id, arguments = WORLDS[kind]
     env = gym.make(env_id, **arguments)
-    assert env.spec is not None
-    text = env.spec.to_json()
-    again = gym.make(EnvSpec.from_json(text))
-    assert again.spec is not None
-    assert json.loads(again.spec.to_json()) == json.loads(text)
-    action = env.action_space.sample()
+    again, action = of_its_spec(env), env.action_space.sample()
     assert_same(again.reset(seed=2), env.reset(seed=2))
     assert_same(again.step(action), env.step(action))
 
 
 @every_world
-@pytest.mark.parametrize("twin_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
-                         ids=["copy", "pickle"])  # fmt: skip
-def test_twins_in_mid_episode_go_on_alike(kind, twin_of):
+def test_twins_in_mid_episode_go_on_alike(kind):
     _, vector, arguments = short(kind)
     env = vector(3, **arguments)
     run(env, 2)
-    twin, rng = twin_of(env), np.random.default_rng(1)
-    for _ in range(8):
-        actions = actions_of(env, rng)
-        assert_same(twin.step(actions), env.step(actions))
-
-
-def spoil(value):
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        value[...] = 1
-    elif not isinstance(value, str):
-        for item in value if isinstance(value, list | tuple | np.ndarray) else []:
-            spoil(item)
+    assert_twins_go_on_alike(env, 8)
 
 
 @every_world
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared(kind, mode):
     _, vector, arguments = short(kind)
-    last = []
-    for spoiled in (False, True):
-        env, rng = vector(3, **arguments, autoreset_mode=mode), np.random.default_rng(2)
-        results: list[Any] = [env.reset(seed=9)]
-        for _ in range(11):
-            if spoiled:
-                spoil(results[-1])
-            results.append(env.step(actions_of(env, rng)))
-        last.append(results[-1])
-    assert last[0][0].tobytes() == last[1][0].tobytes()
-    assert last[0][1].tobytes() == last[1][1].tobytes()
-    assert_same(last[0], last[1])
+    assert_memory_is_not_shared(lambda: vector(3, **arguments, autoreset_mode=mode), 11)
 
 
 @every_world

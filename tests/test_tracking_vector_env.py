@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,8 +12,10 @@ from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.scenes import SCENES
 from tests.side_by_side import (
     assert_masks_alike,
+    assert_memory_is_not_shared,
     assert_mixes_alike,
     assert_steps_alike,
+    assert_twins_go_on_alike,
     peer_of,
 )
 
@@ -88,29 +87,14 @@ def test_make_vec_gives_the_native_environment_with_its_arguments():
 
 
 def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared():
-    rollouts = []
-    for spoil in (False, True):
-        env = TrackingVectorEnv(3, short("auv_buoys", 4))
-        results: list[Any] = [env.reset(seed=9)]
-        for _ in range(7):
-            if spoil:
-                for value in (*results[-1][0].values(), *results[-1][-1].values()):
-                    value[...] = 1
-            results.append(env.step(np.zeros((3, 12), np.float32)))
-        rollouts.append(results[-1])
-    for key in rollouts[0][0]:
-        assert rollouts[0][0][key].tobytes() == rollouts[1][0][key].tobytes()
-    assert rollouts[0][1].tobytes() == rollouts[1][1].tobytes()
+    assert_memory_is_not_shared(lambda: TrackingVectorEnv(3, short("auv_buoys", 4)), 7)
 
 
-def test_pickling_in_mid_episode():
+def test_twins_in_mid_episode_go_on_alike():
     env = TrackingVectorEnv(3, short("satellite", 6))
     env.reset(seed=4)
     env.step(np.zeros((3, 15)))
-    twin = pickle.loads(pickle.dumps(env))
-    for _ in range(9):
-        a, b = env.step(np.ones((3, 15))), twin.step(np.ones((3, 15)))
-        np.testing.assert_array_equal(a[0]["ranges"], b[0]["ranges"])
+    assert_twins_go_on_alike(env, 9)
 
 
 @pytest.mark.parametrize(
