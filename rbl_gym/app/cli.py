@@ -147,38 +147,19 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _reproduce(options: argparse.Namespace) -> int:
-    from rbl_gym.app import camsap2013, papers
+    from rbl_gym.app import papers
 
     experiment = papers.experiments()[options.experiment]
     with progress(options.experiment, experiment.work_units) as advance:
         result = experiment.run(options.trials, options.seed, advance)
-    from rbl_gym.app import figures, reports
+    from rbl_gym.app import figures
 
     plot = options.plot or f"out/{options.experiment}.png"
-    if options.experiment == "camsap2013":
-        figure = figures.camsap2013(result, camsap2013.example(options.seed))
-    elif options.experiment == "doa2019":
-        figure = figures.doa2019(result)
-    elif options.experiment == "network2009":
-        from rbl_gym.app import network_figures
-
-        figure = network_figures.network2009_figure(result)
-    elif options.experiment == "hard":
-        from rbl_gym.app import hard_figures
-
-        figure = hard_figures.hard_figure(result)
-    else:
-        figure = figures.static(result)
-    figures.save(figure, plot)
+    figures.save(experiment.figure(result, options.seed), plot)
     if options.csv:
         papers.write_csv(result, options.csv)
     if write_json(result, options.json):
-        if options.experiment == "network2009":
-            network_figures.print_network2009(result)
-        elif options.experiment == "hard":
-            hard_figures.print_hard(result)
-        else:
-            reports.print_experiment(result)
+        experiment.show(result)
         print_files(picture=plot)
     return 0
 

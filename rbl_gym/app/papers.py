@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,18 +14,39 @@ Advance = Callable[[], None]
 
 
 class Experiment(NamedTuple):
-    """What an experiment shows, its work, and its function (trials, seed, advance) -> result."""
+    """What an experiment shows, its work, its function, and how its result is drawn and printed."""
 
     summary: str
     work_units: int
-    run: Callable[[int, int, Advance], dict[str, Any]]
+    run: Callable[[int, int, Advance], dict[str, Any]]  # of trials, seed, advance
+    figure: Callable[[dict[str, Any], int], Any]  # of the result and the seed
+    show: Callable[[dict[str, Any]], None]
+
+
+def _late(module: str, name: str) -> Callable[..., Any]:
+    """A function of this package whose module is imported late: matplotlib takes its time."""
+
+    def call(*arguments: Any) -> Any:
+        return getattr(importlib.import_module(f"rbl_gym.app.{module}"), name)(*arguments)
+
+    return call
+
+
+def _drawn(module: str, name: str) -> Callable[[dict[str, Any], int], Any]:
+    """A figure that needs the result alone."""
+    return lambda result, _: _late(module, name)(result)
 
 
 def _static(name: str, summary: str, settings: dict[str, icassp2013.Setting]) -> Experiment:
     def run(trials: int, seed: int, advance: Advance) -> dict[str, Any]:
         return icassp2013.run(name, settings, trials, seed, advance)
 
-    return Experiment(summary, icassp2013.work_units(settings), run)
+    figure, show = _drawn("figures", "static"), _late("reports", "print_static")
+    return Experiment(summary, icassp2013.work_units(settings), run, figure, show)
+
+
+def _camsap2013_figure(result: dict[str, Any], seed: int) -> Any:
+    return _late("figures", "camsap2013")(result, camsap2013.example(seed))
 
 
 def experiments() -> dict[str, Experiment]:
@@ -34,16 +56,22 @@ def experiments() -> dict[str, Experiment]:
             "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), ET-KF's trade",
             camsap2013.work_units(trade=True),
             lambda trials, seed, advance: camsap2013.run(trials, seed, advance, trade=True),
+            _camsap2013_figure,
+            _late("reports", "print_camsap2013"),
         ),
         "doa2019": Experiment(
             "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
             doa2019.work_units(),
             doa2019.run,
+            _drawn("figures", "doa2019"),
+            _late("reports", "print_doa2019"),
         ),
         "hard": Experiment(
             "hard conditions: lost and reflected links, wrong starts, outages (docs)",
             hard.work_units(),
             hard.run,
+            _drawn("hard_figures", "hard_figure"),
+            _late("hard_figures", "print_hard"),
         ),
         "icassp2013": _static(
             "icassp2013",
@@ -59,6 +87,8 @@ def experiments() -> dict[str, Experiment]:
             "planar networks: cycle consensus against the bound, convergence (Figs 3 to 6)",
             network2009.work_units(),
             network2009.run,
+            _drawn("network_figures", "network2009_figure"),
+            _late("network_figures", "print_network2009"),
         ),
     }
 

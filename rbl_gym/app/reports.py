@@ -25,16 +25,6 @@ def new_console(width: int = 130) -> Console:
     return Console(width=None if Console().is_terminal else width, highlight=False)
 
 
-def print_experiment(result: dict[str, Any]) -> None:
-    """The tables of a paper's experiment."""
-    if "readings" in result:
-        print_camsap2013(result)
-    elif result["experiment"] == "doa2019":
-        print_doa2019(result)
-    else:
-        print_static(result)
-
-
 def print_camsap2013(result: dict[str, Any]) -> None:
     """One table for each reading, and the claims with their figures."""
     console = new_console()
