@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-long coverage lint format types docs dist clean
+.PHONY: demo test test-long coverage benchmarks lint format types docs dist clean
 
 demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png --html out/demo.html
@@ -17,6 +17,11 @@ test-long: .venv/dev.stamp
 # Twice as long as `test`; lines that no test reaches, and a failure below 95 %.
 coverage: .venv/dev.stamp
 	$(BIN)/python -m pytest -n 2 --cov --cov-report=term
+
+# Speeds, as ratios to what runs beside; minutes each, on a machine with nothing else to do.
+benchmarks: .venv/dev.stamp
+	for name in filters iekf static environments; do \
+	  $(BIN)/python benchmarks/$$name.py --json out/$$name.json || exit 1; done
 
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .
