@@ -81,4 +81,5 @@ def print_rows(results: Mapping[str, Mapping[str, Row]], size: str, ours: str, p
 def write(result: Any, path: str | None) -> None:
     """The figures as JSON, where a path is given."""
     if path:
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps(result, indent=1) + "\n")

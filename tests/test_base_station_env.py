@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from rbl_gym import bearing, bounds, doa_bounds
 from rbl_gym.envs.base_station import BaseStationEnv, BaseStationVectorEnv
+from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,
@@ -117,3 +118,64 @@ def test_the_same_seed_gives_the_same_bytes_and_memory_is_never_shared():
 def test_bad_arguments_are_named(changes, message):
     with pytest.raises(ValueError, match=message):
         BaseStationEnv(**changes)
+
+
+# --- filters ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("observation", ["dict", "flat"])
+def test_the_iterated_ekf_wraps_it(observation):
+    env = EstimatePose(gym.make(ID, scene={"steps": 5}), observation=observation)
+    first = env.reset(seed=3)
+    assert_same(of_its_spec(env).reset(seed=3), first)
+    seen = env.step(env.action_space.sample())[0]
+    assert env.observation_space.contains(first[0])
+    assert env.observation_space.contains(seen)
+
+
+def test_the_belief_is_honest_and_the_bound_is_reached():
+    envs = BaseStationVectorEnv(100, scene={"steps": 40})
+    action, bound, errors, nees = np.zeros((100, 3)), [], [], []
+    envs.reset(seed=1)
+    for _ in range(40):
+        bound.append(envs.step(action)[-1]["score_m"])
+    wrapped = VectorEstimatePose(BaseStationVectorEnv(100, scene={"steps": 40}))
+    wrapped.reset(seed=1)
+    for _ in range(40):
+        _, reward, _, _, info = wrapped.step(action)
+        np.testing.assert_allclose(reward, -np.log(info["score_m"]))
+        errors.append(info["tag_error_m"])
+        nees.append(info["nees"])
+    # Errors of 100 tracks, correlated over their 40 steps: some 5 % either way.
+    assert np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(bound))) == pytest.approx(
+        1, abs=0.15
+    )
+    assert np.mean(nees) == pytest.approx(6, rel=0.15)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_filters_of_a_vector_are_those_of_scalar_environments(mode):
+    envs = VectorEstimatePose(BaseStationVectorEnv(2, scene={"steps": 3}, autoreset_mode=mode))
+    scalars = [EstimatePose(BaseStationEnv(scene={"steps": 3})) for _ in range(2)]
+    envs.reset(seed=4)
+    for i, env in enumerate(scalars):
+        env.reset(seed=4 + i)
+    rng = np.random.default_rng(0)
+    for _ in range(7):
+        actions = actions_of(envs, rng)
+        _, reward, _, truncated, info = envs.step(actions)
+        results = [env.step(one) for env, one in zip(scalars, actions, strict=True)]
+        np.testing.assert_allclose(reward, [one[1] for one in results], rtol=1e-9)
+        over = truncated.all()
+        final = info["final_info"] if mode == "SameStep" and over else info
+        np.testing.assert_allclose(final["nees"], [one[4]["nees"] for one in results], rtol=1e-6)
+        if over:
+            for env in scalars:
+                env.reset()
+        if over and mode == "NextStep":
+            envs.step(actions)
+
+
+def test_filters_of_ranges_are_refused():
+    with pytest.raises(ValueError, match="filter 'kf' has no option 'measurement'"):
+        EstimatePose(gym.make(ID), "kf")

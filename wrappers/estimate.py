@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
 from rbl_gym import bounds, estimators, metrics, rendering, simulation
+from rbl_gym.bearing import AngleNoise
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief, with_noise
 from rbl_gym.scene import Scene
@@ -26,8 +27,9 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     Wraps an environment whose observation has `ranges` and `links` (in scenes with obstacles
     `quality`) or `G` and `B`, besides `anchors` and `twist`, and whose unwrapped form has a
-    `scene` (`RBL/Tracking-v0`). The environment's own reward is
-    switched off. For vector environments: `VectorEstimatePose`.
+    `scene` (`RBL/Tracking-v0`); or `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter
+    ``"iekf"``). The environment's own reward is switched off. For vector environments:
+    `VectorEstimatePose`.
 
     Parameters
     ----------
@@ -78,7 +80,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._reward = check_one_of("reward", reward, REWARDS)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
         self._tags = np.asarray(self._scene.tags)
-        self._filter = make_filter(self._scene, filter, options)
+        self._filter = make_filter(env, self._scene, filter, options)
         self._state: Any = None
         self.observation_space = observation_space(
             self._kind, env.observation_space, self._scene, self._filter
@@ -134,24 +136,24 @@ def scene_of(env: Any) -> Scene:
     return scene
 
 
-def make_filter(scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
-    """A named filter that knows the scene's tags and laws."""
+def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
+    """A named filter that knows the scene's tags, and the laws of what `env` measures."""
     if options is not None and not (
         isinstance(options, Mapping) and all(isinstance(key, str) for key in options)
     ):
         raise ValueError(f"options must be a dict by names, or None, got {options!r:.80}")
+    told = {} if options is None else dict(options)
+    law = getattr(env.unwrapped, "noise", scene.noise)
+    if isinstance(law, AngleNoise):
+        told = {"measurement": "doa", **told}
     return estimators.make(
-        name,
-        tags=np.asarray(scene.tags),
-        noise=scene.noise,
-        process=scene.process,
-        **({} if options is None else options),
+        name, tags=np.asarray(scene.tags), noise=law, process=scene.process, **told
     )
 
 
 def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What a filter reads of an observation."""
-    keys = "ranges", "links", "quality", "G", "B", "anchors", "twist"
+    keys = "ranges", "links", "quality", "G", "B", "anchors", "angles", "station", "twist"
     return {key: observation[key] for key in keys if key in observation}
 
 
@@ -163,6 +165,8 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
     if "G" in observation:
         statistical: Any = filter
         return statistical.update_statistic(state, observation["G"], observation["B"])
+    if "angles" in observation:
+        return filter.update(state, observation["angles"], observation["station"])
     ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
     if "quality" in observation:
         seen = links.astype(np.bool_, copy=False)
@@ -205,9 +209,14 @@ def observation_space(
 ) -> spaces.Space[Any]:
     """The space of `present`, from that of one raw environment which the filter can read."""
     keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
-    needed = {"G", "B"} if "G" in keys else {"ranges", "links"}
-    if not isinstance(inner, spaces.Dict) or not {*needed, "anchors", "twist"} <= keys:
-        raise ValueError(f"env must observe ranges, links, anchors and twist, its space is {inner}")
+    needed = {"G", "B", "anchors"} if "G" in keys else {"ranges", "links", "anchors"}
+    if "angles" in keys:
+        needed = {"angles", "station"}
+    if not isinstance(inner, spaces.Dict) or not {*needed, "twist"} <= keys:
+        raise ValueError(
+            "env must observe ranges, links, anchors and twist, or angles, station and twist, its "
+            f"space is {inner}"
+        )
     if "G" in keys and not hasattr(filter, "update_statistic"):
         raise ValueError(
             "filter must have update_statistic where only the statistic is observed "
@@ -244,7 +253,9 @@ def flat_observation(
     speed = max(scene.speed_m_s, float(np.abs(scene.twist[3:]).max()), 1e-3)
     scale = np.array([np.pi / 10 / scene.dt] * 3 + [speed] * 3)
     std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
-    relative = observation["anchors"] - belief.translation[..., None, :]
+    station = "station" in observation
+    anchors = observation["station"][..., None, :] if station else observation["anchors"]
+    relative = anchors - belief.translation[..., None, :]
     distance = metrics.length(relative)
     batch = belief.translation.shape[:-1]
     parts = [

@@ -30,8 +30,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     """`EstimatePose` for a vector environment: beliefs, rewards and infos of all worlds at once.
 
     Parameters, observations, rewards and infos are those of `EstimatePose`, stacked. Wraps the
-    native vector environment (`TrackingVectorEnv`) in every autoreset mode; worlds that reset get
-    a new state from their prior, the others keep theirs.
+    native vector environments (`TrackingVectorEnv`, `BaseStationVectorEnv`) in every autoreset
+    mode; worlds that reset get a new state from their prior, the others keep theirs.
 
     Examples
     --------
@@ -60,7 +60,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         self._reward = check_one_of("reward", reward, REWARDS)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
         self._tags = np.asarray(self._scene.tags)
-        self._filter = make_filter(self._scene, filter, options)
+        self._filter = make_filter(env, self._scene, filter, options)
         self._state: Any = None
         self._belief: PoseBelief | None = None
         single = observation_space(

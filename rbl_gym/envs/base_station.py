@@ -19,6 +19,8 @@ from rbl_gym.ranging import LinkModel
 from rbl_gym.scene import Scene
 
 ANGLE_STD_RAD = math.radians(0.1)
+# What the info of a reset holds besides.
+_PRIOR = ("prior_rotation", "prior_translation", "prior_covariance")
 # The world, as changes of a scene; it keeps the body on the station's side y > 0.
 WORLD: dict[str, Any] = {
     "name": "drone_yard",
@@ -90,23 +92,19 @@ class BaseStationVectorEnv(BatchEnv):
         self._normals = np.zeros((num_envs, self.scene.steps + 1, *shape))
         self._stations = np.zeros((num_envs, 1, 3))
         self._angles = np.zeros((num_envs, *shape))
-        self._prior = (
-            np.zeros((num_envs, 3, 3)),
-            np.zeros((num_envs, 3)),
-            np.zeros((num_envs, 6, 6)),
-        )
         self._information = np.zeros((num_envs, 6, 6))
         self._score_m = np.zeros(num_envs)
 
-    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
+    def _restart(
+        self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
+    ) -> dict[str, np.ndarray]:
         start = self._episodes.begin(chosen, generators)
         for row, generator in zip(chosen, generators, strict=True):
             generator.standard_normal(out=self._normals[row])
         self._stations[chosen] = start["anchors"]
-        for held, name in zip(self._prior, ("rotation", "translation", "covariance"), strict=True):
-            held[chosen] = start[f"prior_{name}"]
         self._information[chosen] = np.linalg.inv(start["prior_covariance"])
         self._measure(chosen, self._at(chosen))
+        return {name: start[name] for name in _PRIOR}
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         rows = np.flatnonzero(moving)
@@ -158,8 +156,6 @@ class BaseStationVectorEnv(BatchEnv):
             "translation": np.array(at.translation, order="C"),
             "epoch": self._epochs.copy(),
         }
-        for held, name in zip(self._prior, ("rotation", "translation", "covariance"), strict=True):
-            info[f"prior_{name}"] = held.copy()
         if self.reward_mode == "bound":
             info["score_m"] = self._score_m.copy()
         return info
@@ -200,9 +196,9 @@ class BaseStationEnv(ScalarEnv):
     error in metres at the true pose. ``"none"``: 0.
 
     ## Info
-    `rotation`, `translation`: the true pose; `epoch`; `score_m`: b (with ``reward="bound"``);
-    the prior of the episode (`prior_rotation`, `prior_translation`, `prior_covariance`), which
-    refers to epoch 0 before its update.
+    `rotation`, `translation`: the true pose; `epoch`; `score_m`: b (with ``reward="bound"``). Of
+    a reset the prior (`prior_rotation`, `prior_translation`, `prior_covariance`), which refers to
+    epoch 0 before its update.
 
     ## Episode end
     Never terminates; truncates after `scene.steps` steps (100 of 0.1 s).
@@ -217,6 +213,7 @@ class BaseStationEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/BaseStation-v0", angle_std_rad=0.01)
     env = gym.make("rbl_gym:RBL/BaseStation-v0", scene={"steps": 50, "anchor_speed_m_s": 0})
     ```
+    `rbl_gym.wrappers.EstimatePose` runs the iterated EKF on the angles.
     `scene`: changes of the world (`WORLD`), see `rbl_gym.scenes.get`; its noise of ranges is not
     used. `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``.
 
@@ -234,3 +231,22 @@ class BaseStationEnv(ScalarEnv):
         render_mode: str | None = None,
     ) -> None:
         self._configure(render_mode, scene=scene, angle_std_rad=angle_std_rad, reward=reward)
+
+    @property
+    def scene(self) -> Scene:
+        """The world."""
+        return self._batch.scene
+
+    @property
+    def noise(self) -> bearing.AngleNoise:
+        """Law of the angles."""
+        return self._batch.noise
+
+    @property
+    def reward_mode(self) -> str:
+        """Of `REWARDS`; a wrapper that pays itself sets ``"none"``."""
+        return self._batch.reward_mode
+
+    @reward_mode.setter
+    def reward_mode(self, mode: str) -> None:
+        self._batch.reward_mode = mode
