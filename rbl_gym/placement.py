@@ -227,14 +227,14 @@ def _segments(
     task: PlacementTask, context: Context, anchors: FloatArray
 ) -> tuple[list[FloatArray], list[FloatArray]]:
     """Components of the anchors (M, B), and of the body's places less them (P, M, B)."""
-    end = np.moveaxis(positions(task, context), 0, -1).copy()
-    start = np.moveaxis(anchors, 0, -1).copy()
+    end = positions(task, context).transpose(1, 2, 0).copy()
+    start = anchors.transpose(1, 2, 0).copy()
     return [start[:, i] for i in range(3)], [end[:, None, i] - start[:, i] for i in range(3)]
 
 
 def _sight(context: Context, start: list[FloatArray], away: list[FloatArray]) -> BoolArray:
     """Which anchor sees which place, (P, M, B); needs racks."""
-    return obstacles.clear(start, away, np.moveaxis(context.racks, 0, -1).copy())
+    return obstacles.clear(start, away, context.racks.transpose(1, 2, 0).copy())
 
 
 def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
