@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +15,31 @@ import numpy as np
 from rbl_gym import ranging, rotations
 
 DATA = Path(__file__).parent / "data"
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def load(name: str) -> Any:
     """A reference file of tests/data."""
     return json.loads((DATA / name).read_text(encoding="utf-8"))
+
+
+def run_python(code: str) -> list[str]:
+    """Lines of standard output of a fresh interpreter at the root of the checkout.
+
+    An installed copy or an editable install must not help it.
+    """
+    keep = "import sys; sys.meta_path[:] = [f for f in sys.meta_path if '__editable__' not in "
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", f"{keep}str(f)]\n{code}"],
+        cwd=ROOT,
+        env=variables,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
 
 
 def random_world(rng: np.random.Generator, m: int, n: int, batch: tuple[int, ...] = ()):
@@ -67,6 +90,27 @@ def assert_same(got: Any, want: Any, rtol: float = 0.0, atol: float = 0.0) -> No
     else:
         assert np.asarray(got).dtype.kind == np.asarray(want).dtype.kind
         np.testing.assert_allclose(got, want, rtol=rtol, atol=atol)
+
+
+def assert_table_holds(table: Path, result: Any, least: int) -> None:
+    """Each row of a CSV file is a path in the figures and what stands there."""
+    header, *rows = csv.reader(table.read_text(encoding="utf-8").splitlines())
+    assert header[-1] == "value"
+    assert len(rows) >= least
+    for *path, value in rows:
+        node = result
+        for key in filter(None, path):
+            node = node[int(key)] if isinstance(node, list) else node[key]
+        assert str(node) == value
+
+
+def score_by_hand(P: np.ndarray, rotation: np.ndarray, tags: np.ndarray) -> float:
+    """b = sqrt(mean_n tr(J_n P J_n^T)), J_n = [-[Q c_n]x, I]: the RMS error of the tags."""
+    total = 0.0
+    for x, y, z in tags @ rotation.T:
+        J = np.hstack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3)])
+        total += np.trace(J @ P @ J.T)
+    return (total / len(tags)) ** 0.5
 
 
 def share_by_hand(scene, anchor: np.ndarray, point: np.ndarray) -> float:

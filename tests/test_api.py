@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from tests.helpers import ROOT
+
 FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
 # The pictures are drawn by the environments: `render_mode`.
 OWN = {"rbl_gym.rendering"}

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import ast
-import os
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -13,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+from tests.helpers import ROOT, run_python
+
 FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
 PLAIN_MODELS = {
     "rotations", "ranging", "bearing", "sensing_network", "bounds", "components", "motion",
@@ -53,25 +51,6 @@ def within(imported: str, package: str) -> bool:
 
 def modules_of(package: str) -> list[str]:
     return [name for name in MODULES if within(name, package)]
-
-
-def run_python(code: str) -> list[str]:
-    """Lines of standard output of a fresh interpreter at the root of the checkout.
-
-    An installed copy or an editable install must not help it.
-    """
-    keep = "import sys; sys.meta_path[:] = [f for f in sys.meta_path if '__editable__' not in "
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", f"{keep}str(f)]\n{code}"],
-        cwd=ROOT,
-        env=variables,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
 
 
 def pyproject() -> dict:

@@ -139,11 +139,7 @@ def test_anchor_on_a_tag_tells_nothing_of_that_tag():
 def test_anchor_on_a_tag_without_noise_floor_gives_no_nan(law):
     _, tags, Q, t = world(5)
     anchors = np.concatenate([ranging.tag_positions(Q, t, tags)[1:2], 10 * np.eye(3)])
-    try:
-        information = bounds.range_information(anchors, tags, Q, t, law)
-    except ValueError:
-        return
-    assert np.isfinite(information).all()
+    assert np.isfinite(bounds.range_information(anchors, tags, Q, t, law)).all()
 
 
 # --- the static bound -------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import pytest
 from rbl_gym import bodies, estimators, motion, ranging, recordings, rotations
 from rbl_gym.app import camsap2013, replay
 from rbl_gym.app.cli import main
-from tests.helpers import ROOT
+from tests.helpers import ROOT, assert_table_holds
 
 LIAS = ROOT.parent / "shared" / "data" / "lias_planar"
 
@@ -46,26 +46,23 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(name, tmp
     assert "bound" in capsys.readouterr().out
     assert picture.stat().st_size > 20_000
     result = json.loads((tmp_path / "x.json").read_text())
-    rows = list(csv.reader(table.read_text().splitlines()))
-    assert rows[0][-1] == "value"
-    for row in rows[1:]:
-        node = result
-        for key in filter(None, row[:-1]):
-            node = node[int(key)] if isinstance(node, list) else node[key]
-        assert str(node) == row[-1]
-    assert len(rows) > 100
+    assert_table_holds(table, result, least=100)
 
 
-@pytest.fixture(scope="module")
-def experiment():
-    return camsap2013.run(1000, 0)
+@pytest.fixture(scope="module", params=[300, pytest.param(1000, marks=pytest.mark.long)])
+def experiment(request):
+    return camsap2013.run(request.param, 0)
 
 
 @pytest.mark.parametrize("reading", list(camsap2013.READINGS))
-def test_the_tracking_papers_claims_hold_in_1000_trials(experiment, reading):
+def test_the_tracking_papers_claims_hold(experiment, reading):
+    """All of them in 1000 trials; in fewer, that on each single step is left to chance."""
     claims = experiment["readings"][reading]["claims"]
     assert len(claims) == 8
-    assert [claim for claim in claims if not claim["holds"]] == []
+    failed = [claim["statement"] for claim in claims if not claim["holds"]]
+    if experiment["trials"] < 1000:
+        failed = [statement for statement in failed if not statement.startswith("iterated EKF")]
+    assert failed == []
 
 
 @pytest.mark.parametrize("reading", list(camsap2013.READINGS))
@@ -172,13 +169,13 @@ def raw_files(tmp_path):
     tags = np.array([[-0.07, -0.14, 0], [-0.07, 0.14, 0], [0.2, 0.14, 0]])
     sides = [[-4, 3], [0, 3], [4, 3], [4, 0], [4, -3], [0, -3], [-4, -3], [-4, 0]]
     anchors = np.column_stack([sides, np.ones(8)])
-    track = motion.orbit([0, 0, 0.92], 2.0, 0.4, 0.1, 300)
+    track = motion.orbit([0, 0, 0.92], 2.0, 0.4, 0.1, 150)
     path = motion.simulate(track, 0.1, motion.ProcessNoise())
     noise = ranging.RangeNoise(0.03)
     ranges = ranging.simulate(anchors, tags, *path, noise, rng).ranges
     ranges = ranges + 0.17 + 0.06 * rng.standard_normal((8, 3))
     names = [f"a{a}t{t}" for a in range(8) for t in range(3)]
-    times = 0.1 * np.arange(301)
+    times = 0.1 * np.arange(151)
     yaw = np.rad2deg(rotations.yaw(path.rotation))
     return {
         "ranges": write(tmp_path / "ranges.csv", ["t", *names],

@@ -102,7 +102,7 @@ def test_three_craft_beat_two_and_controllers_are_in_their_order():
     losses = {}
     for difficulty in ("easy", "hard"):
         for name in ("random", "ring", "orbit"):
-            env = MobileAnchorsVectorEnv(64, difficulty)
+            env = MobileAnchorsVectorEnv(32, difficulty)
             losses[difficulty, name] = mean_loss(env, controllers.MOBILE[name], 40)
     assert losses["easy", "ring"] < losses["easy", "random"] - 0.5
     assert losses["hard", "orbit"] < losses["hard", "ring"] < losses["hard", "random"]
@@ -111,9 +111,9 @@ def test_three_craft_beat_two_and_controllers_are_in_their_order():
 
 @pytest.mark.parametrize("difficulty", ["easy", "hard"])
 def test_receding_horizon_is_better_than_random(difficulty):
-    env = MobileAnchorsVectorEnv(8, difficulty)
-    planned = mean_loss(env, controllers.receding_horizon, 30)
-    assert planned < mean_loss(env, controllers.random_velocities, 30) - 0.2
+    env = MobileAnchorsVectorEnv(6, difficulty)
+    planned = mean_loss(env, controllers.receding_horizon, 20)
+    assert planned < mean_loss(env, controllers.random_velocities, 20) - 0.2
 
 
 def test_a_plan_costs_the_mean_log_score_along_it():
@@ -196,7 +196,7 @@ def test_nearest_takes_the_nearest():
 @pytest.mark.parametrize("mode", ["top-k", "priced"])
 def test_selection_controllers_are_in_their_order(mode):
     losses = {
-        name: mean_loss(AnchorSelectionVectorEnv(64, mode), controller, 25)
+        name: mean_loss(AnchorSelectionVectorEnv(32, mode), controller, 20)
         for name, controller in controllers.SELECTION.items()
     }
     assert losses["greedy-with-map"] < losses["greedy-blind"] < losses["random"]

@@ -215,11 +215,9 @@ def test_angles_no_direction_has_are_handled(shift):
         found = estimators.locate_doa(angles[:50], TAGS, method, noise)
         assert np.isfinite(found.cost).any()
     found = estimators.locate_doa(angles, TAGS, "ml", noise)
-    truth = DoaCost(angles, np.full((2, 4), noise.std_rad**-2), TAGS, np.zeros(3))(rotation, place)
-    assert (found.cost <= minimize_pose(
-        DoaCost(angles, np.full((2, 4), noise.std_rad**-2), TAGS, np.zeros(3)), rotation,
-        np.tile(place, (200, 1)), 40).at.cost + 1e-6).mean() > 0.97  # fmt: skip
-    assert np.isfinite(truth.cost).all()
+    cost = DoaCost(angles, np.full((2, 4), noise.std_rad**-2), TAGS, np.zeros(3))
+    near = minimize_pose(cost, rotation, np.tile(place, (200, 1)), 40).at.cost
+    assert (found.cost <= near + 1e-6).mean() > 0.97
 
 
 # --- form -------------------------------------------------------------------------------------

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from rbl_gym import estimators, scene_bounds
 from rbl_gym.ranging import LinkNoise
 from rbl_gym.scenes import SCENES
-from rbl_gym.wrappers import EstimatePose
+from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from rbl_gym.wrappers.estimate import update
-from tests.helpers import assert_same
+from tests.helpers import assert_same, score_by_hand
 
 ID = "rbl_gym:RBL/Tracking-v0"
 NAMES = list(SCENES)
@@ -52,15 +52,6 @@ def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> list[Any]:
         if results[-1][3]:
             break
     return results
-
-
-def tag_spread_by_hand(P: np.ndarray, rotation: np.ndarray, tags: np.ndarray) -> float:
-    """Root mean square tag error that a pose covariance implies."""
-    total = 0.0
-    for tag in tags:
-        J = np.hstack([np.cross(rotation @ tag, np.eye(3)), np.eye(3)])
-        total += np.trace(J @ P @ J.T)
-    return (total / len(tags)) ** 0.5
 
 
 # --- the filter by hand -----------------------------------------------------------------------
@@ -105,7 +96,7 @@ def test_wrapped_rollout_equals_driving_the_filter_by_hand(name, filter, options
             hand = dataclasses.replace(hand, noise=noise)  # pyright: ignore[reportArgumentType]
         state = hand.update(state, seen["ranges"], seen["anchors"], seen["links"])
         belief = hand.belief(state)
-        b = tag_spread_by_hand(belief.covariance, belief.rotation, tags)
+        b = score_by_hand(belief.covariance, belief.rotation, tags)
         estimated = tags @ belief.rotation.T + belief.translation
         true = tags @ info["rotation"].T + info["translation"]
         error = np.mean(np.sum((estimated - true) ** 2, axis=1)) ** 0.5
@@ -154,25 +145,27 @@ def test_iekf_is_consistent(name):
     Errors within an episode are correlated in time, episodes are not: the standard deviation
     comes from the spread of the episodes' means, over the root of their number.
     """
-    env = wrapped(short(name, min(SCENES[name].steps, 30)))
-    means = np.array(
-        [np.mean([result[-1]["nees"] for result in rollout(env, seed)]) for seed in range(16)]
-    )
-    deviation = means.std(ddof=1) / len(means) ** 0.5
+    worlds, steps = 200, min(SCENES[name].steps, 20)
+    envs = VectorEstimatePose(gym.make_vec(ID, num_envs=worlds, scene=short(name, steps)), "iekf")
+    envs.action_space.seed(0)
+    seen = [envs.reset(seed=0)[1]["nees"]]
+    seen += [envs.step(envs.action_space.sample())[4]["nees"] for _ in range(steps)]
+    means = np.mean(seen, axis=0)
+    deviation = means.std(ddof=1) / worlds**0.5
     assert abs(means.mean() - 6) < 4 * deviation
-    assert deviation < 0.75  # or the test would say nothing
+    assert deviation < 1.2 * (12 / worlds) ** 0.5  # or the test would say nothing
 
 
-@pytest.mark.parametrize("reward", ["belief", "error"])
 @pytest.mark.parametrize("name", SPATIAL)
 @pytest.mark.parametrize("filter", KALMAN)
-def test_kalman_family_tracks(filter, name, reward):
+def test_kalman_family_tracks(filter, name):
     """Real errors at the end of an episode below half the initial ones, the prior's."""
-    env = wrapped(name, filter, reward=reward)
+    steps = min(SCENES[name].steps, 40)
+    env = wrapped(short(name, steps), filter, reward="error" if filter == "kf" else "belief")
     scene = SCENES[name]
     results = rollout(env, 3)
-    assert len(results) == scene.steps + 1
-    start = tag_spread_by_hand(scene.prior_covariance, np.eye(3), np.array(scene.tags))
+    assert len(results) == steps + 1
+    start = score_by_hand(scene.prior_covariance, np.eye(3), np.array(scene.tags))
     last = [result[-1]["tag_error_m"] for result in results[-5:]]
     assert np.mean(last) < start / 2
     for result in results[1:]:

@@ -179,13 +179,16 @@ def test_tasks_and_their_references(name):
     assert known[0] == "random"
     assert len(known) >= 3
     assert envs.single_observation_space.shape[0] < 256
-    calls = []
-    evaluation.work_units(task, ["random"], 2)
-    if name == "selection":
-        small = SHORT["selection"][0]
-        played = {"mine": random_policy("box", SHORT["selection"][2])}
-        evaluation.evaluate(small, played, ["nearest"], 2, 0, lambda: calls.append(1))
-        assert len(calls) == evaluation.work_units(small, ["nearest"], 1)
+
+
+def test_progress_is_told_as_often_as_announced():
+    calls, (small, _, sizes, kind) = [], SHORT["selection"]
+    played = {"mine": random_policy(kind, sizes)}
+    evaluation.evaluate(small, played, ["nearest"], 2, 0, lambda: calls.append(1))
+    assert len(calls) == evaluation.work_units(small, ["nearest"], 1)
+
+
+def test_an_unknown_task_is_named():
     with pytest.raises(ValueError, match="task must be one of 'auv_buoys'"):
         rl_task("buoys")
 

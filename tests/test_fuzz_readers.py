@@ -14,7 +14,6 @@ from tests.fuzz_files import READERS, check
 
 MUTANTS = 150  # of each good file; docs/fuzzing.md says for how many it was run
 
-# Found, and not mended yet: see docs/fuzzing.md.
 NAMES = list(READERS)
 
 

@@ -68,14 +68,14 @@ def test_greedy_past_racks_is_what_scoring_whole_layouts_gives():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_one_anchor_is_the_best_candidate_and_swaps_leave_no_better_neighbour(seed):
+def test_swaps_come_near_the_best_of_all_and_leave_no_better_neighbour(seed):
     task, context = problem("drone_yard", 3, seed=seed)
     candidates = candidates_of(task, 8, seed)
     found = greedy(task, context, rng(), candidates, swaps=True)
     score = placement.score(task, context, found)
     best = min(float(placement.score(task, context, candidates[list(three)]))
                for three in itertools.combinations(range(8), 3))  # fmt: skip
-    assert best <= score * (1 + 1e-9)
+    assert best * (1 - 1e-9) <= score < 1.03 * best
     for i, new in itertools.product(range(3), candidates):
         neighbour = found.copy()
         neighbour[i] = new

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -127,6 +128,10 @@ def test_another_seed_and_another_scene_are_another_world():
 def test_the_scene_hash_sees_every_field():
     hashes = {bench_worlds.scene_hash(scene) for scene in scenes.SCENES.values()}
     assert len(hashes) == len(scenes.SCENES)
+    room = scenes.get("uwb_room")
+    facts = bench_worlds.scene_facts(room)
+    assert set(facts) == {field.name for field in dataclasses.fields(room)} | {"kind"}
+    assert bench_worlds.scene_hash(dataclasses.replace(room, steps=99)) not in hashes
     for change in ({"dt": 0.2}, {"noise": {"floor_m": 0.2}}, {"links": {"nlos_bias_m": 4.0}},
                    {"noise": {"kind": "squared-range", "sigma_m": 0.1}}):  # fmt: skip
         scene = scenes.get({"name": "uwb_room", **change})

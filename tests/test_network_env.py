@@ -5,8 +5,6 @@
 # pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -18,10 +16,14 @@ from rbl_gym.sensing_network import proj
 from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from rbl_gym.wrappers.estimate_network import consensus
 from tests.helpers import assert_same
-from tests.side_by_side import actions_of, assert_twins_go_on_alike, of_its_spec
+from tests.side_by_side import (
+    actions_of,
+    assert_memory_is_not_shared,
+    assert_twins_go_on_alike,
+    of_its_spec,
+)
 
 ID = "rbl_gym:RBL/PlanarNetwork-v0"
-MODES = ("NextStep", "SameStep", "Disabled")
 
 
 def make(**arguments):
@@ -55,21 +57,8 @@ def test_twins_in_mid_episode_go_on_alike():
     assert_twins_go_on_alike(env, 3)
 
 
-def test_observations_are_in_their_spaces_and_memory_is_never_shared():
-    env = VectorEstimateNetwork(make_vec(steps=4))
-    rng = np.random.default_rng(1)
-    results: list[Any] = [env.reset(seed=9)]
-    for _ in range(6):
-        assert env.observation_space.contains(results[-1][0])
-        for value in (*results[-1][0].values(), *results[-1][-1].values()):
-            value[...] = 1
-        results.append(env.step(actions_of(env, rng)))
-    other = VectorEstimateNetwork(make_vec(steps=4))
-    rng = np.random.default_rng(1)
-    other.reset(seed=9)
-    for _ in range(6):
-        last = other.step(actions_of(other, rng))
-    assert_same(results[-1], last)
+def test_memory_is_never_shared():
+    assert_memory_is_not_shared(lambda: VectorEstimateNetwork(make_vec(steps=4)), 6)
 
 
 @pytest.mark.parametrize("wrap", [False, True], ids=["raw", "estimated"])
@@ -86,6 +75,7 @@ def test_world_i_of_a_vector_is_the_scalar_environment(wrap):
     for _ in range(5):
         actions = actions_of(vector, rng)
         observation, reward, _, truncated, info = vector.step(actions)
+        assert vector.observation_space.contains(observation)
         for world, env in enumerate(scalars):
             single, one, terminated, over, told = env.step(actions[world])
             assert_same({key: value[world] for key, value in observation.items()}, single,
@@ -144,17 +134,17 @@ def test_nodes_that_nothing_is_known_of_have_their_prior():
 # --- the wrapper ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_the_estimates_errors_are_as_large_as_promised(mode):
+@pytest.mark.parametrize(("mode", "worlds"), [("NextStep", 40), ("SameStep", 5), ("Disabled", 5)])
+def test_the_estimates_errors_are_as_large_as_promised(mode, worlds):
     env = VectorEstimateNetwork(
-        make_vec(40, mode, steps=6, n_nodes=6, side_m=6.0, radius_m=7.0), reward="error"
+        make_vec(worlds, mode, steps=6, n_nodes=6, side_m=6.0, radius_m=7.0), reward="error"
     )
     rng = np.random.default_rng(3)
     env.reset(seed=0)
     square, promised = [], []
     for step in range(12):
         if mode == "Disabled" and step == 6:
-            env.reset(options={"reset_mask": np.ones(40, dtype=np.bool_)})
+            env.reset(options={"reset_mask": np.ones(worlds, dtype=np.bool_)})
         _, reward, _, truncated, info = env.step(actions_of(env, rng))
         square.append(info["orientation_error_rad"] ** 2)
         promised.append(info["belief_rad"] ** 2)
@@ -166,8 +156,9 @@ def test_the_estimates_errors_are_as_large_as_promised(mode):
         if last:
             assert set(info["final_obs"][0]) == set(env.single_observation_space.spaces)
             assert env.single_observation_space.contains(info["final_obs"][0])
-    # The ratio scatters by 5 % over seeds.
-    assert np.mean(square) == pytest.approx(np.mean(promised), rel=0.2)
+    # Of 40 worlds the ratio scatters by 5 % over seeds.
+    tolerance = 4 * 0.05 * np.sqrt(40 / worlds)
+    assert np.mean(square) == pytest.approx(np.mean(promised), rel=tolerance)
 
 
 def test_a_warm_start_keeps_long_cycles_from_slipping():

@@ -99,16 +99,20 @@ def test_errors_of_nodes_have_the_bounds_covariance():
         for row in normals
     ])  # fmt: skip
     bound = orientation_covariance(one.edges, n_nodes, sigma)
-    np.testing.assert_allclose(np.cov(proj(errors)[:, 1:].T), bound, rtol=0.25,
-                               atol=0.05 * np.abs(bound).max())  # fmt: skip
+    # 4.5 standard deviations of a sampled covariance, 1 % for the second order.
+    scale = np.outer(np.diag(bound), np.diag(bound))
+    off = np.abs(np.cov(proj(errors)[:, 1:].T) - bound)
+    assert (off <= 4.5 * np.sqrt((scale + bound**2) / 800) + 0.01 * np.sqrt(scale)).all()
 
 
 @pytest.mark.parametrize(("sigma_deg", "limit"), [(2, 1.05), (12, 1.05), (24, 1.10)])
 @pytest.mark.parametrize("degree", [9, 12])
-def test_large_networks_reach_the_bound(sigma_deg, limit, degree):
+@pytest.mark.parametrize("draws", [16, pytest.param(50, marks=pytest.mark.long)])
+def test_large_networks_reach_the_bound(sigma_deg, limit, degree, draws):
+    """At 2 and 12 degrees 5 % are 4.4 standard deviations of a mean over 16 draws."""
     sigma = np.radians(sigma_deg)
     ratios = []
-    for draw in range(50):
+    for draw in range(draws):
         one = random_network(1000, degree, sigma, np.random.default_rng([1000, degree, draw]))
         ratios.append(edge_form(one, orientations(one.edges, one.y, len(one.positions)), sigma))
     assert np.mean(ratios) <= limit

@@ -76,8 +76,13 @@ needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrom
 
 
 @pytest.fixture(scope="module")
-def demo() -> str:
-    return track_pages.demo(camsap2013.run(20, 1), camsap2013.example(1))
+def result() -> dict:
+    return camsap2013.run(5, 1)
+
+
+@pytest.fixture(scope="module")
+def demo(result) -> str:
+    return track_pages.demo(result, camsap2013.example(1))
 
 
 HEADINGS = ["filter", "scene", "ratio", "flips", "verdict"]
@@ -171,8 +176,8 @@ def test_the_page_of_the_demo_opens_and_its_slider_moves_body_and_cursor(demo, t
     assert len(re.findall(r'class="[^"]*scatterlayer', elements)) >= 3
 
 
-def test_logarithmic_axes_are_labelled_with_whole_numbers():
-    shown = track_pages._curves(camsap2013.run(20, 1))
+def test_logarithmic_axes_are_labelled_with_whole_numbers(result):
+    shown = track_pages._curves(result)
     axes = [axis for axis in shown.select_yaxes() if axis.type == "log"]
     assert len(axes) == 4
     for axis in axes:
@@ -185,8 +190,7 @@ def test_logarithmic_axes_are_labelled_with_whole_numbers():
 
 
 def test_a_page_needs_no_network_and_is_the_same_for_the_same_result(demo):
-    result = camsap2013.run(20, 1)
-    again = track_pages.demo(result, camsap2013.example(1))
+    again = track_pages.demo(camsap2013.run(5, 1), camsap2013.example(1))
     # Only the times of the processor differ.
     table = r"<td data-value=\"[\d.]+\">[\d.]+</td></tr>"
     assert re.sub(table, "", demo) == re.sub(table, "", again)
@@ -281,7 +285,6 @@ def test_a_replay_writes_its_page(with_truth, files, tmp_path, capsys):  # noqa:
     text = path.read_text(encoding="utf-8")
     result = json.loads(figures.read_text())
     assert f"{result['epochs']} epochs" in text
-    assert ("errors" in [row[0] for row in cells(text)]) is False
     assert ("p95" in text) is with_truth
     if BROWSER is not None and not with_truth:
         assert opened(path).count("<canvas") >= 2

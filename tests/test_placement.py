@@ -127,7 +127,8 @@ def test_racks_stand_on_the_floor_in_the_middle_of_the_room():
     x, y, z, hx, hy, hz = np.moveaxis(racks, -1, 0)
     np.testing.assert_array_equal(z, hz)
     thin, long = np.minimum(hx, hy), np.maximum(hx, hy)
-    assert abs((hx > hy).mean() - 0.5) < 0.05
+    # 4.5 standard deviations of a share of 4000 coins.
+    assert abs((hx > hy).mean() - 0.5) < 4.5 * 0.5 / 4000**0.5
     ranges = {"x": (x, 1.5, 8.5), "y": (y, 1.2, 6.8), "thin": (thin, 0.2, 0.4),
               "long": (long, 1, 2), "height": (hz, 0.6, 1.2)}  # fmt: skip
     for values, low, high in ranges.values():
@@ -298,8 +299,7 @@ def test_blocks_are_one_call(kind, monkeypatch):
     np.testing.assert_allclose(blocked[1], blocked[2], rtol=1e-12)
 
 
-def test_a_turn_of_the_world_about_the_vertical_and_a_shift_keep_what_they_should():
-    """The score is of geometry: moving region, racks and anchors together changes nothing."""
+def test_moving_region_racks_and_anchors_together_changes_no_score():
     task = make("room with racks")
     context, anchors = problem(task, 14, (6,))
     scores = placement.score(task, context, anchors)

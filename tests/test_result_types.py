@@ -25,7 +25,6 @@ SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4.0]])
 EDGES = np.array([[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
 TAGS = bodies.pyramid()
 PROCESS = motion.ProcessNoise(0.1, 0.1)
-RNG = np.random.default_rng(0)
 
 
 def graph_file(folder):
@@ -36,14 +35,16 @@ def graph_file(folder):
 
 def wandering():
     law, process = unknown_twist.WanderingTwist(), motion.ProcessNoise()
-    return unknown_twist.simulate(np.eye(3), np.zeros(3), law, process, 0.1, 3, RNG)
+    return unknown_twist.simulate(
+        np.eye(3), np.zeros(3), law, process, 0.1, 3, np.random.default_rng(0)
+    )
 
 
 def told():
     noise = ranging.SquaredRangeNoise()
     anchors = np.array([[9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 9, 9.0]])
     body = bodies.pyramid(), np.eye(3), np.zeros(3)
-    return statistic.simulate_statistic(anchors, *body, noise, RNG)
+    return statistic.simulate_statistic(anchors, *body, noise, np.random.default_rng(0))
 
 
 def first_state():
@@ -79,7 +80,8 @@ CASES = {
         estimators.FrameEstimate,
     ),
     "network": (
-        lambda _: sensing_network.random_network(12, 6, 0.1, RNG), sensing_network.SensingNetwork,
+        lambda _: sensing_network.random_network(12, 6, 0.1, np.random.default_rng(0)),
+        sensing_network.SensingNetwork,
     ),
     "path": (lambda _: wandering(), unknown_twist.WanderingPath),
     "statistic": (lambda _: told(), statistic.EpochStatistic),

@@ -22,7 +22,7 @@ from rbl_gym.wrappers.tasks import (
     MobileAnchorsEnv,
     MobileAnchorsVectorEnv,
 )
-from tests.helpers import assert_same, share_by_hand
+from tests.helpers import assert_same, score_by_hand, share_by_hand
 from tests.side_by_side import (
     actions_of,
     assert_masks_alike,
@@ -119,17 +119,21 @@ def test_seeds_decide_and_episodes_differ(kind):
 @every_world
 def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
     env_id, arguments = WORLDS[kind]
+    steps = 100 if env_id == MOBILE else 50
+    assert gym.make(env_id, **arguments).unwrapped._batch.scene.steps == steps
+    if kind not in ("easy", "top 3"):
+        steps, arguments = 8, short(kind, 8)[2]
     env = gym.make(env_id, **arguments).unwrapped
     env.action_space.seed(1)
     env.reset(seed=1)
-    for k in range(1, (100 if env_id == MOBILE else 50) + 1):
+    for k in range(1, steps + 1):
         observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
         assert (type(reward), type(terminated), type(truncated)) == (float, bool, bool)
         assert env.observation_space.contains(observation)
         assert math.isfinite(reward)
         assert info["epoch"] == k
         assert terminated is False
-        assert truncated is (k == (100 if env_id == MOBILE else 50))
+        assert truncated is (k == steps)
     with pytest.raises(ResetNeeded):
         env.step(env.action_space.sample())
 
@@ -171,15 +175,6 @@ def test_a_shorter_limit_truncates(kind):
 # --- the belief by a separate filter ----------------------------------------------------------
 
 
-def score_by_hand(state, tags) -> float:
-    """b = sqrt(mean_n tr(J_n P J_n^T)), J_n = [-[Q c_n]x, I]."""
-    total = 0.0
-    for x, y, z in tags @ state.rotation.T:
-        J = np.hstack([-np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(3)])
-        total += np.trace(J @ state.covariance @ J.T)
-    return math.sqrt(total / len(tags))
-
-
 class Replay:
     """One world by the scene's episode, plain distances, and a filter of its own."""
 
@@ -219,6 +214,9 @@ class Replay:
         noise = law if self.scene.obstacles else None
         self.state = self.filter(noise).update(self.state, ranges, self.anchors, links)
 
+    def score(self) -> float:
+        return score_by_hand(self.state.covariance, self.state.rotation, self.tags)
+
     def log_std(self):
         prior = [self.scene.initial_rotation_rad] * 3 + [self.scene.initial_translation_m] * 3
         return np.log(np.sqrt(np.diag(self.state.covariance)) / prior) + 1
@@ -247,7 +245,7 @@ def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
             *gap[order][:, :2].ravel() / 100, *np.log(np.linalg.norm(gap[order], axis=1) / 100),
         ]  # fmt: skip
         np.testing.assert_allclose(observation, wanted, atol=2e-5)
-        np.testing.assert_allclose(info["score_m"], score_by_hand(twin.state, twin.tags), rtol=1e-6)
+        np.testing.assert_allclose(info["score_m"], twin.score(), rtol=1e-6)
         action = rng.uniform(-1.5, 1.5, 2 * m)
         for j, i in enumerate(order):
             step = action[2 * j : 2 * j + 2]
@@ -256,9 +254,7 @@ def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
         np.testing.assert_allclose(batch_of(env).anchors[0], twin.anchors, atol=1e-9)
         twin.predict(k)
         twin.update(k)
-        np.testing.assert_allclose(
-            reward, -math.log(score_by_hand(twin.state, twin.tags)), rtol=1e-6
-        )
+        np.testing.assert_allclose(reward, -math.log(twin.score()), rtol=1e-6)
         error = twin.state.translation - twin.episode.translation[k]
         np.testing.assert_allclose(info["position_error_m"], np.linalg.norm(error), rtol=1e-6)
         assert info["rotation_error_rad"] < 0.6
@@ -290,7 +286,7 @@ def test_selection_rewards_and_observations_by_a_separate_filter(mode, seed):
         twin.predict(k)
         if len(chosen):
             twin.update(k, chosen)
-        wanted_reward = -math.log(score_by_hand(twin.state, twin.tags))
+        wanted_reward = -math.log(twin.score())
         wanted_reward -= 0.07 * len(chosen) * (mode == "priced")
         np.testing.assert_allclose(reward, wanted_reward, rtol=1e-6)
     assert set(twin.shares) == {0.02, 1.0}
@@ -426,13 +422,14 @@ def test_craft_move_at_their_limit_at_most_and_stay_on_the_water():
 
 
 @pytest.mark.parametrize("kind", ["easy", "hard", "selection"])
-def test_nees_is_six(kind):
+@pytest.mark.parametrize("worlds", [256, pytest.param(1024, marks=pytest.mark.long)])
+def test_nees_is_six(kind, worlds):
     """Means over worlds of a chi-square of 6 degrees; at epochs far apart about independent."""
     if kind == "selection":
-        env: Any = AnchorSelectionVectorEnv(512, autoreset_mode="Disabled")
+        env: Any = AnchorSelectionVectorEnv(worlds, autoreset_mode="Disabled")
         policy = controllers.greedy_blind
     else:
-        env = MobileAnchorsVectorEnv(512, kind, autoreset_mode="Disabled")
+        env = MobileAnchorsVectorEnv(worlds, kind, autoreset_mode="Disabled")
         policy = controllers.orbit
     rng = np.random.default_rng(1)
     env.reset(seed=1)
@@ -443,7 +440,7 @@ def test_nees_is_six(kind):
         assert 5.0 < np.median(values[5:]) < 6.2
         return
     means = values.mean(axis=1)
-    one = math.sqrt(12 / 512)
+    one = math.sqrt(12 / worlds)
     # Mean over epochs: of the errors' memory, a fifth of the epochs count as independent.
     assert abs(np.mean(means[5:]) - 6) < 4 * one / math.sqrt(4), means
     assert np.abs(means[5:] - 6).max() < 5 * one, means

@@ -5,12 +5,8 @@ from __future__ import annotations
 import copy
 import json
 import multiprocessing
-import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -25,9 +21,8 @@ import rbl_gym
 from rbl_gym import bounds
 from rbl_gym.envs.tracking import TrackingEnv, observation_space
 from rbl_gym.scenes import SCENES
-from tests.helpers import assert_same, law_by_hand, share_by_hand
+from tests.helpers import assert_same, law_by_hand, run_python, score_by_hand, share_by_hand
 
-ROOT = Path(__file__).resolve().parent.parent
 ID = "rbl_gym:RBL/Tracking-v0"
 NAMES = list(SCENES)
 MOVABLE = [name for name, scene in SCENES.items() if scene.anchor_speed_m_s > 0]
@@ -60,21 +55,6 @@ def rollout(env: gym.Env, seed: int = 0, steps: int | None = None) -> Iterator[S
         assert k < 10**5
 
 
-def run_python(code: str) -> str:
-    """Standard output of a fresh interpreter at the root of the checkout."""
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        cwd=ROOT,
-        env=variables,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 # --- Gymnasium --------------------------------------------------------------------------------
 
 
@@ -91,7 +71,7 @@ env = gymnasium.make({ID!r})
 env.reset(seed=0)
 print(type(env.unwrapped).__module__)
 """
-    assert run_python(code) == "rbl_gym.envs.tracking\n"
+    assert run_python(code) == ["rbl_gym.envs.tracking"]
 
 
 def test_make_alone_finds_the_environment_in_a_spawned_worker():
@@ -229,11 +209,8 @@ def test_anchors_driven_to_the_edge_of_their_region_stay_in_the_space(name):
         assert env.observation_space.contains(env.step(action)[0])
 
 
-def test_fast_spin_is_refused_or_stays_in_the_space():
-    try:
-        env = TrackingEnv({"name": "auv_buoys", "spin_rad_s": 3.0})
-    except ValueError:
-        return
+def test_fast_spin_stays_in_the_space():
+    env = TrackingEnv({"name": "auv_buoys", "spin_rad_s": 3.0})
     for seed in range(20):
         env.reset(seed=seed)
         assert env.observation_space.contains(env.step(np.zeros(12))[0])
@@ -337,16 +314,6 @@ def test_quality_is_observed_only_among_obstacles(name):
 
 
 # --- reward -----------------------------------------------------------------------------------
-
-
-def score_by_hand(P: np.ndarray, rotation: np.ndarray, tags: np.ndarray) -> float:
-    total = 0.0
-    for tag in tags:
-        J = np.zeros((3, 6))
-        J[:, :3] = np.cross(rotation @ tag, np.eye(3))  # row i: arm x e_i, that is -[arm]x
-        J[:, 3:] = np.eye(3)
-        total += np.trace(J @ P @ J.T)
-    return (total / len(tags)) ** 0.5
 
 
 @pytest.mark.parametrize("links", [{}, LOSSY], ids=["all links", "lost links"])
