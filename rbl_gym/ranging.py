@@ -132,9 +132,10 @@ class SquaredRangeNoise:
         check_number("sigma_m", self.sigma_m, low=1e-300)
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order."""
+        """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order; inf at zero."""
         r = ranges if links is None else np.where(links, ranges, 1.0)
-        return self.squared_range_variance(ranges, links) / (4 * r**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.squared_range_variance(ranges, links) / (4 * r**2)
 
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
@@ -166,6 +167,7 @@ class LinkNoise:
         std = check_array("std_m", self.std_m, ("M", "N"))
         if (std < 0).any():
             raise ValueError(f"std_m must not be negative, got {std.min()}")
+        object.__setattr__(self, "std_m", std)
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
         """Variance of the ranges [m^2]; see `NoiseLaw`."""

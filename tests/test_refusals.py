@@ -51,15 +51,15 @@ BOUNDS = {
 }
 
 
+@pytest.mark.parametrize("noise", [ranging.RangeNoise(0.1), ranging.SquaredRangeNoise(0.1)])
 @pytest.mark.parametrize("name", BOUNDS)
-def test_an_anchor_on_a_tag(name):
+def test_an_anchor_on_a_tag(name, noise):
     # Coordinates without rounding, so that the distance is exactly zero.
     tags = bodies.octahedron(0.5)
-    body = tags, np.eye(3), -tags[0]
-    on_tag = np.vstack([ANCHORS, np.zeros(3)])
-    noise = ranging.RangeNoise(0.1)
+    body = tags, np.eye(3), -tags[1]
+    on_tag = np.vstack([ANCHORS + 0.1, np.zeros(3)])
     links = np.ones((5, 6), dtype=bool)
-    links[4, 0] = False
+    links[4, 1] = False
     # A range without a gradient tells nothing: what is left is what the others tell.
     told = BOUNDS[name](on_tag, *body, noise)
     assert np.isfinite(told).all()
@@ -111,6 +111,11 @@ def test_noise_of_every_link_keeps_ranges_positive():
     law = ranging.LinkNoise(np.array([[0.1, 5.0]]))
     drawn = law.sample(np.array([[1.0, 1.0]]), np.array([[1.0, -1.0]]))
     np.testing.assert_allclose(drawn, [[1.1, 0.0]])
+
+
+def test_noise_of_every_link_takes_a_list():
+    law = ranging.LinkNoise([[0.1, 0.2]])
+    np.testing.assert_allclose(law.variance(np.ones((3, 1, 2))), [[[0.01, 0.04]]] * 3)
 
 
 def test_directions_of_length_zero():
