@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, rotations
-from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.checks import FloatArray, check_array, check_count, check_number
 from rbl_gym.components import (
     exp_and_left_jacobian,
     first,
@@ -83,9 +83,7 @@ class IteratedEkf:
     robust: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int):
-            raise ValueError(f"iterations must be an int, got {self.iterations!r}")
-        check_number("iterations", self.iterations, low=1)
+        check_count("iterations", self.iterations)
         if not isinstance(self.robust, bool):
             raise ValueError(f"robust must be True or False, got {self.robust!r}")
 

@@ -153,6 +153,24 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
     return number
 
 
+def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
+    """`value` as an int from `least` to `most`, or a ValueError that names it."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < least or (most is not None and value > most):
+        wanted = "a positive int" if least == 1 else f"an int of at least {least}"
+        if most is not None:
+            wanted = f"an int from {least} to {most}"
+        raise ValueError(f"{name} must be {wanted}, got {value!r:.80}")
+    return int(value)
+
+
+def check_generator(name: str, rng: Any) -> np.random.Generator:
+    """`rng` if it is a source of random numbers, or a ValueError that names it."""
+    if not isinstance(rng, np.random.Generator):
+        raise ValueError(f"{name} must be a numpy.random.Generator, got {rng!r:.80}")
+    return rng
+
+
 def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:
     """`links` as a boolean mask that broadcasts against ranges of `shape`; None stays None.
 

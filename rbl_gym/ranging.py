@@ -16,7 +16,15 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, checked, kernel
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_generator,
+    check_number,
+    checked,
+    kernel,
+)
 
 __all__ = [
     "NOISE_LAWS", "LinkModel", "LinkNoise", "Measurement", "NoiseLaw", "RangeNoise",
@@ -372,8 +380,7 @@ def simulate(
         On wrong shapes, NaN, or laws and generators that are none.
     """
     check_law("noise", noise)
-    if not isinstance(rng, np.random.Generator):
-        raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r:.80}")
+    check_generator("rng", rng)
     if not isinstance(link_model, LinkModel | None):
         raise ValueError(f"link_model must be a LinkModel or None, got {link_model!r:.80}")
     true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, ranging, rotations
-from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
+from rbl_gym.checks import FloatArray, check_array, check_count, check_number, check_one_of
 from rbl_gym.components import exp_and_left_jacobian, first, last, product
 from rbl_gym.motion import ProcessNoise
 
@@ -168,8 +168,7 @@ def simulate(
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     dt = check_number("dt", dt, low=1e-12)
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise ValueError(f"steps must be a positive int, got {steps!r:.80}")
+    steps = check_count("steps", steps)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     twists = np.empty((steps + 1, *batch, 6))
     twists[0] = law.prior_std() * rng.standard_normal((*batch, 6))

@@ -77,7 +77,9 @@ def test_laws_without_a_variance(name):
 
 def test_biases_of_an_anchor_on_a_tag():
     tags = bodies.octahedron(0.5)
-    with pytest.raises(ValueError, match="an anchor stands on a tag, where a range has no deriv"):
+    with pytest.raises(
+        ValueError, match="anchors must not stand on a tag, where a range has no deriv"
+    ):
         link_bounds.bias_information(
             np.zeros((1, 3)), tags, np.eye(3), -tags[0], ranging.RangeNoise(0.1)
         )

@@ -507,7 +507,7 @@ def test_bad_arguments_are_named(kind, arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be a positive int, got 0"),
+        ({"num_envs": 0}, "num_envs must be an int from 1 to 100000000, got 0"),
         ({"max_episode_steps": 0}, "max_episode_steps must be a positive int, got 0"),
         ({"max_episode_steps": 2.5}, "max_episode_steps must be a positive int, got 2.5"),
         ({"max_episode_steps": "ten"}, "max_episode_steps must be a positive int, got 'ten'"),
