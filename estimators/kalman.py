@@ -232,7 +232,7 @@ class KalmanFamily:
         return _CONSTRAINTS[self.constraint](self, prior, posterior, epoch)
 
     def belief(self, state: KalmanState) -> PoseBelief:
-        """Pose, its covariance, and the raw matrix.
+        """Pose, its covariance, and the raw matrix (copies).
 
         The covariance is that of the projected output, ``J^+ P J^+T``; of UC-KF, whose mean
         is constrained already, ``(J^T P^-1 J)^-1``.
@@ -249,7 +249,8 @@ class KalmanFamily:
             pinv = transposed * np.array([0.5] * 3 + [1.0] * 3)[:, None]
             covariance = symmetric(pinv @ state.covariance @ np.swapaxes(pinv, -1, -2))
         translation = state.mean[..., 9:].copy()
-        return PoseBelief(rotation, translation, covariance, rotation if on_group else matrix)
+        raw = rotation if on_group else matrix.copy(order="K")
+        return PoseBelief(rotation, translation, covariance, raw)
 
     @cached_property
     def _frame(self) -> Frame | None:

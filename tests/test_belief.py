@@ -86,3 +86,16 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
 def test_wrong_names_and_options_are_named(name, changes, message):
     with pytest.raises(ValueError, match=message):
         estimators.make(name, **{**LAWS, **changes})
+
+
+@pytest.mark.parametrize("name", estimators.names())
+def test_a_belief_shares_no_memory_with_its_state(name):
+    filter = estimators.make(
+        name,
+        tags=bodies.octahedron(),
+        noise=ranging.RangeNoise(0.1),
+        process=motion.ProcessNoise(0.1, 0.1),
+    )
+    state = filter.initial(np.eye(3), np.zeros(3), 0.1 * np.eye(6))
+    for field in filter.belief(state):
+        assert not any(np.shares_memory(field, array) for array in state)

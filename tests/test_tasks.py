@@ -425,6 +425,18 @@ def test_craft_move_at_their_limit_at_most_and_stay_on_the_water():
 # --- consistency ------------------------------------------------------------------------------
 
 
+def test_a_state_that_was_handed_out_outlives_its_episode():
+    envs = MobileAnchorsVectorEnv(num_envs=3, autoreset_mode="Disabled")
+    envs.reset(seed=1)
+    held = envs.state
+    before = [field.copy() for field in held]
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    for field, old in zip(held, before, strict=True):
+        np.testing.assert_array_equal(field, old)
+    assert not np.array_equal(envs.state.translation[0], before[1][0])
+    np.testing.assert_array_equal(envs.state.translation[1], before[1][1])
+
+
 @pytest.mark.parametrize("kind", ["easy", "hard", "selection"])
 def test_nees_is_six(kind):
     """Means over worlds of a chi-square of 6 degrees; at epochs far apart about independent."""
