@@ -276,4 +276,5 @@ def freedom(positions: ArrayLike, edges: ArrayLike) -> Freedom:
     null = vectors[:, values < _ZERO * max(1.0, values[-1])]
     turns = np.linalg.matrix_rank(null[3 * n_nodes :], tol=1e-6)
     rank = 6 * n_nodes - null.shape[1]
-    return Freedom(rank, 6 * n_nodes - 7 - rank, int(turns) - 3)
+    # One node alone has no size, and so no scale.
+    return Freedom(rank, max(6 * n_nodes - 7 - rank, 0), int(turns) - 3)
