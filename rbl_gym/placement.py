@@ -114,21 +114,30 @@ class PlacementTask:
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size."""
+        """Rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size.
+
+        Read-only, as all that a task keeps.
+        """
         rng = np.random.default_rng(_POSE_SEED)
         offsets = rng.uniform(-1, 1, (self.n_poses, 3))
-        return rotations.random(rng, (self.n_poses,)), offsets
+        return _read_only(rotations.random(rng, (self.n_poses,))), _read_only(offsets)
 
     @functools.cached_property
     def prior_information(self) -> FloatArray:
         """(6, 6): 60 degrees, and half of the volume's largest extent."""
         extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
-        return np.diag([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+        diagonal = [_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3
+        return _read_only(np.diag(diagonal))
 
     @functools.cached_property
     def shared(self) -> SharedPoses:
         """What the poses and the tags alone decide."""
         return SharedPoses(self.poses[0], np.asarray(self.scene.tags))
+
+
+def _read_only(array: FloatArray) -> FloatArray:
+    array.flags.writeable = False
+    return array
 
 
 def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:

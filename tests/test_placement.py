@@ -416,6 +416,13 @@ def test_legal_is_what_the_region_says(kind):
 # --- what is refused --------------------------------------------------------------------------
 
 
+def test_what_a_task_keeps_cannot_be_written_to():
+    task = placement.task("uwb_room", 4)
+    for array in (*task.poses, task.prior_information):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
