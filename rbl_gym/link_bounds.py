@@ -22,6 +22,7 @@ from rbl_gym.checks import (
     check_links,
     check_number,
     check_one_of,
+    kernel,
 )
 from rbl_gym.motion import ProcessNoise, check_process
 
@@ -79,7 +80,7 @@ def expected_information(
     if nlos_std_m is not None:
         nlos_std_m = check_number("nlos_std_m", nlos_std_m, low=0.0)
     places = _checked(anchors, tags, rotation, translation)
-    distance = ranging.distances(places[0], ranging.tag_positions(places[2], places[3], places[1]))
+    distance = _distances(*places)
     share = np.full(distance.shape, 1 - link_model.drop_probability)
     if link_model.reach_m is not None:
         share = np.where(distance <= link_model.reach_m, share, 0.0)
@@ -116,8 +117,7 @@ def realised_crb(
     check_generator("rng", rng)
     draws = check_count("draws", draws, most=_MOST)
     places = _checked(anchors, tags, rotation, translation)
-    positions = ranging.tag_positions(places[2], places[3], places[1])
-    distance = ranging.distances(places[0], positions)
+    distance = _distances(*places)
     links = rng.random((draws, *distance.shape)) >= link_model.drop_probability
     if link_model.reach_m is not None:
         links &= distance <= link_model.reach_m
@@ -354,6 +354,15 @@ def _checked(
         check_array("tags", tags, ("N", 3)),
         rotations.check_rotation("rotation", rotation),
         check_array("translation", translation, (3,)),
+    )
+
+
+def _distances(
+    anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
+) -> FloatArray:
+    """Distances (..., M, N) of checked places."""
+    return kernel(ranging.distances)(
+        anchors, kernel(ranging.tag_positions)(rotation, translation, tags)
     )
 
 

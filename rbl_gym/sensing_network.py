@@ -141,7 +141,11 @@ def directions(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
         If the nodes of an edge stand on the same point: there is no bearing.
     """
     positions = check_positions(positions)
-    edges = check_edges(edges, len(positions))
+    return directions_of(positions, check_edges(edges, len(positions)))
+
+
+def directions_of(positions: FloatArray, edges: IntArray) -> FloatArray:
+    """`directions` of checked positions and edges."""
     apart = positions[edges[:, 1]] - positions[edges[:, 0]]
     same = (apart == 0).all(axis=1)
     if same.any():
@@ -160,9 +164,10 @@ def check_edge_angles(y: ArrayLike, edges: IntArray) -> FloatArray:
 
 def true_bearings(positions: ArrayLike, orientations: ArrayLike, edges: ArrayLike) -> FloatArray:
     """Bearings (m, 2) without noise: of j in the frame of i, and of i in the frame of j."""
-    toward = directions(positions, edges)
-    edges = check_edges(edges, len(check_positions(positions)))
-    turned = check_array("orientations", orientations, (len(check_positions(positions)),))
+    positions = check_positions(positions)
+    edges = check_edges(edges, len(positions))
+    toward = directions_of(positions, edges)
+    turned = check_array("orientations", orientations, (len(positions),))
     if turned.ndim != 1:
         raise ValueError(f"orientations must have shape (n,), got {turned.shape}")
     turned = turned[edges]
