@@ -12,7 +12,7 @@ from rbl_gym import bounds, scene_bounds, scenes, simulation
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.regions import Box
-from rbl_gym.scene import Scene
+from rbl_gym.scene import TRAJECTORIES, Scene
 from rbl_gym.scenes import SCENES
 from rbl_gym.simulation import Episode
 from tests.helpers import law_by_hand, share_by_hand
@@ -227,7 +227,7 @@ def test_random_twist_stays_within_reach_of_its_start(name):
     assert travelled.max() > 2.0 * scene.dt * 10 - 1e-9  # ten steps straight on, at least
 
 
-@pytest.mark.parametrize("trajectory", scenes.TRAJECTORIES)
+@pytest.mark.parametrize("trajectory", TRAJECTORIES)
 @pytest.mark.parametrize(
     ("field", "value"),
     [
