@@ -31,6 +31,7 @@ from rbl_gym.estimators.from_statistic import StatisticEpoch, check_informed, ch
 from rbl_gym.estimators.from_statistic import update as update_from_statistic
 from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
+    check_batches,
     check_covariance,
     check_epoch,
     check_ranges,
@@ -107,6 +108,7 @@ class KalmanFamily:
     engine: str = "batched"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
         check_one_of("constraint", self.constraint, list(_CONSTRAINTS))
         check_one_of("engine", self.engine, list(ENGINES))
         check_number("sigma_q_scale", self.sigma_q_scale, low=0.0)
@@ -187,9 +189,10 @@ class KalmanFamily:
             weights = weights[..., None] if weights.ndim == 1 else weights
             if weights.shape[-2] != ranges.shape[-2] or weights.shape[-1] not in (
                 1,
-                len(self.tags),
+                self.tags.shape[-2],
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
+        check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
         epoch = Epoch(ranges, anchors, self.tags, weights, mask)
         mean, covariance = ENGINES[self.engine].update(
             state.mean, state.covariance, epoch, self._frame
@@ -288,8 +291,8 @@ class KalmanFamily:
             raise ValueError(
                 f"anchors and tags determine only rank {int(rank.min())} of the filter's 12 "
                 f"states (it needs 4 anchors and 4 tags, neither coplanar), and the prior is "
-                f"too vague to stand in; got {anchors.shape[-2]} anchors, {len(self.tags)} tags. "
-                "Use 'iekf', or a tighter prior covariance"
+                f"too vague to stand in; got {anchors.shape[-2]} anchors, "
+                f"{self.tags.shape[-2]} tags. Use 'iekf', or a tighter prior covariance"
             )
 
 
