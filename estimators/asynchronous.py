@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_finite, check_number
+from rbl_gym.checks import FloatArray, check_array, check_count, check_number
 from rbl_gym.estimators.belief import Filter, PoseBelief
 
 
@@ -88,7 +88,7 @@ class Asynchronous:
         object.__setattr__(self, "anchors", check_array("anchors", self.anchors, ("M", 3)))
         if self.anchors.ndim != 2:
             raise ValueError(f"anchors must be (M, 3), got shape {self.anchors.shape}")
-        _check_index("n_tags", self.n_tags - 1, 1 << 30)
+        object.__setattr__(self, "n_tags", check_count("n_tags", self.n_tags))
         check_number("window_s", self.window_s, low=0.0)
 
     def start(self, state: Any, time: float) -> Stream:
@@ -125,14 +125,14 @@ class Asynchronous:
             On an index out of range, a range or a twist that cannot be.
         """
         time = check_number("time", time)
-        _check_index("anchor", anchor, len(self.anchors))
-        _check_index("tag", tag, self.n_tags)
-        value = check_finite("range", np.asarray(range, dtype=np.float64))
+        anchor = check_count("anchor", anchor, least=0, most=len(self.anchors) - 1)
+        tag = check_count("tag", tag, least=0, most=self.n_tags - 1)
+        value = check_array("range", range, ())
         if (value <= 0).any():
             raise ValueError(f"range must be positive, got {value.min()}")
         if twist is not None:
             twist = check_array("twist", twist, (6,))
-        measured = TimedRange(time, int(anchor), int(tag), value, twist)
+        measured = TimedRange(time, anchor, tag, value, twist)
         newest = max(time, stream.time)
         if time < stream.checkpoints[0].time or time < newest - self.window_s:
             return stream._replace(refused=stream.refused + 1)
@@ -180,11 +180,3 @@ class Asynchronous:
     ) -> PoseBelief:
         """The belief over the pose at a time, as `state`."""
         return self.filter.belief(self.state(stream, time, twist))
-
-
-def _check_index(name: str, value: int, size: int) -> None:
-    """An int of [0, size), or a ValueError."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ValueError(f"{name} must be an int, got {value!r:.80}")
-    if not 0 <= value < size:
-        raise ValueError(f"{name} must be one of 0 ... {size - 1}, got {value}")

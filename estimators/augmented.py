@@ -22,7 +22,7 @@ from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log,
 from rbl_gym.estimators import bias_cost
 from rbl_gym.estimators.belief import PoseBelief, register
 from rbl_gym.estimators.bias_cost import AugmentedState
-from rbl_gym.estimators.inputs import check_epoch, check_variance
+from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState, is_vague
 from rbl_gym.link_bias import LinkBias
 from rbl_gym.motion import ProcessNoise, propagate
@@ -142,6 +142,7 @@ class AugmentedEkf:
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.pose.tags)
         variance = check_variance(self.pose.noise.variance(ranges, mask), mask)
         variance = np.broadcast_to(variance, np.broadcast_shapes(variance.shape, ranges.shape))
+        check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         state = self._with_biases(state, ranges.shape[-2:])
         batch = np.broadcast_shapes(
             state.translation.shape[:-1], ranges.shape[:-2], anchors.shape[:-2]

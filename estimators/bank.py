@@ -31,6 +31,7 @@ from rbl_gym.estimators.hypotheses import (
     with_best,
     with_rivals,
 )
+from rbl_gym.estimators.inputs import check_batches
 from rbl_gym.estimators.localization import locate
 from rbl_gym.estimators.manifold import TRAILING, IteratedEkf, PoseState, as_state, block_size
 from rbl_gym.estimators.manifold import update_in_blocks as in_blocks
@@ -84,7 +85,9 @@ class IteratedEkfBank:
     volume: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        self._filter  # noqa: B018  checks what it is given
+        object.__setattr__(self, "tags", self._filter.tags)
+        if self.tags.ndim != 2:
+            raise ValueError(f"tags must have shape (N, 3), got {self.tags.shape}")
         if self.volume is not None:
             volume = check_array("volume", self.volume, (2, 3))
             if volume.shape != (2, 3) or (volume[0] > volume[1]).any():
@@ -138,6 +141,7 @@ class IteratedEkfBank:
             As `IteratedEkf.update`.
         """
         ranges, weights, anchors = self._filter.weighed(ranges, anchors, links)
+        check_batches(state=state.log_odds.shape[:-1], ranges=ranges.shape[:-2])
         batch = np.broadcast_shapes(
             state.log_odds.shape[:-1], ranges.shape[:-2], weights.shape[:-2], anchors.shape[:-2]
         )

@@ -16,7 +16,14 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from numpy.typing import ArrayLike, NDArray
 
-from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
+from rbl_gym.checks import (
+    FloatArray,
+    check_array,
+    check_count,
+    check_generator,
+    check_number,
+    check_one_of,
+)
 from rbl_gym.network_graphs import BASES, check_connected, cycle_matrix
 from rbl_gym.sensing_network import check_edge_angles, proj
 
@@ -120,12 +127,19 @@ def cycle_projection(C: sp.csr_matrix, y: ArrayLike, branch: ArrayLike | None = 
         Cycle matrix (q, m) and edge angles (m,).
     branch
         k (q,), whole numbers; None: the nearest, cycle by cycle.
+
+    Raises
+    ------
+    ValueError
+        On another shape, or a branch that is not of whole numbers.
     """
+    C = sp.csr_matrix(C)
     y = check_array("y", y, (C.shape[1],)) if C.shape[1] else np.zeros(0)
+    if y.ndim != 1:
+        raise ValueError(f"y must have shape ({C.shape[1]},), got {y.shape}")
     if C.shape[0] == 0:
         return y.copy()
-    around = C @ y
-    off = proj(around) if branch is None else around - _TURN * np.asarray(branch)
+    off = _around(C @ y, None if branch is None else _TURN * _whole(branch, C.shape[0]))
     return y - C.T @ scipy.sparse.linalg.spsolve((C @ C.T).tocsc(), off)
 
 
@@ -208,11 +222,12 @@ def cycle_iteration(
     if C.shape[1] != len(edges):
         raise ValueError(f"cycles must have a column per edge, {len(edges)}, got {C.shape}")
     check_one_of("order", order, ORDERS)
-    check_number("tol", tol, low=0.0)
-    check_number("loss", loss, low=0.0, high=1.0)
+    tol = check_number("tol", tol, low=0.0)
+    max_steps = check_count("max_steps", max_steps, least=0)
+    loss = check_number("loss", loss, low=0.0, high=1.0)
     one_by_one = order == "asynchronous"
-    if rng is None and (one_by_one or loss):
-        raise ValueError("rng must be a Generator for a random order or losses, got None")
+    if one_by_one or loss:
+        check_generator("rng", rng)
     step = _step(C, kappa, one_by_one)
     target = None if branch is None else _TURN * _whole(branch, C.shape[0])
     lengths = np.maximum(np.diff(C.indptr), 1)

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bearing, bounds
-from rbl_gym.checks import FloatArray, are_finite, check_array, check_number, check_one_of
+from rbl_gym.checks import (
+    FloatArray,
+    are_finite,
+    check_array,
+    check_generator,
+    check_number,
+    check_one_of,
+)
 from rbl_gym.estimators.doa_cost import DoaCost
 from rbl_gym.estimators.doa_global import global_search
 from rbl_gym.estimators.doa_newton import newton_iteration, unit_quaternion
@@ -96,10 +103,11 @@ def locate_doa(
         an unknown method or half-space.
     """
     check_one_of("method", method, list(METHODS))
-    if half_space not in HALF_SPACES:
+    if not isinstance(half_space, str | None) or half_space not in HALF_SPACES:
         raise ValueError(f"half_space must be 'y>0', 'y<0' or None, got {half_space!r}")
     if not isinstance(noise, bearing.AngleNoise):
         raise ValueError(f"noise must be a bearing.AngleNoise, got {noise!r:.80}")
+    rng = np.random.default_rng(0) if rng is None else check_generator("rng", rng)
     if distance_weight is not None:
         distance_weight = check_number("distance_weight", distance_weight, low=1e-12)
     tags = check_array("tags", tags, ("N", 3))
@@ -119,7 +127,7 @@ def locate_doa(
 
     epoch = DoaEpoch(
         flat(angles, 2), 1 / noise.variance(flat(angles, 2)), flat(tags, 2),
-        HALF_SPACES[half_space], distance_weight, rng or np.random.default_rng(0),
+        HALF_SPACES[half_space], distance_weight, rng,
     )  # fmt: skip
     size = _BLOCK if method == "nia" else _BLOCK_OF_STARTS
     blocks = [

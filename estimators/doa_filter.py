@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -112,7 +113,8 @@ class DoaEkf(IteratedEkf):
             of_ranges = np.broadcast_to(of_ranges, shape)
             epoch += [ranges, of_ranges if mask is None else of_ranges * mask, anchors]
             trailing += [2, 2, 2]
-        return update_in_blocks(self._update_angles, epoch, trailing, _BLOCK)
+        size = _BLOCK if self.tags.ndim == 2 else math.inf
+        return update_in_blocks(self._update_angles, epoch, trailing, size)
 
     @functools.cached_property
     def _has_rotation(self) -> bool:
@@ -142,7 +144,7 @@ class DoaEkf(IteratedEkf):
                     "tags must be at least 3 and not collinear where the prior rotation is vague, "
                     f"got {self.tags.shape[-2]}; give a tighter prior"
                 )
-            others = (array.shape[:-2] for array in (angles, *of_ranges))
+            others = (array.shape[:-2] for array in (angles, *of_ranges, self.tags))
             batch = np.broadcast_shapes(vague.shape, station.shape[:-1], *others)
             start = global_start(problem, vague, batch, _best_of_angles)
         return posterior(problem, *start, self.iterations)

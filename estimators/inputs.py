@@ -67,9 +67,23 @@ def check_epoch(
             ) from error
         if mask.all():
             mask = None
+    check_batches(ranges=ranges.shape[:-2], anchors=anchors.shape[:-2])
     if values or mask is not None:
         check_ranges(ranges, mask)
     return ranges, anchors, mask
+
+
+def check_batches(**batches: tuple[int, ...]) -> None:
+    """A ValueError where the leading axes of arguments, given by their names, do not broadcast."""
+    if sum(map(bool, batches.values())) < 2:
+        return
+    try:
+        np.broadcast_shapes(*batches.values())
+    except ValueError as error:
+        raise ValueError(
+            f"leading axes of {' and '.join(batches)} must broadcast, got "
+            f"{' and '.join(map(str, batches.values()))}"
+        ) from error
 
 
 def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:

@@ -31,6 +31,7 @@ from rbl_gym.estimators.from_statistic import StatisticEpoch, check_informed, ch
 from rbl_gym.estimators.from_statistic import update as update_from_statistic
 from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
+    check_batches,
     check_covariance,
     check_epoch,
     check_ranges,
@@ -107,6 +108,7 @@ class KalmanFamily:
     engine: str = "batched"
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
         check_one_of("constraint", self.constraint, list(_CONSTRAINTS))
         check_one_of("engine", self.engine, list(ENGINES))
         check_number("sigma_q_scale", self.sigma_q_scale, low=0.0)
@@ -187,9 +189,10 @@ class KalmanFamily:
             weights = weights[..., None] if weights.ndim == 1 else weights
             if weights.shape[-2] != ranges.shape[-2] or weights.shape[-1] not in (
                 1,
-                len(self.tags),
+                self.tags.shape[-2],
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
+        check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
         epoch = Epoch(ranges, anchors, self.tags, weights, mask)
         mean, covariance = ENGINES[self.engine].update(
             state.mean, state.covariance, epoch, self._frame
@@ -232,7 +235,7 @@ class KalmanFamily:
         return _CONSTRAINTS[self.constraint](self, prior, posterior, epoch)
 
     def belief(self, state: KalmanState) -> PoseBelief:
-        """Pose, its covariance, and the raw matrix.
+        """Pose, its covariance, and the raw matrix (copies).
 
         The covariance is that of the projected output, ``J^+ P J^+T``; of UC-KF, whose mean
         is constrained already, ``(J^T P^-1 J)^-1``.
@@ -249,7 +252,8 @@ class KalmanFamily:
             pinv = transposed * np.array([0.5] * 3 + [1.0] * 3)[:, None]
             covariance = symmetric(pinv @ state.covariance @ np.swapaxes(pinv, -1, -2))
         translation = state.mean[..., 9:].copy()
-        return PoseBelief(rotation, translation, covariance, rotation if on_group else matrix)
+        raw = rotation if on_group else matrix.copy(order="K")
+        return PoseBelief(rotation, translation, covariance, raw)
 
     @cached_property
     def _frame(self) -> Frame | None:
@@ -287,8 +291,8 @@ class KalmanFamily:
             raise ValueError(
                 f"anchors and tags determine only rank {int(rank.min())} of the filter's 12 "
                 f"states (it needs 4 anchors and 4 tags, neither coplanar), and the prior is "
-                f"too vague to stand in; got {anchors.shape[-2]} anchors, {len(self.tags)} tags. "
-                "Use 'iekf', or a tighter prior covariance"
+                f"too vague to stand in; got {anchors.shape[-2]} anchors, "
+                f"{self.tags.shape[-2]} tags. Use 'iekf', or a tighter prior covariance"
             )
 
 

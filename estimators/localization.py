@@ -14,12 +14,9 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, ranging
 from rbl_gym.checks import BoolArray, FloatArray, are_finite, check_array, check_number, kernel
-from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
+from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.locators import METHODS, Epoch, Fit
-from rbl_gym.estimators.maximum_likelihood import (
-    Alternatives,
-    no_alternatives,
-)
+from rbl_gym.estimators.maximum_likelihood import Alternatives, no_alternatives
 from rbl_gym.estimators.squared_range import Statistic, statistic
 from rbl_gym.ranging import NoiseLaw
 
@@ -110,7 +107,9 @@ def locate(
     fit = _method(method)
     ranging.check_law("noise", noise)
     tags = check_array("tags", tags, ("N", 3))
+    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
     ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
+    check_batches(ranges=ranges.shape[:-2], tags=tags.shape[:-2])
     epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
     blocks = [
         _solve(fit, _rows(epoch, slice(start, start + _BLOCK)))
@@ -204,7 +203,6 @@ def _epoch(
         weights = np.where(mask, weights, 0.0)
         flat_mask = flat(mask)
     stat = statistic(flat(ranges), flat(anchors), flat(tags), flat(1 / squared), flat_mask)
-    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
     return Epoch(flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m), batch
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, rotations
-from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.checks import FloatArray, check_array, check_count, check_number
 from rbl_gym.components import (
     exp_and_left_jacobian,
     first,
@@ -31,6 +31,7 @@ from rbl_gym.components import (
 )
 from rbl_gym.estimators.belief import PoseBelief
 from rbl_gym.estimators.inputs import (
+    check_batches,
     check_covariance,
     check_epoch,
     check_variance,
@@ -65,7 +66,7 @@ class IteratedEkf:
     Parameters
     ----------
     tags
-        (N, 3), metres, body frame, as given.
+        (N, 3), metres, body frame, as given; with leading axes each trial has its own.
     noise
         Law of the ranges; variances are taken at the measured ranges.
     process
@@ -83,15 +84,14 @@ class IteratedEkf:
     robust: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.iterations, bool) or not isinstance(self.iterations, int):
-            raise ValueError(f"iterations must be an int, got {self.iterations!r}")
-        check_number("iterations", self.iterations, low=1)
+        object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
+        check_count("iterations", self.iterations)
         if not isinstance(self.robust, bool):
             raise ValueError(f"robust must be True or False, got {self.robust!r}")
 
     @functools.cached_property
-    def _lift(self) -> FloatArray:
-        return lift_map(self.tags)
+    def _lift(self) -> FloatArray | None:
+        return lift_map(self.tags) if self.tags.ndim == 2 else None
 
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
@@ -146,8 +146,10 @@ class IteratedEkf:
             and the anchors or tags cannot determine a pose (the message names the rank).
         """
         ranges, weights, anchors = self.weighed(ranges, anchors, links)
+        check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         epoch = (*state, ranges, weights, anchors)
-        return update_in_blocks(self._update, epoch, TRAILING, block_size(ranges))
+        size = block_size(ranges) if self.tags.ndim == 2 else math.inf
+        return update_in_blocks(self._update, epoch, TRAILING, size)
 
     def weighed(
         self, ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None
@@ -182,7 +184,8 @@ class IteratedEkf:
             vague = is_vague(state.covariance)
             if vague.any():
                 _check_determined(anchors, self.tags)
-                batch = np.broadcast_shapes(vague.shape, ranges.shape[:-2], anchors.shape[:-2])
+                others = (array.shape[:-2] for array in (ranges, anchors, self.tags))
+                batch = np.broadcast_shapes(vague.shape, *others)
                 start = global_start(problem, vague, batch, best_of_net)
         found = (robust_solution if self.robust else minimize_pose)(
             problem, *start, self.iterations
@@ -225,7 +228,7 @@ def update_in_blocks(
     update: Callable[..., Any],
     epoch: Sequence[FloatArray],
     trailing: Sequence[int],
-    size: int,
+    size: float,
 ) -> Any:
     """`update` (state, arrays ...) over at most `size` trials at once; returns what it returns.
 
@@ -238,8 +241,8 @@ def update_in_blocks(
         return update(PoseState(*epoch[:3]), *epoch[3:])
     flat = [_flatten(a, n, batch) for a, n in zip(epoch, trailing, strict=True)]
     parts = []
-    for start in range(0, math.prod(batch), size):
-        block = [a if len(a) == 1 else a[start : start + size] for a in flat]
+    for start in range(0, math.prod(batch), int(size)):
+        block = [a if len(a) == 1 else a[start : start + int(size)] for a in flat]
         parts.append(update(PoseState(*block[:3]), *block[3:]))
     joined = (np.concatenate(fields) for fields in zip(*parts, strict=True))
     return type(parts[0])(*(a.reshape((*batch, *a.shape[1:])) for a in joined))

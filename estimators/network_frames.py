@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_number
 from rbl_gym.estimators.network_orientations import maximum_likelihood
-from rbl_gym.network_bounds import bearing_jacobian, free_columns, range_jacobian
+from rbl_gym.network_bounds import bearing_jacobian, free_columns, range_jacobian, sparse_rows
 from rbl_gym.network_graphs import check_connected
 from rbl_gym.rigidity import check_frames, check_joint
 from rbl_gym.sensing_network import (
@@ -168,10 +168,9 @@ def _scaled(measured: _Measured, positions: FloatArray) -> FloatArray:
 
 def _differences(edges: IntArray, vectors: FloatArray, n_nodes: int) -> sp.csr_matrix:
     """Rows (m, 2 n - 2): ``v' (p_j - p_i)`` of each edge's vector v, node 0 at the origin."""
-    columns = (2 * edges[:, :, None] + [0, 1]).ravel()
-    values = np.concatenate([-vectors, vectors], axis=1).ravel()
-    shape = (len(edges), 2 * n_nodes)
-    return sp.csr_matrix((values, columns, 4 * np.arange(len(edges) + 1)), shape=shape)[:, 2:]
+    columns = (2 * edges[:, :, None] + [0, 1]).reshape(-1, 4)
+    values = np.concatenate([-vectors, vectors], axis=1)
+    return sparse_rows(values, columns, 2 * n_nodes)[:, 2:]
 
 
 def _joint(measured: _Measured, theta: FloatArray, positions: FloatArray) -> FrameEstimate:

@@ -16,7 +16,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.checks import FloatArray, check_array, check_one_of
 from rbl_gym.estimators.consensus import cycle_consensus
 from rbl_gym.network_graphs import check_connected, spanning_tree, sum_to_root
 from rbl_gym.sensing_network import IntArray, check_edge_angles, proj
@@ -168,12 +168,23 @@ def chordal_optimum(
         As `orientations`.
     start
         (n,) radians; None: the maximum-likelihood orientations.
+
+    Raises
+    ------
+    ValueError
+        As `orientations`, and on a start of another shape.
     """
     edges = check_connected(edges, n_nodes)
     y = check_edge_angles(y, edges)
     if n_nodes == 1:
         return ChordalOptimum(np.zeros(1), 0.0, True)
-    theta = maximum_likelihood(edges, y, n_nodes) if start is None else np.asarray(start, float)
+    if start is None:
+        theta = maximum_likelihood(edges, y, n_nodes)
+    else:
+        theta = check_array("start", start, (n_nodes,))
+        if theta.ndim != 1:
+            raise ValueError(f"start must have shape ({n_nodes},), got {theta.shape}")
+        theta = theta - theta[0]
     for _ in range(_MAX_STEPS):
         residual = residuals(edges, y, theta)
         # Newton's curvature where it is safe, that of the squares elsewhere.

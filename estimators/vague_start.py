@@ -107,7 +107,8 @@ def _translation_given(rotation: FloatArray, problem: Any) -> FloatArray:
     scale = 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
     stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale)
     information = np.linalg.inv(problem.prior.covariance[..., 3:, 3:])
-    turned = data.tags @ np.swapaxes(rotation, -1, -2)
+    tags = data.tags if data.tags.ndim == 2 else data.tags[:, None]
+    turned = tags @ np.swapaxes(rotation, -1, -2)
     per_tag = stat.b[:, None] - (stat.G[:, None] @ turned[..., None])[..., 0]
     held = information @ problem.prior.translation[..., None]
     right = held + np.swapaxes(per_tag.sum(axis=-2), -1, -2)

@@ -13,7 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_finite, check_number, check_shape, checked
+from rbl_gym.checks import (
+    FloatArray,
+    check_array,
+    check_finite,
+    check_generator,
+    check_number,
+    check_shape,
+    checked,
+    kernel,
+)
 from rbl_gym.ranging import tag_positions
 
 __all__ = [
@@ -165,7 +174,8 @@ def simulate(
     """
     if not isinstance(noise, AngleNoise):
         raise ValueError(f"noise must be an AngleNoise, got {noise!r:.80}")
-    true = angles(tag_positions(rotation, translation, tags), station)
+    check_generator("rng", rng)
+    true = angles(kernel(tag_positions)(rotation, translation, tags), station)
     return noise.sample(true, rng.standard_normal(true.shape))
 
 

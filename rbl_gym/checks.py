@@ -19,6 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 # float64 throughout; numpy's own stubs promise no more than this of most functions.
 FloatArray = NDArray[np.floating[Any]]
 BoolArray = NDArray[np.bool_]
+# One number for all three of the world's axes, or one for each.
+Axes = float | tuple[float, float, float]
 # No length, time or rate is as large; its powers still are finite numbers.
 HUGE = 1e50
 
@@ -151,6 +153,35 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
         bounds = f" in [{low:g}, {high:g}]" if low > -math.inf or high < math.inf else ""
         raise ValueError(f"{name} must be a finite number{bounds}, got {number}")
     return number
+
+
+def check_axes(name: str, value: ArrayLike) -> Axes:
+    """A standard deviation, or one for each of the world's axes; or a ValueError."""
+    array = check_array(name, value, ())
+    if array.shape not in ((), (3,)):
+        raise ValueError(f"{name} must be one number or three, got shape {array.shape}")
+    if (array < 0).any():
+        raise ValueError(f"{name} must not be negative, got {array.tolist()}")
+    # Lists come out of JSON; tuples keep the configuration hashable.
+    return float(array) if array.ndim == 0 else tuple(array.tolist())
+
+
+def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
+    """`value` as an int from `least` to `most`, or a ValueError that names it."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < least or (most is not None and value > most):
+        wanted = "a positive int" if least == 1 else f"an int of at least {least}"
+        if most is not None:
+            wanted = f"an int from {least} to {most}"
+        raise ValueError(f"{name} must be {wanted}, got {value!r:.80}")
+    return int(value)
+
+
+def check_generator(name: str, rng: Any) -> np.random.Generator:
+    """`rng` if it is a source of random numbers, or a ValueError that names it."""
+    if not isinstance(rng, np.random.Generator):
+        raise ValueError(f"{name} must be a numpy.random.Generator, got {rng!r:.80}")
+    return rng
 
 
 def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.checks import FloatArray, check_array, check_count, check_generator, check_number
 
 __all__ = ["LinkBias", "simulate"]
 
@@ -65,10 +65,19 @@ def simulate(
         `LinkBias`, seconds (K,) that do not decrease, and how many links there are.
     rng, batch
         Source of the normals, and the leading axes.
+
+    Raises
+    ------
+    ValueError
+        On times that decrease, and on a law, a number of links or a generator that is none.
     """
+    if not isinstance(law, LinkBias):
+        raise ValueError(f"law must be a LinkBias, got {law!r:.80}")
     times = check_array("times", times, ("K",))
     if times.ndim != 1 or (np.diff(times) < 0).any():
-        raise ValueError("times must be (K,) and not decrease")
+        raise ValueError(f"times must be (K,) and not decrease, got {times!r:.80}")
+    links = check_count("links", links)
+    check_generator("rng", rng)
     normals = rng.standard_normal((len(times), *batch, links + 1))
     drawn = law.std_m * normals[..., :links] + law.common_std_m * normals[..., links:]
     for k, step in enumerate(np.diff(times)):

@@ -17,9 +17,12 @@ from rbl_gym import bounds, ranging, rotations
 from rbl_gym.checks import (
     FloatArray,
     check_array,
+    check_count,
+    check_generator,
     check_links,
     check_number,
     check_one_of,
+    kernel,
 )
 from rbl_gym.motion import ProcessNoise, check_process
 
@@ -77,7 +80,7 @@ def expected_information(
     if nlos_std_m is not None:
         nlos_std_m = check_number("nlos_std_m", nlos_std_m, low=0.0)
     places = _checked(anchors, tags, rotation, translation)
-    distance = ranging.distances(places[0], ranging.tag_positions(places[2], places[3], places[1]))
+    distance = _distances(*places)
     share = np.full(distance.shape, 1 - link_model.drop_probability)
     if link_model.reach_m is not None:
         share = np.where(distance <= link_model.reach_m, share, 0.0)
@@ -111,12 +114,10 @@ def realised_crb(
         As `bounds.pose_crb`: also where the links of a single draw do not determine the pose.
     """
     _check_laws(noise, link_model)
-    if not isinstance(rng, np.random.Generator):
-        raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r:.80}")
-    _check_count("draws", draws)
+    check_generator("rng", rng)
+    draws = check_count("draws", draws, most=_MOST)
     places = _checked(anchors, tags, rotation, translation)
-    positions = ranging.tag_positions(places[2], places[3], places[1])
-    distance = ranging.distances(places[0], positions)
+    distance = _distances(*places)
     links = rng.random((draws, *distance.shape)) >= link_model.drop_probability
     if link_model.reach_m is not None:
         links &= distance <= link_model.reach_m
@@ -228,7 +229,7 @@ def bias_information(
     _check_laws(noise)
     distance, J = bounds.range_jacobian(*places)
     if not (distance > 0).all():
-        raise ValueError("an anchor stands on a tag, where a range has no derivative")
+        raise ValueError("anchors must not stand on a tag, where a range has no derivative")
     weight = 1 / np.broadcast_to(noise.variance(distance), distance.shape)
     if mask is not None:
         weight = weight * mask
@@ -243,7 +244,7 @@ def with_biases(pose_information: ArrayLike, bias_std_m: float, n_biases: int) -
     """Joint information (..., 6 + G, 6 + G) of a pose's prior and of G independent biases."""
     J = check_array("pose_information", pose_information, (6, 6))
     std = check_number("bias_std_m", bias_std_m, low=1e-12)
-    _check_count("n_biases", n_biases)
+    n_biases = check_count("n_biases", n_biases, most=_MOST)
     joint = np.zeros((*J.shape[:-2], 6 + n_biases, 6 + n_biases))
     joint[..., :6, :6] = J
     joint[..., range(6, 6 + n_biases), range(6, 6 + n_biases)] = std**-2
@@ -356,9 +357,13 @@ def _checked(
     )
 
 
-def _check_count(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 < value <= _MOST:
-        raise ValueError(f"{name} must be a positive int up to {_MOST}, got {value!r:.80}")
+def _distances(
+    anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
+) -> FloatArray:
+    """Distances (..., M, N) of checked places."""
+    return kernel(ranging.distances)(
+        anchors, kernel(ranging.tag_positions)(rotation, translation, tags)
+    )
 
 
 def _check_laws(noise: Any, link_model: Any = _ALL_MEASURE) -> None:

@@ -6,12 +6,15 @@ import numpy as np
 from scipy import special
 
 from rbl_gym import rotations
-from rbl_gym.checks import FloatArray, checked
+from rbl_gym.checks import FloatArray, checked, kernel
 
 __all__ = [
     "expected_mean_angular_error", "length", "mean_angular_error", "nees", "pose_error",
     "tag_error",
 ]  # fmt: skip
+
+# Behind the doors: what comes to these was checked.
+_ERROR, _ANGLE_BETWEEN = kernel(rotations.error), kernel(rotations.angle_between)
 
 
 @checked(rotation_hat=(3, 3), translation_hat=(3,), rotation=(3, 3), translation=(3,))
@@ -28,7 +31,7 @@ def pose_error(
     rotation_hat, translation_hat, rotation, translation
         Estimate and truth: (..., 3, 3), (..., 3), (..., 3, 3), (..., 3); metres.
     """
-    turn = rotations.error(rotation_hat, rotation)
+    turn = _ERROR(rotation_hat, rotation)
     shift = np.asarray(translation_hat) - np.asarray(translation)
     return np.concatenate(np.broadcast_arrays(turn, shift), axis=-1)
 
@@ -87,7 +90,7 @@ def mean_angular_error(matrix: FloatArray, rotation: FloatArray) -> FloatArray:
     not be orthogonal.
     """
     columns = np.swapaxes(np.asarray(matrix), -1, -2), np.swapaxes(np.asarray(rotation), -1, -2)
-    return rotations.angle_between(*columns).mean(axis=-1)
+    return _ANGLE_BETWEEN(*columns).mean(axis=-1)
 
 
 @checked(covariance=(6, 6), rotation=(3, 3))

@@ -16,7 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import rotations
-from rbl_gym.checks import FloatArray, check_array, check_number, checked, kernel
+from rbl_gym.checks import (
+    Axes,
+    FloatArray,
+    check_array,
+    check_axes,
+    check_count,
+    check_number,
+    checked,
+    kernel,
+)
 
 __all__ = [
     "Path", "ProcessNoise", "Trajectory", "constant_twist", "interpolate", "lawn_mower_points",
@@ -26,6 +35,11 @@ __all__ = [
 _MOST_STEPS = 10**9
 # Behind the doors: what comes to these was checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
+
+
+def six(rotation: Axes, translation: Axes) -> FloatArray:
+    """Six numbers (6,): those of the rotation's axes, then those of the translation's."""
+    return np.concatenate([np.broadcast_to(rotation, 3), np.broadcast_to(translation, 3)])
 
 
 @dataclass(frozen=True)
@@ -43,25 +57,16 @@ class ProcessNoise:
         If a value is negative or not finite, or there are neither 1 nor 3.
     """
 
-    rotation_rad: float | tuple[float, float, float] = 0.0
-    translation_m: float | tuple[float, float, float] = 0.0
+    rotation_rad: Axes = 0.0
+    translation_m: Axes = 0.0
 
     def __post_init__(self) -> None:
         for name in ("rotation_rad", "translation_m"):
-            value = check_array(name, getattr(self, name), ())
-            if value.shape not in ((), (3,)):
-                raise ValueError(f"{name} must be one number or three, got shape {value.shape}")
-            if (value < 0).any():
-                raise ValueError(f"{name} must not be negative, got {value.tolist()}")
-            # Lists come out of JSON; tuples keep the configuration hashable.
-            object.__setattr__(
-                self, name, float(value) if value.ndim == 0 else tuple(value.tolist())
-            )
+            object.__setattr__(self, name, check_axes(name, getattr(self, name)))
 
     def std(self) -> FloatArray:
         """The six standard deviations after 1 s: rotation (rad), then translation (m)."""
-        rotation = np.broadcast_to(self.rotation_rad, 3)
-        return np.concatenate([rotation, np.broadcast_to(self.translation_m, 3)])
+        return six(self.rotation_rad, self.translation_m)
 
     def covariance(self, twist: FloatArray, dt: ArrayLike) -> FloatArray:
         """Covariance (..., 6, 6) that one step adds to the pose error (w, v).
@@ -126,12 +131,13 @@ def simulate(
     trajectory
         Start and nominal twists.
     dt
-        Step, seconds.
+        Step, seconds; a ValueError where it is not positive.
     process
         Law of the noise; it acts on the twist, with variance growing with time.
     normals
         Standard normals (..., T, 6); None: no process noise.
     """
+    dt = check_number("dt", dt, low=1e-12)
     nominal = trajectory.twists
     batch = np.broadcast_shapes(
         trajectory.rotation.shape[:-2],
@@ -197,7 +203,8 @@ def constant_twist(
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     twist = check_array("twist", twist, (6,))
-    twists = np.repeat(twist[..., None, :], _check_steps(steps), axis=-2)
+    steps = check_count("steps", steps, most=_MOST_STEPS)
+    twists = np.repeat(twist[..., None, :], steps, axis=-2)
     return Trajectory(rotation, translation, twists)
 
 
@@ -219,7 +226,8 @@ def random_twist(
     """
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
-    steps, hold = _check_steps(steps), _check_steps(hold, "hold")
+    steps = check_count("steps", steps, most=_MOST_STEPS)
+    hold = check_count("hold", hold, most=_MOST_STEPS)
     speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
     turn_rate_rad_s = check_number("turn_rate_rad_s", turn_rate_rad_s, low=0.0)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
@@ -266,7 +274,7 @@ def waypoints(
     speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
     dt = check_number("dt", dt, low=1e-12)
     spin = check_array("spin_rad_s", spin_rad_s, (3,))
-    travelled = speed_m_s * dt * np.arange(_check_steps(steps) + 1)
+    travelled = speed_m_s * dt * np.arange(check_count("steps", steps, most=_MOST_STEPS) + 1)
     velocity = np.diff(_along(points, travelled), axis=-2) / dt
     batch = np.broadcast_shapes(spin.shape[:-1], velocity.shape[:-2])
     twists = _trials_last(batch, len(travelled) - 1, 6)
@@ -327,7 +335,7 @@ def orbit(
     radius_m = check_number("radius_m", radius_m, low=1e-9)
     dt = check_number("dt", dt, low=1e-12)
     rate = check_number("speed_m_s", speed_m_s, low=0.0) / radius_m
-    steps = _check_steps(steps)
+    steps = check_count("steps", steps, most=_MOST_STEPS)
     angle = check_array("phase", phase, ())[..., None] + rate * dt * np.arange(steps + 1)
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
     places = centre[..., None, :] + radius_m * circle
@@ -388,10 +396,3 @@ def interpolate(
     return Path(
         rotations.exp(fraction * turn) @ rotation[before], translation[before] + fraction * step
     )
-
-
-def _check_steps(steps: int, name: str = "steps") -> int:
-    whole = isinstance(steps, (int, float, np.number)) and steps % 1 == 0
-    if not whole or not 1 <= steps <= _MOST_STEPS:
-        raise ValueError(f"{name} must be a positive int, got {steps!r}")
-    return int(steps)

@@ -14,7 +14,13 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_number
 from rbl_gym.network_graphs import check_connected, incidence
-from rbl_gym.sensing_network import IntArray, check_edges, check_pair, check_positions, directions
+from rbl_gym.sensing_network import (
+    IntArray,
+    check_edges,
+    check_pair,
+    check_positions,
+    directions_of,
+)
 
 __all__ = ["bearing_jacobian", "frame_covariance", "orientation_covariance", "range_jacobian"]
 
@@ -56,7 +62,7 @@ def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
     positions = check_positions(positions)
     n_nodes = len(positions)
     edges = check_edges(edges, n_nodes)
-    toward = directions(positions, edges)
+    toward = directions_of(positions, edges)
     apart = positions[edges[:, 1]] - positions[edges[:, 0]]
     across = np.column_stack([-np.sin(toward), np.cos(toward)])
     length = np.linalg.norm(apart, axis=1, keepdims=True)
@@ -70,21 +76,22 @@ def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
     places = n_nodes + 2 * np.repeat(edges, 2, axis=0)[:, :, None] + [0, 1]
     columns = np.column_stack([edges.ravel(), places.reshape(-1, 4)])
     values = np.column_stack([np.full(2 * len(edges), -1.0), -both, both])
-    return _rows(values, columns, 3 * n_nodes)
+    return sparse_rows(values, columns, 3 * n_nodes)
 
 
 def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
     """Derivative (k, 3 n) of the distances of pairs of nodes, columns as `bearing_jacobian`."""
-    positions = np.asarray(positions, dtype=np.float64)
+    positions = check_positions(positions)
     n_nodes = len(positions)
     pairs = check_edges(pairs, n_nodes)
-    toward = directions(positions, pairs)
+    toward = directions_of(positions, pairs)
     along = np.column_stack([np.cos(toward), np.sin(toward)])
     columns = (n_nodes + 2 * pairs[:, :, None] + [0, 1]).reshape(-1, 4)
-    return _rows(np.concatenate([-along, along], axis=1), columns, 3 * n_nodes)
+    return sparse_rows(np.concatenate([-along, along], axis=1), columns, 3 * n_nodes)
 
 
-def _rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_matrix:
+def sparse_rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_matrix:
+    """The matrix (m, width) of rows with equally many entries (m, k), at columns (m, k)."""
     rows, each = values.shape
     return sp.csr_matrix((values.ravel(), columns.ravel(), each * np.arange(rows + 1)),
                          shape=(rows, width))  # fmt: skip

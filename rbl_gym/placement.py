@@ -25,6 +25,7 @@ from rbl_gym.checks import (
     FloatArray,
     as_float,
     check_array,
+    check_count,
     check_finite,
     check_number,
 )
@@ -96,13 +97,11 @@ class PlacementTask:
     def __post_init__(self) -> None:
         if not isinstance(self.scene, Scene):
             raise ValueError(f"scene must be a Scene, got {self.scene!r:.80}")
-        for name, low, high in (
-            ("n_anchors", 1, math.inf), ("racks", 0, MAX_RACKS), ("n_poses", 1, math.inf),
+        for name, least, most in (
+            ("n_anchors", 1, None), ("racks", 0, MAX_RACKS), ("n_poses", 1, None),
         ):  # fmt: skip
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise ValueError(f"{name} must be an int, got {value!r}")
-            check_number(name, value, low=low, high=high)
+            value = check_count(name, getattr(self, name), least=least, most=most)
+            object.__setattr__(self, name, value)
         check_number("blocked_information", self.blocked_information, low=0.0, high=1.0)
         if not np.ptp(self.scene.volume.bounds(), axis=0).any():
             raise ValueError(
@@ -115,21 +114,30 @@ class PlacementTask:
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size."""
+        """Rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size.
+
+        Read-only, as all that a task keeps.
+        """
         rng = np.random.default_rng(_POSE_SEED)
         offsets = rng.uniform(-1, 1, (self.n_poses, 3))
-        return rotations.random(rng, (self.n_poses,)), offsets
+        return _read_only(rotations.random(rng, (self.n_poses,))), _read_only(offsets)
 
     @functools.cached_property
     def prior_information(self) -> FloatArray:
         """(6, 6): 60 degrees, and half of the volume's largest extent."""
         extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
-        return np.diag([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+        diagonal = [_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3
+        return _read_only(np.diag(diagonal))
 
     @functools.cached_property
     def shared(self) -> SharedPoses:
         """What the poses and the tags alone decide."""
         return SharedPoses(self.poses[0], np.asarray(self.scene.tags))
+
+
+def _read_only(array: FloatArray) -> FloatArray:
+    array.flags.writeable = False
+    return array
 
 
 def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:
@@ -143,8 +151,7 @@ def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0)
         On an unknown scene, racks outside a room, a number that is none.
     """
     scene = scenes.get(scene)
-    if isinstance(racks, bool) or not isinstance(racks, int):
-        raise ValueError(f"racks must be an int, got {racks!r:.80}")
+    racks = check_count("racks", racks, least=0, most=MAX_RACKS)
     usual = scene.n_anchors - bool(racks)
     return PlacementTask(scene, usual if n_anchors is None else n_anchors, racks)
 

@@ -16,7 +16,15 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, checked, kernel
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_generator,
+    check_number,
+    checked,
+    kernel,
+)
 
 __all__ = [
     "NOISE_LAWS", "LinkModel", "LinkNoise", "Measurement", "NoiseLaw", "RangeNoise",
@@ -132,9 +140,10 @@ class SquaredRangeNoise:
         check_number("sigma_m", self.sigma_m, low=1e-300)
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order."""
+        """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order; inf at zero."""
         r = ranges if links is None else np.where(links, ranges, 1.0)
-        return self.squared_range_variance(ranges, links) / (4 * r**2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.squared_range_variance(ranges, links) / (4 * r**2)
 
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
@@ -166,6 +175,7 @@ class LinkNoise:
         std = check_array("std_m", self.std_m, ("M", "N"))
         if (std < 0).any():
             raise ValueError(f"std_m must not be negative, got {std.min()}")
+        object.__setattr__(self, "std_m", std)
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
         """Variance of the ranges [m^2]; see `NoiseLaw`."""
@@ -370,8 +380,7 @@ def simulate(
         On wrong shapes, NaN, or laws and generators that are none.
     """
     check_law("noise", noise)
-    if not isinstance(rng, np.random.Generator):
-        raise ValueError(f"rng must be a numpy.random.Generator, got {rng!r:.80}")
+    check_generator("rng", rng)
     if not isinstance(link_model, LinkModel | None):
         raise ValueError(f"link_model must be a LinkModel or None, got {link_model!r:.80}")
     true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))

@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, check_array, check_one_of
-from rbl_gym.network_bounds import bearing_jacobian, range_jacobian
+from rbl_gym.network_bounds import bearing_jacobian, range_jacobian, sparse_rows
 from rbl_gym.network_graphs import check_connected, components
-from rbl_gym.sensing_network import check_edges, check_positions, directions
+from rbl_gym.sensing_network import check_edges, check_positions, directions_of
 
 __all__ = [
     "Freedom", "Localizability", "feasible_rotations", "freedom", "localizability",
@@ -79,15 +79,12 @@ def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> sp.csr_m
     The row of edge (i, j) is ``u' (dp_j - dp_i)``, u' the unit vector across it; columns are
     x and y of node 0, then of node 1, and so on.
     """
-    toward = directions(positions, edges)
-    n_nodes = len(np.asarray(positions))
-    edges = check_edges(edges, n_nodes)
+    positions = check_positions(positions)
+    edges = check_edges(edges, len(positions))
+    toward = directions_of(positions, edges)
     across = np.column_stack([-np.sin(toward), np.cos(toward)])
     columns = (2 * edges[:, :, None] + [0, 1]).reshape(-1, 4)
-    values = np.concatenate([-across, across], axis=1)
-    m = len(edges)
-    return sp.csr_matrix((values.ravel(), columns.ravel(), 4 * np.arange(m + 1)),
-                         shape=(m, 2 * n_nodes))  # fmt: skip
+    return sparse_rows(np.concatenate([-across, across], axis=1), columns, 2 * len(positions))
 
 
 def parallel_rigidity_rank(positions: ArrayLike, edges: ArrayLike) -> tuple[int, int]:
@@ -113,7 +110,7 @@ def check_frames(positions: ArrayLike, edges: ArrayLike) -> None:
         If the graph is not connected, or not parallel rigid at these positions; the message
         names the components or the missing rank.
     """
-    check_connected(edges, len(np.asarray(positions)))
+    check_connected(edges, len(check_positions(positions)))
     rank, full = parallel_rigidity_rank(positions, edges)
     if rank < full:
         raise ValueError(f"edges must make the network parallel rigid, rank {full}, "
@@ -276,4 +273,5 @@ def freedom(positions: ArrayLike, edges: ArrayLike) -> Freedom:
     null = vectors[:, values < _ZERO * max(1.0, values[-1])]
     turns = np.linalg.matrix_rank(null[3 * n_nodes :], tol=1e-6)
     rank = 6 * n_nodes - null.shape[1]
-    return Freedom(rank, 6 * n_nodes - 7 - rank, int(turns) - 3)
+    # One node alone has no size, and so no scale.
+    return Freedom(rank, max(6 * n_nodes - 7 - rank, 0), int(turns) - 3)

@@ -252,10 +252,11 @@ def from_quaternion(q: ArrayLike) -> FloatArray:
     ValueError
         If the shape is not (..., 4) or a quaternion is zero or not finite.
     """
-    q = check_array("quaternion", q, (4,))
+    q = check_array("q", q, (4,))
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     if (norm < 1e-12).any():
-        raise ValueError("quaternion must not be zero")
+        index = tuple(int(i) for i in np.argwhere(norm[..., 0] < 1e-12)[0])
+        raise ValueError(f"q must not be zero, got {q[index].tolist()} at index {index}")
     w, x, y, z = np.moveaxis(q / norm, -1, 0)
     return np.stack(
         [
@@ -353,7 +354,7 @@ def _cofactors(X: FloatArray) -> FloatArray:
 @checked(Q_hat=(3, 3), Q=(3, 3))
 def error(Q_hat: ArrayLike, Q: ArrayLike) -> FloatArray:
     """Global rotation error ``w`` (..., 3) with ``Q_hat = exp(w) Q``; its norm is the angle."""
-    return log(np.asarray(Q_hat) @ np.swapaxes(np.asarray(Q), -1, -2))
+    return kernel(log)(np.asarray(Q_hat) @ np.swapaxes(np.asarray(Q), -1, -2))
 
 
 @checked(u=(3,), v=(3,))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rbl_gym import rotations
-from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
+from rbl_gym.checks import FloatArray, check_array, check_count, check_number, check_one_of
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.obstacles import check_obstacles
 from rbl_gym.ranging import NOISE_LAWS, LinkModel, NoiseLaw
@@ -121,9 +121,7 @@ class Scene:
         check_one_of("trajectory", self.trajectory, TRAJECTORIES)
         check_one_of("prior", self.prior, ("drawn", "start"))
         for name in ("n_anchors", "steps"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a positive int, got {value!r}")
+            object.__setattr__(self, name, check_count(name, getattr(self, name)))
         shapes: dict[str, tuple[int | str, ...]] = {
             "tags": ("N", 3), "anchors": ("M", 3), "twist": (6,), "start_translation": (3,),
         }  # fmt: skip

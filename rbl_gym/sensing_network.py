@@ -19,7 +19,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from rbl_gym.checks import FloatArray, as_float, check_array, check_finite, check_number
+from rbl_gym.checks import (
+    FloatArray,
+    as_float,
+    check_array,
+    check_count,
+    check_finite,
+    check_number,
+)
 
 __all__ = [
     "SensingNetwork", "directions", "edge_angles", "measure", "proj", "random_network",
@@ -56,13 +63,6 @@ def proj(angle: ArrayLike) -> FloatArray:
     return np.where((angle >= -np.pi) & (angle < np.pi), angle, wrapped)
 
 
-def check_n_nodes(n_nodes: int) -> None:
-    """A ValueError where it is no number of nodes that memory could hold."""
-    whole = isinstance(n_nodes, int | np.integer) and not isinstance(n_nodes, bool)
-    if not whole or not 1 <= n_nodes <= _MOST_NODES:
-        raise ValueError(f"n_nodes must be a positive int, got {n_nodes!r:.80}")
-
-
 def check_edges(edges: ArrayLike, n_nodes: int, name: str = "edges") -> IntArray:
     """`edges` as (m, 2) indices of two different nodes each, under this or another `name`.
 
@@ -74,7 +74,7 @@ def check_edges(edges: ArrayLike, n_nodes: int, name: str = "edges") -> IntArray
     ValueError
         If they are not pairs of whole numbers in [0, n_nodes), or an edge joins a node to itself.
     """
-    check_n_nodes(n_nodes)
+    n_nodes = check_count("n_nodes", n_nodes, most=_MOST_NODES)
     try:
         array = np.asarray(edges)
     except ValueError as error:
@@ -141,7 +141,11 @@ def directions(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
         If the nodes of an edge stand on the same point: there is no bearing.
     """
     positions = check_positions(positions)
-    edges = check_edges(edges, len(positions))
+    return directions_of(positions, check_edges(edges, len(positions)))
+
+
+def directions_of(positions: FloatArray, edges: IntArray) -> FloatArray:
+    """`directions` of checked positions and edges."""
     apart = positions[edges[:, 1]] - positions[edges[:, 0]]
     same = (apart == 0).all(axis=1)
     if same.any():
@@ -160,9 +164,10 @@ def check_edge_angles(y: ArrayLike, edges: IntArray) -> FloatArray:
 
 def true_bearings(positions: ArrayLike, orientations: ArrayLike, edges: ArrayLike) -> FloatArray:
     """Bearings (m, 2) without noise: of j in the frame of i, and of i in the frame of j."""
-    toward = directions(positions, edges)
-    edges = check_edges(edges, len(check_positions(positions)))
-    turned = check_array("orientations", orientations, (len(check_positions(positions)),))
+    positions = check_positions(positions)
+    edges = check_edges(edges, len(positions))
+    toward = directions_of(positions, edges)
+    turned = check_array("orientations", orientations, (len(positions),))
     if turned.ndim != 1:
         raise ValueError(f"orientations must have shape (n,), got {turned.shape}")
     turned = turned[edges]
@@ -226,7 +231,7 @@ def random_network(
     """
     from rbl_gym.network_graphs import components
 
-    check_n_nodes(n_nodes)
+    n_nodes = check_count("n_nodes", n_nodes, most=_MOST_NODES)
     mean_degree = check_number("mean_degree", mean_degree, low=0.0)
     positions = rng.uniform(0.0, math.sqrt(n_nodes), (n_nodes, 2))
     edges = unit_disk_edges(positions, math.sqrt(mean_degree / np.pi))

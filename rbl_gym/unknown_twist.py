@@ -20,9 +20,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, ranging, rotations
-from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
+from rbl_gym.checks import (
+    Axes,
+    FloatArray,
+    check_array,
+    check_axes,
+    check_count,
+    check_generator,
+    check_number,
+    check_one_of,
+)
 from rbl_gym.components import exp_and_left_jacobian, first, last, product
-from rbl_gym.motion import ProcessNoise
+from rbl_gym.motion import ProcessNoise, check_process, six
 
 __all__ = [
     "FRAMES", "TwistSensor", "WanderingPath", "WanderingTwist", "posterior_crb_step",
@@ -30,7 +39,6 @@ __all__ = [
 ]  # fmt: skip
 
 FRAMES = ("world", "body")
-Axes = float | tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -60,22 +68,15 @@ class WanderingTwist:
 
     def __post_init__(self) -> None:
         for name in ("turn_rate_rad_s", "speed_m_s", "turn_acceleration", "acceleration"):
-            value = check_array(name, getattr(self, name), ())
-            if value.shape not in ((), (3,)):
-                raise ValueError(f"{name} must be one number or three, got shape {value.shape}")
-            if (value < 0).any():
-                raise ValueError(f"{name} must not be negative, got {value.tolist()}")
-            # Lists come out of JSON; tuples keep the configuration hashable.
-            value = float(value) if value.ndim == 0 else tuple(value.tolist())
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, check_axes(name, getattr(self, name)))
 
     def prior_std(self) -> FloatArray:
         """Standard deviations (6,) of the first twist."""
-        return _six(self.turn_rate_rad_s, self.speed_m_s)
+        return six(self.turn_rate_rad_s, self.speed_m_s)
 
     def std(self) -> FloatArray:
         """Standard deviations (6,) of the twist's change after 1 s."""
-        return _six(self.turn_acceleration, self.acceleration)
+        return six(self.turn_acceleration, self.acceleration)
 
 
 @dataclass(frozen=True)
@@ -164,12 +165,18 @@ def simulate(
         Seconds of a step, and how many.
     rng
         Source of all randomness.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes or values, and on laws or generators that are none.
     """
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     dt = check_number("dt", dt, low=1e-12)
-    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-        raise ValueError(f"steps must be a positive int, got {steps!r:.80}")
+    steps = check_count("steps", steps)
+    _check_laws(law, process)
+    check_generator("rng", rng)
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
     twists = np.empty((steps + 1, *batch, 6))
     twists[0] = law.prior_std() * rng.standard_normal((*batch, 6))
@@ -289,13 +296,18 @@ def posterior_crb_step(
     J = check_array("J", J, (12, 12))
     twist = check_array("twist", twist, (6,))
     dt = check_number("dt", dt, low=0.0)
+    _check_laws(law, process)
+    if not isinstance(sensor, TwistSensor | None):
+        raise ValueError(f"sensor must be a TwistSensor or None, got {sensor!r:.80}")
     if sensor is not None:
         J = J + sensor.information(twist)
     try:
         P = bounds.symmetric(np.linalg.inv(J))
         predicted = np.linalg.inv(predict_covariance(P, twist, dt, process, law))
     except np.linalg.LinAlgError as error:
-        raise ValueError("J must be information about all 12 states, is singular") from error
+        raise ValueError(
+            f"J must be information about all 12 states, got a singular one {J!r:.80}"
+        ) from error
     seen = bounds.range_information(anchors, tags, rotation, translation, noise, links)
     batch = np.broadcast_shapes(predicted.shape[:-2], seen.shape[:-2])
     result = np.broadcast_to(bounds.symmetric(predicted), (*batch, 12, 12)).copy()
@@ -303,8 +315,10 @@ def posterior_crb_step(
     return result
 
 
-def _six(rotation: Axes, translation: Axes) -> FloatArray:
-    return np.concatenate([np.broadcast_to(rotation, 3), np.broadcast_to(translation, 3)])
+def _check_laws(law: WanderingTwist, process: ProcessNoise) -> None:
+    if not isinstance(law, WanderingTwist):
+        raise ValueError(f"law must be a WanderingTwist, got {law!r:.80}")
+    check_process(process)
 
 
 def _turned(rotation: FloatArray, twist: FloatArray) -> FloatArray:

@@ -273,6 +273,21 @@ def test_biases_are_forgotten_as_their_law_says(twist):
     np.testing.assert_allclose(own, law.covariance(12), atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"law": 0.1}, "law must be a LinkBias, got 0.1"),
+        ({"times": [1.0, 0.0]}, r"times must be \(K,\) and not decrease, got array"),
+        ({"links": 2.5}, "links must be a positive int, got 2.5"),
+        ({"rng": 7}, "rng must be a numpy.random.Generator, got 7"),
+    ],
+)
+def test_biases_that_cannot_be_drawn(changes, message):
+    good = {"law": LinkBias(), "times": [0.0, 1.0], "links": 3, "rng": np.random.default_rng(0)}
+    with pytest.raises(ValueError, match=message):
+        link_bias.simulate(**{**good, **changes})
+
+
 def test_drawn_biases_have_their_laws_moments():
     law = LinkBias(0.05, 2.0, 0.1)
     drawn = link_bias.simulate(law, [0.0, 1.0, 1.0], 3, np.random.default_rng(7), (20_000,))

@@ -77,7 +77,7 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
         ("kf", {"noise": 0.1}, "noise must have variance and squared_range_variance, got 0.1"),
         ("kf", {"process": None}, "process must have covariance and std"),
         ("iekf", {"tags": np.zeros((5, 2))}, r"tags must have shape \(..., N, 3\), got \(5, 2\)"),
-        ("iekf", {"iterations": 0}, r"iterations must be a finite number in \[1, inf\], got 0"),
+        ("iekf", {"iterations": 0}, "iterations must be a positive int, got 0"),
         ("et-kf", {"threshold": -1}, "threshold must be a finite number"),
         ("kf", {"engine": "numpy"}, "engine must be one of 'batched', 'filterpy', got 'numpy'"),
         ("kf", {"weights": [1.0, -1.0]}, "weights must not be negative, got -1.0"),
@@ -86,3 +86,16 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
 def test_wrong_names_and_options_are_named(name, changes, message):
     with pytest.raises(ValueError, match=message):
         estimators.make(name, **{**LAWS, **changes})
+
+
+@pytest.mark.parametrize("name", estimators.names())
+def test_a_belief_shares_no_memory_with_its_state(name):
+    filter = estimators.make(
+        name,
+        tags=bodies.octahedron(),
+        noise=ranging.RangeNoise(0.1),
+        process=motion.ProcessNoise(0.1, 0.1),
+    )
+    state = filter.initial(np.eye(3), np.zeros(3), 0.1 * np.eye(6))
+    for field in filter.belief(state):
+        assert not any(np.shares_memory(field, array) for array in state)

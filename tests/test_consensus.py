@@ -156,7 +156,9 @@ def test_an_edge_that_comes_twice_was_measured_twice():
         ({"cycles": "all"}, "cycles must be one of"),
         ({"cycles": np.ones((1, 2))}, "a column per edge"),
         ({"order": "random"}, "order must be one of"),
-        ({"order": "asynchronous"}, "rng must be a Generator"),
+        ({"order": "asynchronous"}, r"rng must be a numpy\.random\.Generator, got None"),
+        ({"max_steps": -1}, "max_steps must be an int of at least 0, got -1"),
+        ({"max_steps": 2.5}, r"max_steps must be an int of at least 0, got 2\.5"),
         ({"loss": 1.5}, "loss must be"),
         ({"tol": -1.0}, "tol must be"),
         ({"branch": [0.5]}, "branch must be 1 whole numbers"),
@@ -167,6 +169,19 @@ def test_wrong_arguments_are_named(change, message):
     arguments = {"edges": [[0, 1], [1, 2], [0, 2]], "y": [0.1, 0.2, 0.3], "n_nodes": 3, **change}
     with pytest.raises(ValueError, match=message):
         cycle_iteration(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("y", "branch", "message"),
+    [
+        ([0.1, 0.2, 0.3], [0.5], "branch must be 1 whole numbers"),
+        ([0.1, 0.2, 0.3], [0, 1], "branch must have shape"),
+        (np.zeros((2, 3)), None, r"y must have shape \(3,\), got \(2, 3\)"),
+    ],
+)
+def test_wrong_arguments_of_the_projection_are_named(y, branch, message):
+    with pytest.raises(ValueError, match=message):
+        cycle_projection(np.array([[1.0, 1.0, -1.0]]), y, branch)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("trials", [200, pytest.param(1000, marks=pytest.mark.long)])

@@ -138,6 +138,13 @@ def test_environments_own_reward_is_switched_off(monkeypatch):
     assert len(rollout(wrapped(short("uwb_room")))) == 13
 
 
+def test_a_wrapper_that_is_refused_leaves_the_environment_its_reward():
+    env = gym.make("rbl_gym:RBL/Tracking-v0")
+    with pytest.raises(ValueError, match="filter must be one of"):
+        EstimatePose(env, "no-such-filter")
+    assert env.unwrapped.reward_mode == "bound"  # pyright: ignore[reportAttributeAccessIssue]
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_iekf_is_consistent(name):
     """The mean NEES is 6 within 4 standard deviations of the mean over independent episodes.

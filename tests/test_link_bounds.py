@@ -259,10 +259,10 @@ def test_everything_broadcasts():
          "rng must be a numpy.random.Generator, got 7"),
         (lambda w: link_bounds.realised_crb(
             *w, NOISE, ranging.LinkModel(), np.random.default_rng(1), 0),
-         "draws must be a positive int up to 1000000, got 0"),
+         "draws must be an int from 1 to 1000000, got 0"),
         (lambda w: link_bounds.nlos_efficiency(1.1, 5, 0.1), "probability must be a finite number"),
         (lambda w: link_bounds.nlos_efficiency(0.1, 5, 0.0), "std_m must be positive, got 0.0"),
-        (lambda w: link_bounds.with_biases(np.eye(6), 0.1, 0), "n_biases must be a positive int"),
+        (lambda w: link_bounds.with_biases(np.eye(6), 0.1, 0), "n_biases must be an int from 1 to"),
         (lambda w: link_bounds.marginal_information(np.eye(6)), r"joint must have shape \(..., 6"),
         (lambda w: link_bounds.posterior_bias_step(
             np.eye(8), *w, NOISE, np.zeros(6), 0.1, motion.ProcessNoise(0.1, 0.1)),

@@ -401,12 +401,16 @@ def test_recorded_track_is_driven_through_its_resampled_poses(seed, dt):
 I, O, RNG = np.eye(3), np.zeros(3), np.random.default_rng(0)  # noqa: E741
 TIMES = [0.0, 1.0, 2.0]
 BAD_CALLS = {
-    "steps zero": (motion.constant_twist, (I, O, TWIST, 0), "steps must be a positive int, got 0"),
-    "steps half": (motion.constant_twist, (I, O, TWIST, 2.5), "steps must be a positive int"),
-    "steps nan": (motion.constant_twist, (I, O, TWIST, np.nan), "steps must be a positive int"),
+    "steps zero": (motion.constant_twist, (I, O, TWIST, 0), "steps must be an int from 1 to"),
+    "steps half": (motion.constant_twist, (I, O, TWIST, 2.5), "steps must be an int from 1 to"),
+    "steps nan": (motion.constant_twist, (I, O, TWIST, np.nan), "steps must be an int from 1 to"),
+    "no step": (
+        motion.simulate, (motion.constant_twist(I, O, TWIST, 3), 0.0, motion.ProcessNoise(0.1)),
+        "dt must be a finite number in",
+    ),
     "twist shape": (motion.constant_twist, (I, O, O, 3), "twist must have shape (..., 6), got"),
     "not a rotation": (motion.constant_twist, (2 * I, O, TWIST, 3), "rotation must be orthogonal"),
-    "hold": (motion.random_twist, (I, O, 1, 1, 5, RNG, 0), "hold must be a positive int, got 0"),
+    "hold": (motion.random_twist, (I, O, 1, 1, 5, RNG, 0), "hold must be an int from 1 to"),
     "speed nan": (motion.random_twist, (I, O, np.nan, 1, 5, RNG), "speed_m_s must be"),
     "turn nan": (motion.random_twist, (I, O, 1, np.nan, 5, RNG), "turn_rate_rad_s must be"),
     "one point": (motion.waypoints, (I, [O], 1, 1, 5), "points must hold at least 2 way-points"),

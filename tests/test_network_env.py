@@ -195,7 +195,7 @@ def test_part_of_the_network_is_estimated_and_the_rest_keeps_what_it_had():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"n_nodes": 1}, "n_nodes must be an int of at least 2, got 1"),
+        ({"n_nodes": 1}, "n_nodes must be an int from 2 to 10000, got 1"),
         ({"n_nodes": 4.0}, "n_nodes must be an int"),
         ({"steps": 0}, "steps must be"),
         ({"radius_m": np.nan}, "radius_m must be a finite number"),

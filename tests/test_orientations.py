@@ -214,6 +214,16 @@ def test_one_node_and_a_tree_are_certified():
     assert found.cost == pytest.approx(0, abs=1e-20)
 
 
+def test_a_start_in_another_frame_is_turned_to_that_of_node_0():
+    edges, y = [[0, 1], [1, 2], [0, 2]], [0.1, 0.2, 0.33]
+    found = chordal_optimum(edges, y, 3, start=[1.0, 1.1, 1.3])
+    np.testing.assert_allclose(found.theta, chordal_optimum(edges, y, 3).theta, atol=1e-9)
+    with pytest.raises(ValueError, match=r"start must have shape \(\.\.\., 3\), got \(2,\)"):
+        chordal_optimum(edges, y, 3, start=[1.0, 1.1])
+    with pytest.raises(ValueError, match=r"start must have shape \(3,\), got \(1, 3\)"):
+        chordal_optimum(edges, y, 3, start=np.zeros((1, 3)))
+
+
 @every_method
 @pytest.mark.parametrize(
     ("edges", "y", "message"),

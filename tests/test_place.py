@@ -241,7 +241,7 @@ def test_coplanar_anchors_are_warned_of():
         (["--anchors", "2"], "the number of anchors must be 3 to 64, got 2"),
         (["--anchors", "2..4"], "the number of anchors must be 3 to 64, got 2"),
         (["--region", "0,0,0,20,1,1"], "region must lie inside the room"),
-        (["--racks", "9"], "racks must be a finite number in [0, 2]"),
+        (["--racks", "9"], "racks must be an int from 0 to 2"),
         (["--scene", "nowhere"], "scene must be one of"),
         (["--scene", "nowhere.toml"], "rbl-gym place: nowhere.toml: No such file or directory"),
     ],

@@ -416,17 +416,24 @@ def test_legal_is_what_the_region_says(kind):
 # --- what is refused --------------------------------------------------------------------------
 
 
+def test_what_a_task_keeps_cannot_be_written_to():
+    task = placement.task("uwb_room", 4)
+    for array in (*task.poses, task.prior_information):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("attic",), "scene must be one of"),
         (("camsap2013",), "scene must have a volume with an extent, 'camsap2013' has none"),
-        (("uwb_room", 0), "n_anchors must be a finite number in [1, inf], got 0"),
-        (("uwb_room", 2.0), "n_anchors must be an int, got 2.0"),
-        (("uwb_room", True), "n_anchors must be an int, got True"),
-        (("uwb_room", 4, 3), "racks must be a finite number in [0, 2], got 3"),
-        (("uwb_room", 4, -1), "racks must be a finite number in [0, 2], got -1"),
-        (("uwb_room", None, "two"), "racks must be an int, got 'two'"),
+        (("uwb_room", 0), "n_anchors must be a positive int, got 0"),
+        (("uwb_room", 2.0), "n_anchors must be a positive int, got 2.0"),
+        (("uwb_room", True), "n_anchors must be a positive int, got True"),
+        (("uwb_room", 4, 3), "racks must be an int from 0 to 2, got 3"),
+        (("uwb_room", 4, -1), "racks must be an int from 0 to 2, got -1"),
+        (("uwb_room", None, "two"), "racks must be an int from 0 to 2, got 'two'"),
         (("auv_buoys", 4, 1), "racks must be 0 in a scene without walls, got 1 in 'auv_buoys'"),
     ],
 )

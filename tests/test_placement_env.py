@@ -337,9 +337,9 @@ def test_contexts_are_those_in_info():
         ({"racks": 1}, "racks must be 0 in a scene without walls"),
         ({"sight": True}, "sight must be False without racks, which alone block it, got racks=0"),
         ({"sight": 1}, "sight must be True or False, got 1"),
-        ({"racks": 1.5}, "racks must be an int, got 1.5"),
+        ({"racks": 1.5}, "racks must be an int from 0 to 2, got 1.5"),
         ({"n_anchors": 0}, "n_anchors must be"),
-        ({"n_anchors": "four"}, "n_anchors must be an int, got 'four'"),
+        ({"n_anchors": "four"}, "n_anchors must be a positive int, got 'four'"),
         ({"render_mode": "human"}, "render_mode must be None"),
     ],
 )
@@ -352,8 +352,8 @@ def test_bad_arguments_are_named(kind, arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be a positive int, got 0"),
-        ({"num_envs": 2.0}, "num_envs must be a positive int, got 2.0"),
+        ({"num_envs": 0}, "num_envs must be an int from 1 to 100000000, got 0"),
+        ({"num_envs": 2.0}, "num_envs must be an int from 1 to 100000000, got 2.0"),
         ({"autoreset_mode": "Never"}, "autoreset_mode must be one of 'NextStep'"),
         ({"max_episode_steps": 0}, "max_episode_steps must be"),
     ],

@@ -43,6 +43,59 @@ def test_links_and_ranges_of_other_batches():
         filter.update(state, ranges, ANCHORS, np.ones((3, 4, 5), dtype=bool))
 
 
+@pytest.mark.parametrize("name", estimators.names())
+def test_batches_that_do_not_fit(name):
+    filter = estimators.make(
+        name, tags=TAGS, noise=ranging.RangeNoise(0.1), process=motion.ProcessNoise(0.1, 0.1)
+    )
+    many = np.tile(np.eye(3), (3, 1, 1))
+    state = filter.initial(many, PLACE[2], 0.1 * np.eye(6))
+    ranges = ranging.distances(ANCHORS, ranging.tag_positions(*PLACE[1:], TAGS))
+    with pytest.raises(
+        ValueError, match=r"of state and ranges must broadcast, got \(3,\) and \(2,"
+    ):
+        filter.update(state, np.tile(ranges, (2, 1, 1)), ANCHORS)
+    with pytest.raises(ValueError, match=r"ranges and anchors must broadcast, got \(3,\) and \(2,"):
+        filter.update(state, np.tile(ranges, (3, 1, 1)), np.tile(ANCHORS, (2, 1, 1)))
+
+
+def test_a_bank_is_of_one_body():
+    laws = {"noise": ranging.RangeNoise(0.1), "process": motion.ProcessNoise(0.1, 0.1)}
+    with pytest.raises(ValueError, match=r"tags must have shape \(N, 3\), got \(2, 5, 3\)"):
+        estimators.make("iekf-bank", tags=np.tile(TAGS, (2, 1, 1)), **laws)
+
+
+@pytest.mark.parametrize("spread", [0.1, 100.0])
+@pytest.mark.parametrize("name", [n for n in estimators.names() if n != "iekf-bank"])
+def test_bodies_with_tags_of_their_own(name, spread):
+    anchors = np.vstack([ANCHORS, [4.0, 4.0, 6.0]])
+    tags = np.array([1.0, 1.5, 2.0])[:, None, None] * TAGS
+    ranges = ranging.distances(anchors, ranging.tag_positions(*PLACE[1:], tags)) + 0.05
+    found = []
+    for which in (slice(None), 0, 1, 2):
+        filter = estimators.make(
+            name,
+            tags=tags[which],
+            noise=ranging.RangeNoise(0.1),
+            process=motion.ProcessNoise(0.1, 0.1),
+        )
+        batch = ranges[which].shape[:-2]
+        state = filter.initial(
+            np.broadcast_to(np.eye(3), (*batch, 3, 3)), PLACE[2] + 0.1, spread * np.eye(6)
+        )
+        found.append(filter.belief(filter.update(state, ranges[which], anchors)))
+    for field in range(3):
+        np.testing.assert_allclose(
+            found[0][field], [each[field] for each in found[1:]], rtol=1e-6, atol=1e-6
+        )
+
+
+def test_a_filter_takes_tags_as_a_list():
+    laws = ranging.RangeNoise(0.1), motion.ProcessNoise(0.1, 0.1)
+    for kind in (estimators.IteratedEkf, estimators.KalmanFamily):
+        assert isinstance(kind(TAGS.tolist(), *laws).tags, np.ndarray)
+
+
 BOUNDS = {
     "raw": bounds.range_information,
     "uncertain tags": lambda *a: bounds.range_information(*a, tag_std_m=0.01),
@@ -51,15 +104,15 @@ BOUNDS = {
 }
 
 
+@pytest.mark.parametrize("noise", [ranging.RangeNoise(0.1), ranging.SquaredRangeNoise(0.1)])
 @pytest.mark.parametrize("name", BOUNDS)
-def test_an_anchor_on_a_tag(name):
+def test_an_anchor_on_a_tag(name, noise):
     # Coordinates without rounding, so that the distance is exactly zero.
     tags = bodies.octahedron(0.5)
-    body = tags, np.eye(3), -tags[0]
-    on_tag = np.vstack([ANCHORS, np.zeros(3)])
-    noise = ranging.RangeNoise(0.1)
+    body = tags, np.eye(3), -tags[1]
+    on_tag = np.vstack([ANCHORS + 0.1, np.zeros(3)])
     links = np.ones((5, 6), dtype=bool)
-    links[4, 0] = False
+    links[4, 1] = False
     # A range without a gradient tells nothing: what is left is what the others tell.
     told = BOUNDS[name](on_tag, *body, noise)
     assert np.isfinite(told).all()
@@ -77,7 +130,9 @@ def test_laws_without_a_variance(name):
 
 def test_biases_of_an_anchor_on_a_tag():
     tags = bodies.octahedron(0.5)
-    with pytest.raises(ValueError, match="an anchor stands on a tag, where a range has no deriv"):
+    with pytest.raises(
+        ValueError, match="anchors must not stand on a tag, where a range has no deriv"
+    ):
         link_bounds.bias_information(
             np.zeros((1, 3)), tags, np.eye(3), -tags[0], ranging.RangeNoise(0.1)
         )
@@ -111,6 +166,11 @@ def test_noise_of_every_link_keeps_ranges_positive():
     law = ranging.LinkNoise(np.array([[0.1, 5.0]]))
     drawn = law.sample(np.array([[1.0, 1.0]]), np.array([[1.0, -1.0]]))
     np.testing.assert_allclose(drawn, [[1.1, 0.0]])
+
+
+def test_noise_of_every_link_takes_a_list():
+    law = ranging.LinkNoise([[0.1, 0.2]])
+    np.testing.assert_allclose(law.variance(np.ones((3, 1, 2))), [[[0.01, 0.04]]] * 3)
 
 
 def test_directions_of_length_zero():

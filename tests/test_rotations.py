@@ -167,9 +167,9 @@ def test_from_quaternion_undoes_quaternion_at_any_length_and_sign(seed, length):
 @pytest.mark.parametrize(
     ("q", "message"),
     [
-        (np.zeros((2, 4)), "quaternion must not be zero"),
-        (np.ones(3), "quaternion must have shape (..., 4), got (3,)"),
-        ([1, 0, np.nan, 0], "quaternion must be finite, got nan at index (2,)"),
+        (np.zeros((2, 4)), "q must not be zero, got [0.0, 0.0, 0.0, 0.0] at index (0,)"),
+        (np.ones(3), "q must have shape (..., 4), got (3,)"),
+        ([1, 0, np.nan, 0], "q must be finite, got nan at index (2,)"),
     ],
 )
 def test_bad_quaternion_is_refused(q, message):

@@ -259,6 +259,7 @@ def test_what_stays_free_in_space():
     assert [free(n, [[k, k + 1] for k in range(n - 1)]) for n in (2, 3, 4)] == [
         (1, 1), (3, 2), (5, 3),
     ]  # fmt: skip
+    assert free(1, []) == (0, 0)
     assert free(3, [[0, 1], [1, 2], [0, 2]]) == (0, 0)
     # Rings have 4 n measurements for 6 n - 7 unknowns.
     for n in (4, 5, 6):

@@ -421,6 +421,18 @@ def test_craft_move_at_their_limit_at_most_and_stay_on_the_water():
 # --- consistency ------------------------------------------------------------------------------
 
 
+def test_a_state_that_was_handed_out_outlives_its_episode():
+    envs = MobileAnchorsVectorEnv(num_envs=3, autoreset_mode="Disabled")
+    envs.reset(seed=1)
+    held = envs.state
+    before = [field.copy() for field in held]
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    for field, old in zip(held, before, strict=True):
+        np.testing.assert_array_equal(field, old)
+    assert not np.array_equal(envs.state.translation[0], before[1][0])
+    np.testing.assert_array_equal(envs.state.translation[1], before[1][1])
+
+
 @pytest.mark.parametrize("kind", ["easy", "hard", "selection"])
 @pytest.mark.parametrize("worlds", [256, pytest.param(1024, marks=pytest.mark.long)])
 def test_nees_is_six(kind, worlds):
@@ -504,7 +516,7 @@ def test_bad_arguments_are_named(kind, arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be a positive int, got 0"),
+        ({"num_envs": 0}, "num_envs must be an int from 1 to 100000000, got 0"),
         ({"max_episode_steps": 0}, "max_episode_steps must be a positive int, got 0"),
         ({"max_episode_steps": 2.5}, "max_episode_steps must be a positive int, got 2.5"),
         ({"max_episode_steps": "ten"}, "max_episode_steps must be a positive int, got 'ten'"),

@@ -100,7 +100,7 @@ def test_twins_in_mid_episode_go_on_alike():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be a positive int, got 0"),
+        ({"num_envs": 0}, "num_envs must be an int from 1 to 100000000, got 0"),
         ({"scene": "attic"}, "scene must be one of"),
         ({"reward": "gold"}, "reward must be one of 'bound', 'none', got 'gold'"),
         ({"autoreset_mode": "Never"}, "autoreset_mode must be one of 'NextStep'"),

@@ -188,6 +188,23 @@ def test_drawn_trajectories_have_the_laws_moments():
             "steps must be a positive int",
         ),
         (
+            lambda: ut.simulate(
+                np.eye(3), np.zeros(3), PROCESS, PROCESS, 0.1, 1, np.random.default_rng(0)  # pyright: ignore[reportArgumentType]
+            ),
+            "law must be a WanderingTwist, got ProcessNoise",
+        ),
+        (
+            lambda: ut.simulate(np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 1, 0),  # pyright: ignore[reportArgumentType]
+            "rng must be a numpy.random.Generator, got 0",
+        ),
+        (
+            lambda: ut.posterior_crb_step(
+                np.eye(12), np.eye(3), np.eye(3), np.eye(3), np.ones(3), NOISE,
+                np.zeros(6), 0.1, LAW, LAW,  # pyright: ignore[reportArgumentType]
+            ),
+            "process must be a motion.ProcessNoise, got WanderingTwist",
+        ),
+        (
             lambda: ut.posterior_crb_step(
                 np.zeros((12, 12)), np.eye(3), np.eye(3), np.eye(3), np.ones(3), NOISE,
                 np.zeros(6), 0.1, PROCESS, LAW,

@@ -85,6 +85,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.observation_space = observation_space(
             self._kind, env.observation_space, self._scene, self._filter
         )
+        switch_off_reward(env)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -123,7 +124,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 def scene_of(env: Any) -> Scene:
-    """The scene of an environment, its own reward switched off; or a ValueError."""
+    """The scene of an environment, or a ValueError."""
     unwrapped = env.unwrapped
     scene = getattr(unwrapped, "scene", None)
     if not isinstance(scene, Scene):
@@ -131,9 +132,13 @@ def scene_of(env: Any) -> Scene:
             "env must have a rbl_gym Scene as its scene, as RBL/Tracking-v0 has and tasks with a "
             f"filter of their own or without one have not, got {unwrapped!r}"
         )
-    if hasattr(unwrapped, "reward_mode"):
-        unwrapped.reward_mode = "none"
     return scene
+
+
+def switch_off_reward(env: Any) -> None:
+    """No reward of the environment's own, which the wrapper's replaces."""
+    if hasattr(env.unwrapped, "reward_mode"):
+        env.unwrapped.reward_mode = "none"
 
 
 def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:

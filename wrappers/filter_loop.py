@@ -55,9 +55,7 @@ class FilterLoop(BatchEnv):
         prior = self.filter.initial(
             *(start[f"prior_{name}"] for name in ("rotation", "translation", "covariance"))
         )
-        for field, new in zip(self.state, prior, strict=True):
-            field[chosen] = new
-        self._score_m = None
+        self._put(chosen, prior)
 
     @property
     def at(self) -> simulation.Epoch:

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym import rendering, scenes, simulation
-from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
 from rbl_gym.envs.batch import ScalarEnv
 from rbl_gym.scene import Scene
 from rbl_gym.wrappers.filter_loop import FilterLoop
@@ -181,9 +181,7 @@ class AnchorSelectionVectorEnv(FilterLoop):
     ) -> None:
         world = _world(scene, steps=50)
         self.mode = check_one_of("mode", mode, SELECTIONS)
-        if isinstance(k, bool) or not isinstance(k, int) or not 1 <= k <= world.n_anchors:
-            raise ValueError(f"k must be an int from 1 to {world.n_anchors}, got {k!r}")
-        self.k = k
+        self.k = check_count("k", k, most=world.n_anchors)
         self.price = check_number("price", price, low=0.0)
         self.single_action_space = (
             spaces.Box(-1.0, 1.0, (world.n_anchors,), np.float32)

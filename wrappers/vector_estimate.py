@@ -22,6 +22,7 @@ from rbl_gym.wrappers.estimate import (
     observation_space,
     present,
     scene_of,
+    switch_off_reward,
     update,
 )
 
@@ -68,6 +69,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         )
         self.single_observation_space = single
         self.observation_space = batch_space(single, env.num_envs)
+        switch_off_reward(env)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -83,7 +85,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         observation, _, terminated, truncated, info = self.env.step(actions)
         fresh = info.get("_prior_rotation", np.zeros(self.num_envs, dtype=np.bool_))
         same_step = self.env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-        last = truncated if same_step else np.zeros_like(fresh)
+        last = terminated | truncated if same_step else np.zeros_like(fresh)
         moved = ~fresh | last
         if moved.any():
             self._advance(observation, info, moved, last)

@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from rbl_gym import rendering
-from rbl_gym.checks import BoolArray, FloatArray, as_array, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, as_array, check_count, check_one_of
 
 Observation = Any
 # More than any machine holds.
@@ -53,10 +53,10 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         max_episode_steps: int | None,
         autoreset_mode: str | AutoresetMode,
     ) -> None:
-        check_count("num_envs", num_envs, most=MOST_ENVS)
+        num_envs = check_count("num_envs", num_envs, most=MOST_ENVS)
         rendering.check_mode(render_mode)
         if max_episode_steps is not None:
-            check_count("max_episode_steps", max_episode_steps)
+            max_episode_steps = check_count("max_episode_steps", max_episode_steps)
         modes = [mode.value for mode in AutoresetMode]
         if not isinstance(autoreset_mode, AutoresetMode):
             autoreset_mode = AutoresetMode(check_one_of("autoreset_mode", autoreset_mode, modes))
@@ -222,16 +222,6 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         if not legal.all():
             raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
         return array.astype(self.action_space.dtype)
-
-
-def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
-    """A whole number from `least` to `most`, or a ValueError that names it."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        wanted = "a positive int" if least == 1 else f"an int of at least {least}"
-        raise ValueError(f"{name} must be {wanted}, got {value!r:.80}")
-    if most is not None and value > most:
-        raise ValueError(f"{name} must be at most {most}, got {value!r:.80}")
-    return value
 
 
 def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:

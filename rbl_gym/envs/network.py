@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
-from rbl_gym.envs.batch import BatchEnv, ScalarEnv, check_count
+from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
+from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.network_bounds import linked_covariance
 from rbl_gym.network_graphs import components
 from rbl_gym.rendering import network as rendering
@@ -50,8 +50,8 @@ class PlanarNetworkVectorEnv(BatchEnv):
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        check_count("steps", steps)
-        self.n_nodes = check_count("n_nodes", n_nodes, least=2, most=MOST_NODES)
+        steps = check_count("steps", steps)
+        self.n_nodes = n_nodes = check_count("n_nodes", n_nodes, least=2, most=MOST_NODES)
         self.side_m = check_number("side_m", side_m, low=1e-6)
         self.radius_m = check_number("radius_m", radius_m, low=0.0)
         self.blind_m = check_number("blind_m", blind_m, low=1e-9)
