@@ -41,6 +41,8 @@ __all__ = [
 
 # Anchors of a task where nothing else is said: the scenes' own, and one fewer beside racks.
 MAX_RACKS = 2
+# More anchors or poses than any machine scores.
+_MOST_PLACES = 10**6
 # Rotation of the prior that regularises the bound.
 _PRIOR_ROTATION_RAD = math.radians(60)
 # The poses of a task are the same for ever, so that scores can be compared.
@@ -98,7 +100,7 @@ class PlacementTask:
         if not isinstance(self.scene, Scene):
             raise ValueError(f"scene must be a Scene, got {self.scene!r:.80}")
         for name, least, most in (
-            ("n_anchors", 1, None), ("racks", 0, MAX_RACKS), ("n_poses", 1, None),
+            ("n_anchors", 1, _MOST_PLACES), ("racks", 0, MAX_RACKS), ("n_poses", 1, _MOST_PLACES),
         ):  # fmt: skip
             value = check_count(name, getattr(self, name), least=least, most=most)
             object.__setattr__(self, name, value)

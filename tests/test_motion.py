@@ -439,5 +439,7 @@ def test_bad_call_is_refused(case):
         function(*arguments)
 
 
-def test_a_whole_float_counts_as_steps():
-    assert motion.orbit(np.zeros(3), 1.0, 1.0, 0.1, 5.0).twists.shape == (5, 6)  # type: ignore[arg-type]
+def test_numbers_of_steps_are_whole():
+    assert motion.orbit(np.zeros(3), 1.0, 1.0, 0.1, np.int64(5)).twists.shape == (5, 6)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"steps must be an int from 1 to .*, got 5\.0"):
+        motion.orbit(np.zeros(3), 1.0, 1.0, 0.1, 5.0)  # pyright: ignore[reportArgumentType]

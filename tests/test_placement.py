@@ -428,9 +428,9 @@ def test_what_a_task_keeps_cannot_be_written_to():
     [
         (("attic",), "scene must be one of"),
         (("camsap2013",), "scene must have a volume with an extent, 'camsap2013' has none"),
-        (("uwb_room", 0), "n_anchors must be a positive int, got 0"),
-        (("uwb_room", 2.0), "n_anchors must be a positive int, got 2.0"),
-        (("uwb_room", True), "n_anchors must be a positive int, got True"),
+        (("uwb_room", 0), "n_anchors must be an int from 1 to 1000000, got 0"),
+        (("uwb_room", 2.0), "n_anchors must be an int from 1 to 1000000, got 2.0"),
+        (("uwb_room", True), "n_anchors must be an int from 1 to 1000000, got True"),
         (("uwb_room", 4, 3), "racks must be an int from 0 to 2, got 3"),
         (("uwb_room", 4, -1), "racks must be an int from 0 to 2, got -1"),
         (("uwb_room", None, "two"), "racks must be an int from 0 to 2, got 'two'"),

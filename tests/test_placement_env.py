@@ -339,7 +339,7 @@ def test_contexts_are_those_in_info():
         ({"sight": 1}, "sight must be True or False, got 1"),
         ({"racks": 1.5}, "racks must be an int from 0 to 2, got 1.5"),
         ({"n_anchors": 0}, "n_anchors must be"),
-        ({"n_anchors": "four"}, "n_anchors must be a positive int, got 'four'"),
+        ({"n_anchors": "four"}, "n_anchors must be an int from 1 to 1000000, got 'four'"),
         ({"render_mode": "human"}, "render_mode must be None"),
     ],
 )

@@ -249,4 +249,5 @@ class BaseStationEnv(ScalarEnv):
 
     @reward_mode.setter
     def reward_mode(self, mode: str) -> None:
+        """Set the mode of the rewards to come."""
         self._batch.reward_mode = mode
