@@ -100,7 +100,7 @@ BOUNDS = {
     "raw": bounds.range_information,
     "uncertain tags": lambda *a: bounds.range_information(*a, tag_std_m=0.01),
     "squared": lambda *a: bounds.range_information(*a, model="squared"),
-    "lost links": lambda *a: link_bounds.expected_information(*a, ranging.LinkModel()),
+    "lost links": lambda *a: link_bounds.expected_information(*a, link_model=ranging.LinkModel()),
 }
 
 

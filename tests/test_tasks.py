@@ -120,7 +120,8 @@ def test_seeds_decide_and_episodes_differ(kind):
 def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
     env_id, arguments = WORLDS[kind]
     steps = 100 if env_id == MOBILE else 50
-    assert gym.make(env_id, **arguments).unwrapped._batch.scene.steps == steps
+    world: Any = gym.make(env_id, **arguments).unwrapped
+    assert world._batch.scene.steps == steps
     if kind not in ("easy", "top 3"):
         steps, arguments = 8, short(kind, 8)[2]
     env = gym.make(env_id, **arguments).unwrapped

@@ -155,7 +155,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
         return self._mirrored[which]
 
     def _observe(self) -> np.ndarray:
-        parts = [self._features]
+        parts: list[np.ndarray] = [self._features]
         if self.mode == "sequential":
             parts.append(self._actions.reshape(self.num_envs, -1))
         if self.sight:
