@@ -56,11 +56,10 @@ class RlTask:
         )
 
 
-def _mobile(steps: int, **arguments: Any) -> RlTask:
-    # Many worlds for few steps each: a step of the filter costs a world a third of what it does
-    # with 64 of them.
+def _mobile(steps: int, rollout: int, **arguments: Any) -> RlTask:
+    # A step of the filter costs each of 256 worlds a third of what it does each of 64.
     return RlTask(
-        "RBL/MobileAnchors-v0", arguments, steps, 13, gamma=0.95, gae_lambda=0.9, num_envs=256
+        "RBL/MobileAnchors-v0", arguments, steps, rollout, gamma=0.95, gae_lambda=0.9, num_envs=256
     )
 
 
@@ -81,8 +80,8 @@ TASKS: dict[str, RlTask] = {
     "uwb_room": _placement(1_200_000, 5, scene="uwb_room", racks=2, sight=True),
     "satellite": _placement(450_000, 5, scene="satellite"),
     "mounts": _placement(1_200_000, 5, scene="uwb_room", racks=2, mode="mounts"),
-    "mobile-easy": _mobile(600_000, difficulty="easy"),
-    "mobile-hard": _mobile(1_500_000, difficulty="hard"),
+    "mobile-easy": _mobile(600_000, 50, difficulty="easy"),
+    "mobile-hard": _mobile(1_500_000, 13, difficulty="hard"),
     "selection": _selection(k=3),
     "selection-priced": _selection(mode="priced"),
 }
