@@ -47,10 +47,13 @@ class FilterLoop(BatchEnv):
             np.tile(np.eye(6), (num_envs, 1, 1)),
         )
         self._score_m: FloatArray | None = None
+        # The worlds as they were asked for last, and the epochs of that.
+        self._at: tuple[bytes, simulation.Epoch] | None = None
 
     def _start(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
         """New episodes of some worlds; their state is the prior."""
         start = self._episodes.begin(chosen, generators)
+        self._at = None
         self.anchors[chosen] = start["anchors"]
         prior = self.filter.initial(
             *(start[f"prior_{name}"] for name in ("rotation", "translation", "covariance"))
@@ -59,8 +62,11 @@ class FilterLoop(BatchEnv):
 
     @property
     def at(self) -> simulation.Epoch:
-        """The true worlds now: what a policy must not see."""
-        return self._episodes.at(self._epochs)
+        """The true worlds now: what a policy must not see. Not to be written to."""
+        epochs = self._epochs.tobytes()
+        if self._at is None or self._at[0] != epochs:
+            self._at = epochs, self._episodes.at(self._epochs)
+        return self._at[1]
 
     @property
     def twist(self) -> FloatArray:
