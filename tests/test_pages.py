@@ -182,10 +182,10 @@ def test_logarithmic_axes_are_labelled_with_whole_numbers(result):
     assert len(axes) == 4
     for axis in axes:
         assert [float(text) for text in axis.ticktext] == list(axis.tickvals)
-    assert track_pages._ticks(0.013, 0.2)["ticktext"] == [
+    assert track_html.log_ticks(0.013, 0.2)["ticktext"] == [
         "0.01", "0.02", "0.05", "0.1", "0.2", "0.5", "1", "2", "5",
     ]  # fmt: skip
-    short = track_pages._ticks(0.016, 0.031)["tickvals"]
+    short = track_html.log_ticks(0.016, 0.031)["tickvals"]
     assert [mark for mark in short if 0.016 <= mark <= 0.031] == [0.02, 0.025, 0.03]
 
 

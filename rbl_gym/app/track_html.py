@@ -113,7 +113,9 @@ def figure(story: Story) -> go.Figure:
         shown.update_xaxes(title_text="time (s)", title_standoff=4)
         for column, (low, high) in zip((1, 3), tops, strict=False):
             shown.update_yaxes(range=[low, high], row=2, col=column)
-        shown.update_yaxes(type="log", range=np.log10(tops[2]).tolist(), row=2, col=5)
+        shown.update_yaxes(
+            type="log", range=np.log10(tops[2]).tolist(), **log_ticks(*tops[2]), row=2, col=5
+        )
     return shown
 
 
@@ -349,3 +351,11 @@ def anchors_table(story: Story) -> str:
     rows = [[str(name), *map(float, place)]
             for name, place in zip(story.names, story.anchors, strict=True)]  # fmt: skip
     return page.table("anchors", ["anchor", "x (m)", "y (m)", "z (m)"], rows)
+
+
+def log_ticks(low: float, high: float) -> dict[str, Any]:
+    """1, 2 and 5 of every decade, or more of a short axis; plotly's own labels are bare digits."""
+    digits = (1, 2, 5) if high > 5 * low else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    marks = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
+    return {"tickvals": marks, "ticktext": [f"{mark:g}" for mark in marks]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -92,7 +91,7 @@ def _curves(result: dict[str, Any]) -> go.Figure:
             if key != "nees":
                 drawn = [*data["bound"][key], *(value for line in lines.values() for value in line)]
                 shown.update_yaxes(
-                    type="log", **_ticks(min(drawn), max(drawn)), row=row, col=column
+                    type="log", **track_html.log_ticks(min(drawn), max(drawn)), row=row, col=column
                 )
                 shown.add_trace(
                     go.Scatter(x=steps, y=data["bound"][key], name="posterior CRB", mode="markers",
@@ -108,14 +107,6 @@ def _curves(result: dict[str, Any]) -> go.Figure:
     shown.update_layout(height=320 * len(readings) + 40, template="plotly_white", legend=legend,
                         margin={"l": 50, "r": 10, "t": 60, "b": 40})  # fmt: skip
     return shown
-
-
-def _ticks(low: float, high: float) -> dict[str, Any]:
-    """1, 2 and 5 of every decade, or more of a short axis; plotly's own labels are bare digits."""
-    digits = (1, 2, 5) if high > 5 * low else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    marks = [float(f"{digit}e{decade}") for decade in decades for digit in digits]
-    return {"tickvals": marks, "ticktext": [f"{mark:g}" for mark in marks]}
 
 
 def replay(recording: Recording, track: Track, result: dict[str, Any], settings: Settings) -> str:
