@@ -213,7 +213,7 @@ class BaseStationEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/BaseStation-v0", angle_std_rad=0.01)
     env = gym.make("rbl_gym:RBL/BaseStation-v0", scene={"steps": 50, "anchor_speed_m_s": 0})
     ```
-    `rbl_gym.wrappers.EstimatePose` runs the iterated EKF on the angles.
+    The wrapper `EstimatePose` runs the iterated EKF on the angles.
     `scene`: changes of the world (`WORLD`), see `rbl_gym.scenes.get`; its noise of ranges is not
     used. `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``.
 
