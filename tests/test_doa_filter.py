@@ -175,3 +175,24 @@ def test_bad_input_is_named(call, message):
     state = filter.initial(np.eye(3), [5.0, 5.0, 3.0], 0.01 * np.eye(6))
     with pytest.raises(ValueError, match=message):
         call(filter, state)
+
+
+@pytest.mark.parametrize("vague", [False, True])
+def test_bodies_of_their_own_are_a_loop(vague):
+    rng, station = np.random.default_rng(0), np.zeros(3)
+    tags = bodies.centred(bodies.doa2019()) * np.array([1.0, 1.1, 1.2])[:, None, None]
+    rotation = rotations.exp(0.1 * rng.standard_normal((3, 3)))
+    translation = np.array([5, 12, 3.0]) + rng.standard_normal((3, 3))
+    noise, process = bearing.AngleNoise(0.002), motion.ProcessNoise(0.05, 0.1)
+    angles = bearing.simulate(tags, rotation, translation, noise, rng)
+    P = np.diag([np.pi**2] * 3 + [100.0] * 3) if vague else 0.01 * np.eye(6)
+
+    def updated(tags, angles):
+        filter = estimators.make("iekf", tags=tags, noise=noise, process=process, measurement="doa")
+        return filter.update(filter.initial(np.eye(3), [5, 12, 3], P), angles, station)
+
+    together = updated(tags, angles)
+    for i in range(3):
+        alone = updated(tags[i], angles[i])
+        for all_of_them, one in zip(together, alone, strict=True):
+            np.testing.assert_allclose(all_of_them[i], one, atol=1e-12)
