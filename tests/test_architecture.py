@@ -16,6 +16,7 @@ FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers":
 PLAIN_MODELS = {
     "rotations", "ranging", "bearing", "sensing_network", "bounds", "components", "motion",
     "checks", "network_bounds", "network_graphs", "rigidity", "unknown_twist", "link_bias",
+    "kernels",
 }  # fmt: skip
 # numpy.random's names that are no global state.
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
@@ -120,8 +121,11 @@ def test_imports_are_absolute_and_by_the_one_name(name):
     assert not bare
 
 
-# What a module needs that no extra of the developers brings: where it is absent, so is the module.
-BEYOND = {"rbl_gym.wrappers.sb3": "stable_baselines3"}
+# What a module needs that may be absent: then, so is the module.
+BEYOND = {
+    "rbl_gym.wrappers.sb3": "stable_baselines3",
+    **{name: "numba" for name in MODULES if name.startswith("rbl_gym.kernels.")},
+}
 
 
 def test_every_module_imports_alone_and_none_under_a_second_name():
@@ -142,7 +146,7 @@ print(second)
 
 
 def test_import_is_light():
-    heavy = ["matplotlib", "filterpy", "scipy.stats", "rich", "pandas", "torch"]
+    heavy = ["matplotlib", "filterpy", "scipy.stats", "rich", "pandas", "torch", "numba"]
     lines = run_python(f"""
 import sys, rbl_gym
 print([m for m in {heavy} if m in sys.modules])

@@ -1,0 +1,114 @@
+"""How kernels are compiled and kept: numba, without fast mathematics, on disk by their contents.
+
+Only modules of kernels import this one; it imports numba.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+_FOLDER = Path(__file__).parent
+_TYPES = {"f": numba.float64, "i": numba.int64, "b": numba.boolean}
+
+
+def contents_hash(folder: Path) -> str:
+    """Hash of all modules in a folder."""
+    digest = hashlib.sha256()
+    for file in sorted(folder.glob("*.py")):
+        digest.update(file.name.encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _keyed(base: Any, stamp: str) -> Any:
+    """A place of numba's for cached kernels, for ours alone, where `stamp` tells stale ones."""
+
+    class Locator(base):
+        def get_source_stamp(self) -> str:
+            return stamp
+
+        def get_disambiguator(self) -> str:
+            # In place of the line number: no second file where a kernel has moved.
+            return "kernel"
+
+        @classmethod
+        def from_function(cls, function: Any, file: str) -> Any:
+            ours = Path(file).parent == _FOLDER
+            return super().from_function(function, file) if ours else None
+
+    return Locator
+
+
+def _find_cache() -> bool:
+    """Whether kernels can be kept on disk.
+
+    numba takes a kernel for stale when its own file changes; ours are when any file of this
+    package does. Nothing public lets us say so: where the private names are gone, or no folder
+    can be written, every process compiles anew.
+    """
+    try:
+        from numba.core import caching
+
+        stamp = contents_hash(_FOLDER)
+        bases = (
+            caching.UserProvidedCacheLocator,  # NUMBA_CACHE_DIR
+            caching.InTreeCacheLocator,
+            caching.UserWideCacheLocator,
+        )
+        ours = [_keyed(base, stamp) for base in bases]
+        caching.CacheImpl._locator_classes[:0] = ours
+    except (ImportError, AttributeError, OSError):
+        return False
+    return any(locator.from_function(contents_hash, __file__) for locator in ours)
+
+
+_CACHE = _find_cache()
+
+
+def helper(function: F) -> F:
+    """Compile a function that kernels call; division by zero gives inf, as in NumPy."""
+    return numba.njit(error_model="numpy", cache=_CACHE)(function)
+
+
+def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
+    """A decorator: the function, which writes its last arguments, as a generalized ufunc.
+
+    The function stays what it is; its attribute ``build()`` compiles it, once.
+
+    Parameters
+    ----------
+    signature
+        As NumPy's, such as ``"(d,d),(d),()->(d)"``; an output ``()`` is written as ``out[0]``.
+    types
+        One letter for each argument: f (float64), i (int64) or b (bool). Empty: all f.
+    """
+    axes = [part.strip("()") for part in signature.replace("->", ",").replace(" ", "").split("),")]
+    ranks = [part.count(",") + 1 if part else 0 for part in axes]
+    inputs = signature.split("->")[0].count("(")
+
+    def decorate(function: F) -> F:
+        @functools.cache
+        def build() -> Any:
+            letters = types or "f" * len(ranks)
+            arguments = []
+            for place, (letter, rank) in enumerate(zip(letters, ranks, strict=True)):
+                # Outputs are arrays even where they have no axes.
+                rank = rank if place < inputs else max(rank, 1)
+                kind = _TYPES[letter]
+                arguments.append(kind[(slice(None),) * rank] if rank else kind)
+            return numba.guvectorize([tuple(arguments)], signature, nopython=True, cache=_CACHE)(
+                function
+            )
+
+        function.build = build  # pyright: ignore[reportFunctionMemberAccess]
+        return function
+
+    return decorate

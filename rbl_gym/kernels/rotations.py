@@ -1,0 +1,100 @@
+"""Rotations of one trial: exponential, logarithm, left Jacobian and its inverse.
+
+`rbl_gym.rotations` has the textbook forms, and the tests hold both to each other.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rbl_gym.kernels.jit import helper
+
+# Below these squared angles series take the place of the closed forms.
+_SMALL, _SMALL_INVERSE = 0.25, 1e-2
+
+
+@helper
+def coefficients(s: float) -> tuple[float, float, float]:
+    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 of s = x^2."""
+    if s < _SMALL:
+        a = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156)))))
+        b = 1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90 * (1 - s / 132 * (1 - s / 182)))))
+        c = 1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156 * (1 - s / 210)))))
+        return a, 0.5 * b, c / 6
+    x = math.sqrt(s)
+    sine, half = math.sin(x), math.sin(0.5 * x)
+    return sine / x, 2 * half * half / s, (x - sine) / (s * x)
+
+
+@helper
+def series(x: float, y: float, z: float, a: float, b: float, diagonal: float, out: Any) -> None:
+    """``diagonal I + a [w]x + b w w^T`` of w = (x, y, z): the form of exp and its Jacobians."""
+    xy, xz, yz = b * x * y, b * x * z, b * y * z
+    out[0, 0] = diagonal + b * x * x
+    out[1, 1] = diagonal + b * y * y
+    out[2, 2] = diagonal + b * z * z
+    out[0, 1], out[1, 0] = xy - a * z, xy + a * z
+    out[2, 0], out[0, 2] = xz - a * y, xz + a * y
+    out[1, 2], out[2, 1] = yz - a * x, yz + a * x
+
+
+@helper
+def exp(x: float, y: float, z: float, out: Any) -> None:
+    """The rotation matrix of the rotation vector (x, y, z)."""
+    s = x * x + y * y + z * z
+    a, b, _ = coefficients(s)
+    series(x, y, z, a, b, 1 - b * s, out)
+
+
+@helper
+def left_jacobian(x: float, y: float, z: float, out: Any) -> None:
+    """Left Jacobian of exp at (x, y, z)."""
+    s = x * x + y * y + z * z
+    _, b, c = coefficients(s)
+    series(x, y, z, b, c, 1 - c * s, out)
+
+
+@helper
+def left_jacobian_inverse(x: float, y: float, z: float, out: Any) -> None:
+    """Inverse of the left Jacobian at (x, y, z), of length below 2 pi."""
+    s = x * x + y * y + z * z
+    if s < _SMALL_INVERSE:
+        c = (1 + s / 60 * (1 + s / 42 * (1 + s / 40 * (1 + s * 5 / 198)))) / 12
+    else:
+        half = 0.5 * math.sqrt(s)
+        c = (1 - half * math.cos(half) / math.sin(half)) / s
+    series(x, y, z, -0.5, c, 1 - c * s, out)
+
+
+@helper
+def log(Q: Any) -> tuple[float, float, float]:
+    """The rotation vector of a rotation matrix, of length at most pi."""
+    x, y, z = 0.5 * (Q[2, 1] - Q[1, 2]), 0.5 * (Q[0, 2] - Q[2, 0]), 0.5 * (Q[1, 0] - Q[0, 1])
+    sine, cosine = math.sqrt(x * x + y * y + z * z), 0.5 * (Q[0, 0] + Q[1, 1] + Q[2, 2] - 1)
+    if cosine > -0.9:
+        scale = 1.0 if sine < 1e-9 else math.atan2(sine, cosine) / sine
+        return scale * x, scale * y, scale * z
+    return _log_of_half_turn(Q, x, y, z)
+
+
+@helper
+def _log_of_half_turn(Q: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """`log` near pi, where the symmetric part carries the axis: by the unit quaternion.
+
+    (x, y, z) is the axis times the sine. A row of ``4 q q^T`` that is not small is q.
+    """
+    if Q[0, 0] >= Q[1, 1] and Q[0, 0] >= Q[2, 2]:
+        w = 2 * x
+        i, j, k = 1 + Q[0, 0] - Q[1, 1] - Q[2, 2], Q[0, 1] + Q[1, 0], Q[0, 2] + Q[2, 0]
+    elif Q[1, 1] >= Q[2, 2]:
+        w = 2 * y
+        i, j, k = Q[0, 1] + Q[1, 0], 1 - Q[0, 0] + Q[1, 1] - Q[2, 2], Q[1, 2] + Q[2, 1]
+    else:
+        w = 2 * z
+        i, j, k = Q[0, 2] + Q[2, 0], Q[1, 2] + Q[2, 1], 1 - Q[0, 0] - Q[1, 1] + Q[2, 2]
+    sine = math.sqrt(i * i + j * j + k * k)
+    scale = 2 * math.atan2(sine, abs(w)) / sine
+    if w < 0:
+        scale = -scale
+    return scale * i, scale * j, scale * k

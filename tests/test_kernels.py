@@ -1,0 +1,229 @@
+"""The common ground of the kernels: dispatch, cache, small matrices, rotations."""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import sys
+import types
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rbl_gym import kernels, rotations
+from tests.helpers import ROOT, run_python
+
+needs_numba = pytest.mark.skipif(not kernels.enabled(), reason="kernels are off")
+
+
+@kernels.compiled("of_this_test:half")
+def half(x):
+    """Half of x (...)."""
+    return np.asarray(x) / 2
+
+
+@pytest.fixture
+def kernel_of_half(monkeypatch):
+    """A kernel that can be told from its textbook form: it doubles."""
+    from rbl_gym.kernels.jit import gufunc
+
+    def double(x, out):
+        out[0] = 2 * x
+
+    module = types.SimpleNamespace(half=gufunc("()->()")(double))
+    monkeypatch.setitem(sys.modules, "rbl_gym.kernels.of_this_test", module)
+    monkeypatch.setattr(half, "_run", None)
+
+
+# --- which form runs --------------------------------------------------------------------------
+
+
+@needs_numba
+def test_a_call_runs_the_kernel_and_broadcasts(kernel_of_half):
+    assert half(3.0) == 6.0
+    np.testing.assert_array_equal(half(np.ones((2, 1, 3))), np.full((2, 1, 3), 2.0))
+    assert half.textbook(3.0) == 1.5
+    assert half.kernel(3.0) == 6.0
+    assert (half.__name__, half.__doc__) == ("half", "Half of x (...).")
+
+
+def test_without_kernels_the_textbook_form_runs(monkeypatch):
+    monkeypatch.setattr(kernels, "enabled", lambda: False)
+    monkeypatch.setattr(half, "_run", None)
+    assert half(3.0) == 1.5
+
+
+def test_the_environment_switches_kernels_off():
+    code = """
+import os, sys
+os.environ["RBL_GYM_COMPILED"] = "0"
+from rbl_gym import kernels
+kernels.compile_all()
+print(kernels.enabled(), "numba" in sys.modules)
+"""
+    assert run_python(code) == ["False False"]
+
+
+def test_a_numba_that_does_not_import_is_a_warning(monkeypatch):
+    monkeypatch.setattr(kernels, "find_spec", lambda name: object())
+    monkeypatch.delenv("RBL_GYM_COMPILED", raising=False)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    kernels.enabled.cache_clear()
+    with pytest.warns(UserWarning, match="kernels are off"):
+        assert not kernels.enabled()
+    kernels.enabled.cache_clear()
+
+
+@needs_numba
+def test_nan_makes_no_warning_in_either_form(kernel_of_half):
+    assert np.isnan(half(np.nan))
+    half._run = lambda x: np.sqrt(x)
+    assert np.isnan(half(-1.0))
+    half._run = None
+
+
+# --- pickles ----------------------------------------------------------------------------------
+
+
+def test_it_pickles_by_its_name():
+    assert pickle.loads(pickle.dumps(half)) is half
+    cloudpickle = pytest.importorskip("cloudpickle")
+    assert cloudpickle.loads(cloudpickle.dumps(half)) is half
+    # As part of a function that travels by value, as to a worker of dask.
+    doubled = cloudpickle.loads(cloudpickle.dumps(lambda x: half.textbook(x) * 4))
+    assert doubled(3.0) == 6.0
+
+
+def test_a_spawned_worker_finds_it(monkeypatch):
+    monkeypatch.setenv("RBL_GYM_COMPILED", "0")
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(half, (3.0,)) == 1.5
+
+
+# --- the cache --------------------------------------------------------------------------------
+
+_KERNEL = """
+from rbl_gym.kernels.helper import factor
+from rbl_gym.kernels.jit import gufunc
+
+@gufunc("()->()")
+def scaled(x, out):
+    out[0] = factor() * x
+"""
+_HELPER = """
+from rbl_gym.kernels.jit import helper
+
+@helper
+def factor():
+    return {}
+"""
+
+
+@needs_numba
+def test_a_kernel_on_disk_is_stale_when_a_helper_in_another_file_changes(tmp_path):
+    package = tmp_path / "rbl_gym" / "kernels"
+    package.mkdir(parents=True)
+    (tmp_path / "rbl_gym" / "__init__.py").touch()
+    for file in ("__init__.py", "jit.py"):
+        (package / file).write_bytes((ROOT / "rbl_gym" / "kernels" / file).read_bytes())
+    (package / "kernel.py").write_text(_KERNEL)
+    code = f"""
+sys.path.insert(0, {str(tmp_path)!r})
+from rbl_gym.kernels import kernel
+print(kernel.scaled.build()(1.0))
+"""
+    saved = set()
+    for value in (2.0, 3.0, 3.0):
+        (package / "helper.py").write_text(_HELPER.format(value))
+        assert run_python(code) == [str(value)]
+        saved.add(tuple(sorted((f.name, f.stat().st_mtime_ns) for f in package.rglob("*.nb?"))))
+    # Compiled twice, the third time loaded; nothing stale is left behind.
+    assert len(saved) == 2
+    assert len({len(files) for files in saved}) == 1
+    assert all(files for files in saved)
+
+
+# --- small matrices and rotations -------------------------------------------------------------
+
+
+def positive(rng, n):
+    root = rng.standard_normal((n, n)) * np.logspace(-3, 3, n)
+    return root.T @ root
+
+
+@needs_numba
+@pytest.mark.parametrize("n", [1, 3, 6])
+def test_factor_solution_and_inverse_equal_numpy(n):
+    from rbl_gym.kernels import linear_algebra as la
+
+    rng = np.random.default_rng(n)
+    A, b = positive(rng, n), rng.standard_normal(n)
+    L, x, P = np.zeros((n, n)), np.empty(n), np.empty((n, n))
+    assert la.cholesky(np.tril(A), L)
+    np.testing.assert_allclose(L, np.linalg.cholesky(A), rtol=1e-9)
+    la.solve_factored(L, b, x)
+    np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-8)
+    la.invert_factored(L, P)
+    want = np.linalg.inv(A)
+    scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
+    np.testing.assert_allclose(P / scale, want / scale, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(P, P.T)
+
+
+@needs_numba
+def test_a_singular_matrix_is_told_and_solved_where_it_can_be():
+    from rbl_gym.kernels import linear_algebra as la
+
+    A = np.diag([4.0, 0.0, 1.0])
+    L, x = np.zeros((3, 3)), np.empty(3)
+    assert not la.cholesky(A, L)
+    la.solve_factored(L, np.array([8.0, 0.0, 3.0]), x)
+    np.testing.assert_allclose(x, [2.0, 0.0, 3.0])
+    assert not la.cholesky(np.full((3, 3), np.nan), L)
+    assert np.isnan(L[0, 0])
+
+
+@needs_numba
+def test_products_equal_numpy():
+    from rbl_gym.kernels import linear_algebra as la
+
+    rng = np.random.default_rng(1)
+    A, B, out = rng.standard_normal((2, 4)), rng.standard_normal((4, 3)), np.empty((2, 3))
+    la.multiply(A, B, out)
+    np.testing.assert_allclose(out, A @ B, rtol=1e-14)
+    la.multiply_transposed(A, np.ascontiguousarray(B.T), out)
+    np.testing.assert_allclose(out, A @ B, rtol=1e-14)
+
+
+def rotation_vectors():
+    """Lengths from 1e-9 to pi, many of them near the ends, and zero."""
+    rng = np.random.default_rng(2)
+    length = np.concatenate(
+        [[0.0, np.pi], 10 ** rng.uniform(-9, np.log10(np.pi), 200),
+         np.pi - 10 ** rng.uniform(-9, -1, 100), 0.5 + rng.uniform(-1e-9, 1e-9, 20)]
+    )  # fmt: skip
+    axis = rng.standard_normal((len(length), 3))
+    axis[:30] = np.round(axis[:30])
+    axis[(axis == 0).all(axis=1)] = [1.0, 0.0, 0.0]
+    return length[:, None] * axis / np.linalg.norm(axis, axis=1, keepdims=True)
+
+
+@needs_numba
+def test_rotations_equal_scipy_and_the_textbook_forms():
+    from rbl_gym.kernels import rotations as ours
+
+    out = np.empty((3, 3))
+    for w in rotation_vectors():
+        ours.exp(*w, out)
+        np.testing.assert_allclose(out, Rotation.from_rotvec(w).as_matrix(), atol=1e-14)
+        back = np.array(ours.log(out))
+        # At pi both ends of the axis are right.
+        if np.linalg.norm(w) > np.pi - 1e-7 and back @ w < 0:
+            back = -back
+        np.testing.assert_allclose(back, w, rtol=0, atol=3e-15 + 1e-15 * np.linalg.norm(w))
+        ours.left_jacobian(*w, out)
+        np.testing.assert_allclose(out, rotations.left_jacobian(w), atol=1e-14)
+        inverse = np.empty((3, 3))
+        ours.left_jacobian_inverse(*w, inverse)
+        np.testing.assert_allclose(out @ inverse, np.eye(3), atol=1e-13)
