@@ -135,6 +135,27 @@ def test_filters_reach_what_is_predicted():
         assert figures["nees"] == pytest.approx(6, abs=0.3)
 
 
+def test_lost_bodies_count_in_the_figures_of_all():
+    """Without a prior, half of the bodies below a ceiling are put above it: both are said."""
+    flat = [[0.2, 0.15, 0], [-0.2, 0.15, 0], [-0.2, -0.15, 0], [0.2, -0.15, 0]]
+    tables = {
+        **GOOD,
+        "obstacles": [],
+        "region": {"low": [1, 1, 0.3], "high": [3, 2, 1.0]},
+        "body": {"tags": flat},
+        "noise": {"floor_m": 0.03},
+    }
+    problem = scene_files.of_mapping(tables)
+    anchors = np.array([[0, 0, 2], [4, 0, 2], [4, 3, 2], [0, 3, 2], [1.3, 1, 2], [2.6, 2, 2.0]])
+    check = place_check.run(problem, anchors, 400, 0)
+    found = check["filters"]["locate, from nothing"]
+    # The side is a toss of a coin: within four standard deviations of a half.
+    assert found["lost"] == pytest.approx(0.5, abs=0.1)
+    assert found["position_rmse_m"] < 0.2
+    # A mirror pose is about 2 x 1.35 m off.
+    assert 1.0 < found["position_rmse_all_m"] < 3.0
+
+
 def test_blocked_links_are_noisier_by_what_is_left_of_their_information(with_rack):
     anchors = np.array([[0, 0, 1], [8, 6, 1], [0, 6, 2.5], [8, 0, 2.5], [4, 3, 3.0]])
     drawn = place_check.simulate(with_rack, anchors, 2000, np.random.default_rng(0))
@@ -203,6 +224,8 @@ def test_the_figures_have_these_names(placed):
     assert set(result["check"]["filters"]["iterated EKF"]) == {
         "lost", "nees", "position_rmse_m", "position_predicted_m", "position_ratio",
         "rotation_rmse_deg", "rotation_predicted_deg", "rotation_ratio",
+        "nees_all", "position_rmse_all_m", "position_predicted_all_m", "position_ratio_all",
+        "rotation_rmse_all_deg", "rotation_predicted_all_deg", "rotation_ratio_all",
     }  # fmt: skip
     assert result["obstacles"] == [{"low_m": [3, 2, 0], "high_m": [4, 3, 2.5]}]
 

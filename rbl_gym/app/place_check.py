@@ -121,25 +121,30 @@ def _free_places(problem: Problem, count: int, rng: np.random.Generator) -> Floa
 
 
 def figures(drawn: Trials, found: Any, bound: FloatArray) -> dict[str, float]:
-    """Real and predicted root mean squares, their ratios and the NEES; lost poses are counted.
+    """Real and predicted root mean squares, of all bodies and of those found, and their ratios.
 
-    `found` has rotation, translation and covariance; `bound` is the predicted covariance.
+    `lost` is the share of bodies further off than chance allows, or without a pose. Keys with
+    `_all` are of every body that has a pose, the others of those that are not lost. `found` has
+    rotation, translation and covariance; `bound` is the predicted covariance.
     """
     error = metrics.pose_error(found.rotation, found.translation, drawn.rotation, drawn.translation)
     nees = metrics.nees(error, found.covariance)
     # By the bound too: a filter that claims too little must not hide its errors as lost.
-    kept = ~((nees > _LOST_NEES) & (metrics.nees(error, bound) > _LOST_NEES))
+    known = np.isfinite(nees)
+    kept = known & ~((nees > _LOST_NEES) & (metrics.nees(error, bound) > _LOST_NEES))
     result = {"lost": float(1 - kept.mean())}
-    if not kept.any():
-        return result
-    variance = np.einsum("bii->bi", bound)[kept]
-    for name, part, unit in (
-        ("position_m", slice(3, 6), 1.0),
-        ("rotation_deg", slice(3), 180 / np.pi),
-    ):
-        real = unit * np.sqrt((error[kept, part] ** 2).sum(-1).mean())
-        predicted = unit * np.sqrt(variance[:, part].sum(-1).mean())
-        result |= {f"{name.replace('_', '_rmse_')}": float(real),
-                   f"{name.replace('_', '_predicted_')}": float(predicted),
-                   f"{name.split('_')[0]}_ratio": float(real / predicted)}  # fmt: skip
-    return result | {"nees": float(nees[kept].mean())}
+    variance = np.einsum("bii->bi", bound)
+    for of, rows in (("", kept), ("_all", known)):
+        if not rows.any():
+            continue
+        for name, part, unit, scale in (
+            ("position", slice(3, 6), "m", 1.0),
+            ("rotation", slice(3), "deg", 180 / np.pi),
+        ):
+            real = scale * np.sqrt((error[rows, part] ** 2).sum(-1).mean())
+            predicted = scale * np.sqrt(variance[rows, part].sum(-1).mean())
+            result |= {f"{name}_rmse{of}_{unit}": float(real),
+                       f"{name}_predicted{of}_{unit}": float(predicted),
+                       f"{name}_ratio{of}": float(real / predicted)}  # fmt: skip
+        result[f"nees{of}"] = float(nees[rows].mean())
+    return result

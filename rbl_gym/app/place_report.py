@@ -12,6 +12,10 @@ from rich.table import Table
 from rbl_gym.app.page import digits
 
 
+# A share of lost bodies above this is said in words.
+_MANY_LOST = 0.01
+
+
 class Rows(NamedTuple):
     """A table as texts; the first column is text, the others are figures."""
 
@@ -43,9 +47,15 @@ def notes(result: dict[str, Any]) -> list[str]:
         + ("infinite (coplanar)." if conditioning is None else f"{conditioning:.3g}."),
         f"Check: {check['trials']} bodies at random poses in the region; the EKF starts from a "
         f"prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m around "
-        "the truth. NEES of an honest filter: 6. Lost: further off than once in a million; RMSE "
-        "and NEES are of the others.",
+        "the truth. NEES of an honest filter: 6. Lost: further off than once in a million. RMSE is "
+        "of all bodies; of found, predicted, ratio and NEES are of those not lost.",
     ]
+    for name, figures in check["filters"].items():
+        if figures["lost"] > _MANY_LOST:
+            found.append(
+                f"{name}: {100 * figures['lost']:.3g} % of the bodies are lost; the prediction "
+                "and its ratio hold for the others only."
+            )
     if result["coplanar"]:
         found.append(
             "These anchors lie in one plane: the mirror image behind it can fit the ranges as "
@@ -124,16 +134,16 @@ def _layouts(layouts: dict[str, dict[str, float]]) -> Rows:
 def _check(check: dict[str, Any]) -> Rows:
     rows = []
     for name, figures in check["filters"].items():
-        row = [name]
+        row = [name, f"{100 * figures['lost']:.1f} %"]
         for quantity, unit, n in (("position", "m", 4), ("rotation", "deg", 3)):
-            for key in (f"{quantity}_rmse_{unit}", f"{quantity}_predicted_{unit}"):
-                row.append(digits(figures[key], n) if key in figures else "-")
+            for key in ("rmse_all_{}", "rmse_{}", "predicted_{}"):
+                value = figures.get(f"{quantity}_{key.format(unit)}")
+                row.append("-" if value is None else digits(value, n))
             ratio = f"{quantity}_ratio"
             row.append(f"{figures[ratio]:.3f}" if ratio in figures else "-")
-        nees = f"{figures['nees']:.2f}" if "nees" in figures else "-"
-        rows.append([*row, nees, f"{100 * figures['lost']:.1f} %"])
-    headings = ["filter", "position RMSE (m)", "predicted", "ratio", "rotation RMSE (deg)",
-                "predicted", "ratio", "NEES (6)", "lost"]  # fmt: skip
+        rows.append([*row, f"{figures['nees']:.2f}" if "nees" in figures else "-"])
+    headings = ["filter", "lost", "position RMSE (m)", "of found", "predicted", "ratio",
+                "rotation RMSE (deg)", "of found", "predicted", "ratio", "NEES (6)"]  # fmt: skip
     return Rows(f"checked by Monte Carlo, {check['trials']} trials", headings, rows)
 
 
