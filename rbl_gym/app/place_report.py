@@ -11,7 +11,6 @@ from rich.table import Table
 
 from rbl_gym.app.page import digits
 
-
 # A share of lost bodies above this is said in words.
 _MANY_LOST = 0.01
 
