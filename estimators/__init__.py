@@ -17,7 +17,6 @@ from rbl_gym.estimators.belief import (
     make,
     names,
     register,
-    with_noise,
 )
 from rbl_gym.estimators.consensus import (
     cycle_consensus,
@@ -68,5 +67,4 @@ __all__ = [
     "orientations",
     "register",
     "ring_least_squares",
-    "with_noise",
 ]

@@ -16,16 +16,32 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_count, check_number
 from rbl_gym.estimators.belief import Filter, PoseBelief
+from rbl_gym.ranging import NoiseLaw
 
 
 class TimedRange(NamedTuple):
-    """One range: seconds, indices of anchor and tag, metres (...), twist of the interval before."""
+    """One range of a stream.
+
+    Attributes
+    ----------
+    time
+        Seconds.
+    anchor, tag
+        Indices.
+    range
+        (...), metres.
+    twist
+        (..., 6) of the interval before; None: the filter estimates it.
+    noise
+        Law of the range; None: the filter's.
+    """
 
     time: float
     anchor: int
     tag: int
     range: FloatArray
     twist: FloatArray | None
+    noise: NoiseLaw | None = None
 
 
 class Checkpoint(NamedTuple):
@@ -107,6 +123,7 @@ class Asynchronous:
         tag: int,
         range: ArrayLike,
         twist: ArrayLike | None = (0.0,) * 6,
+        noise: NoiseLaw | None = None,
     ) -> Stream:
         """The stream with one more range (metres; (...) of many bodies with the same times).
 
@@ -118,6 +135,8 @@ class Asynchronous:
         twist
             (..., 6) of the interval that ends at this range: at rest, a random walk, unless it is
             told; None for a filter that estimates it.
+        noise
+            Law of this range, for instance ``LinkNoise([[0.05]])``; None: the filter's.
 
         Raises
         ------
@@ -132,7 +151,7 @@ class Asynchronous:
             raise ValueError(f"range must be positive, got {value.min()}")
         if twist is not None:
             twist = check_array("twist", twist, (6,))
-        measured = TimedRange(time, anchor, tag, value, twist)
+        measured = TimedRange(time, anchor, tag, value, twist, noise)
         newest = max(time, stream.time)
         if time < stream.checkpoints[0].time or time < newest - self.window_s:
             return stream._replace(refused=stream.refused + 1)
@@ -153,7 +172,9 @@ class Asynchronous:
         ranges[..., measured.anchor, measured.tag] = measured.range
         links = np.zeros(shape, np.bool_)
         links[measured.anchor, measured.tag] = True
-        state = self.filter.update(state, ranges, self.anchors, links)
+        # A filter of an older interface takes no law, and needs none where no range has one.
+        law = {} if measured.noise is None else {"noise": measured.noise}
+        state = self.filter.update(state, ranges, self.anchors, links, **law)
         return Checkpoint(measured.time, state, measured)
 
     def _moved(self, point: Checkpoint, time: float, twist: FloatArray | None) -> Any:

@@ -8,7 +8,6 @@ that of the plain `IteratedEkf`, at its speed.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log,
 from rbl_gym.estimators import bias_cost
 from rbl_gym.estimators.belief import PoseBelief, register
 from rbl_gym.estimators.bias_cost import AugmentedState
-from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance
+from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, law_of
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState, is_vague
 from rbl_gym.link_bias import LinkBias
 from rbl_gym.motion import ProcessNoise, propagate
@@ -125,8 +124,11 @@ class AugmentedEkf:
         ranges: ArrayLike,
         anchors: ArrayLike,
         links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
     ) -> AugmentedState:
         """State after one epoch of ranges (..., M, N); links True = measured.
+
+        `noise` is the law of this epoch, None: that of the filter of the pose.
 
         With biases every update must name the same anchors in the same order. A vague prior is
         started as by `IteratedEkf`, the biases taken for noise.
@@ -138,9 +140,9 @@ class AugmentedEkf:
         """
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
         if not self.biases:
-            return _carried(state, self.pose.update(pose, ranges, anchors, links))
+            return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.pose.tags)
-        variance = check_variance(self.pose.noise.variance(ranges, mask), mask)
+        variance = check_variance(law_of(noise, self.pose.noise).variance(ranges, mask), mask)
         variance = np.broadcast_to(variance, np.broadcast_shapes(variance.shape, ranges.shape))
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         state = self._with_biases(state, ranges.shape[-2:])
@@ -205,8 +207,7 @@ class AugmentedEkf:
         biases = (state.extra @ sums.T).reshape((*state.extra.shape[:-1], *ranges.shape[-2:]))
         spread = np.einsum("lk,...kj,lj->...l", sums, state.covariance[..., 6:, 6:], sums)
         law = ranging.LinkNoise(np.sqrt(variance + spread.reshape(biases.shape)))
-        plain = dataclasses.replace(self.pose, noise=law)
-        return plain.update(prior, np.maximum(ranges - biases, 1e-6), anchors, mask)
+        return self.pose.update(prior, np.maximum(ranges - biases, 1e-6), anchors, mask, law)
 
     def belief(self, state: AugmentedState) -> PoseBelief:
         """What the state says about the pose (copies)."""

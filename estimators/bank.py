@@ -132,15 +132,18 @@ class IteratedEkfBank:
         ranges: ArrayLike,
         anchors: ArrayLike,
         links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
     ) -> BankState:
         """State after one epoch of ranges (..., M, N): hypotheses weighed, added, dropped.
+
+        `noise` is the law of this epoch, None: the filter's.
 
         Raises
         ------
         ValueError
             As `IteratedEkf.update`.
         """
-        ranges, weights, anchors = self._filter.weighed(ranges, anchors, links)
+        ranges, weights, anchors = self._filter.weighed(ranges, anchors, links, noise)
         check_batches(state=state.log_odds.shape[:-1], ranges=ranges.shape[:-2])
         batch = np.broadcast_shapes(
             state.log_odds.shape[:-1], ranges.shape[:-2], weights.shape[:-2], anchors.shape[:-2]

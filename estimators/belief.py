@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
 import inspect
 from collections.abc import Callable
@@ -57,9 +56,18 @@ class Filter(Protocol):
         ...
 
     def update(
-        self, state: Any, ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None = None
+        self,
+        state: Any,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
     ) -> Any:
-        """State after the ranges (..., M, N) to anchors (..., M, 3); links True = measured."""
+        """State after the ranges (..., M, N) to anchors (..., M, 3).
+
+        `links` (..., M, N) is True where measured; None: all. `noise` is the law of this epoch;
+        None: the law that the filter was made with.
+        """
         ...
 
     def belief(self, state: Any) -> PoseBelief:
@@ -160,18 +168,25 @@ def factory_of(name: str) -> Callable[..., Filter]:
     )
 
 
-def with_noise(filter: Filter, law: NoiseLaw) -> Filter | None:
-    """The filter with another law of the ranges, or None where it takes none.
+def check_takes_noise(name: str, filter: Filter, why: str) -> None:
+    """A ValueError that names a filter whose `update` has no argument `noise`.
 
-    It takes one if it is a dataclass with a field `noise`, or with a filter `pose` that has one.
+    Parameters
+    ----------
+    name
+        Of the filter, for the message.
+    filter
+        The filter.
+    why
+        What has a law of its own for each epoch, for the message.
     """
-    if not dataclasses.is_dataclass(filter):
-        return None
-    fields = {field.name for field in dataclasses.fields(filter)}
-    if "noise" in fields:
-        return dataclasses.replace(filter, noise=law)  # pyright: ignore[reportArgumentType]
-    inner = with_noise(getattr(filter, "pose", None), law) if "pose" in fields else None  # pyright: ignore[reportArgumentType]
-    return None if inner is None else dataclasses.replace(filter, pose=inner)  # pyright: ignore[reportArgumentType]
+    parameters = inspect.signature(filter.update).parameters
+    if "noise" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        return
+    raise ValueError(
+        f"filter {name!r} must take update(state, ranges, anchors, links=None, noise=None), "
+        f"because {why}; its update takes ({', '.join(parameters)})"
+    )
 
 
 def inverse(matrix: FloatArray) -> FloatArray:

@@ -63,10 +63,12 @@ class DoaEkf(IteratedEkf):
         angles: ArrayLike,
         station: ArrayLike,
         links: ArrayLike | None = None,
+        noise: bearing.AngleNoise | None = None,
         *,
         ranges: ArrayLike | None = None,
         anchors: ArrayLike | None = None,
         range_links: ArrayLike | None = None,
+        range_noise: NoiseLaw | None = None,
     ) -> PoseState:
         """State after one epoch of directions of arrival, and of ranges where there are any.
 
@@ -81,6 +83,8 @@ class DoaEkf(IteratedEkf):
             Place of the base station, (..., 3) or, as the one anchor, (..., 1, 3).
         links
             Mask (..., N) or (..., 1, N): which tags were heard; None: all.
+        noise, range_noise
+            Laws of the angles and of the ranges of this epoch; None: the filter's.
         ranges, anchors, range_links
             (..., M, N), (..., M, 3) and their mask, of the same epoch; anchors None: one range
             to every tag, from the station.
@@ -99,16 +103,20 @@ class DoaEkf(IteratedEkf):
             # What was not heard may hold anything.
             angles = np.where(heard[..., None, :], np.broadcast_to(angles, shape), 0.0)
         angles = bearing.check_angles(angles, n_tags)
-        weights = 1 / self.noise.variance(angles)
+        law = self.noise if noise is None else noise
+        if not isinstance(law, bearing.AngleNoise):
+            raise ValueError(f"noise must be a bearing.AngleNoise, or None, got {noise!r:.80}")
+        weights = 1 / law.variance(angles)
         if heard is not None:
             weights = weights * heard[..., None, :]
         epoch, trailing = [*state, angles, weights, station], [2, 1, 2, 2, 2, 1]
         if ranges is not None:
-            if self.range_noise is None:
+            range_law = self.range_noise if range_noise is None else range_noise
+            if range_law is None:
                 raise ValueError("range_noise must be given to the filter that takes ranges")
             anchors = station[..., None, :] if anchors is None else anchors
             ranges, anchors, mask = check_epoch(ranges, anchors, range_links, self.tags)
-            of_ranges = 1 / check_variance(self.range_noise.variance(ranges, mask), mask)
+            of_ranges = 1 / check_variance(range_law.variance(ranges, mask), mask)
             shape = np.broadcast_shapes(of_ranges.shape, ranges.shape)
             of_ranges = np.broadcast_to(of_ranges, shape)
             epoch += [ranges, of_ranges if mask is None else of_ranges * mask, anchors]

@@ -14,6 +14,7 @@ from rbl_gym.checks import (
     check_links,
     check_shape,
 )
+from rbl_gym.ranging import NoiseLaw
 
 # Ranges that stay in the cache from one look at them to the next.
 _PART = 1 << 15
@@ -113,6 +114,25 @@ def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
     if not (variance > 0).all():
         raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
     return variance
+
+
+def law_of(noise: NoiseLaw | None, own: NoiseLaw) -> NoiseLaw:
+    """The law of an epoch: the filter's own where None is given, else checked.
+
+    Raises
+    ------
+    ValueError
+        If what is given is no law of ranges.
+    """
+    if noise is None:
+        return own
+    if not callable(getattr(noise, "variance", None)) or not callable(
+        getattr(noise, "squared_range_variance", None)
+    ):
+        raise ValueError(
+            f"noise must have variance and squared_range_variance, or be None, got {noise!r:.80}"
+        )
+    return noise
 
 
 def spanned_dimensions(points: FloatArray) -> np.ndarray:

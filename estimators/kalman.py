@@ -36,6 +36,7 @@ from rbl_gym.estimators.inputs import (
     check_epoch,
     check_ranges,
     check_variance,
+    law_of,
 )
 from rbl_gym.estimators.least_squares import unvec, vec
 from rbl_gym.estimators.shared_covariance import shared, spread_out
@@ -163,8 +164,11 @@ class KalmanFamily:
         ranges: ArrayLike,
         anchors: ArrayLike,
         links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
     ) -> KalmanState:
-        """State after one epoch of ranges (..., M, N).
+        """State after one epoch of ranges (..., M, N); `noise` is its law, None: the filter's.
+
+        Weights that the filter was given count more than any law.
 
         Raises
         ------
@@ -174,10 +178,11 @@ class KalmanFamily:
             message names the rank).
         """
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=False)
+        law = law_of(noise, self.noise)
         self._check_determined(state, anchors)
         if self.weights is None:
             with np.errstate(invalid="ignore", over="ignore"):
-                variance = self.noise.squared_range_variance(ranges, mask)
+                variance = law.squared_range_variance(ranges, mask)
             try:
                 weights = 1 / check_variance(variance, mask)
             except ValueError:

@@ -35,6 +35,7 @@ from rbl_gym.estimators.inputs import (
     check_covariance,
     check_epoch,
     check_variance,
+    law_of,
     spanned_dimensions,
 )
 from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
@@ -131,8 +132,9 @@ class IteratedEkf:
         ranges: ArrayLike,
         anchors: ArrayLike,
         links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
     ) -> PoseState:
-        """State after one epoch of ranges (..., M, N).
+        """State after one epoch of ranges (..., M, N); `noise` is its law, None: the filter's.
 
         Where the prior rotation is vague (`vague_start`), the update starts from many poses and
         keeps the best. Among coplanar anchors the mirror pose may explain the ranges as well:
@@ -145,18 +147,23 @@ class IteratedEkf:
             On wrong shapes, NaN, ranges that are not positive; and where the prior is vague
             and the anchors or tags cannot determine a pose (the message names the rank).
         """
-        ranges, weights, anchors = self.weighed(ranges, anchors, links)
+        ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         epoch = (*state, ranges, weights, anchors)
         size = block_size(ranges) if self.tags.ndim == 2 else math.inf
         return update_in_blocks(self._update, epoch, TRAILING, size)
 
     def weighed(
-        self, ranges: ArrayLike, anchors: ArrayLike, links: ArrayLike | None
+        self,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None,
+        noise: NoiseLaw | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A checked epoch as (ranges, weights, anchors): inverse variances, 0 of lost links."""
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
-        weights = 1 / check_variance(self.noise.variance(ranges, mask), mask)
+        law = law_of(noise, self.noise)
+        weights = 1 / check_variance(law.variance(ranges, mask), mask)
         weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
         return ranges, weights if mask is None else weights * mask, anchors
 

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from rbl_gym import metrics
+from rbl_gym import metrics, ranging
 from rbl_gym.checks import FloatArray
 from rbl_gym.conformance import (
     ANCHORS,
@@ -69,7 +70,8 @@ def check_filter(
         leading axes), ``pose`` (proper rotations, covariances symmetric and positive definite),
         ``batching`` (a batch is a loop), ``purity`` (arguments and states are never changed),
         ``determinism``, ``pickling``, ``invariance`` (the world moved and turned), ``links``
-        (a missing link has no weight), ``nan`` (is refused by a ValueError), ``nees`` (the
+        (a missing link has no weight), ``noise`` (the law of an epoch is an argument of
+        `update`, for that epoch alone), ``nan`` (is refused by a ValueError), ``nees`` (the
         belief is honest and better than the prior).
     """
     _try_all(_FILTER_CHECKS, make_filter, skip, seed)
@@ -212,6 +214,33 @@ def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
     check_same("an epoch without a link must leave the belief as it was", before, nothing)
 
 
+def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
+    filter, epochs = _made(make_filter), simulate(rng, (3,), 2)
+    links = np.ones(epochs.ranges.shape[1:], dtype=np.bool_)
+    links[..., 1, 0] = False
+    state = call("initial", filter.initial, *epochs.prior)
+
+    def belief(filter: Any, state: Any, noise: Any = None) -> Any:
+        name = f"update(..., noise={'None' if noise is None else type(noise).__name__})"
+        update = partial(filter.update, noise=noise)
+        return filter.belief(call(name, update, state, epochs.ranges[0], ANCHORS, links))
+
+    own = filter.belief(filter.update(state, epochs.ranges[0], ANCHORS, links))
+    check_same("noise None must mean the law that the filter was made with",
+               own, belief(filter, state))  # fmt: skip
+    each = ranging.LinkNoise(NOISE.floor_m * rng.uniform(0.5, 3.0, epochs.ranges.shape[1:]))
+    for law in (ranging.RangeNoise(3 * NOISE.floor_m), each):
+        other = _made(make_filter, law)
+        twin = call("initial", other.initial, *epochs.prior)
+        check_same(
+            f"update(..., noise=law) must give what a filter made with that {type(law).__name__} "
+            "gives",
+            belief(other, twin), belief(filter, state, law),
+        )  # fmt: skip
+    check_same("the noise of one update must not stay for the next",
+               own, belief(filter, state))  # fmt: skip
+
+
 def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
     filter, epochs = _made(make_filter), simulate(rng, (3,), 1)
     state = call("initial", filter.initial, *epochs.prior)
@@ -244,8 +273,8 @@ def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
     )
 
 
-def _made(make_filter: Callable[..., Any]) -> Any:
-    laws = {"tags": TAGS, "noise": NOISE, "process": PROCESS}
+def _made(make_filter: Callable[..., Any], noise: ranging.NoiseLaw = NOISE) -> Any:
+    laws = {"tags": TAGS, "noise": noise, "process": PROCESS}
     return call("make_filter(tags=, noise=, process=)", make_filter, **laws)
 
 
@@ -336,7 +365,7 @@ _FILTER_CHECKS = {
     "interface": _filter_interface, "shapes": _filter_shapes, "pose": _filter_pose,
     "batching": _filter_batching, "purity": _filter_purity, "determinism": _filter_determinism,
     "pickling": _filter_pickling, "invariance": _filter_invariance, "links": _filter_links,
-    "nan": _filter_nan, "nees": _filter_nees,
+    "noise": _filter_noise, "nan": _filter_nan, "nees": _filter_nees,
 }  # fmt: skip
 _LOCATOR_CHECKS = {
     "shapes": _locator_shapes, "pose": _locator_pose, "batching": _locator_batching,

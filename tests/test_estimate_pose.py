@@ -183,18 +183,6 @@ def test_kalman_family_tracks(filter, name):
         assert np.linalg.det(turn) > 0
 
 
-def test_filter_without_a_noise_field_is_updated_as_it_is():
-    """A third party's filter need not know of the quality."""
-
-    class Stranger:
-        def update(self, state, ranges, anchors, links=None):
-            return "updated"
-
-    seen = raw("hall").reset(seed=1)[0]
-    stranger: Any = Stranger()
-    assert update(stranger, None, seen, SCENES["hall"]) == "updated"
-
-
 def test_iekf_believes_itself_at_the_bound():
     """The score of its belief and that of the posterior Cramer-Rao bound are within 3 %."""
     gaps = []

@@ -122,22 +122,3 @@ def test_filters_have_their_types(name, options, expected):
         name, tags=TAGS, noise=noise, process=PROCESS, **options
     )
     assert type(filter) is expected
-
-
-@pytest.mark.parametrize("name", ["kf", "iekf", "iekf-cv", "iekf-bias"])
-def test_filters_take_another_noise(name):
-    first, second = ranging.RangeNoise(0.1), ranging.RangeNoise(0.3)
-    filter = estimators.make(name, tags=TAGS, noise=first, process=PROCESS)
-    other = estimators.with_noise(filter, second)
-    state = filter.initial(np.eye(3), np.array([1, 2, 3.0]), 0.01 * np.eye(6))
-    anchors = np.array([[9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 9, 9.0]])
-    epoch = ranging.distances(anchors, TAGS + [1, 2, 3.0]), anchors
-    direct = estimators.make(name, tags=TAGS, noise=second, process=PROCESS)
-    assert other is not None
-    found, expected = (one.belief(one.update(state, *epoch)) for one in (other, direct))
-    np.testing.assert_array_equal(found.covariance, expected.covariance)
-    assert (found.covariance != filter.belief(filter.update(state, *epoch)).covariance).any()
-
-
-def test_a_filter_that_takes_no_noise_says_so():
-    assert estimators.with_noise(object(), ranging.RangeNoise(0.1)) is None  # pyright: ignore[reportArgumentType]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rbl_gym import estimators, testing
+from rbl_gym import estimators, ranging, testing
 from rbl_gym.testing import check_filter, check_locator
 
 
@@ -42,8 +42,8 @@ class Wrapped:
     def predict(self, state, twist, dt):
         return self.inner.predict(state, twist, dt)
 
-    def update(self, state, ranges, anchors, links=None):
-        return self.inner.update(state, ranges, anchors, links)
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        return self.inner.update(state, ranges, anchors, links, noise)
 
     def belief(self, state):
         return self.inner.belief(state)
@@ -107,10 +107,10 @@ class Negative(Wrapped):
 
 
 class MixesTrials(Wrapped):
-    def update(self, state, ranges, anchors, links=None):
+    def update(self, state, ranges, anchors, links=None, noise=None):
         if np.ndim(ranges) > 2:
             ranges = np.roll(ranges, 1, axis=0)
-        return super().update(state, ranges, anchors, links)
+        return super().update(state, ranges, anchors, links, noise)
 
 
 class InPlace(Wrapped):
@@ -120,8 +120,8 @@ class InPlace(Wrapped):
 
 
 class EatsRanges(Wrapped):
-    def update(self, state, ranges, anchors, links=None):
-        state = super().update(state, ranges, anchors, links)
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        state = super().update(state, ranges, anchors, links, noise)
         ranges[...] = 0.0
         return state
 
@@ -129,9 +129,9 @@ class EatsRanges(Wrapped):
 class Remembers(Wrapped):
     seen = 0
 
-    def update(self, state, ranges, anchors, links=None):
+    def update(self, state, ranges, anchors, links=None, noise=None):
         self.seen += 1
-        return super().update(state, ranges * (1 + 1e-9 * self.seen), anchors, links)
+        return super().update(state, ranges * (1 + 1e-9 * self.seen), anchors, links, noise)
 
 
 class HoldsALambda(Wrapped):
@@ -141,27 +141,50 @@ class HoldsALambda(Wrapped):
 
 
 class LikesTheOrigin(Wrapped):
-    def update(self, state, ranges, anchors, links=None):
-        state = super().update(state, ranges, anchors, links)
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        state = super().update(state, ranges, anchors, links, noise)
         return state._replace(translation=0.999 * state.translation)
 
 
 class IgnoresLinks(Wrapped):
-    def update(self, state, ranges, anchors, links=None):
-        return super().update(state, np.maximum(ranges, 1.0), anchors)
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        return super().update(state, np.maximum(ranges, 1.0), anchors, None, noise)
 
 
 class ForgetsWhereNothingIs(Wrapped):
-    def update(self, state, ranges, anchors, links=None):
-        after = super().update(state, ranges, anchors, links)
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        after = super().update(state, ranges, anchors, links, noise)
         if links is not None and not np.any(links):
             return after._replace(covariance=2 * after.covariance)
         return after
 
 
-class SwallowsNan(Wrapped):
+class OfTheOldInterface(Wrapped):
     def update(self, state, ranges, anchors, links=None):
-        return super().update(state, np.nan_to_num(ranges, nan=5.0), anchors, links)
+        return super().update(state, ranges, anchors, links)
+
+
+class DeafToNoise(Wrapped):
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        return super().update(state, ranges, anchors, links)
+
+
+class TakesTheMeanNoise(Wrapped):
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        if noise is not None:
+            noise = ranging.RangeNoise(np.sqrt(noise.variance(ranges).mean()))
+        return super().update(state, ranges, anchors, links, noise)
+
+
+class KeepsTheNoise(Wrapped):
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        self.kept = noise or getattr(self, "kept", None)
+        return super().update(state, ranges, anchors, links, self.kept)
+
+
+class SwallowsNan(Wrapped):
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        return super().update(state, np.nan_to_num(ranges, nan=5.0), anchors, links, noise)
 
 
 class WrongErrorOnNan(Wrapped):
@@ -178,8 +201,8 @@ class Boastful(Wrapped):
 
 
 class Standstill(Wrapped):
-    def update(self, state, ranges, anchors, links=None):
-        super().update(state, ranges, anchors, links)
+    def update(self, state, ranges, anchors, links=None, noise=None):
+        super().update(state, ranges, anchors, links, noise)
         return state
 
 
@@ -202,6 +225,10 @@ class Standstill(Wrapped):
         (LikesTheOrigin, "invariance", "a world moved and turned must move and turn the belief"),
         (IgnoresLinks, "links", "an anchor without a link, 0 in its place, must count like no"),
         (ForgetsWhereNothingIs, "links", "an epoch without a link must leave the belief"),
+        (OfTheOldInterface, "noise", r"update\(..., noise=None\) must take .* raised TypeError"),
+        (DeafToNoise, "noise", "what a filter made with that RangeNoise gives: .* is off by"),
+        (TakesTheMeanNoise, "noise", "what a filter made with that LinkNoise gives: .* is off by"),
+        (KeepsTheNoise, "noise", "the noise of one update must not stay for the next"),
         (SwallowsNan, "nan", "update must raise a ValueError on NaN in ranges, raised nothing"),
         (WrongErrorOnNan, "nan", r"NaN in twist, raised RuntimeError\('nan'\)"),
         (Boastful, "nees", "got [0-9.]+: errors are larger than claimed"),

@@ -46,7 +46,7 @@ def test_every_python_block_runs(package, monkeypatch, capsys):
 
 
 def test_the_template_has_ten_lines_to_write():
-    body = blocks("python")[0].split("links=None):\n", 1)[1].strip().splitlines()
+    body = blocks("python")[0].split("noise=None):\n", 1)[1].strip().splitlines()
     assert len(body) == 10
 
 

@@ -13,7 +13,8 @@ from gymnasium.utils import RecordConstructorArgs
 from rbl_gym import bounds, estimators, metrics, rendering, simulation
 from rbl_gym.bearing import AngleNoise
 from rbl_gym.checks import FloatArray, check_one_of
-from rbl_gym.estimators import Filter, PoseBelief, with_noise
+from rbl_gym.estimators import Filter, PoseBelief
+from rbl_gym.estimators.belief import check_takes_noise
 from rbl_gym.scene import Scene
 
 REWARDS = ("belief", "error")
@@ -151,9 +152,17 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
     law = getattr(env.unwrapped, "noise", scene.noise)
     if isinstance(law, AngleNoise):
         told = {"measurement": "doa", **told}
-    return estimators.make(
+    filter = estimators.make(
         name, tags=np.asarray(scene.tags), noise=law, process=scene.process, **told
     )
+    check_takes_obstacles(name, filter, scene)
+    return filter
+
+
+def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:
+    """A ValueError where obstacles give every epoch its own law and the filter takes none."""
+    if scene.obstacles:
+        check_takes_noise(name, filter, "the scene's obstacles give every epoch its own noise")
 
 
 def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -165,7 +174,7 @@ def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], scene: Scene) -> Any:
     """The filter's state after the measurements of an epoch, with their `quality` if it is told.
 
-    A filter learns of the quality by its noise law, if it takes one (`estimators.with_noise`).
+    The quality makes the law of the epoch, which the filter is given as `noise`.
     """
     if "G" in observation:
         statistical: Any = filter
@@ -173,11 +182,11 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
     if "angles" in observation:
         return filter.update(state, observation["angles"], observation["station"])
     ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
-    if "quality" in observation:
-        seen = links.astype(np.bool_, copy=False)
-        law = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
-        filter = with_noise(filter, law) or filter
-    return filter.update(state, ranges, anchors, links)
+    if "quality" not in observation:
+        return filter.update(state, ranges, anchors, links)
+    seen = links.astype(np.bool_, copy=False)
+    law = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
+    return filter.update(state, ranges, anchors, links, noise=law)
 
 
 def judge(

@@ -13,7 +13,7 @@ from rbl_gym.app import bench_figures, bench_recordings, bench_worlds, replay
 from rbl_gym.app.bench_figures import Errors, Reference
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.squared_range import geometric_rank
-from rbl_gym.wrappers.estimate import update
+from rbl_gym.wrappers.estimate import check_takes_obstacles, update
 
 
 class Tracked(NamedTuple):
@@ -70,7 +70,9 @@ def scene_stage(spec: Any, condition: str, trials: int, seed: int) -> Stage:
 
     def make(name: str, options: dict[str, Any]) -> estimators.Filter:
         laws = {"tags": told.tags, "noise": told.noise, "process": told.process}
-        return estimators.make(name, **laws, **options)
+        filter = estimators.make(name, **laws, **options)
+        check_takes_obstacles(name, filter, told)
+        return filter
 
     def figures(tracked: Tracked) -> dict[str, Any]:
         distance = None

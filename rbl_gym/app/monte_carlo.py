@@ -12,6 +12,7 @@ from rbl_gym import bounds, estimators, metrics, ranging, scene_bounds, simulati
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.scene import Scene
 from rbl_gym.statistic import EpochStatistic, simulate_statistic
+from rbl_gym.wrappers.estimate import check_takes_obstacles
 
 OBSERVATIONS = ("ranges", "statistic")
 
@@ -94,9 +95,11 @@ def simulate_world(
 
 def make(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
     """A named filter that knows the scene's tags and laws."""
-    return estimators.make(
+    filter = estimators.make(
         name, tags=scene.tags, noise=scene.noise, process=scene.process, **options
     )
+    check_takes_obstacles(name, filter, scene)
+    return filter
 
 
 def beliefs(world: World, filter: estimators.Filter) -> Iterator[tuple[Any, estimators.PoseBelief]]:
@@ -113,8 +116,22 @@ def beliefs(world: World, filter: estimators.Filter) -> Iterator[tuple[Any, esti
                 raise ValueError(f"filter must be of the KF family to read G and B, got {filter!r}")
             state = filter.update_statistic(state, *measured)
         else:
-            state = filter.update(state, measured.ranges, episode.anchors, measured.links)
+            state = filter.update(
+                state, measured.ranges, episode.anchors, measured.links, **_law(world, epoch)
+            )
         yield state, filter.belief(state)
+
+
+def _law(world: World, epoch: int) -> dict[str, ranging.NoiseLaw]:
+    """The argument `noise` of an epoch, where obstacles give it a law of its own."""
+    if not world.scene.obstacles:
+        return {}
+    measured: Any = world.measurements[epoch]
+    at = simulation.epoch_of(world.episode, epoch)
+    quality = simulation.link_quality(world.scene, at, world.episode.anchors)
+    return {
+        "noise": simulation.perceived_noise(world.scene, measured.ranges, measured.links, quality)
+    }
 
 
 def run(

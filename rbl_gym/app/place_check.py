@@ -61,9 +61,12 @@ def run(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[s
         laws["iterated EKF, not told"] = (scene.noise, True)
     result = {}
     for name, (law, robust) in laws.items():
-        filter = estimators.IteratedEkf(np.array(scene.tags), law, scene.process, robust=robust)
+        filter = estimators.IteratedEkf(
+            np.array(scene.tags), scene.noise, scene.process, robust=robust
+        )
         state = filter.initial(drawn.prior_rotation, drawn.prior_translation, prior)
-        belief = filter.belief(filter.update(state, drawn.ranges, anchors, drawn.links))
+        epoch = drawn.ranges, anchors, drawn.links
+        belief = filter.belief(filter.update(state, *epoch, noise=law))
         result[name] = figures(drawn, belief, with_prior)
     if (bounds.information_rank(drawn.information) == 6).all():
         tags = np.asarray(scene.tags)

@@ -11,6 +11,7 @@ import numpy as np
 
 from rbl_gym import estimators, metrics, motion, ranging, recordings, rotations
 from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.estimators.belief import check_takes_noise
 from rbl_gym.link_bias import LinkBias
 from rbl_gym.recordings import Recording
 
@@ -104,19 +105,18 @@ def steps(
 ) -> Iterator[tuple[Any, estimators.PoseBelief]]:
     """State and belief of a filter after every epoch of a recording, started from nothing.
 
-    A noise that the recording reports itself reaches a filter that takes one.
+    Standard deviations that the recording reports itself are the law of their epoch.
     """
     state = filter.initial(*_prior(recording, settings))
-    reported = settings.range_std_m is None
     before = recording.times[0]
     for k, now in enumerate(recording.times):
-        if reported and recording.range_std is not None:
-            filter = (
-                estimators.with_noise(filter, ranging.LinkNoise(recording.range_std[k])) or filter
-            )
         if now > before:
             state = filter.predict(state, np.zeros(6), now - before)
-        state = filter.update(state, recording.ranges[k], recording.anchors, recording.links[k])
+        epoch = recording.ranges[k], recording.anchors, recording.links[k]
+        law = {}
+        if _has_own_std(recording, settings):
+            law["noise"] = ranging.LinkNoise(recording.range_std[k])
+        state = filter.update(state, *epoch, **law)
         yield state, filter.belief(state)
         before = now
 
@@ -125,11 +125,11 @@ def range_std_of(recording: Recording, settings: Settings) -> float | str:
     """The standard deviation of a range [m], or ``"recorded"`` where each has its own."""
     if settings.range_std_m is not None:
         return settings.range_std_m
-    if recording.range_std is None:
-        return DEFAULT_RANGE_STD_M
-    law = ranging.LinkNoise(recording.range_std[0])
-    takes_it = estimators.with_noise(make_filter(recording, settings), law) is not None
-    return "recorded" if takes_it else DEFAULT_RANGE_STD_M
+    return "recorded" if _has_own_std(recording, settings) else DEFAULT_RANGE_STD_M
+
+
+def _has_own_std(recording: Recording, settings: Settings) -> bool:
+    return settings.range_std_m is None and recording.range_std is not None
 
 
 def track_of(recording: Recording, beliefs: list[estimators.PoseBelief]) -> Track:
@@ -150,14 +150,26 @@ def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
 def named_filter(
     recording: Recording, settings: Settings, name: str, options: dict[str, Any]
 ) -> estimators.Filter:
-    """`make_filter` for any filter and options of its own."""
+    """`make_filter` for any filter and options of its own.
+
+    Raises
+    ------
+    ValueError
+        As `estimators.make`; and for a filter that does not take the law of an epoch, where the
+        recording has one.
+    """
     walk, turn = settings.walk_m, math.radians(settings.walk_deg)
     if settings.planar:
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
     else:
         process = motion.ProcessNoise(turn, walk)
     noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
-    return estimators.make(name, tags=recording.tags, noise=noise, process=process, **options)
+    laws = {"tags": recording.tags, "noise": noise, "process": process}
+    filter = estimators.make(name, **laws, **options)
+    if _has_own_std(recording, settings):
+        why = "the recording has a standard deviation for every range"
+        check_takes_noise(name, filter, why)
+    return filter
 
 
 # Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.

@@ -145,6 +145,8 @@ def _tag_rmse(
     kind, options, reflections = FILTERS[name]
     anchors = np.repeat(anchors, repeats, axis=0)
     racks = np.repeat(contexts.racks, repeats, axis=0)
+    laws = {"tags": tags, "noise": scene.noise, "process": scene.process}
+    filter = estimators.make(kind, **laws, **options)
     state: Any = None
     total = np.zeros(len(anchors))
     for k in range(_STEPS + 1):
@@ -156,14 +158,14 @@ def _tag_rmse(
         if reflections:
             ranges = ranges + NLOS_BIAS_M * bodies.reflected[k]
         ranges = np.maximum(ranges, 1e-3)
-        told = ranging.LinkNoise(scale * np.sqrt(scene.noise.variance(ranges)))
-        law = told if contexts.racks.shape[-2] else scene.noise
-        filter = estimators.make(kind, tags=tags, noise=law, process=scene.process, **options)
+        law = None
+        if contexts.racks.shape[-2]:
+            law = ranging.LinkNoise(scale * np.sqrt(scene.noise.variance(ranges)))
         if k == 0:
             state = filter.initial(*bodies.prior, scene.prior_covariance)
         else:
             state = filter.predict(state, bodies.twists[k - 1], scene.dt)
-        state = filter.update(state, ranges, anchors)
+        state = filter.update(state, ranges, anchors, noise=law)
         if k > _SETTLING:
             belief = filter.belief(state)
             error = metrics.tag_error(
