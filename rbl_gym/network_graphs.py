@@ -15,9 +15,11 @@ from scipy.sparse import csgraph
 from rbl_gym.checks import check_one_of
 from rbl_gym.sensing_network import IntArray, check_edges
 
-__all__ = ["BASES", "SpanningTree", "cycle_matrix", "incidence", "spanning_tree"]
+__all__ = ["BASES", "CYCLES", "SpanningTree", "cycle_matrix", "incidence", "spanning_tree"]
 
 BASES = ("bfs", "paton", "minimum")
+CYCLES = (*BASES, "all")
+_MOST_CYCLES = 100_000  # that "all" lists; a complete graph of 9 nodes has 62,814
 _NAMED = 8  # nodes of a component that a message lists
 
 
@@ -130,7 +132,7 @@ def _tree_edges(edges: IntArray, parent: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> sp.csr_matrix:
-    """Cycle matrix C (m - n + 1, m), entries -1, 0, 1: ``C B = 0``.
+    """Cycle matrix C (q, m), entries -1, 0, 1: ``C B = 0`` (Definition 4).
 
     Parameters
     ----------
@@ -140,18 +142,43 @@ def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> sp.csr_m
         ``"bfs"``: one cycle for each edge outside of the breadth-first tree, run in the sense
         of that edge from i to j. ``"paton"``: a tree grown from the node that was reached
         last, each cycle cut short where it meets a neighbour. ``"minimum"``: shortest
-        cycles in all (Horton), for graphs of up to some hundred nodes.
+        cycles in all (Horton), for graphs of up to some hundred nodes. These are bases, q is
+        m - n + 1 (Theorem 5). ``"all"``: every cycle of a small graph once, in either sense.
 
     Raises
     ------
     ValueError
-        If the graph is not connected; the message names the components.
+        If the graph is not connected (the message names the components), or has more than
+        100,000 cycles where all are asked for.
     """
-    check_one_of("basis", basis, BASES)
+    check_one_of("basis", basis, CYCLES)
     edges = check_connected(edges, n_nodes)
     if basis == "bfs":
         return fundamental_cycles(edges, spanning_tree(edges, n_nodes))
-    return (_minimum_basis if basis == "minimum" else _paton_basis)(edges, n_nodes)
+    return _OTHERS[basis](edges, n_nodes)
+
+
+def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+    """A cycle matrix (q, m) of one's own; its rows may depend on each other.
+
+    Raises
+    ------
+    ValueError
+        If it has another number of columns, or a row is no closed walk over edges that are run
+        once each.
+    """
+    C = sp.csr_matrix(cycles, dtype=np.float64, copy=True)
+    if C.shape[1] != len(edges):
+        raise ValueError(f"cycles must have a column per edge, {len(edges)}, got {C.shape}")
+    C.sum_duplicates()
+    C.eliminate_zeros()
+    if not (np.abs(C.data) == 1).all():
+        wrong = C.data[np.abs(C.data) != 1][0]
+        raise ValueError(f"cycles must have entries -1, 0 and 1, got {wrong:g}")
+    open_ = np.unique((C @ incidence(edges, n_nodes)).nonzero()[0])
+    if len(open_):
+        raise ValueError(f"cycles must be closed walks, got one that is not in row {open_[0]}")
+    return C
 
 
 def fundamental_cycles(edges: IntArray, tree: SpanningTree) -> sp.csr_matrix:
@@ -207,11 +234,67 @@ def _paton_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
                 at = parent[at]
             walks.append([*walk, (at, used[other][at])])
             used[other].setdefault(node, row)
+    return _walked(walks, edges)
+
+
+def _walked(walks: list[list[tuple[int, int]]], edges: IntArray) -> sp.csr_matrix:
+    """Cycle matrix of closed walks, each a list of (node, row of the edge that leaves it)."""
     rows = [row for row, walk in enumerate(walks) for _ in walk]
     starts, columns = (np.array([step[k] for walk in walks for step in walk], dtype=np.intp)
                        for k in (0, 1))  # fmt: skip
     signs = np.where(edges[columns, 0] == starts, 1.0, -1.0)
     return sp.csr_matrix((signs, (rows, columns)), shape=(len(walks), len(edges)))
+
+
+def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
+    """Every cycle, from its smallest node on, in the sense that leaves it by the smaller row.
+
+    A path is grown only where it can still come back to its start: no branch is without a cycle.
+    """
+    near: list[list[tuple[int, int]]] = [[] for _ in range(n_nodes)]
+    beside = [0] * n_nodes  # neighbours, as bits
+    for row, (i, j) in enumerate(edges.tolist()):
+        near[i].append((j, row))
+        near[j].append((i, row))
+        beside[i] |= 1 << j
+        beside[j] |= 1 << i
+
+    def comes_back(node: int, start: int, free: int) -> bool:
+        reached = new = 1 << node
+        while new:
+            if new & beside[start]:
+                return True
+            at = new.bit_length() - 1
+            new ^= 1 << at
+            found = beside[at] & free & ~reached
+            reached |= found
+            new |= found
+        return False
+
+    walks: list[list[tuple[int, int]]] = []
+    for start in range(n_nodes):
+        free = (1 << n_nodes) - (2 << start)
+        nodes, rows, ways = [start], list[int](), [iter(near[start])]
+        while ways:
+            for other, row in ways[-1]:
+                if other == start and rows and row > rows[0]:
+                    walks.append(list(zip(nodes, [*rows, row], strict=True)))
+                    if len(walks) > _MOST_CYCLES:
+                        raise ValueError(f"edges must have at most {_MOST_CYCLES:,} cycles to "
+                                         "list all of them, got more")  # fmt: skip
+                elif free >> other & 1 and comes_back(other, start, free ^ 1 << other):
+                    free ^= 1 << other
+                    nodes.append(other)
+                    rows.append(row)
+                    ways.append(iter(near[other]))
+                    break
+            else:
+                ways.pop()
+                left = nodes.pop()
+                if rows:
+                    rows.pop()
+                    free |= 1 << left
+    return _walked(walks, edges)
 
 
 def _minimum_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
@@ -244,3 +327,6 @@ def _minimum_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
             pivots[bits.bit_length()] = bits
             chosen.append(cycle)
     return sp.csr_matrix(sp.vstack(chosen)) if chosen else sp.csr_matrix((0, len(edges)))
+
+
+_OTHERS = {"paton": _paton_basis, "minimum": _minimum_basis, "all": _all_cycles}

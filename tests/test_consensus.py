@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
 from rbl_gym import estimators
 from rbl_gym.app import network2009
@@ -64,7 +65,7 @@ def test_the_limit_is_the_projection_on_its_branch_in_any_order(basis):
         bound = tol / np.sqrt(consensus.eigenvalues(C)[0]) + 1e-12
         runs = [cycle_iteration(edges, y, n_nodes, C, tol=tol)]
         runs += [cycle_iteration(edges, y, n_nodes, C, rule, tol=tol)
-                 for rule in consensus.STEP_BOUNDS]  # fmt: skip
+                 for rule in consensus.STEP_RULES]  # fmt: skip
         for k, (kappa, loss) in enumerate([(None, 0.0), (None, 0.4), (0.1, 0.0)]):
             rng = np.random.default_rng([seed, k])
             runs.append(cycle_iteration(edges, y, n_nodes, C, kappa, tol=tol, rng=rng, loss=loss,
@@ -76,7 +77,7 @@ def test_the_limit_is_the_projection_on_its_branch_in_any_order(basis):
             np.testing.assert_allclose(C @ run.psi, 2 * np.pi * run.branch, atol=2 * tol)
 
 
-@pytest.mark.parametrize("rule", [None, *consensus.STEP_BOUNDS])
+@pytest.mark.parametrize("rule", consensus.STEP_RULES)
 @every_basis
 def test_measured_factor_is_the_true_one(basis, rule):
     row = network2009._convergence(
@@ -95,10 +96,106 @@ def test_the_step_must_be_below_two_over_lambda_max():
     for wrong in (2 / high, 0.0, -1.0, np.nan):
         with pytest.raises(ValueError, match="kappa must"):
             cycle_iteration(edges, y, n_nodes, kappa=wrong)
-    with pytest.raises(ValueError, match="kappa must be one of 'rows', 'product'"):
+    with pytest.raises(ValueError, match="kappa must be one of 'theorem', 'best', 'trace', 'rows'"):
         cycle_iteration(edges, y, n_nodes, kappa="fast")
-    for rule in consensus.STEP_BOUNDS:
-        assert consensus.step_size(cycle_matrix(edges, n_nodes), rule) < 2 / high
+
+
+@every_basis
+def test_every_rule_is_what_it_says(basis):
+    for edges, _, n_nodes in networks(3, seed=8):
+        C = cycle_matrix(edges, n_nodes, basis)
+        values = np.linalg.eigvalsh((C @ C.T).toarray())
+        want = {
+            "theorem": 2 / (1 + values[-1]),
+            "best": 2 / (values[0] + values[-1]),
+            "trace": 2 / (1 + np.abs(C.toarray()).sum()),
+            "rows": 2 / (1 + np.abs((C @ C.T).toarray()).sum(axis=1).max()),
+        }
+        for rule, kappa in want.items():
+            assert consensus.step_size(C, rule) == pytest.approx(kappa, rel=1e-10)
+            assert kappa < 2 / values[-1]
+            true = np.abs(1 - kappa * values).max()
+            assert consensus.convergence_factor(C, kappa) == pytest.approx(true, rel=1e-10)
+            assert consensus.convergence_factor(C, want["best"]) <= true + 1e-12
+            if basis == "bfs":  # Theorem 19, of the squared error
+                assert true**2 <= consensus.printed_factor(kappa) + 1e-12
+
+
+def test_the_printed_factor_is_one_minus_kappa_squared():
+    """At Theorem 19's bound it is the true one of a basis with lambda_min = 1."""
+    assert consensus.printed_factor(0.25) == 0.5625
+    pairs = [[i, j] for i in range(6) for j in range(i + 1, 6)]
+    C = cycle_matrix(pairs, 6)  # K6, the cycles of a star: eigenvalues 1 and 6
+    assert consensus.eigenvalues(C) == pytest.approx((1, 6))
+    kappa = consensus.step_size(C, "theorem")
+    true = consensus.convergence_factor(C, kappa)
+    assert true**2 == pytest.approx(consensus.printed_factor(kappa))
+
+
+K4 = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
+
+
+def test_all_cycles_of_k4_agree_with_the_projection_or_say_that_they_cannot():
+    """7 cycles of rank 3, noise of 0.9 rad an edge: cycles often slip, some against others."""
+    rng = np.random.default_rng(0)
+    C = cycle_matrix(K4, 4, "all")
+    rests = 0
+    for k in range(80):
+        y = proj(rng.normal(0, 0.9, 6))
+        order = consensus.ORDERS[k % 10 == 0]
+        run = cycle_iteration(K4, y, 4, "all", order=order, rng=rng)
+        assert np.isfinite(run.psi).all()
+        assert run.converged == run.consistent
+        if run.consistent:
+            np.testing.assert_allclose(run.psi, cycle_projection(C, y, run.branch), atol=1e-10)
+            B = np.linalg.lstsq(C.toarray(), C @ y - 2 * np.pi * run.branch, rcond=None)[0]
+            np.testing.assert_allclose(run.psi, y - B, atol=1e-10)
+        else:
+            rests += 1
+            with pytest.raises(ValueError, match="branch: the multiples of 2 pi of dependent"):
+                cycle_projection(C, y, run.branch)
+            with pytest.raises(ValueError, match="contradict each other"):
+                cycle_iteration(K4, y, 4, "all", branch=run.branch)
+            with pytest.raises(RuntimeError, match=r"did not converge in \d+ steps: branch"):
+                cycle_consensus(K4, y, 4, "all", max_steps=1000)
+    assert 0 < rests < 20
+
+
+def test_dependent_cycles_of_consistent_branches_give_what_a_basis_gives():
+    """Copies of cycles and all cycles span what a basis spans; the nearest branches agree."""
+    rng = np.random.default_rng(3)
+    y = 0.1 * rng.standard_normal((5, 6))
+    basis = cycle_matrix(K4, 4)
+    want = cycle_projection(basis, y)
+    for C in (cycle_matrix(K4, 4, "all"), sp.vstack([basis, basis[:1], -basis[1:]])):
+        np.testing.assert_allclose(cycle_projection(sp.csr_matrix(C), y), want, atol=1e-12)
+        np.testing.assert_allclose(cycle_consensus(K4, y[0], 4, C), want[0], atol=1e-10)
+    # The eigenvalues that are not zero are all alike: one step.
+    assert consensus.eigenvalues(cycle_matrix(K4, 4, "all")) == pytest.approx((8, 8))
+    assert cycle_iteration(K4, y[0], 4, "all", "best").steps == 1
+
+
+def test_a_random_order_that_cannot_come_to_rest_ends():
+    """Branches 1, 0, 0, 0, -1, 0, 0 of K4 contradict each other; Kaczmarz would run for ever."""
+    rng = np.random.default_rng(0)
+    C = cycle_matrix(K4, 4, "all")
+    while True:
+        y = proj(rng.normal(0, 0.9, 6))
+        if not cycle_iteration(K4, y, 4, C).consistent:
+            break
+    for settings in ({"order": "asynchronous"}, {"loss": 0.3}):
+        run = cycle_iteration(K4, y, 4, C, rng=np.random.default_rng(1), **settings)
+        assert run.converged == run.consistent
+        assert run.steps < 5000
+
+
+def test_projection_of_many_is_the_projection_of_each():
+    edges, y, n_nodes = next(networks(1, seed=9))
+    C = cycle_matrix(edges, n_nodes)
+    many = y + 0.1 * np.random.default_rng(0).standard_normal((2, 3, len(y)))
+    got = cycle_projection(C, many)
+    for k in np.ndindex(2, 3):
+        np.testing.assert_allclose(got[k], cycle_projection(C, many[k]), atol=1e-12)
 
 
 def test_sparse_eigenvalues_agree_with_dense_ones(monkeypatch):
@@ -153,8 +250,10 @@ def test_an_edge_that_comes_twice_was_measured_twice():
         ({"y": [0.1, np.nan, 0.2]}, "y must be finite, got nan at index"),
         ({"y": [0.1, 0.2]}, r"y must have shape \(3,\) like the edges"),
         ({"n_nodes": 4}, "2 components"),
-        ({"cycles": "all"}, "cycles must be one of"),
+        ({"cycles": "some"}, "cycles must be one of"),
         ({"cycles": np.ones((1, 2))}, "a column per edge"),
+        ({"cycles": 2 * np.array([[1, 1, -1]])}, "cycles must have entries -1, 0 and 1, got 2"),
+        ({"cycles": [[1, 1, 1]]}, "closed walks, got one that is not in row 0"),
         ({"order": "random"}, "order must be one of"),
         ({"order": "asynchronous"}, r"rng must be a numpy\.random\.Generator, got None"),
         ({"max_steps": -1}, "max_steps must be an int of at least 0, got -1"),
@@ -176,7 +275,7 @@ def test_wrong_arguments_are_named(change, message):
     [
         ([0.1, 0.2, 0.3], [0.5], "branch must be 1 whole numbers"),
         ([0.1, 0.2, 0.3], [0, 1], "branch must have shape"),
-        (np.zeros((2, 3)), None, r"y must have shape \(3,\), got \(2, 3\)"),
+        (np.zeros((2, 4)), None, "y must have shape"),
     ],
 )
 def test_wrong_arguments_of_the_projection_are_named(y, branch, message):

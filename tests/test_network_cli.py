@@ -95,7 +95,7 @@ def test_reproduce_network2009(tmp_path, capsys, monkeypatch):
             assert row["largest_difference"] < 1e-3
     # Theorem 19 holds for the cycles of a tree; elsewhere not always.
     assert {row["printed_holds"] for row in result["convergence"]["bfs"].values()} == {1.0}
-    assert result["convergence"]["minimum"]["product"]["printed_holds"] < 1
+    assert result["convergence"]["minimum"]["theorem"]["printed_holds"] < 1
     for row in result["asynchronous"]:
         assert row["largest_error_rad"] < 1e-11
 

@@ -4,6 +4,8 @@
 # pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false
 from __future__ import annotations
 
+import itertools
+
 import networkx as nx
 import numpy as np
 import pytest
@@ -106,6 +108,43 @@ def test_minimum_basis_is_as_short_as_networkxs_and_patons_as_patons():
         shortest = sum(map(len, nx.minimum_cycle_basis(known)))
         assert cycle_matrix(one.edges, n_nodes, "minimum").nnz == shortest
         assert shortest <= cycle_matrix(one.edges, n_nodes, "paton").nnz
+
+
+def test_all_cycles_are_those_of_brute_force():
+    """Every connected set of edges that meets each of its nodes twice; parallel edges too."""
+    rng = np.random.default_rng(5)
+    for n_nodes, m in ((3, 3), (4, 6), (5, 8), (5, 9), (6, 9)):
+        pairs = np.array(list(itertools.combinations(range(n_nodes), 2)))
+        edges = np.concatenate([[[k, k + 1] for k in range(n_nodes - 1)],
+                                rng.choice(pairs, m - n_nodes + 1)])  # fmt: skip
+        want = set()
+        for size in range(2, n_nodes + 1):
+            for rows in itertools.combinations(range(m), size):
+                nodes, degree = np.unique(edges[list(rows)], return_counts=True)
+                names = np.searchsorted(nodes, edges[list(rows)])
+                if (degree == 2).all() and not components(names, len(nodes)).any():
+                    want.add(rows)
+        C = cycle_matrix(edges, n_nodes, "all")
+        assert abs(C @ incidence(edges, n_nodes)).sum() == 0
+        assert sorted(tuple(np.flatnonzero(row)) for row in C.toarray()) == sorted(want)
+
+
+def test_the_complete_graphs_have_the_cycles_that_they_have():
+    for n_nodes, count in ((3, 1), (4, 7), (5, 37), (6, 197), (7, 1172)):
+        pairs = np.array(list(itertools.combinations(range(n_nodes), 2)))
+        C = cycle_matrix(pairs, n_nodes, "all")
+        assert C.shape == (count, len(pairs))
+        assert np.linalg.matrix_rank(C.toarray()) == len(pairs) - n_nodes + 1
+    with pytest.raises(ValueError, match="at most 100,000 cycles"):
+        cycle_matrix(list(itertools.combinations(range(12), 2)), 12, "all")
+
+
+def test_a_long_chain_of_triangles_and_a_ring_are_listed_at_once():
+    """No search among dead ends: 100 triangles in a row, and a ring of 300 nodes."""
+    chain = [edge for k in range(0, 200, 2) for edge in ((k, k + 1), (k + 1, k + 2), (k, k + 2))]
+    assert cycle_matrix(chain, 201, "all").shape == (100, 300)
+    ring = np.column_stack([np.arange(300), np.roll(np.arange(300), -1)])
+    assert cycle_matrix(ring, 300, "all").nnz == 300
 
 
 def test_components_and_tree_as_networkx():

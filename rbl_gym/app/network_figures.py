@@ -38,7 +38,7 @@ def network2009_figure(result: dict[str, Any]) -> Figure:
     axes[0, 1].legend(frameon=False)
     for basis, history in result["history"].items():
         axes[1, 0].semilogy(np.maximum(history, 1e-16), color=_COLOURS[basis], label=basis)
-        printed = result["convergence"][basis]["exact"]["printed_factor_squared"]
+        printed = result["convergence"][basis]["theorem"]["printed_factor_squared"]
         steps = np.arange(len(history))
         axes[1, 0].semilogy(steps, history[0] * printed ** (steps / 2), color=_COLOURS[basis],
                             ls=":", lw=1)  # fmt: skip
