@@ -148,10 +148,10 @@ SCENES: dict[str, Scene] = {
             tags=as_tuples(bodies.pyramid(1.0)),
             noise=SquaredRangeNoise(0.0316),
             process=ProcessNoise(math.radians(0.1), 1.0),
-            dt=1.0,
+            dt=1.0,  # not printed: an assumption
             steps=20,
             trajectory="constant",
-            twist=(*[math.radians(13.0)] * 3, 13.0, 13.0, 13.0),
+            twist=(*[math.radians(1.0)] * 3, 1.0, 1.0, 1.0),  # 1_3 deg/s and 1_3 m/s
             start_rotation=as_tuples(np.eye(3)),
             start_translation=(0.0, 0.0, 0.0),
             # 100 I12 of the paper: pose information .02 and .01, that is 50 and 100.

@@ -108,7 +108,7 @@ def test_scene_has_the_figures_of_the_table(name):
 
 def test_papers_worlds():
     tracking, static = scenes.get("camsap2013"), scenes.get("icassp2013")
-    np.testing.assert_allclose(tracking.twist, [np.deg2rad(13)] * 3 + [13] * 3)
+    np.testing.assert_allclose(tracking.twist, [np.deg2rad(1)] * 3 + [1] * 3)
     np.testing.assert_array_equal(tracking.start_rotation, np.eye(3))
     assert tracking.start_translation == (0, 0, 0)
     # Q = Rz(10) Ry(-25) Rx(20), written out by hand.

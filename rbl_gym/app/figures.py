@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
+from scipy.stats import chi2
 
 from rbl_gym.app.camsap2013 import Example
 from rbl_gym.app.replay import Errors, Track
@@ -33,8 +35,8 @@ STATIC_COLOURS = {
     "ML, marginalised": "#7fb800",
 }
 DOA_COLOURS = {"NIA + UQ": "#2e86ab", "ML": "#1b7f5c", "PSO": "#e8a33d", "PSA": "#d1495b"}
-# A belief is centimetres wide on a track of hundreds of metres.
-_MAGNIFY = 200
+# A belief is centimetres wide on a track of tens of metres.
+_MAGNIFY = 20
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -51,39 +53,50 @@ def save(figure: Figure, path: str) -> None:
 
 
 def camsap2013(result: dict[str, Any], example: Example) -> Figure:
-    """One trajectory with its beliefs and errors; the error curves of both readings, the bound."""
+    """Figs 2 and 3 of the tracking paper, NEES, and one trial or ET-KF's trade beside them."""
     figure = new_figure(14, 7.2)
-    grid = figure.add_gridspec(2, 3, height_ratios=[1.25, 1])
-    _trajectory(figure.add_subplot(grid[0, 0]), example)
-    lower = figure.add_subplot(grid[1, 0])
-    if all("trade" in data for data in result["readings"].values()):
-        _trade(lower, result)
+    axes = figure.subplots(2, 3, width_ratios=[1.05, 1, 1])
+    _trajectory(axes[0, 0], example)
+    if "trade" in result:
+        _trade(axes[1, 0], result["trade"])
     else:
-        _errors(lower, example)
-    for column, (reading, data) in enumerate(result["readings"].items()):
-        for row, (key, label) in enumerate(
-            (("rotation_rmse", "rotation RMSE (Frobenius)"),
-             ("translation_rmse_m", "translation RMSE [m]"))
-        ):  # fmt: skip
-            axes = figure.add_subplot(grid[row, column + 1])
-            steps = np.arange(1, len(data["bound"][key]) + 1)
-            for name, filter in data["filters"].items():
-                axes.semilogy(steps, filter["per_step"][key], color=COLOURS[name], label=name,
-                              lw=1.6, ls="--" if name == "KF-ortho" else "-")  # fmt: skip
-            axes.semilogy(steps, data["bound"][key], "k.", ms=5, label="posterior CRB")
-            axes.set_ylabel(label)
-            axes.set_xlabel("step")
-            axes.set_xticks([1, 5, 10, 15, 20])
-            axes.set_title(f"turn noise {reading}/s, {result['trials']} trials", fontsize=9)
-            axes.yaxis.set_major_formatter(ScalarFormatter())
-            axes.yaxis.set_minor_formatter(ScalarFormatter())
-            axes.grid(alpha=0.25, which="both", lw=0.5)
-            if row == 0:
-                axes.legend(frameon=False, fontsize=8, ncols=2)
-            else:
-                axes.text(0.98, 0.9, "the linear filters coincide", transform=axes.transAxes,
-                          ha="right", fontsize=8, color=COLOURS["UC-KF"])  # fmt: skip
+        _errors(axes[1, 0], example)
+    tracking_curves([axes[0, 1], axes[0, 2], axes[1, 1], axes[1, 2]], result)
     return figure
+
+
+def tracking_curves(axes: Sequence[Any], result: dict[str, Any]) -> None:
+    """RMSE of rotation and translation (Fig. 2), MAE (Fig. 3), mean NEES; each over the steps."""
+    panels = (
+        ("rotation_rmse", "rotation RMSE (Frobenius)", "Fig. 2, rotation"),
+        ("translation_rmse_m", "translation RMSE [m]", "Fig. 2, translation"),
+        ("mean_angular_error_deg", "mean angular error [deg]", "Fig. 3"),
+        ("nees", "mean NEES", "NEES; grey: 95 % of an honest filter"),
+    )
+    steps = np.arange(1, len(result["bound"]["rotation_rmse"]) + 1)
+    for ax, (key, label, title) in zip(axes, panels, strict=True):
+        for name, filter in result["filters"].items():
+            ax.plot(steps, filter["per_step"][key], color=COLOURS[name], label=name, lw=1.6,
+                    ls="--" if name == "KF-ortho" else "-")  # fmt: skip
+        if f"estimated_{key}" in result["filters"]["KF"]["per_step"]:
+            estimated = result["filters"]["KF"]["per_step"][f"estimated_{key}"]
+            ax.plot(steps, estimated, "x", color="0.25", ms=5, label="estimated by KF")
+            ax.plot(steps, result["bound"][key], "k.", ms=5, label="posterior CRB")
+        if key == "nees":
+            low, high = chi2.ppf([0.025, 0.975], 6 * result["trials"]) / result["trials"]
+            ax.axhspan(low, high, color="0.85", zorder=0)
+        else:
+            ax.set_yscale("log")
+            for axis_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+                axis_formatter(ScalarFormatter())
+        ax.set_ylabel(label)
+        ax.set_xlabel("time step")
+        ax.set_xticks([1, 5, 10, 15, 20])
+        ax.set_title(f"{title}, {result['trials']} trials", fontsize=9)
+        ax.grid(alpha=0.25, which="both", lw=0.5)
+    axes[0].legend(frameon=False, fontsize=8, ncols=2)
+    axes[1].text(0.98, 0.72, "KF, KF-ortho, ET-KF and UC-KF coincide", transform=axes[1].transAxes,
+                 ha="right", fontsize=8, color=COLOURS["UC-KF"])  # fmt: skip
 
 
 def _trajectory(axes: Any, example: Example) -> None:
@@ -99,7 +112,7 @@ def _trajectory(axes: Any, example: Example) -> None:
             places = truth[k, :2] + _MAGNIFY * ring
             axes.plot(*places.T, color=COLOURS[name], lw=1.2, label=name if k == 0 else None)
     heading = episode.rotation[0][:, :2, 0]
-    axes.quiver(*truth[:, :2].T, *heading.T, angles="xy", scale_units="xy", scale=0.06,
+    axes.quiver(*truth[:, :2].T, *heading.T, angles="xy", scale_units="xy", scale=0.5,
                 width=0.004, color="0.3", zorder=3)  # fmt: skip
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("x [m]")
@@ -108,21 +121,19 @@ def _trajectory(axes: Any, example: Example) -> None:
     axes.legend(frameon=False, fontsize=8, loc="upper left")
 
 
-def _trade(axes: Any, result: dict[str, Any]) -> None:
+def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
     """ET-KF's error against how often it projects, a point for every threshold."""
-    for (reading, data), marker in zip(result["readings"].items(), "os", strict=False):
-        rates = [100 * row["trigger_rate"] for row in data["trade"]]
-        errors = [row["rotation_rmse"] for row in data["trade"]]
-        axes.plot(rates, errors, marker=marker, ms=4, lw=1.2, color=COLOURS["ET-KF"],
-                  label=f"turn noise {reading}/s")  # fmt: skip
-        for row, rate, error in zip(data["trade"], rates, errors, strict=True):
-            if 1 < rate < 97:
-                axes.annotate(f"{row['threshold']:g}", (rate, error), xytext=(3, 4),
-                              textcoords="offset points", fontsize=7)  # fmt: skip
+    rates = [100 * row["trigger_rate"] for row in trade]
+    errors = [row["rotation_rmse"] for row in trade]
+    axes.plot(rates, errors, "o-", ms=4, lw=1.2, color=COLOURS["ET-KF"])
+    for row, rate, error in zip(trade, rates, errors, strict=True):
+        if 0 < rate < 97:
+            axes.annotate(f"{row['threshold']:g}", (rate, error), xytext=(3, 4),
+                          textcoords="offset points", fontsize=7)  # fmt: skip
     axes.set_xlabel("updates that project [%]")
     axes.set_ylabel("rotation RMSE (Frobenius)")
     axes.set_title("ET-KF's trade, labelled by threshold", fontsize=9)
-    axes.legend(frameon=False, fontsize=8)
+    axes.grid(alpha=0.25, lw=0.5)
 
 
 def _errors(axes: Any, example: Example) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rbl_gym import bounds, estimators, metrics, ranging, scene_bounds, simulation
 from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.estimators.kalman import KalmanState
 from rbl_gym.scene import Scene
 from rbl_gym.statistic import EpochStatistic, simulate_statistic
 from rbl_gym.wrappers.estimate import check_takes_obstacles
@@ -43,8 +44,9 @@ class Trace(NamedTuple):
         Pose error of the belief (K, B, 6).
     nees, score
         Of the belief: ``e^T P^-1 e``; b in metres.
-    own_rotation
-        Variance of the rotation's Frobenius error that the filter claims in its own state.
+    own_rotation, own_translation
+        Variances that the filter claims in its own state: of the rotation's Frobenius error
+        (the tracking paper's tr P_q), and of the translation (tr P_t).
     constrained
         Whether the update put the rotation back onto SO(3).
     seconds
@@ -57,6 +59,7 @@ class Trace(NamedTuple):
     nees: FloatArray
     score: FloatArray
     own_rotation: FloatArray
+    own_translation: FloatArray
     constrained: FloatArray
     seconds: float
 
@@ -155,7 +158,7 @@ def run(
                 error,
                 metrics.nees(error, belief.covariance),
                 bounds.score(belief.covariance, belief.rotation, tags),
-                _own_variance(state.covariance),
+                *_own_variances(state),
                 getattr(state, "constrained", np.zeros(len(error))),
             )
         )
@@ -165,12 +168,13 @@ def run(
     return Trace._make([*columns, seconds / columns[0].size])
 
 
-def _own_variance(covariance: FloatArray) -> FloatArray:
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    if variance.shape[-1] == 12:
-        return variance[..., :9].sum(-1)
+def _own_variances(state: Any) -> tuple[FloatArray, FloatArray]:
+    """Of the rotation's Frobenius error and of the translation."""
+    variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
+    if isinstance(state, KalmanState):
+        return variance[..., :9].sum(-1), variance[..., 9:].sum(-1)
     # |exp(w) Q - Q|_F^2 = 2 |w|^2 to first order.
-    return 2 * variance[..., :3].sum(-1)
+    return 2 * variance[..., :3].sum(-1), variance[..., 3:6].sum(-1)
 
 
 def rms(values: FloatArray, axis: int | None = None) -> Any:

@@ -26,26 +26,28 @@ def new_console(width: int = 130) -> Console:
 
 
 def print_camsap2013(result: dict[str, Any]) -> None:
-    """One table for each reading, and the claims with their figures."""
+    """The filters in a table, and the claims of the paper and ours with their figures."""
     console = new_console()
-    for reading, data in result["readings"].items():
-        table = Table(title=f"camsap2013, turn noise {reading}/s, {result['trials']} trials")
-        table.add_column("filter")
-        for heading, _, _ in CAMSAP_COLUMNS:
-            table.add_column(heading, justify="right")
-        for label, figures in data["filters"].items():
-            table.add_row(label, *(form.format(figures[key]) for _, key, form in CAMSAP_COLUMNS))
-        console.print(table)
-        for claim in data["claims"]:
-            verdict = "holds" if claim["holds"] else "FAILS"
-            console.print(f"  {verdict}  {claim['statement']}  ({claim['figures']})")
-        if "trade" in data:
-            console.print("  ET-KF: " + ", ".join(
-                f"threshold {row['threshold']:g}: {100 * row['trigger_rate']:.0f} % projected, "
-                f"RMSE {row['rotation_rmse']:.4f}" for row in data["trade"]))  # fmt: skip
-        console.print()
+    table = Table(title=f"{result['experiment']}, {result['trials']} trials")
+    table.add_column("filter")
+    for heading, _, _ in CAMSAP_COLUMNS:
+        table.add_column(heading, justify="right")
+    for label, figures in result["filters"].items():
+        table.add_row(label, *(form.format(figures[key]) for _, key, form in CAMSAP_COLUMNS))
+    console.print(table)
+    for source, heading in (("paper", "claims of the paper"), ("ours", "claims of this package")):
+        console.print(f"{heading}:")
+        for claim in result["claims"]:
+            if claim["source"] == source:
+                verdict = "holds" if claim["holds"] else "FAILS"
+                console.print(f"  {verdict}  {claim['statement']}  ({claim['figures']})")
+    if "trade" in result:
+        console.print("ET-KF: " + ", ".join(
+            f"threshold {row['threshold']:g}: {100 * row['trigger_rate']:.0f} % projected, "
+            f"RMSE {row['rotation_rmse']:.4f}" for row in result["trade"]))  # fmt: skip
     deviation = 100 / (6 * result["trials"]) ** 0.5
     console.print(
+        f"Assumed, for it is not printed: {', '.join(result['assumed'])}.\n"
         "Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward = -log b.\n"
         "KF and ET-KF are judged by their raw matrix, as in the paper. One standard deviation of\n"
         f"an RMSE is about {deviation:.1f} %: with few trials a claim can fail by chance."

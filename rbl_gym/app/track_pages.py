@@ -42,69 +42,67 @@ def demo(result: dict[str, Any], example: Example) -> str:
         [str(k + 1) for k in range(scene.n_anchors)], np.asarray(scene.tags),
         (episode.rotation[0], episode.translation[0], np.ones(count, dtype=np.bool_)), beliefs,
     )  # fmt: skip
-    reading = next(iter(result["readings"]))
-    tables = []
-    for name, data in result["readings"].items():
-        headings = ["filter", *(column[0] for column in CAMSAP_COLUMNS)]
-        rows = [[label, *(form.format(row[key]) for _, key, form in CAMSAP_COLUMNS)]
-                for label, row in data["filters"].items()]  # fmt: skip
-        tables.append(page.table(f"turn noise {name}/s, {result['trials']} trials", headings, rows))
-        claims = [
-            [claim["statement"], claim["holds"], claim["figures"]] for claim in data["claims"]
-        ]
-        tables.append(page.table(f"claims at {name}/s", ["claim", "holds", "figures"], claims))
+    headings = ["filter", *(column[0] for column in CAMSAP_COLUMNS)]
+    rows = [[label, *(form.format(row[key]) for _, key, form in CAMSAP_COLUMNS)]
+            for label, row in result["filters"].items()]  # fmt: skip
+    claims = [
+        [claim["source"], claim["statement"], claim["holds"], claim["figures"]]
+        for claim in result["claims"]
+    ]
+    assumed = ", ".join(result["assumed"])
     parts = [
-        page.note(f"One trial at turn noise {reading}/s. {_LEGEND}"),
+        page.note(f"One trial. {_LEGEND}"),
         page.plot(track_html.figure(story), "track"),
         "<h2>All trials</h2>",
         page.plot(_curves(result), "curves", first=False),
         page.note("Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward "
                   "= -log b, b the expected RMS error of the tags in metres; NEES of an honest "
-                  "filter is 6."),
-        *tables,
+                  f"filter is 6. Assumed, for the paper does not print it: {assumed}."),
+        page.table(f"filters, {result['trials']} trials", headings, rows),
+        page.table("claims", ["of", "claim", "holds", "figures"], claims),
     ]  # fmt: skip
     return page.document("Tracking a rigid body: five filters and the bound", parts)
 
 
 def _curves(result: dict[str, Any]) -> go.Figure:
-    """RMSE and mean NEES per step of all trials, a row for each reading."""
-    readings = result["readings"]
+    """RMSE (Fig. 2), MAE (Fig. 3) and mean NEES per step of all trials."""
     charts = (("rotation_rmse", "rotation RMSE (Frobenius)"),
-              ("translation_rmse_m", "translation RMSE (m)"), ("nees", "mean NEES"))  # fmt: skip
-    titles = [f"{title}, {name}/s" for name in readings for _, title in charts]
-    shown = make_subplots(len(readings), 3, subplot_titles=titles, horizontal_spacing=0.07,
-                          vertical_spacing=0.13)  # fmt: skip
+              ("translation_rmse_m", "translation RMSE (m)"),
+              ("mean_angular_error_deg", "mean angular error (deg)"),
+              ("nees", "mean NEES"))  # fmt: skip
+    shown = make_subplots(2, 2, subplot_titles=[title for _, title in charts],
+                          horizontal_spacing=0.08, vertical_spacing=0.13)  # fmt: skip
     trials = result["trials"]
     low, high = chi2.ppf([0.025, 0.975], 6 * trials) / trials
-    for row, data in enumerate(readings.values(), 1):
-        for column, (key, _) in enumerate(charts, 1):
-            lines = {name: filter["per_step"][key] for name, filter in data["filters"].items()}
-            steps = list(range(1, len(next(iter(lines.values()))) + 1))
-            for name, values in lines.items():
-                shown.add_trace(
-                    go.Scatter(x=steps, y=values, name=name, legendgroup=name,
-                               showlegend=row == column == 1,
-                               line={"color": COLOURS[name], "width": 2,
-                                     "dash": "dash" if name == "KF-ortho" else "solid"}),
-                    row=row, col=column,
-                )  # fmt: skip
-            if key != "nees":
-                drawn = [*data["bound"][key], *(value for line in lines.values() for value in line)]
-                shown.update_yaxes(
-                    type="log", **track_html.log_ticks(min(drawn), max(drawn)), row=row, col=column
-                )
-                shown.add_trace(
-                    go.Scatter(x=steps, y=data["bound"][key], name="posterior CRB", mode="markers",
-                               legendgroup="bound", showlegend=row == column == 1,
-                               marker={"color": "#222222", "size": 5}),
-                    row=row, col=column,
-                )  # fmt: skip
-        shown.update_xaxes(range=[0.5, steps[-1] + 0.5], row=row)
-        shown.add_hrect(low, high, row=row, col=3, line_width=0, fillcolor="#868e96", opacity=0.25)  # pyright: ignore[reportArgumentType]
-    shown.update_xaxes(title_text="step", title_standoff=4)
+    steps = list(range(1, len(result["bound"]["rotation_rmse"]) + 1))
+    for k, (key, _) in enumerate(charts):
+        row, column = divmod(k, 2)
+        lines = {
+            name: (filter["per_step"][key], COLOURS[name], "lines")
+            for name, filter in result["filters"].items()
+        }
+        if key in result["bound"]:
+            estimated = result["filters"]["KF"]["per_step"][f"estimated_{key}"]
+            lines["estimated by KF"] = (estimated, "#868e96", "markers")
+            lines["posterior CRB"] = (result["bound"][key], "#222222", "markers")
+        for name, (values, colour, mode) in lines.items():
+            shown.add_trace(
+                go.Scatter(x=steps, y=values, name=name, legendgroup=name, showlegend=k == 0,
+                           mode=mode, marker={"color": colour, "size": 5},
+                           line={"color": colour, "width": 2,
+                                 "dash": "dash" if name == "KF-ortho" else "solid"}),
+                row=row + 1, col=column + 1,
+            )  # fmt: skip
+        if key != "nees":
+            drawn = [value for values, _, _ in lines.values() for value in values]
+            shown.update_yaxes(type="log", **track_html.log_ticks(min(drawn), max(drawn)),
+                               row=row + 1, col=column + 1)  # fmt: skip
+    shown.update_xaxes(range=[0.5, steps[-1] + 0.5])
+    shown.add_hrect(low, high, row=2, col=2, line_width=0, fillcolor="#868e96", opacity=0.25)  # pyright: ignore[reportArgumentType]
+    shown.update_xaxes(title_text="time step", title_standoff=4)
     shown.update_annotations(font_size=13)
     legend = {"orientation": "h", "x": 0, "y": 1.06, "yanchor": "bottom"}
-    shown.update_layout(height=320 * len(readings) + 40, template="plotly_white", legend=legend,
+    shown.update_layout(height=680, template="plotly_white", legend=legend,
                         margin={"l": 50, "r": 10, "t": 60, "b": 40})  # fmt: skip
     return shown
 
