@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rbl_gym import motion, rotations
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.recording_units import check_units
 
 __all__ = ["Recording", "Truth", "read_recording", "truth_at"]
 
@@ -27,12 +28,11 @@ _Ids = tuple[tuple[str, ...], tuple[str, ...]]  # of the anchors, of the tags
 _Log = tuple[FloatArray, FloatArray, FloatArray | None]  # times, ranges (0: no link), range_std
 
 _MAX_RANGE_M = 10e3
-_MAX_COORDINATE_M = 100e3
+_MAX_COORDINATE_M = 1e8  # geocentric and map coordinates are in the world frame
+_MAX_TAG_M = 1e4
 _MAX_TIME_S = 1e11  # the year 5138
 _MAX_YAW_DEG = 1e6
-_MAX_SCALE_RATIO = 50.0
 _TOO_LONG = f"must be at most {_MAX_RANGE_M:.0f} m (looks like millimetres?)"
-_TOO_FAR = f"must be at most {_MAX_COORDINATE_M:.0f} m (looks like millimetres?)"
 
 
 class Truth(NamedTuple):
@@ -101,7 +101,8 @@ def read_recording(
     links = measured > 0
     if not links.any():
         raise ValueError(f"{table.path}: must have an epoch with a link, got none")
-    _check_scale(table.path, measured[links], anchor_points)
+    paths = table.path, os.fspath(anchors), os.fspath(tags)
+    check_units(paths, times, measured, links, anchor_points, tag_points)
     poses = None if truth is None else _read_truth(_read_table(truth))
     return Recording(times, measured, links, std, anchor_points, tag_points, *ids, poses)
 
@@ -188,11 +189,12 @@ class _Table(NamedTuple):
         self.check(ok, "t", f"time must {must} from row to row")
         return times
 
-    def points(self, columns: Iterable[str]) -> FloatArray:
-        """(rows, len(columns)) coordinates in metres."""
+    def points(self, columns: Iterable[str], most: float = _MAX_COORDINATE_M) -> FloatArray:
+        """(rows, len(columns)) coordinates in metres, of magnitude `most` at most."""
         points = {column: self.numbers(column) for column in columns}
+        too_far = f"must be at most {most:.0f} m (looks like millimetres?)"
         for column, values in points.items():
-            self.check(np.abs(values) <= _MAX_COORDINATE_M, column, _TOO_FAR)
+            self.check(np.abs(values) <= most, column, too_far)
         return np.stack([*points.values()], axis=-1)
 
     def ranges(self, column: str, valid: ArrayLike = 1) -> FloatArray:
@@ -271,7 +273,7 @@ def _read_points(path: AnyPath, kind: str) -> tuple[tuple[str, ...], FloatArray]
     ids = tuple(cell.strip() for cell in table.columns[column])
     table.check(np.array([*map(bool, ids)]), column, "id must not be empty")
     table.check(_is_first(ids), column, "id must be unique")
-    return ids, table.points("xyz")
+    return ids, table.points("xyz", _MAX_TAG_M if kind == "tag" else _MAX_COORDINATE_M)
 
 
 def _read_wide(table: _Table, ids: _Ids) -> _Log:
@@ -324,18 +326,6 @@ def _calibrated(
     links = (ranges > 0) & (corrected > 0)
     std = None if std is None else np.where(links, std / scale, 0.0)
     return np.where(links, corrected, 0.0), std
-
-
-def _check_scale(path: str, measured: FloatArray, anchors: FloatArray) -> None:
-    """Raise if the ranges are of another order of magnitude than the anchors' layout."""
-    layout = np.linalg.norm(anchors - anchors.mean(axis=0), axis=-1).mean()
-    typical = np.median(measured)
-    # A single anchor, or anchors all at one place, say nothing about the scale.
-    if layout > 1e-6 and not 1 / _MAX_SCALE_RATIO <= typical / layout <= _MAX_SCALE_RATIO:
-        raise ValueError(
-            f"{path}: units look inconsistent, the median range is {typical:.4g} m and "
-            f"the anchors lie {layout:.4g} m from their centre"
-        )
 
 
 def _read_truth(table: _Table) -> Truth:

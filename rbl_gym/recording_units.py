@@ -1,0 +1,155 @@
+"""Do the units of a recording fit together? Triangle inequalities between ranges and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray
+
+# Ranges of one link this old still say where the body is, to a part of its distance to an anchor.
+_STALE_S = 0.5
+# Epochs and pairs of points that are looked at.
+_EPOCHS, _PAIRS = 500, 200
+# Fewer pairs of ranges may all be wrong by chance.
+_FEWEST = 12
+# Points are too far apart where the sum of two ranges is below this share of their distance,
+# too near to each other where ranges differ by more than so many of their distances.
+_SUM, _TOO_NEAR = 0.9, 20.0
+# Differences of ranges below this share of a range may be noise.
+_NOISE = 0.03
+# Tags are too far apart where nine in ten differences of ranges are below this share of their
+# distance: all anchors would stand broadside to all pairs of tags, within three degrees.
+_BROADSIDE = 0.05
+# Below this the unit is more likely a thousandth than a hundredth.
+_MILLI = 3e-3
+# Spread of points, relative to their size or to the range, below which they are flat.
+_FLAT = 0.1
+# The median range over the mean distance of the anchors from their centre, or its inverse.
+_MAX_SCALE_RATIO = 50.0
+
+
+def check_units(
+    paths: tuple[str, str, str],
+    times: FloatArray,
+    ranges: FloatArray,
+    links: BoolArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+) -> None:
+    """Raise where ranges (K, M, N), anchors (M, 3) and tags (N, 3) cannot be in one unit.
+
+    A range r of a point p obeys ``|r - r'| <= |p - p'| <= r + r'`` for two anchors of one tag and
+    for two tags of one anchor; noise adds to the left side. `paths` are the files of the ranges,
+    the anchors and the tags, for the message.
+
+    Raises
+    ------
+    ValueError
+        If most pairs break an inequality by more than noise does.
+    """
+    typical = float(np.median(ranges[links]))
+    layout = np.linalg.norm(anchors - anchors.mean(axis=0), axis=-1).mean()
+    # A single anchor, or anchors all at one place, say nothing about the scale.
+    if layout > 1e-6 and not 1 / _MAX_SCALE_RATIO <= typical / layout <= _MAX_SCALE_RATIO:
+        raise ValueError(
+            f"{paths[0]}: units look inconsistent, the median range is {typical:.4g} m and "
+            f"the anchors lie {layout:.4g} m from their centre"
+        )
+    newest, fresh = _held(times, ranges, links)
+    _check_spread(paths[2], tags, anchors, newest, fresh, typical)
+    _check_pairs(paths[1], "anchors", anchors, ranges.swapaxes(1, 2), links.swapaxes(1, 2),
+                 newest.swapaxes(1, 2), fresh.swapaxes(1, 2), typical)  # fmt: skip
+    _check_pairs(paths[2], "tags", tags, ranges, links, newest, fresh, typical)
+
+
+def _held(times: FloatArray, ranges: FloatArray, links: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """The last range of every link at some epochs, and where it is not too old.
+
+    Radios that measure one link at a time never have two in one epoch.
+    """
+    count = len(times)
+    last = np.where(links, np.arange(count)[:, None, None], -1)
+    last = np.maximum.accumulate(last, axis=0)[:: 1 + count // _EPOCHS]
+    now = times[:: 1 + count // _EPOCHS, None, None]
+    fresh = (last >= 0) & (now - times[last] <= _STALE_S)
+    return np.take_along_axis(ranges, np.maximum(last, 0), axis=0), fresh
+
+
+def _pairs(points: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
+    """Indices of pairs of distinct points, and their distances."""
+    one, other = np.triu_indices(len(points), 1)
+    distance = np.linalg.norm(points[one] - points[other], axis=-1)
+    far = np.flatnonzero(distance > 1e-9)[:: 1 + len(one) // _PAIRS]
+    return one[far], other[far], distance[far]
+
+
+def _check_pairs(
+    path: str,
+    name: str,
+    points: FloatArray,
+    ranges: FloatArray,
+    links: BoolArray,
+    newest: FloatArray,
+    fresh: BoolArray,
+    typical: float,
+) -> None:
+    """Raise where points (P, 3), the last axis of the ranges, break a triangle inequality."""
+    one, other, distance = _pairs(points)
+    both = fresh[..., one] & fresh[..., other]
+    if both.sum() >= _FEWEST:
+        total = (newest[..., one] + newest[..., other])[both]
+        apart = np.broadcast_to(distance, both.shape)[both]
+        if np.median(total / apart) < _SUM:
+            raise ValueError(
+                f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart "
+                f"and the sum of two ranges to them is {np.median(total):.4g} m "
+                "(looks like centimetres or millimetres?)"
+            )
+    some = slice(None, None, 1 + len(ranges) // _EPOCHS)
+    ranges, links = ranges[some], links[some]
+    both = links[..., one] & links[..., other]
+    if both.sum() >= _FEWEST:
+        gap = np.abs(ranges[..., one] - ranges[..., other])[both]
+        apart = np.broadcast_to(distance, both.shape)[both]
+        if np.median(gap / apart) > _TOO_NEAR and np.median(gap) > _NOISE * typical:
+            raise ValueError(
+                f"{path}: units look inconsistent, {name} are {np.median(apart):.4g} m apart "
+                f"and ranges to them differ by {np.median(gap):.4g} m"
+            )
+
+
+def _check_spread(
+    path: str,
+    tags: FloatArray,
+    anchors: FloatArray,
+    newest: FloatArray,
+    fresh: BoolArray,
+    typical: float,
+) -> None:
+    """Raise where tags are so far apart that no anchor would stand but broadside to them."""
+    one, other, distance = _pairs(tags)
+    both = fresh[..., one] & fresh[..., other]
+    if both.sum() < _FEWEST:
+        return
+    # Pairs of a line have all directions broadside to them in one plane, those of a flat body
+    # in one line, those of a solid nowhere.
+    size = _extents(tags)
+    solid = int((size > _FLAT * size[0]).sum())
+    reach = np.append(_extents(anchors), np.inf)[[2, 1, 3][solid - 1]]
+    if reach < _FLAT * typical:
+        return
+    share = (np.abs(newest[..., one] - newest[..., other]) / distance)[both]
+    seen = float(np.quantile(share, 0.9))
+    if seen < _BROADSIDE:
+        raise ValueError(
+            f"{path}: units look inconsistent, tags are up to {distance.max():.4g} m apart and "
+            f"ranges of one anchor to two of them differ by {100 * seen:.2g} % of their distance "
+            f"at most (looks like {'millimetres' if seen < _MILLI else 'centimetres'}?)"
+        )
+
+
+def _extents(points: FloatArray) -> FloatArray:
+    """Root mean squares (3,) of points (P, 3) along their principal axes, the largest first."""
+    spread = (points - points.mean(axis=0)) / np.sqrt(len(points))
+    values = np.linalg.svd(spread, compute_uv=False)
+    return np.pad(values, (0, 3 - len(values)))
