@@ -5,6 +5,7 @@ Graphs are multigraphs: rows of `edges` (m, 2), each an edge of its own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -38,8 +39,12 @@ def components(edges: ArrayLike, n_nodes: int) -> IntArray:
                                         directed=False)[1].astype(np.intp)  # fmt: skip
 
 
-def check_connected(edges: ArrayLike, n_nodes: int) -> IntArray:
+def check_connected(
+    edges: ArrayLike, n_nodes: int, ids: Sequence[int] | np.ndarray | None = None
+) -> IntArray:
     """`edges`, checked, of a connected graph.
+
+    `ids` (n,) are the nodes' names in the message; None: 0 to n - 1.
 
     Raises
     ------
@@ -51,14 +56,15 @@ def check_connected(edges: ArrayLike, n_nodes: int) -> IntArray:
     if label.any():
         parts = np.bincount(label)
         order = np.argsort(-parts, kind="stable")
-        named = [_name(np.flatnonzero(label == part)) for part in order[:3]]
+        names = np.arange(n_nodes) if ids is None else np.asarray(ids)
+        named = [_name(names[label == part]) for part in order[:3]]
         more = f" and {len(parts) - 3} more" if len(parts) > 3 else ""
         raise ValueError(f"edges must connect all {n_nodes} nodes, got {len(parts)} components: "
                          f"{', '.join(named)}{more}")  # fmt: skip
     return edges
 
 
-def _name(nodes: IntArray) -> str:
+def _name(nodes: np.ndarray) -> str:
     listed = ", ".join(map(str, nodes[:_NAMED]))
     return "{" + listed + (f", ... {len(nodes)} nodes" if len(nodes) > _NAMED else "") + "}"
 

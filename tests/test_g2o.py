@@ -52,6 +52,49 @@ def test_csv_in_all_its_forms(written):
                                                                      [3, 5, 6]]  # fmt: skip
 
 
+def test_edges_without_information(written):
+    mixed = "EDGE_SE2 0 1 1 0 .1\nEDGE_SE2 1 2 1 0 .1 9 0 0 8 0 7\n"
+    graph = g2o.read_graph(written(mixed, "a.g2o"))
+    assert np.isnan(graph.information[0]).all()
+    np.testing.assert_array_equal(graph.information[1], np.diag([9, 8, 7]))
+    assert g2o.read_graph(written("EDGE_SE2 0 1 1 0 .1\n", "b.g2o")).information is None
+    full = "i,j,dx,dy,dtheta,I11,I12,I13,I22,I23,I33\n0,1,1,2,3,,,,,,\n1,2,1,2,3,9,0,0,8,0,7\n"
+    np.testing.assert_array_equal(g2o.read_graph(written(full)).information, graph.information)
+
+
+def test_keys_beyond_the_whole_numbers_of_floats(written):
+    # GTSAM's keys: a letter in the top byte. As floats those of a letter are one and the same.
+    keys = [ord("l") * 2**56, ord("x") * 2**56, ord("x") * 2**56 + 1]
+    assert float(keys[1]) == float(keys[2])
+    text = f"EDGE_SE2 {keys[1]} {keys[2]} 1 0 .1\nEDGE_SE2 {keys[1]} {keys[0]} 1 0 .2\n"
+    graph = g2o.read_graph(written(text, "a.g2o"))
+    assert graph.ids.tolist() == keys
+    assert graph.edges.tolist() == [[1, 2], [1, 0]]
+    largest = 2**64 - 1
+    table = g2o.read_graph(written(f"i,j,dtheta\n{largest},0,0.5\n"))
+    assert table.ids.tolist() == [0, largest]
+    assert g2o.read_graph(written("i,j,dtheta\n1.0,2e0,0.5\n")).ids.tolist() == [1, 2]
+
+
+def test_what_is_no_planar_pose_is_skipped_by_name(written):
+    other = """VERTEX_SE2 0 0 0 0
+VERTEX_SE2 1 0 0 0
+VERTEX_SE2 7 0 0 0
+VERTEX_XY 3 1 2
+EDGE_SE2_XY 0 3 1 2 1 0 1
+EDGE_SE2_XY 1 3 1 2 1 0 1
+EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1
+PARAMS_SE2OFFSET 0 0 0 0
+EDGE_SE2 0 1 1 0 0.5 1 0 0 1 0 1
+"""
+    graph = g2o.read_graph(written(other, "a.g2o"))
+    assert graph.ids.tolist() == [0, 1]
+    assert graph.skipped == {
+        "VERTEX_XY": 1, "EDGE_SE2_XY": 2, "EDGE_SE3:QUAT": 1, "PARAMS_SE2OFFSET": 1,
+        "VERTEX_SE2 without an edge": 1,
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("text", "name", "message"),
     [
@@ -70,7 +113,11 @@ def test_csv_in_all_its_forms(written):
         ("i,j,dtheta\n0.5,1,2\n", "a.csv", "column 'i': must be a whole number.* got 0.5"),
         ("i,j,dtheta\n0,-1,2\n", "a.csv", "column 'j': must be a whole number.* got -1"),
         ("i,j,dtheta\n0,1,2\n3,3,2\n", "a.csv", "line 3, column 'j': must differ from i, got 3"),
-        ("EDGE_SE3 0 1 2\n", "a.g2o", "must be EDGE_SE2, VERTEX_SE2 or FIX .* got 'EDGE_SE3'"),
+        ("EDGE_SE3:QUAT 0 1 2\n", "a.g2o", "a.g2o: must have an edge, .*: 1 EDGE_SE3:QUAT"),
+        ("ODOMETRY 0 1 2\n", "a.g2o", "line 1: must start with EDGE_SE2 .* got 'ODOMETRY'"),
+        ("EDGE_SE2 0 18446744073709551616 1 0 0\n", "a.g2o", "column 'j': must be a whole number"),
+        ("VERTEX_SE2 x 1 1 1\n", "a.g2o", "line 1, column 'id': must be a whole number"),
+        ("EDGE_SE2 0 1 1 1 1 1 0 nan 1 0 1\n", "a.g2o", "column 'I13': must be a finite number"),
         ("EDGE_SE2 0 1 2\n", "a.g2o", "line 1: must have 11 values, got 3"),
         ("EDGE_SE2 0 1 1 1 1 -1 0 0 1 0 1\n", "a.g2o", "column 'I11': must not be negative"),
         ("VERTEX_SE2 0 1 1 1\n", "a.g2o", "must have an edge, got none"),

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from rbl_gym.app import network2009
+from rbl_gym.app import network, network2009
 from rbl_gym.app.cli import main
 from rbl_gym.sensing_network import proj
 from tests.helpers import ROOT, assert_table_holds
@@ -56,9 +56,95 @@ def test_a_network_of_bearings_without_places(tmp_path, capsys):
     assert picture.stat().st_size > 10_000
 
 
+def solved(path, capsys, *options):
+    assert main(["network", str(path), "--json", *options]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_loop_closure_of_little_weight_bends_nothing(tmp_path, capsys):
+    # Around the ring 4 x 0.5 rad; the closure says -1, with a deviation of 100 rad.
+    path = tmp_path / "a.g2o"
+    chain = "".join(f"EDGE_SE2 {k} {k + 1} 1 0 0.5 90 0 0 90 0 400\n" for k in range(7, 11))
+    path.write_text(chain + "EDGE_SE2 7 11 1 1 -1 1e-4 0 0 1e-4 0 1e-4\n")
+    result = solved(path, capsys)
+    off = np.degrees(proj(-1 - 2.0))
+    worst, *good = result["worst_edges"]
+    assert (worst["i"], worst["j"], worst["weight"]) == (7, 11, 1e-4)
+    assert worst["residual_deg"] == pytest.approx(off, rel=1e-5)
+    # Least squares share the loop's error out by variances: 1e-4 / 400 of it for each.
+    for edge in good:
+        assert edge["residual_deg"] == pytest.approx(-off * 1e-4 / 400, rel=1e-4)
+    assert result["cost"] == pytest.approx(1e-4 * np.radians(off) ** 2, rel=1e-5)
+    assert result["weights"] == "information of theta"
+    unit = solved(path, capsys, "--weights", "unit")
+    assert unit["weights"] == "all edges alike, as asked for"
+    for edge in unit["worst_edges"]:
+        assert abs(edge["residual_deg"]) == pytest.approx(abs(off) / 5)
+
+
+def test_weights_bend_the_picture_neither(tmp_path):
+    path = tmp_path / "a.g2o"
+    path.write_text("EDGE_SE2 0 1 1 0 0 90 0 0 90 0 400\nEDGE_SE2 1 2 1 0 0 90 0 0 90 0 400\n"
+                    "EDGE_SE2 0 2 9 7 0 1e-6 0 0 1e-6 0 400\n")  # fmt: skip
+    places = network.run(str(path)).positions
+    np.testing.assert_allclose(places, [[0, 0], [1, 0], [2, 0]], atol=1e-6)
+
+
+def test_edges_without_information_where_none_is_needed(tmp_path, capsys):
+    path = tmp_path / "a.g2o"
+    loop = [f"EDGE_SE2 {i} {j} 1 0 {y} 1 0 0 1 0 {w}" for i, j, y, w in
+            ((1, 2, 0.1, 4), (2, 3, 0.1, 4), (1, 3, 0.5, 2))]  # fmt: skip
+    # The edge to node 9 is on no cycle.
+    path.write_text("\n".join([*loop, "EDGE_SE2 3 9 1 0 0.7"]))
+    result = solved(path, capsys)
+    assert result["cost"] == pytest.approx(0.3**2 / (1 / 4 + 1 / 4 + 1 / 2))
+    path.write_text("\n".join([loop[0], "EDGE_SE2 2 3 1 0 0.1", loop[2]]))
+    assert main(["network", str(path)]) == 2
+    assert f"{path}: every edge on a cycle must have information" in (
+        error := capsys.readouterr().err
+    )
+    assert "edge 2 3" in error
+    assert solved(path, capsys, "--weights", "unit")["cost"] == pytest.approx(0.3**2 / 3)
+    path.write_text("\n".join(line.rsplit(maxsplit=6)[0] for line in loop))
+    result = solved(path, capsys)
+    assert result["cost"] == pytest.approx(0.3**2 / 3)
+    assert result["weights"] == "all edges alike: the file has no information"
+
+
+def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
+    path = tmp_path / "a.g2o"
+    path.write_text("EDGE_SE2 5 6 1 0 0.1 1 0 0 1 0 9\nEDGE_SE2 6 5 1 0 1 1 0 0 1 0 0\n")
+    result = solved(path, capsys)
+    assert result["edges_without_weight"] == 1
+    assert result["worst_edges"][0]["residual_deg"] == pytest.approx(np.degrees(1.1))
+    assert main(["network", str(path)]) == 0
+    assert "1 edges with I33 = 0 are left out" in capsys.readouterr().out
+    path.write_text("EDGE_SE2 5 6 1 0 0.1 1 0 0 1 0 9\nEDGE_SE2 6 88 1 0 1 1 0 0 1 0 0\n")
+    assert main(["network", str(path)]) == 2
+    assert "2 components: {5, 6}, {88}" in (error := capsys.readouterr().err)
+    assert "I33 above 0" in error
+
+
+def test_skipped_lines_and_large_keys_are_named(tmp_path, capsys):
+    path = tmp_path / "a.g2o"
+    key = ord("x") * 2**56
+    path.write_text(f"EDGE_SE2 {key} {key + 1} 1 0 0.1 1 0 0 1 0 1\n"
+                    f"EDGE_SE2_XY {key} 3 1 0 1 0 1\n"
+                    "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1\n")  # fmt: skip
+    result = solved(path, capsys)
+    assert result["skipped_lines"] == {"EDGE_SE2_XY": 1, "EDGE_SE3:QUAT": 1}
+    assert (result["worst_edges"][0]["i"], result["worst_edges"][0]["j"]) == (key, key + 1)
+    assert main(["network", str(path)]) == 0
+    assert "skipped, no planar poses: 1 EDGE_SE2_XY, 1 EDGE_SE3:QUAT" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (
+            "i,j,dtheta\n70,71,0.5\n400,401,0.5\n",
+            "edges.csv: edges must connect all 4 nodes, got 2 components: {70, 71}, {400, 401}",
+        ),
         ("i,j,dtheta\n0,1,0.5\n2,3,0.5\n", "2 components: {0, 1}, {2, 3}"),
         ("i,j,dtheta\n0,1,nan\n", "line 2, column 'dtheta': must be a finite number"),
     ],
@@ -74,8 +160,9 @@ def test_what_is_wrong_is_said(text, message, tmp_path, capsys):
 
 @pytest.mark.skipif(not G2O.is_dir(), reason="pose graphs are not beside the checkout")
 def test_manhattan(capsys):
-    assert main(["network", str(G2O / "manhattan_edges.csv"), "--json"]) == 0
-    result = json.loads(capsys.readouterr().out)
+    path = G2O / "manhattan_edges.csv"
+    assert solved(path, capsys)["certified"]
+    result = solved(path, capsys, "--weights", "unit")
     assert result["certified"]
     assert result["chordal_cost"] == pytest.approx(1.0205618, rel=1e-7)
     assert result["cost_rad2"] == pytest.approx(1.02062, rel=1e-5)

@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 from rbl_gym import estimators, g2o
 from rbl_gym.estimators import chordal_optimum, network_orientations, orientations
@@ -75,6 +76,56 @@ def test_maximum_likelihood_is_the_global_optimum_of_small_graphs():
         theta = orientations(one.edges, one.y, n_nodes)
         best = global_optimum(one.edges, one.y, n_nodes)
         assert cost(one.edges, one.y, theta) == pytest.approx(best, rel=1e-9)
+
+
+@pytest.mark.parametrize("spread", [0.5, 3.0])
+def test_weights_are_those_of_least_squares(spread):
+    """Against scipy's, started at the truth; weights over a factor of e^(6 spread) or so."""
+    rng = np.random.default_rng(7)
+    for _ in range(5):
+        one = random_network(12, 5, 0.0, rng)
+        n_nodes, (i, j) = len(one.positions), one.edges.T
+        weights = 50 * np.exp(spread * rng.standard_normal(len(one.edges)))
+        y = one.y + rng.standard_normal(len(one.edges)) / np.sqrt(weights)
+
+        def off(theta, i=i, j=j, y=y, weights=weights):
+            theta = np.concatenate([[0.0], theta])
+            return np.sqrt(weights) * proj(y - theta[j] + theta[i])
+
+        best = scipy.optimize.least_squares(off, one.orientations[1:], xtol=1e-14, ftol=1e-14)
+        theta = orientations(one.edges, y, n_nodes, weights=weights)
+        assert cost(one.edges, y, theta, weights) <= 2 * best.cost * (1 + 1e-9)
+        if cost(one.edges, y, theta, weights) > 2 * best.cost * (1 - 1e-6):
+            np.testing.assert_allclose(proj(theta[1:] - best.x), 0, atol=1e-6)
+        # The unit of the weights says nothing.
+        again = orientations(one.edges, y, n_nodes, weights=1e-9 * weights)
+        np.testing.assert_allclose(proj(again - theta), 0, atol=1e-8)
+
+
+@pytest.mark.parametrize("method", ["ml", "chordal", "spectral"])
+def test_an_edge_of_weight_2_is_two_edges(method):
+    one = random_network(60, 8, 0.3, np.random.default_rng(8))
+    n_nodes = len(one.positions)
+    weights = 1.0 + (np.arange(len(one.edges)) % 3 == 0)
+    twice = weights == 2
+    edges, y = np.concatenate([one.edges, one.edges[twice]]), np.concatenate([one.y, one.y[twice]])
+    theta = orientations(one.edges, one.y, n_nodes, method=method, weights=weights)
+    np.testing.assert_allclose(
+        proj(theta - orientations(edges, y, n_nodes, method=method)), 0, atol=1e-8
+    )
+    found = chordal_optimum(one.edges, one.y, n_nodes, weights=weights)
+    both = chordal_optimum(edges, y, n_nodes)
+    assert (found.cost, found.certified) == (pytest.approx(both.cost, rel=1e-9), both.certified)
+
+
+def test_wrong_weights_are_named():
+    edges, y = [[0, 1], [1, 2]], [0.1, 0.2]
+    with pytest.raises(ValueError, match="weights must be above 0, got 0 at index 1"):
+        orientations(edges, y, 3, weights=[1, 0])
+    with pytest.raises(ValueError, match=r"weights must have shape \(2,\) like the edges"):
+        chordal_optimum(edges, y, 3, weights=[1.0])
+    with pytest.raises(ValueError, match="weights must be None with the method 'cycle'"):
+        orientations(edges, y, 3, method="cycle", weights=[1, 1])
 
 
 def test_maximum_likelihood_costs_least():
@@ -150,6 +201,9 @@ print(min(spent))
 @pytest.mark.skipif(not G2O.is_dir(), reason="pose graphs are not beside the checkout")
 def test_pose_graphs_are_solved_and_certified(name, least):
     graph = g2o.read_graph(G2O / f"{name}_edges.csv")
+    weights = graph.information[:, 2, 2]
+    weighted = chordal_optimum(graph.edges, graph.y, len(graph.ids), weights=weights)
+    assert weighted.certified
     found = chordal_optimum(graph.edges, graph.y, len(graph.ids))
     assert found.certified
     assert found.cost == pytest.approx(least, rel=1e-7)
@@ -163,13 +217,14 @@ def test_the_proof_is_what_eigenvalues_say():
     for sigma in np.linspace(0.1, 1.2, 40):
         one = random_network(25, 6, sigma, rng)
         n_nodes = len(one.positions)
-        found = chordal_optimum(one.edges, one.y, n_nodes)
+        weights = np.exp(rng.standard_normal(len(one.edges)))
+        found = chordal_optimum(one.edges, one.y, n_nodes, weights=weights)
         # A start elsewhere may end in a local minimum: it must not be certified.
         start = rng.uniform(-3, 3, n_nodes)
-        other = chordal_optimum(one.edges, one.y, n_nodes, start=start - start[0])
+        other = chordal_optimum(one.edges, one.y, n_nodes, start=start - start[0], weights=weights)
         for each in (found, other):
             residual = network_orientations.residuals(one.edges, one.y, each.theta)
-            S = network_orientations._dual(one.edges, residual, n_nodes).toarray()
+            S = network_orientations._dual(one.edges, residual, n_nodes, weights).toarray()
             values = np.linalg.eigvalsh(S)
             assert each.certified == (values[0] > -1e-9 and values[1] > 1e-9)
             verdicts.add(each.certified)

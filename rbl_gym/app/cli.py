@@ -121,6 +121,10 @@ def _add_network(commands: Any) -> None:
         "it is proved that none are better. See docs/networks.md for the file formats.",
     )
     network.add_argument("file", metavar="FILE", help=".g2o, or CSV: i,j and dtheta (or a,b)")
+    network.add_argument(
+        "--weights", choices=("information", "unit"), default="information",
+        help="of the edges: the file's information of theta (default), or all alike",
+    )  # fmt: skip
     network.add_argument("--plot", metavar="F", help="picture: the graph and the residuals")
     add_json(network)
     network.set_defaults(run=_network)
@@ -167,7 +171,7 @@ def _reproduce(options: argparse.Namespace) -> int:
 def _network(options: argparse.Namespace) -> int:
     from rbl_gym.app import network
 
-    solved = network.run(options.file)
+    solved = network.run(options.file, options.weights)
     if options.plot:
         from rbl_gym.app import figures, network_figures
 

@@ -118,9 +118,20 @@ def print_network(result: dict[str, Any]) -> None:
     proof = "certified: no other orientations cost less" if result["certified"] else \
         "NOT certified: others may cost less"  # fmt: skip
     out.print(f"{result['nodes']} nodes, {result['edges']} edges, {result['loops']} loops")
-    out.print(f"cost {result['cost_rad2']:.10g} rad^2 (along a tree: "
-              f"{result['tree_cost_rad2']:.4g}), residuals {result['residual_rms_deg']:.3f} deg "
-              f"RMS, {result['residual_max_deg']:.2f} deg at most")  # fmt: skip
+    if result["skipped_lines"]:
+        lines = ", ".join(f"{count} {kind}" for kind, count in result["skipped_lines"].items())
+        out.print(f"skipped, no planar poses: {lines}")
+    without = result["edges_without_weight"]
+    out.print(f"weights: {result['weights']}"
+              + (f"; {without} edges with I33 = 0 are left out" if without else ""))  # fmt: skip
+    out.print(f"cost {result['cost']:.10g}, sum of weight x residual^2 (along a tree: "
+              f"{result['tree_cost']:.4g})")  # fmt: skip
+    out.print(f"residuals {result['residual_rms_deg']:.3f} deg RMS "
+              f"({result['residual_weighted_rms_deg']:.3f} weighted), "
+              f"{result['residual_max_deg']:.2f} deg at most; largest:")  # fmt: skip
+    for edge in result["worst_edges"]:
+        degrees = round(edge["residual_deg"], 3) + 0.0  # no "-0.000"
+        out.print(f"  edge {edge['i']} {edge['j']}: {degrees:.3f} deg, weight {edge['weight']:g}")
     out.print(f"chordal cost {result['chordal_cost']:.10g}, {proof}")
     out.print(f"solved in {1e3 * result['seconds']:.1f} ms, certified in "
               f"{1e3 * result['certificate_seconds']:.1f} ms")  # fmt: skip
