@@ -153,18 +153,24 @@ def positive(rng, n):
 
 
 @needs_numba
-@pytest.mark.parametrize("n", [1, 3, 6])
-def test_factor_solution_and_inverse_equal_numpy(n):
+@pytest.mark.parametrize(("n", "size"), [(1, 0), (3, 0), (6, 0), (6, 6)])
+def test_factor_solution_and_inverse_equal_numpy(n, size):
     from rbl_gym.kernels import linear_algebra as la
 
+    cholesky, solve_factored, invert_factored = {
+        0: (la.cholesky, la.solve_factored, la.invert_factored),
+        6: (la.cholesky6, la.solve_factored6, la.invert_factored6),
+    }[size]
     rng = np.random.default_rng(n)
     A, b = positive(rng, n), rng.standard_normal(n)
     L, x, P = np.zeros((n, n)), np.empty(n), np.empty((n, n))
-    assert la.cholesky(np.tril(A), L)
-    np.testing.assert_allclose(L, np.linalg.cholesky(A), rtol=1e-9)
-    la.solve_factored(L, b, x)
+    assert cholesky(np.tril(A), L)
+    want = np.linalg.cholesky(A)
+    np.testing.assert_allclose(np.diag(L), 1 / np.diag(want), rtol=1e-9)
+    np.testing.assert_allclose(np.tril(L, -1), np.tril(want, -1), rtol=1e-9)
+    solve_factored(L, b, x)
     np.testing.assert_allclose(x, np.linalg.solve(A, b), rtol=1e-8)
-    la.invert_factored(L, P)
+    invert_factored(L, P)
     want = np.linalg.inv(A)
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
     np.testing.assert_allclose(P / scale, want / scale, rtol=0, atol=1e-8)
