@@ -98,7 +98,7 @@ def vector_job(scene: str, reward: str, num_envs: int) -> Callable[[], float]:
 
 def belief_job(scene: str, num_envs: int) -> Callable[[], float]:
     """The same with the iterated EKF (2 iterations), beliefs and rewards."""
-    envs = TrackingVectorEnv(num_envs, scene)
+    envs = TrackingVectorEnv(num_envs, scene, "none")
     wrapped = VectorEstimatePose(envs, "iekf", options={"iterations": 2})
     return whole_episode(wrapped, envs.scene.steps + 1, num_envs)
 

@@ -144,7 +144,7 @@ def run(seed: int, index: int) -> tuple[World, int]:
     world = random_world(rng)
     num_envs, steps = SIZES[world.cost]
     mode = AutoresetMode.SAME_STEP if rng.random() < 0.5 else AutoresetMode.NEXT_STEP
-    raw = TrackingVectorEnv(num_envs, world.scene, autoreset_mode=mode)
+    raw = TrackingVectorEnv(num_envs, world.scene, "none", autoreset_mode=mode)
     envs = VectorEstimatePose(raw, world.filter, world.options)
     try:
         envs.reset(seed=int(rng.integers(2**31)))

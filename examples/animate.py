@@ -22,7 +22,7 @@ parser.add_argument("--fps", type=int, default=12)
 options = parser.parse_args()
 
 scene = {"name": options.scene, "steps": options.steps}
-env = gym.make("rbl_gym:RBL/Tracking-v0", scene=scene, render_mode="rgb_array")
+env = gym.make("rbl_gym:RBL/Tracking-v0", scene=scene, reward="none", render_mode="rgb_array")
 env = EstimatePose(env, options.filter)
 env.reset(seed=options.seed)
 env.action_space.seed(options.seed)

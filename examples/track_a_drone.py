@@ -6,7 +6,8 @@ import numpy as np
 from rbl_gym.wrappers import EstimatePose
 
 for name in ("uc-kf", "iekf"):
-    env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene="drone_yard"), filter=name)
+    env = gym.make("rbl_gym:RBL/Tracking-v0", scene="drone_yard", reward="none")
+    env = EstimatePose(env, filter=name)
     env.reset(seed=7)
     errors = []
     truncated = False

@@ -128,21 +128,47 @@ def test_what_the_environment_says_passes_through(name):
         assert a[2:-1] == b[2:-1]
 
 
-def test_environments_own_reward_is_switched_off(monkeypatch):
+class Watched(gym.Wrapper):
+    """Keeps what passes through it, as statistics and videos below a wrapper do."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.seen = []
+
+    def reset(self, **arguments):
+        result = self.env.reset(**arguments)
+        self.seen.append(result)
+        return result
+
+    def step(self, action):
+        result = self.env.step(action)
+        self.seen.append(result)
+        return result
+
+
+@pytest.mark.parametrize("reward", ["bound", "none"])
+@pytest.mark.parametrize("name", ["uwb_room", "hall", "satellite"])
+def test_wrappers_below_see_the_environment_as_it_is(name, reward):
+    want = rollout(raw(short(name), reward=reward), 2)
+    below = Watched(raw(short(name), reward=reward))
+    above = rollout(EstimatePose(below), 2)
+    for got, mine, plain in zip(below.seen, above, want, strict=True):
+        assert got[1:-1] == plain[1:-1]
+        assert_same(got[0], plain[0])
+        assert_same(got[-1], plain[-1])
+        assert mine[-1].get("bound_m") == plain[-1].get("score_m")
+    if reward == "bound":
+        assert sum(step[1] for step in below.seen[1:]) != 0
+
+
+def test_without_a_reward_of_the_environment_no_bound_is_computed(monkeypatch):
     def refuse(*_: Any) -> None:
         raise AssertionError("the bound was computed")
 
     monkeypatch.setattr(scene_bounds, "posterior_course", refuse)
     with pytest.raises(AssertionError, match="the bound"):
-        raw(short("uwb_room"), reward="bound").reset(seed=0)
-    assert len(rollout(wrapped(short("uwb_room")))) == 13
-
-
-def test_a_wrapper_that_is_refused_leaves_the_environment_its_reward():
-    env = gym.make("rbl_gym:RBL/Tracking-v0")
-    with pytest.raises(ValueError, match="filter must be one of"):
-        EstimatePose(env, "no-such-filter")
-    assert env.unwrapped.reward_mode == "bound"  # pyright: ignore[reportAttributeAccessIssue]
+        wrapped(short("uwb_room")).reset(seed=0)
+    assert len(rollout(EstimatePose(raw(short("uwb_room"), reward="none")))) == 13
 
 
 @pytest.mark.parametrize("name", NAMES)

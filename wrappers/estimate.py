@@ -29,8 +29,11 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Wraps an environment whose observation has `ranges` and `links` (in scenes with obstacles
     `quality`) or `G` and `B`, besides `anchors` and `twist`, and whose unwrapped form has a
     `scene` (`RBL/Tracking-v0`); or `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter
-    ``"iekf"``). The environment's own reward is switched off. For vector environments:
-    `VectorEstimatePose`.
+    ``"iekf"``). For vector environments: `VectorEstimatePose`.
+
+    The environment is left as it is: what stands below the wrapper sees the environment's own
+    reward, what stands above sees the wrapper's. Where nobody needs the former, an environment
+    made with ``reward="none"`` saves the time that it takes.
 
     Parameters
     ----------
@@ -52,13 +55,15 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Info
     ----
     `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees` (6 degrees of freedom) and
-    `score_m` (b of the belief), beside what the environment says.
+    `score_m` (b of the belief), beside what the environment says; its own `score_m`, b of the
+    bound, is `bound_m` here.
 
     Examples
     --------
     >>> import gymnasium as gym
     >>> from rbl_gym.wrappers import EstimatePose
-    >>> env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene="drone_yard"), "iekf")
+    >>> env = gym.make("rbl_gym:RBL/Tracking-v0", scene="drone_yard", reward="none")
+    >>> env = EstimatePose(env, "iekf")
     >>> observation, info = env.reset(seed=1)
     >>> observation, reward, terminated, truncated, info = env.step(0)
     >>> info["position_error_m"] < 1.0
@@ -86,7 +91,6 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self.observation_space = observation_space(
             self._kind, env.observation_space, self._scene, self._filter
         )
-        switch_off_reward(env)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -96,7 +100,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         prior = (info["prior_rotation"], info["prior_translation"], info["prior_covariance"])
         self._state = self._filter.initial(*prior)
         belief = self._update(observation)
-        self._judge(belief, info)
+        info = self._judged(belief, info)
         return self._observation(observation, belief), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -104,7 +108,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, _, terminated, truncated, info = self.env.step(action)
         self._state = self._filter.predict(self._state, observation["twist"], self._scene.dt)
         belief = self._update(observation)
-        self._judge(belief, info)
+        info = self._judged(belief, info)
         reward = (
             -float(np.log(info["score_m"])) if self._reward == "belief" else -info["tag_error_m"]
         )
@@ -114,11 +118,11 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._state = update(self._filter, self._state, observation, self._scene)
         return self._filter.belief(self._state)
 
-    def _judge(self, belief: PoseBelief, info: dict[str, Any]) -> None:
-        """Errors against the true pose, into `info`."""
+    def _judged(self, belief: PoseBelief, info: dict[str, Any]) -> dict[str, Any]:
+        """The infos with the errors against the true pose."""
         figures = judge(belief, info["rotation"], info["translation"], self._tags)
-        info.update({name: float(value) for name, value in figures.items()})
         rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
+        return {**with_bound(info), **{name: float(value) for name, value in figures.items()}}
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
         return present(self._kind, observation, belief, self._scene)
@@ -136,10 +140,10 @@ def scene_of(env: Any) -> Scene:
     return scene
 
 
-def switch_off_reward(env: Any) -> None:
-    """No reward of the environment's own, which the wrapper's replaces."""
-    if hasattr(env.unwrapped, "reward_mode"):
-        env.unwrapped.reward_mode = "none"
+def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy of an environment's infos in which b of its bound is `bound_m`, not `score_m`."""
+    names = {"score_m": "bound_m", "_score_m": "_bound_m"}
+    return {names.get(key, key): value for key, value in info.items()}
 
 
 def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:

@@ -53,7 +53,12 @@ class Sb3VecEnv(VecEnv):
         self._lengths = np.zeros(envs.num_envs, dtype=np.int64)
 
     def reset(self) -> Any:
-        """Start all episodes, with the seeds of `seed` if any were given."""
+        """Start all episodes, with the seeds of `seed` if any were given.
+
+        Options (`set_options`) are refused: the worlds have none of their own.
+        """
+        if any(self._options):
+            raise ValueError(f"options must be empty, got {self._options!r:.80}")
         seeds: Any = None if all(one is None for one in self._seeds) else self._seeds
         observation, _ = self.envs.reset(seed=seeds)
         self._reset_seeds()

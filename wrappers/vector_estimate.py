@@ -22,8 +22,8 @@ from rbl_gym.wrappers.estimate import (
     observation_space,
     present,
     scene_of,
-    switch_off_reward,
     update,
+    with_bound,
 )
 
 
@@ -38,7 +38,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     --------
     >>> import gymnasium as gym
     >>> from rbl_gym.wrappers import VectorEstimatePose
-    >>> envs = gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=64, scene="drone_yard")
+    >>> envs = gym.make_vec(
+    ...     "rbl_gym:RBL/Tracking-v0", num_envs=64, scene="drone_yard", reward="none")
     >>> envs = VectorEstimatePose(envs, "iekf")
     >>> observation, info = envs.reset(seed=1)
     >>> observation["belief_covariance"].shape
@@ -69,13 +70,13 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         )
         self.single_observation_space = single
         self.observation_space = batch_space(single, env.num_envs)
-        switch_off_reward(env)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start the filters of the worlds that reset from their priors."""
         observation, info = self.env.reset(seed=seed, options=options)
+        info = with_bound(info)
         self._start(observation, info, info["_prior_rotation"])
         self._report(self._figures(info, np.zeros(self.num_envs, dtype=np.bool_)), info)
         return self._present(observation), info
@@ -83,6 +84,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Step the worlds; predict and update those that go on, start those that begin."""
         observation, _, terminated, truncated, info = self.env.step(actions)
+        info = with_bound(info)
         fresh = info.get("_prior_rotation", np.zeros(self.num_envs, dtype=np.bool_))
         same_step = self.env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         last = terminated | truncated if same_step else np.zeros_like(fresh)
@@ -156,8 +158,10 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def _finish(
         self, info: dict[str, Any], figures: dict[str, FloatArray], last: BoolArray
     ) -> None:
-        """The last beliefs of ended episodes into `final_obs` and `final_info`."""
+        """The last beliefs of ended episodes into copies of `final_obs` and `final_info`."""
         assert self._belief is not None
+        info["final_obs"] = info["final_obs"].copy()
+        info["final_info"] = with_bound(info["final_info"])
         for i in np.flatnonzero(last):
             belief = PoseBelief(*(field[i].copy() for field in self._belief))
             info["final_obs"][i] = present(self._kind, info["final_obs"][i], belief, self._scene)

@@ -241,13 +241,3 @@ class BaseStationEnv(ScalarEnv):
     def noise(self) -> bearing.AngleNoise:
         """Law of the angles."""
         return self._batch.noise
-
-    @property
-    def reward_mode(self) -> str:
-        """Of `REWARDS`; a wrapper that pays itself sets ``"none"``."""
-        return self._batch.reward_mode
-
-    @reward_mode.setter
-    def reward_mode(self, mode: str) -> None:
-        """Set the mode of the rewards to come."""
-        self._batch.reward_mode = mode

@@ -6,11 +6,13 @@ same code with one world, so that the scalar environment and world i of a vector
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -24,7 +26,35 @@ Observation = Any
 MOST_ENVS = 10**8
 
 
-class BatchEnv(VectorEnv[Any, Any, Any]):
+class StatedLength:
+    """An environment whose `spec` tells the length of its episodes.
+
+    The length depends on the arguments of ``make``. A `max_episode_steps` of the registration
+    would be the same for all, and a `TimeLimit` that cuts the longer ones.
+    """
+
+    _spec: EnvSpec | None = None
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode."""
+        raise NotImplementedError
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """The specification that ``make`` gave, with the `max_episode_steps` of this environment."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            # `make_vec` repeats as an argument what the specification has as a field.
+            kwargs = {key: value for key, value in spec.kwargs.items() if key != "max_episode_steps"}
+            spec = dataclasses.replace(spec, max_episode_steps=self.episode_steps, kwargs=kwargs)
+        self._spec = spec
+
+
+class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """Worlds in arrays; a subclass says what they are.
 
     Seeding: ``reset(seed=s)`` seeds world i with ``s + i``, a list gives each its own. Every
@@ -74,6 +104,11 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
         self._generators: list[np.random.Generator] = []
         self._done = np.zeros(num_envs, dtype=np.bool_)
         self._epochs = np.zeros(num_envs, dtype=np.int64)
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode."""
+        return self.steps_limit
 
     # --- what a world is --------------------------------------------------------------------
 
@@ -226,11 +261,8 @@ class BatchEnv(VectorEnv[Any, Any, Any]):
 
 def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
     """Which worlds ``options={"reset_mask": mask}`` resets, all without it; or a ValueError."""
-    if options is None:
-        return np.ones(num_envs, dtype=np.bool_)
-    if not isinstance(options, Mapping):
-        raise ValueError(f"options must be a dict or None, got {options!r:.80}")
-    if "reset_mask" not in options:
+    check_options(options, ("reset_mask",))
+    if not options:
         return np.ones(num_envs, dtype=np.bool_)
     mask = as_array("reset_mask", options["reset_mask"])
     if mask.shape != (num_envs,) or mask.dtype != np.bool_ or not mask.any():
@@ -239,6 +271,21 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
             f"got shape {mask.shape} of {mask.dtype}"
         )
     return mask
+
+
+def check_options(options: Any, known: tuple[str, ...] = ()) -> None:
+    """A ValueError on options of a reset that are no dict, or have a key that is not known."""
+    if options is None:
+        return
+    if not isinstance(options, Mapping):
+        raise ValueError(f"options must be a dict or None, got {options!r:.80}")
+    for key in options:
+        if key not in known:
+            raise ValueError(
+                f"options must have no key but {', '.join(known)}, got {key!r:.80}"
+                if known
+                else f"options must be empty or None, got {key!r:.80}"
+            )
 
 
 def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
@@ -274,7 +321,7 @@ def _row(observation: Observation, i: int) -> Observation:
     return observation[i].copy()
 
 
-class ScalarEnv(gym.Env[Any, Any]):
+class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One world of a `BatchEnv`, as a scalar environment.
 
     A subclass names its `batch_class`; its ``__init__`` hands the arguments on to
@@ -297,6 +344,11 @@ class ScalarEnv(gym.Env[Any, Any]):
         self.metadata = {**self.metadata, "render_fps": self._batch.render_fps}
 
     @property
+    def episode_steps(self) -> int:
+        """Steps of an episode."""
+        return self._batch.episode_steps
+
+    @property
     def film(self) -> rendering.Film | None:
         """What the frames are drawn from, with a render mode."""
         return self._batch.film
@@ -308,7 +360,8 @@ class ScalarEnv(gym.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode."""
+        """Start an episode; `options` must be empty."""
+        check_options(options)
         super().reset(seed=seed)
         self._batch._generators = [self.np_random]
         observation, info = self._batch.reset()

@@ -77,6 +77,11 @@ class AnchorPlacementVectorEnv(BatchEnv):
             self._information = np.zeros((num_envs, self.task.n_poses, 6, 6))
             self._log_score = np.zeros(num_envs)
 
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode: one for each anchor that is placed by itself."""
+        return min(self._placements, self.steps_limit)
+
     def _shot(self) -> tuple[Any, None]:
         share = self.task.n_anchors // self._placements
         return rendering.Layout(self._contexts, self._anchors, share * self._epochs), None
@@ -211,7 +216,8 @@ class AnchorPlacementEnv(ScalarEnv):
     every anchor, from that of 3 m.
 
     ## Episode end
-    Terminates with the last anchor.
+    Terminates with the last anchor; `env.spec.max_episode_steps` says how many steps that is. (In
+    an environment made from that spec Gymnasium's `TimeLimit` truncates the same step too.)
 
     ## Info
     `anchors` (M, 3), zeros where not yet placed; `region` (centre and half size, metres),

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import posterior, ranging, rendering, scene_bounds, scenes, simulation
 from rbl_gym.checks import BoolArray, FloatArray, as_array, check_array, check_one_of
+from rbl_gym.envs.batch import StatedLength, check_options
 from rbl_gym.scene import Scene
 
 REWARDS = ("bound", "none")
@@ -23,7 +24,7 @@ OBSERVATIONS = ("ranges", "statistic")
 # it and world i of the vector environment to each other.
 
 
-class TrackingEnv(gym.Env[Any, Any]):
+class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """A rigid body moves; anchors measure noisy ranges to its tags; where is it, and how turned?
 
     ## Description
@@ -62,7 +63,7 @@ class TrackingEnv(gym.Env[Any, Any]):
     ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square
     tag error in metres, at the true pose: how good any estimator could be with these anchors
     and all of their ranges.
-    ``reward="none"``: 0, for wrappers that compute their own.
+    ``reward="none"``: 0, and no bound is computed: the quick way where a wrapper gives the reward.
 
     ## Starting state
     Start pose, way-points, turn rate, and anchors that the scene leaves open are drawn at
@@ -74,7 +75,8 @@ class TrackingEnv(gym.Env[Any, Any]):
     (where ranges are observed); `epoch`; `score_m`: b (with ``reward="bound"``).
 
     ## Episode end
-    Never terminates; truncates after `scene.steps` steps.
+    Never terminates; truncates after `scene.steps` steps (`env.spec.max_episode_steps` says how
+    many). The `max_episode_steps` of ``gym.make`` can only shorten that.
 
     ## Rendering
     ``render_mode="rgb_array"``: anchors, body and path in space, the body close up with the 95 %
@@ -122,10 +124,16 @@ class TrackingEnv(gym.Env[Any, Any]):
         self._episode: simulation.Episode | None = None
         self._epoch = 0
 
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode: the scene's."""
+        return self.scene.steps
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode; the measurements are those of epoch 0."""
+        """Start an episode; the measurements are those of epoch 0. `options` must be empty."""
+        check_options(options)
         super().reset(seed=seed)
         episode = simulation.draw_episode(self.scene, self.np_random, statistic=self.statistic)
         self._episode = episode
