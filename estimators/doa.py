@@ -210,7 +210,7 @@ def fit_of_places(epoch: DoaEpoch, positions: FloatArray, converged: np.ndarray)
     return Fit(
         rotation * blank[:, None, None],
         translation * blank[:, None],
-        covariance_of(at.hessian),
+        covariance_of(at.hessian) * blank[:, None, None],
         converged & known,
         np.where(known, at.cost, np.inf),
         at.hessian,

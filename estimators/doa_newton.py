@@ -26,13 +26,20 @@ DISTANCE_WEIGHT = 10.0
 START_SHIFT = 1e-3
 STEP_TOLERANCE = 1e-8
 MAX_ITERATIONS = 30
+# Farther off than this, in sizes of the body, an iteration has run away; and without an end this
+# far off too. Angles that tell a body at the first are exact to its 1e-6, at the second to 1e-3.
+FARTHEST = 1e6
+_FAR = 1e3
 # Below this step, in units of length, the residuals' curvature counts too (Newton proper): noise
 # leaves residuals, and with them Gauss-Newton would go on converging linearly.
 _CURVED = 1e-2
 
 
 class Places(NamedTuple):
-    """Places (B, K, 3) of the tags, iterations taken (B,), and whether the last step was small."""
+    """Places (B, K, 3) of the tags, iterations taken (B,), and whether the last step was small.
+
+    NaN where the iteration ran away: beyond 1e6 sizes of the body, or without an end beyond 1e3.
+    """
 
     positions: FloatArray
     iterations: np.ndarray
@@ -80,11 +87,13 @@ def newton_iteration(
         step = _newton_step(
             now, goal, known, pairs, weight, (size < _CURVED * extent).astype(float)
         )
+        # What runs away does not come back.
+        gone = ~(np.abs(now + step).max(axis=(0, 1)) < FARTHEST * extent)
+        step = np.where(gone, np.nan, step)
         now = now + step
         size = np.sqrt(np.einsum("ikb,ikb->b", step, step))
         done = size < STEP_TOLERANCE
-        # What runs away does not come back.
-        stop = done | ~(np.abs(now).max(axis=(0, 1)) < 1e9)
+        stop = done | gone
         if stop.any():
             x[:, :, active[stop]] = now[:, :, stop]
             iterations[active[stop]] = iteration
@@ -94,7 +103,8 @@ def newton_iteration(
             now, goal, known = now[..., keep], goal[..., keep], known[:, keep]
         if not len(active):
             break
-    x[:, :, active] = now
+    lost = ~(np.abs(now).max(axis=(0, 1)) < _FAR * extent)
+    x[:, :, active] = np.where(lost, np.nan, now)
     return Places(x.transpose(2, 1, 0) * unit[:, None, None], iterations, converged)
 
 

@@ -92,15 +92,17 @@ def linearize(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Angles (2, ...) and their gradients (2, 3, ...) at places (3, ...), components first.
 
     The gradient of the angle to the axis e is ``(x (e x) / a - e a) / |x|^2``, a the distance
-    from the axis.
+    from the axis; it is made of quotients of at most 1, which no place overflows.
     """
-    squared = np.einsum("i...,i...->...", x, x)
-    found, gradient = np.empty((2, *squared.shape)), np.empty((2, *x.shape))
+    near = _nearness(x)
+    found, gradient = np.empty((2, *near.shape)), np.empty((2, *x.shape))
     for row, (k, (along, across)) in enumerate(zip(_AXES, _along_and_across(x), strict=True)):
         np.arctan2(across, along, out=found[row])
-        scale = squared * across
-        np.multiply(x, along / np.where(scale > _NOWHERE**3, scale, np.inf), out=gradient[row])
-        gradient[row, k] = -across / np.where(squared > _NOWHERE**2, squared, np.inf)
+        turn = along * near * near
+        safe = _safe(across)
+        for i in ((k + 1) % 3, (k + 2) % 3):
+            np.multiply(x[i] / safe, turn, out=gradient[row, i])
+        np.multiply(-across * near, near, out=gradient[row, k])
     return found, gradient
 
 
@@ -110,15 +112,17 @@ def curvature(x: FloatArray, weights: FloatArray) -> FloatArray:
     In the cylinder about the axis e, u the unit vector away from it, h along and a across: the
     angle is ``atan2(a, h)``, and the circle about the axis adds ``h / (a |x|^2)`` across both.
     """
-    squared = np.einsum("i...,i...->...", x, x)
+    near = _nearness(x)
     total = np.zeros((3, *x.shape))
     for k, (along, across), weight in zip(_AXES, _along_and_across(x), weights, strict=True):
-        safe = np.where(across > 0, across, np.inf)
-        u = x / safe
-        u[k] = 0.0
-        both = 2 * along * across / squared**2
-        mixed = (across**2 - along**2) / squared**2
-        around = along / (squared * safe)
+        safe = _safe(across)
+        u = np.zeros_like(x)
+        for i in ((k + 1) % 3, (k + 2) % 3):
+            u[i] = x[i] / safe
+        cosine, sine = along * near, across * near
+        both = 2 * cosine * sine * near * near
+        mixed = (sine + cosine) * (sine - cosine) * near * near
+        around = cosine * near / safe
         total += (weight * -(both + around)) * u[:, None] * u
         total[k] += weight * mixed * u
         total[:, k] += weight * mixed * u
@@ -130,6 +134,16 @@ def curvature(x: FloatArray, weights: FloatArray) -> FloatArray:
 def _along_and_across(x: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     """Of each axis that is looked along: the coordinate and the distance from it."""
     return [(x[k], np.hypot(x[(k + 1) % 3], x[(k + 2) % 3])) for k in _AXES]
+
+
+def _nearness(x: FloatArray) -> FloatArray:
+    """One over the distance (...) of places (3, ...), 0 where there is no direction."""
+    return 1 / _safe(np.hypot(x[0], np.hypot(x[1], x[2])))
+
+
+def _safe(distance: FloatArray) -> FloatArray:
+    """Distances to divide by: infinite where there is no direction."""
+    return np.where(distance > _NOWHERE, distance, np.inf)
 
 
 def directions(angles: FloatArray, sign: ArrayLike = 1.0) -> FloatArray:

@@ -127,3 +127,19 @@ def test_bad_angles_are_refused(value, message):
         bearing.AngleNoise(0.0)
     with pytest.raises(ValueError, match="noise must be a bearing"):
         doa_bounds.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], 0.1)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("scale", [1e-45, 1e-3, 1e9, 1e120, 1e150, 1e300])
+def test_angles_and_derivatives_at_any_distance(scale):
+    """Angles do not know the distance, gradients fall with it, nothing overflows."""
+    x = np.random.default_rng(4).normal(size=(3, 200))
+    found, gradient = bearing.linearize(x)
+    far, flat = bearing.linearize(scale * x)
+    np.testing.assert_allclose(far, found, rtol=1e-12)
+    # A product with 1e-300 loses digits below the smallest normal number.
+    np.testing.assert_allclose(flat * min(scale, 1e290), gradient * min(1, 1e290 / scale),
+                               rtol=1e-9, atol=1e-12)  # fmt: skip
+    if scale < 1e150:
+        weights = np.ones((2, 200))
+        bent = bearing.curvature(scale * x, weights) * scale * scale
+        np.testing.assert_allclose(bent, bearing.curvature(x, weights), rtol=1e-9, atol=1e-9)

@@ -111,6 +111,26 @@ def test_without_noise_the_pose_is_exact(method):
     np.testing.assert_allclose(found.translation[good], np.tile(T, (good.sum(), 1)), atol=1e-8)
 
 
+@pytest.mark.parametrize("half_space", ["y>0", None])
+@pytest.mark.parametrize("sigma_deg", [0.0, 1.0])
+def test_newtons_iteration_that_runs_away_says_nothing(sigma_deg, half_space):
+    """Warnings are errors: no step leaves the finite range. What is told is near the body."""
+    _, angles, noise = trials(3000, sigma_deg, seed=1)
+    found = estimators.locate_doa(angles, TAGS, "nia", noise, half_space)
+    gone = np.isnan(found.translation).any(axis=-1)
+    assert 20 < gone.sum() < 200
+    assert not found.converged[gone].any()
+    assert np.isnan(found.rotation[gone]).all()
+    assert np.isnan(found.covariance[gone]).all()
+    assert np.isinf(found.cost[gone]).all()
+    assert (found.rank[gone] == 0).all()
+    for field in (found.rotation, found.covariance, found.cost):
+        assert np.isfinite(field[~gone]).all()
+    distance = np.linalg.norm(found.translation[~gone], axis=-1)
+    assert distance.max() < 1e4
+    assert distance[found.converged[~gone]].max() < 100
+
+
 @degrees
 @pytest.mark.parametrize("half_space", ["y>0", None])
 def test_finds_the_global_optimum_of_brute_force(sigma_deg, half_space):

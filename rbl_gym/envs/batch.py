@@ -49,7 +49,9 @@ class StatedLength:
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None:
             # `make_vec` repeats as an argument what the specification has as a field.
-            kwargs = {key: value for key, value in spec.kwargs.items() if key != "max_episode_steps"}
+            kwargs = {
+                key: value for key, value in spec.kwargs.items() if key != "max_episode_steps"
+            }
             spec = dataclasses.replace(spec, max_episode_steps=self.episode_steps, kwargs=kwargs)
         self._spec = spec
 
