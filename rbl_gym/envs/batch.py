@@ -42,7 +42,7 @@ class StatedLength:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """The specification that ``make`` gave, with the `max_episode_steps` of this environment."""
+        """What ``make`` made this from, with the length of its episodes."""
         return self._spec
 
     @spec.setter
