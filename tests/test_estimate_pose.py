@@ -19,7 +19,6 @@ from rbl_gym import estimators, scene_bounds
 from rbl_gym.ranging import LinkNoise
 from rbl_gym.scenes import SCENES
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
-from rbl_gym.wrappers.estimate import update
 from tests.helpers import assert_same, score_by_hand
 
 ID = "rbl_gym:RBL/Tracking-v0"

@@ -47,11 +47,11 @@ class StatedLength:
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
+        """Keep a specification, and state the length in it."""
         if spec is not None:
             # `make_vec` repeats as an argument what the specification has as a field.
-            kwargs = {
-                key: value for key, value in spec.kwargs.items() if key != "max_episode_steps"
-            }
+            kwargs = dict(spec.kwargs)
+            kwargs.pop("max_episode_steps", None)
             spec = dataclasses.replace(spec, max_episode_steps=self.episode_steps, kwargs=kwargs)
         self._spec = spec
 
