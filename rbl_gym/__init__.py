@@ -3,15 +3,35 @@
 Importing it registers the environments' ids and nothing heavy.
 """
 
+import sys
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_file_location
 from pathlib import Path
+from typing import Any
 
 __version__ = "0.1.0"
 
-# In a checkout the estimators and wrappers stand beside the package, not inside it; this lets
-# them be found from the checkout's root under any install mode. Never true in site-packages.
-_root = Path(__file__).resolve().parent.parent
-if (_root / "pyproject.toml").is_file() and (_root / "estimators").is_dir():
-    __path__.append(str(_root))
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+class _Folders:
+    """Finds the two packages that in a checkout stand beside this one, and nothing else."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        package, _, folder = name.partition(".")
+        if package != __name__ or folder not in ("estimators", "wrappers"):
+            return None
+        place = _ROOT / folder
+        return spec_from_file_location(
+            name, place / "__init__.py", submodule_search_locations=[str(place)]
+        )
+
+
+# Never in site-packages, where both stand inside. First, before the finder of an editable install,
+# which may be of another checkout.
+if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "estimators").is_dir():
+    sys.meta_path.insert(0, _Folders)
 
 
 def _register_environments() -> None:

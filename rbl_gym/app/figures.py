@@ -39,19 +39,25 @@ DOA_COLOURS = {"NIA + UQ": "#2e86ab", "ML": "#1b7f5c", "PSO": "#e8a33d", "PSA": 
 _MAGNIFY = 20
 
 
+# A decorator for what draws: matplotlib's settings outside of it stay the user's.
+styled = matplotlib.rc_context(
+    {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+)
+
+
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure in the style of the house."""
-    matplotlib.rcParams.update({"font.size": 9, "axes.spines.top": False,
-                                "axes.spines.right": False})  # fmt: skip
+    """An empty figure."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
+@styled
 def save(figure: Figure, path: str) -> None:
     """Write a figure, making its folder."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
 
 
+@styled
 def camsap2013(result: dict[str, Any], example: Example) -> Figure:
     """Figs 2 and 3 of the tracking paper, NEES, and one trial or ET-KF's trade beside them."""
     figure = new_figure(14, 7.2)
@@ -156,6 +162,7 @@ def _errors(axes: Any, example: Example) -> None:
     axes.legend(frameon=False, fontsize=8)
 
 
+@styled
 def static(result: dict[str, Any]) -> Figure:
     """Angle and translation error over the reference range, a column for every setting."""
     settings = result["settings"]
@@ -189,6 +196,7 @@ def static(result: dict[str, Any]) -> Figure:
     return figure
 
 
+@styled
 def doa2019(result: dict[str, Any]) -> Figure:
     """RMSE of R and t over the noise with the bound, and the success rates; a row a setting."""
     settings = result["settings"]
@@ -231,6 +239,7 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
     return (vectors @ (np.sqrt(5.991 * values)[:, None] * circle)).T
 
 
+@styled
 def replay(recording: Recording, track: Track, found: Errors | None) -> Figure:
     """The track from above with the anchors, and, where truth exists, the errors over time."""
     figure = new_figure(12, 5.2 if found is not None else 6)

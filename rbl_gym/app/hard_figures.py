@@ -8,13 +8,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from rbl_gym.app.figures import new_figure
+from rbl_gym.app.figures import new_figure, styled
 from rbl_gym.app.reports import new_console
 
 _COLOURS = {"iekf": "#d1495b", "iekf, robust": "#2e86ab", "bank, robust": "#1b7f5c",
             "bank": "#2e86ab", "bank, volume": "#1b7f5c"}  # fmt: skip
 
 
+@styled
 def hard_figure(result: dict[str, Any]) -> Figure:
     """Translation errors over the bound, and who is back after wrong starts."""
     figure = new_figure(12, 8)

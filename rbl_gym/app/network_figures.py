@@ -10,13 +10,14 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from rbl_gym.app import network2009
-from rbl_gym.app.figures import new_figure
+from rbl_gym.app.figures import new_figure, styled
 from rbl_gym.app.network import Solved
 from rbl_gym.app.reports import new_console
 
 _COLOURS = {"bfs": "#d1495b", "paton": "#2e86ab", "minimum": "#1b7f5c"}
 
 
+@styled
 def network2009_figure(result: dict[str, Any]) -> Figure:
     """A network, the error against the loops, convergence, and the factors."""
     figure = new_figure(11, 8)
@@ -89,6 +90,7 @@ def print_network2009(result: dict[str, Any]) -> None:
                   "projection")  # fmt: skip
 
 
+@styled
 def network_figure(solved: Solved) -> Figure:
     """The graph where it has places, and the residuals of its edges."""
     figure = new_figure(10, 4.6)

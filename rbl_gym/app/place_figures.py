@@ -25,9 +25,9 @@ _PLAN: Plane = (0, 1)
 _SIDE: Plane = (0, 2)
 
 
+@matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10})
 def figure(placed: Placed) -> Figure:
     """Maps of position and orientation, a side view, the usual layouts or the number's curve."""
-    matplotlib.rcParams.update({"font.size": 9, "axes.titlesize": 10})
     problem, anchors = placed.problem, placed.design.anchors
     low, high = problem.corners()
     plan = accuracy_map(problem, anchors)
