@@ -148,6 +148,51 @@ def test_the_same_seed_gives_the_same_figures_whatever_else_is_asked():
     assert evaluate(task, seed=1)["methods"]["random"] != alone["methods"]["random"]
 
 
+@pytest.mark.parametrize("kind", SHORT)
+def test_a_policy_as_saved_is_scored_in_the_worlds_of_evaluations(kind):
+    task, scalar, sizes, policy_kind = SHORT[kind]
+    policy = random_policy(policy_kind, sizes)
+    got = evaluation.held_out_returns(task, policy, 3, 2)
+    returns = []
+    for i in range(3):
+        env = scalar(**task.arguments)
+        observation, _ = env.reset(seed=HELD_OUT_SEED + 2 * SEED_STRIDE + i)
+        total, truncated = 0.0, False
+        while not truncated:
+            observation, reward, _, truncated, _ = env.step(policy(observation))
+            total += reward
+        returns.append(total)
+    assert got["policy_mean_return"] == pytest.approx(np.mean(returns), rel=1e-6)
+    assert got["policy_std_error"] == pytest.approx(np.std(returns, ddof=1) / 3**0.5, rel=1e-5)
+    assert got["random_mean_return"] != got["policy_mean_return"]
+    assert evaluation.held_out_returns(task, policy, 3, 2) == got
+
+
+def test_a_training_says_how_good_the_policy_is_that_it_saved(monkeypatch, tmp_path, capsys):
+    """By a stand-in for PPO: the learning curve shines, the policy that is saved does not."""
+    size = rl_task("auv_buoys").make(1).single_observation_space.shape[0]
+    bad = random_policy("box", (size, 8, 3))
+
+    def pretend(name, task, steps, seed, advance):
+        curve = [{"steps": steps, "mean_return": 99.0}]
+        figures = {"task": name, "seed": seed, "steps": steps, "seconds": 1.0, "cpu_seconds": 1.0,
+                   "env_share": 0.1, "curve": curve}  # fmt: skip
+        return bad._replace(biases=(*bad.biases[:-1], np.full(3, 1e3))), figures
+
+    monkeypatch.setattr(training, "train", pretend)
+    command = ["train", "auv_buoys", "--steps", "1", "--out", str(tmp_path / "p.npz")]
+    assert main([*command, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)["held_out"]
+    assert told["worlds"] == 256
+    # All anchors in one corner.
+    assert told["policy_mean_return"] < told["random_mean_return"]
+    assert main(command) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "99.0000 while exploring" in text
+    assert f"256 held-out worlds: {told['policy_mean_return']:.4f}" in text
+    assert "NO BETTER THAN RANDOM ACTIONS" in text
+
+
 def test_evaluations_and_trainings_never_share_worlds():
     assert max(task.num_envs for task in TASKS.values()) <= SEED_STRIDE
     with pytest.raises(ValueError, match="seed must be below 1000, got 1000"):

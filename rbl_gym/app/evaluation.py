@@ -99,6 +99,25 @@ def evaluate(
     }
 
 
+def held_out_returns(task: RlTask, policy: Policy, worlds: int, seed: int) -> dict[str, Any]:
+    """Returns of the policy as it is saved, and of random actions, in the worlds of `evaluate`.
+
+    A training's own returns are those of actions drawn about the policy's, in other worlds.
+    """
+    check_fit(policy, str(policy.meta.get("task")), task.make(1))
+
+    def by_chance(env: Any, _: np.ndarray) -> np.ndarray:
+        return env.action_space.sample()
+
+    result: dict[str, Any] = {"worlds": worlds}
+    for name, act in (("policy", lambda _, seen: policy(seen)), ("random", by_chance)):
+        returns = _returns(task, act, worlds, seed)[0]
+        result[f"{name}_mean_return"] = float(returns.mean())
+        spread = float(returns.std(ddof=1)) if worlds > 1 else 0.0
+        result[f"{name}_std_error"] = spread / math.sqrt(worlds)
+    return result
+
+
 def work_units(task: RlTask, names: list[str], n_policies: int) -> int:
     """How often `evaluate` calls `advance`."""
     known = references(task)
@@ -184,7 +203,16 @@ def _rollout(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> FloatArray:
     """Losses (worlds,) of one episode of each world."""
+    returns, steps = _returns(task, act, worlds, seed)
+    return -returns / steps
+
+
+def _returns(
+    task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
+) -> tuple[FloatArray, int]:
+    """Sums of the rewards (worlds,) of one episode of each world, and its steps."""
     env, observation, _ = _held_out(task, worlds, seed)
+    env.action_space.seed(seed)
     total, steps = np.zeros(worlds), 0
     done = np.zeros(worlds, dtype=np.bool_)
     while not done.all():
@@ -192,7 +220,7 @@ def _rollout(
         total += reward
         steps += 1
         done = terminated | truncated
-    return -total / steps
+    return total, steps
 
 
 # --- placement --------------------------------------------------------------------------------

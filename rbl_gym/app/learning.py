@@ -18,6 +18,9 @@ from rbl_gym.app.terminal import (
 )
 from rbl_gym.checks import check_one_of
 
+# Held-out worlds in which a trained policy is scored, those of ``evaluate``.
+_WORLDS = 256
+
 
 def add_train(commands: Any) -> None:
     """The parser of ``rbl-gym train``."""
@@ -42,7 +45,7 @@ def add_evaluate(commands: Any) -> None:
         description="Score policies against the references on held-out worlds, with 95 % "
         "intervals of the paired bootstrap.",
     )
-    _add_players(evaluate, list(TASKS), worlds=256, references="all of the task's")
+    _add_players(evaluate, list(TASKS), worlds=_WORLDS, references="all of the task's")
     add_json(evaluate)
     evaluate.set_defaults(run=_evaluate)
 
@@ -76,7 +79,7 @@ def _add_players(
 
 
 def _train(options: argparse.Namespace) -> int:
-    from rbl_gym.app import policies, training
+    from rbl_gym.app import evaluation, policies, training
 
     task = rl_task(options.task)
     steps = options.steps or task.steps
@@ -90,6 +93,8 @@ def _train(options: argparse.Namespace) -> int:
         ) from error
     policies.save(policy, path)
     result["policy"] = str(path)
+    # Of the file, not of what PPO remembers: that is what others will play.
+    result["held_out"] = evaluation.held_out_returns(task, policies.load(path), _WORLDS, seed=0)
     if write_json(result, options.json):
         from rbl_gym.app import reports
 

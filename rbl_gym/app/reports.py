@@ -130,15 +130,26 @@ def print_replay(result: dict[str, Any]) -> None:
 
 
 def print_training(result: dict[str, Any]) -> None:
-    """The learning curve in a few points, and where the time went."""
+    """The learning curve in a few points, where the time went, and how good the policy is."""
     console = new_console()
     curve = result["curve"]
     for point in curve[:: max(1, len(curve) // 10)]:
-        console.print(f"{point['steps']:>10,} steps  mean return {point['mean_return']:.4f}")
+        console.print(
+            f"{point['steps']:>10,} steps  mean return {point['mean_return']:.4f} while exploring"
+        )
     console.print(
         f"{result['steps']:,} steps in {result['seconds']:.0f} s; the environment took "
         f"{100 * result['env_share']:.0f} % of the processor's time\npolicy: {result['policy']}"
     )
+    held_out = result["held_out"]
+    returns = {name: held_out[f"{name}_mean_return"] for name in ("policy", "random")}
+    console.print(
+        f"mean return in {held_out['worlds']} held-out worlds: {returns['policy']:.4f} +- "
+        f"{held_out['policy_std_error']:.4f} of the policy as saved (it plays the most likely "
+        f"action), {returns['random']:.4f} +- {held_out['random_std_error']:.4f} of random actions"
+    )
+    if returns["policy"] <= returns["random"]:
+        console.print("The policy is NO BETTER THAN RANDOM ACTIONS: train longer (--steps).")
 
 
 def print_evaluation(result: dict[str, Any]) -> None:
