@@ -1,4 +1,6 @@
-"""The static paper's estimators on squared ranges: LS, LS-projected, CLS, weighted Procrustes.
+"""Estimators on squared ranges: LS, LS-projected, CLS (CTLS), weighted Procrustes (UC-LS).
+
+LS and CLS are of the static paper (ICASSP 2013), LS with projection and UC-LS of the slides.
 
 All read the statistic of an epoch (`squared_range`) and broadcast over leading axes. Where the
 links of a trial do not determine a solution, its entries are NaN; the caller must look.
@@ -14,7 +16,9 @@ from rbl_gym.checks import FloatArray, kernel
 from rbl_gym.estimators.squared_range import Statistic, information
 
 # Behind the doors: entries of what is not determined are NaN here.
-_EXP, _NEAREST = kernel(rotations.exp), kernel(rotations.nearest)
+_NEAREST = kernel(rotations.nearest)
+# From a step on the tangent space to a rotation, equal to second order.
+RETRACTIONS = {"exponential": kernel(rotations.exp), "cayley": kernel(rotations.cayley)}
 
 # The generators of SO(3): E[i] = [e_i]x.
 _E = rotations.hat(np.eye(3))
@@ -34,12 +38,17 @@ def unvec(vector: FloatArray) -> FloatArray:
 
 
 def procrustes(
-    weight: FloatArray, target: FloatArray, start: FloatArray, iterations: int = 30
+    weight: FloatArray,
+    target: FloatArray,
+    start: FloatArray,
+    iterations: int = 30,
+    retraction: str = "exponential",
 ) -> tuple[FloatArray, FloatArray]:
     """Rotation that minimises ``(vec Q - q)^T W (vec Q - q) / 2`` by Newton's method on SO(3).
 
     Exact Hessian, damped where it is not positive or the cost would rise; the update is
-    ``Q <- exp(w) Q``. Local: the caller chooses the starts (put them on a batch axis).
+    ``Q <- R(w) Q`` with the retraction R. Local: the caller chooses the starts (put them on a
+    batch axis).
 
     Parameters
     ----------
@@ -49,6 +58,8 @@ def procrustes(
         Rotation (..., 3, 3) to start from.
     iterations
         At the most; it stops when all trials stand still.
+    retraction
+        One of `RETRACTIONS`.
 
     Returns
     -------
@@ -76,7 +87,7 @@ def procrustes(
         # A step past a quarter turn leaves the region the quadratic model speaks of.
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         step = step * np.minimum(1.0, 1.5 / np.maximum(length, 1e-300))
-        candidate = _EXP(step) @ Q
+        candidate = RETRACTIONS[retraction](step) @ Q
         new_residual = vec(candidate) - target
         new_pull = (weight @ new_residual[..., None])[..., 0]
         new_cost = 0.5 * np.einsum("...i,...i->...", new_residual, new_pull)
@@ -104,7 +115,9 @@ def translation_fit(stat: Statistic, rotation: FloatArray) -> FloatArray:
 
 
 def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """CLS = CTLS, Algorithm 1: every tag located by itself, then an orthogonal Procrustes fit.
+    """CLS, which is CTLS too: every tag located by itself, then an orthogonal Procrustes fit.
+
+    Static paper: (17)-(19) and Lemma 1, (20)-(21) and Lemma 2, Algorithm 1.
 
     Tags whose links do not determine their place are left out; three that are not collinear
     have to remain.
@@ -125,14 +138,20 @@ def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def procrustes_fit(stat: Statistic, starts: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weighted orthogonal Procrustes (optimally constrained LS), searched for globally.
+def procrustes_fit(
+    stat: Statistic, starts: FloatArray, retraction: str = "exponential"
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted orthogonal Procrustes, searched for globally.
+
+    Remark 2 of the static paper; UC-LS in the appendix of the slides.
 
     Parameters
     ----------
     starts
         Rotations (..., S, 3, 3); Newton's method runs from the first of every trial and from
         the two of least cost among the others.
+    retraction
+        One of `RETRACTIONS`.
 
     Returns
     -------
@@ -152,7 +171,7 @@ def procrustes_fit(stat: Statistic, starts: FloatArray) -> tuple[FloatArray, Flo
     order = np.argsort(cost[..., 1:], axis=-1)[..., :2] + 1
     chosen = np.concatenate([np.zeros_like(order[..., :1]), order], axis=-1)
     starts = np.take_along_axis(starts, chosen[..., None, None], axis=-3)
-    Q, cost = procrustes(weight, target, starts)
+    Q, cost = procrustes(weight, target, starts, retraction=retraction)
     best = np.argmin(cost, axis=-1)
     rotation = np.take_along_axis(Q, best[..., None, None, None], axis=-3)[..., 0, :, :]
     return rotation, translation_fit(stat, rotation)

@@ -13,8 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds, ranging
-from rbl_gym.checks import BoolArray, FloatArray, are_finite, check_array, check_number, kernel
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    are_finite,
+    check_array,
+    check_number,
+    check_one_of,
+    kernel,
+)
 from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, spanned_dimensions
+from rbl_gym.estimators.least_squares import RETRACTIONS
 from rbl_gym.estimators.locators import METHODS, Epoch, Fit
 from rbl_gym.estimators.maximum_likelihood import Alternatives, no_alternatives
 from rbl_gym.estimators.squared_range import Statistic, statistic
@@ -72,6 +81,7 @@ def locate(
     method: str = "ml",
     links: ArrayLike | None = None,
     tag_std_m: float = 0.0,
+    retraction: str = "exponential",
 ) -> PoseEstimate:
     """The pose of a body from one epoch of ranges; a thousand problems are one call.
 
@@ -85,32 +95,45 @@ def locate(
         Law of the ranges; variances are taken at the measured ranges.
     method
         ``"ls"``: least squares on the squared ranges without the constraint (static paper,
-        (14)). ``"ls-projected"``: its matrix projected onto SO(3), then the translation.
-        ``"cls"``: tag by tag, then an orthogonal Procrustes fit (CTLS, Algorithm 1).
-        ``"procrustes"``: weighted orthogonal Procrustes, the optimally constrained least
-        squares. ``"ml"``: maximum likelihood of the raw ranges, searched for globally where
-        the geometry is poor. ``"two-step"``: ``cls`` and two Gauss-Newton steps on the raw
-        ranges. ``"robust"``: for ranges of which some are wrong. Or a name that a package
-        offers by the entry-point group ``rbl_gym.locators``.
+        (14)). ``"ls-projected"``: its matrix projected onto SO(3), then the translation
+        (slides). ``"cls"``, or ``"ctls"``, the same: tag by tag, then an orthogonal Procrustes
+        fit (static paper, (17)-(21), Lemmas 1 and 2, Algorithm 1). ``"procrustes"``, or
+        ``"uc-ls"``, the same: weighted orthogonal Procrustes by Newton's method, the optimally
+        constrained least squares (static paper, Remark 2; slides, appendix). ``"ml"``: maximum
+        likelihood of the raw ranges, searched for globally where the geometry is poor.
+        ``"two-step"``: ``cls`` and two Gauss-Newton steps on the raw ranges. ``"robust"``: for
+        ranges of which some are wrong. Or a name that a package offers by the entry-point group
+        ``rbl_gym.locators``.
     links
         Mask (..., M, N), True = measured.
     tag_std_m
         Standard deviation of the tags' places on the body, per axis; marginalised by ``ml``.
+    retraction
+        How Newton's method of ``procrustes`` turns a step into a rotation: ``"exponential"``
+        or ``"cayley"`` (slides). Both end in the same pose.
 
     Raises
     ------
     ValueError
-        On wrong shapes, NaN, ranges that are not positive, an unknown method; and where the
+        On wrong shapes, NaN, ranges that are not positive, an unknown method, a retraction
+        other than the exponential for a method that has none; and where the
         anchors or tags cannot give what a squared-range method needs (four anchors not
         coplanar; tags not collinear, for ``ls`` not coplanar).
     """
     fit = _method(method)
+    check_one_of("retraction", retraction, list(RETRACTIONS))
+    if retraction != "exponential" and fit is not METHODS["procrustes"]:
+        raise ValueError(
+            f"retraction {retraction!r} is for the methods 'procrustes' and 'uc-ls', "
+            f"got method {method!r}"
+        )
     ranging.check_law("noise", noise)
     tags = check_array("tags", tags, ("N", 3))
     tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
     ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
     check_batches(ranges=ranges.shape[:-2], tags=tags.shape[:-2])
     epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
+    epoch = epoch._replace(retraction=retraction)
     blocks = [
         _solve(fit, _rows(epoch, slice(start, start + _BLOCK)))
         for start in range(0, len(epoch.ranges), _BLOCK)
@@ -174,6 +197,7 @@ def _rows(epoch: Epoch, rows: slice) -> Epoch:
         epoch.weights[rows],
         Statistic._make(field[rows] for field in epoch.stat),
         epoch.tag_std_m,
+        epoch.retraction,
     )
 
 
@@ -207,7 +231,9 @@ def _epoch(
 
 
 # Rank of the anchors and of the tags that the squared-range methods stand on.
-_NEEDS = {"ls": (3, 3), "ls-projected": (3, 3), "cls": (3, 2), "procrustes": (3, 2)}
+_NEEDS = {"ls": (3, 3), "ls-projected": (3, 3)} | dict.fromkeys(
+    ("cls", "ctls", "procrustes", "uc-ls"), (3, 2)
+)
 
 
 def _check_geometry(method: str, anchors: FloatArray, tags: FloatArray) -> None:

@@ -27,7 +27,8 @@ class Epoch(NamedTuple):
     """Checked arrays of B trials: ranges (B, M, N), anchors (B, M, 3), tags (B, N, 3).
 
     `weights` (B, M, N) are inverse variances of the ranges, 0 where a link is missing;
-    `stat` is the statistic of the squared ranges; `tag_std_m` that of the tags' places.
+    `stat` is the statistic of the squared ranges; `tag_std_m` that of the tags' places;
+    `retraction` that of Newton's method in ``procrustes``.
     """
 
     ranges: FloatArray
@@ -36,6 +37,7 @@ class Epoch(NamedTuple):
     weights: FloatArray
     stat: Statistic
     tag_std_m: float
+    retraction: str = "exponential"
 
 
 class Fit(NamedTuple):
@@ -95,7 +97,7 @@ def _procrustes(epoch: Epoch) -> Fit:
     first = np.where(np.isfinite(first), first, np.eye(3))[:, None]
     net = np.broadcast_to(ROTATION_NET, (len(first), 24, 3, 3))
     starts = np.concatenate([first, net], axis=1)
-    rotation, translation = least_squares.procrustes_fit(epoch.stat, starts)
+    rotation, translation = least_squares.procrustes_fit(epoch.stat, starts, epoch.retraction)
     G = np.broadcast_to(epoch.stat.G, (*epoch.tags.shape[:2], 3, 3))
     covariance = covariance_of(bounds.lift(bounds.tag_jacobian(rotation, epoch.tags), G))
     return _linear(rotation, translation, covariance)
@@ -188,7 +190,9 @@ METHODS: dict[str, Callable[[Epoch], Fit]] = {
     "ls": _ls,
     "ls-projected": _ls_projected,
     "cls": _cls,
+    "ctls": _cls,
     "procrustes": _procrustes,
+    "uc-ls": _procrustes,
     "two-step": _two_step,
     "ml": _ml,
     "robust": _robust,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rbl_gym.checks import check_one_of
-from rbl_gym.ranging import NOISE_LAWS
+from rbl_gym.ranging import NOISE_FORMS, NOISE_LAWS
 from rbl_gym.regions import REGIONS, Box
 
 
@@ -20,7 +20,7 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         The dataclass.
     changes
         Name of a field -> its value, or a mapping of what changes in it. With the key ``"kind"``
-        the mapping says all of a region (`REGIONS`) or noise law (`NOISE_LAWS`).
+        the mapping says all of a region (`REGIONS`) or noise law (`NOISE_FORMS`).
     path
         How errors call it.
 
@@ -56,7 +56,8 @@ def _nested(old: Any, value: Mapping[str, Any], path: str) -> Any:
         return replace(old, value, path)
     if not kinds:
         raise ValueError(f"{path} comes in one kind only, got kind {value['kind']!r}")
-    kind = kinds[check_one_of(f"{path}.kind", value["kind"], list(kinds))]
+    forms = NOISE_FORMS if kinds is NOISE_LAWS else kinds
+    kind = forms[check_one_of(f"{path}.kind", value["kind"], list(forms))]
     try:
         return kind(**{key: item for key, item in value.items() if key != "kind"})
     except (TypeError, ValueError) as error:

@@ -9,6 +9,7 @@ recognise the papers' case.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Any, NamedTuple, Protocol
@@ -91,6 +92,37 @@ class RangeNoise:
         tag for all tags of an anchor (its eq. (2)); ``reference_tag=None``: of each link.
         """
         return cls(0.0, 10 ** (-check_number("db", db) / 20), reference_tag)
+
+    @classmethod
+    def from_time_of_arrival(
+        cls,
+        speed_m_s: float,
+        n_samples: float,
+        kappa: float,
+        snr: float,
+        reference_tag: int | None = 0,
+    ) -> RangeNoise:
+        """The static paper's law from what makes it, its (1) and (2).
+
+        The variance of a range r is ``3 c^2 r^2 / (N_s kappa SNR)``; the reference range is
+        ``10 log10(N_s kappa SNR / (3 c^2))`` dB.
+
+        Parameters
+        ----------
+        speed_m_s
+            Speed c of the wave, metres per second.
+        n_samples
+            Samples N_s of a ranging.
+        kappa
+            The constant of the ranging method.
+        snr
+            Signal-to-noise ratio, a ratio and not decibels.
+        reference_tag
+            As in `from_reference_range_db`.
+        """
+        values = {"speed_m_s": speed_m_s, "n_samples": n_samples, "kappa": kappa, "snr": snr}
+        c, n, k, ratio = (check_number(name, value, low=1e-300) for name, value in values.items())
+        return cls(0.0, math.sqrt(3 / (n * k * ratio)) * c, reference_tag)
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
         """Variance of the ranges [m^2]; see `NoiseLaw`."""
@@ -203,6 +235,12 @@ def check_law(name: str, noise: Any) -> None:
 NOISE_LAWS: dict[str, type[NoiseLaw]] = {
     "range": RangeNoise,
     "squared-range": SquaredRangeNoise,
+}
+# Other ways to say a law of these.
+NOISE_FORMS: dict[str, Callable[..., NoiseLaw]] = {
+    **NOISE_LAWS,
+    "reference-range": RangeNoise.from_reference_range_db,
+    "time-of-arrival": RangeNoise.from_time_of_arrival,
 }
 
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rbl_gym.checks import FloatArray, check_array, checked, kernel
 
 __all__ = [
-    "angle_between", "error", "exp", "from_euler_zyx", "from_quaternion", "hat",
+    "angle_between", "cayley", "error", "exp", "from_euler_zyx", "from_quaternion", "hat",
     "left_jacobian", "left_jacobian_inverse", "log", "nearest", "quaternion", "random", "vee",
     "yaw",
 ]  # fmt: skip
@@ -149,6 +149,19 @@ def exp(w: ArrayLike, out: FloatArray | None = None) -> FloatArray:
     squared = np.einsum("...i,...i->...", w, w)
     a, b, _ = coefficients(squared)
     return _series(w, a, b, 1.0 - b * squared, out)
+
+
+@checked(w=(3,))
+def cayley(w: ArrayLike) -> FloatArray:
+    """Rotation (..., 3, 3) by ``2 atan(|w| / 2)`` about ``w`` (..., 3), the Cayley transform.
+
+    ``(I - X)^-1 (I + X)`` with ``X = hat(w) / 2``. It agrees with `exp` to second order in w,
+    needs no sine, and does not reach half turns.
+    """
+    w = np.asarray(w, dtype=np.float64)
+    quarter = 0.25 * np.einsum("...i,...i->...", w, w)
+    scale = 1 / (1 + quarter)
+    return _series(w, scale, 0.5 * scale, (1 - quarter) * scale)
 
 
 @checked(w=(3,))

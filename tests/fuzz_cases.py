@@ -65,7 +65,7 @@ def case(function: Callable[..., Any], label: str = "", **arguments: Any) -> Non
     CASES[name.strip()] = function, arguments
 
 
-for _function in (rotations.hat, rotations.exp, rotations.left_jacobian,
+for _function in (rotations.hat, rotations.exp, rotations.cayley, rotations.left_jacobian,
                   rotations.left_jacobian_inverse):  # fmt: skip
     case(_function, w=T)
 for _function in (rotations.log, rotations.quaternion, rotations.yaw):

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from rbl_gym import bodies, bounds, estimators, metrics, ranging, rotations, scenes
 from rbl_gym.estimators import localization as door
-from rbl_gym.estimators import maximum_likelihood
+from rbl_gym.estimators import maximum_likelihood, squared_range
 from rbl_gym.estimators.levenberg_marquardt import minimize_pose
 from rbl_gym.estimators.range_cost import RangeCost
 from tests.helpers import load, random_world, simulate
@@ -86,6 +86,62 @@ def test_bound_after_projection_of_the_reference_implementation(case):
     np.testing.assert_allclose(
         np.sqrt(np.trace(P[3:, 3:])), expected["translation_rmse_m"], rtol=1e-9
     )
+
+
+@pytest.mark.parametrize(("alias", "method"), [("ctls", "cls"), ("uc-ls", "procrustes")])
+def test_the_names_of_the_papers_reach_their_methods(alias, method):
+    _, anchors, noise, ranges = paper_world(5, 60, 3)
+    named = estimators.locate(ranges, anchors, BODY, noise, alias)
+    plain = estimators.locate(ranges, anchors, BODY, noise, method)
+    np.testing.assert_array_equal(named.rotation, plain.rotation)
+    np.testing.assert_array_equal(named.translation, plain.translation)
+
+
+def test_ctls_solves_the_total_least_squares_problem_of_the_static_paper():
+    """(21), written out: free in Q and in the perturbation, from the solution and from elsewhere.
+
+    ``E = Q (Cbar + Delta) - X`` is eliminated; X is from noise-free anchors, so that the paper's
+    pseudo-inverse is exact and X is the tags' centred places with an error of their own.
+    """
+    rng = np.random.default_rng(4)
+    _, anchors, noise, ranges = paper_world(1, 40, 4)
+    found = estimators.locate(ranges[0], anchors[0], BODY, noise, "ctls")
+    # X of (18): every tag located by itself, weights of the first tag's ranges.
+    weights = 1 / noise.squared_range_variance(ranges[0])
+    stat = squared_range.statistic(ranges[0], anchors[0], BODY, weights)
+    places = np.linalg.solve(stat.G, stat.b[..., None])[..., 0]
+    X, C = (points - points.mean(axis=0) for points in (places, BODY))
+
+    def residuals(x):
+        Delta = x[3:].reshape(C.shape)
+        return np.concatenate([Delta.ravel(), ((C + Delta) @ rotations.exp(x[:3]).T - X).ravel()])
+
+    starts = [
+        rotations.log(found.rotation),
+        rotations.log(found.rotation) + 0.2 * rng.normal(size=3),
+    ]
+    for start in starts:
+        x = np.concatenate([start, np.zeros(C.size)])
+        peer = least_squares(residuals, x, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        np.testing.assert_allclose(rotations.exp(peer.x[:3]), found.rotation, atol=1e-6)
+
+
+def test_both_retractions_end_in_the_same_pose():
+    _, anchors, noise, ranges = paper_world(20, 40, 5)
+    one, other = (
+        estimators.locate(ranges, anchors, BODY, noise, "uc-ls", retraction=name)
+        for name in ("exponential", "cayley")
+    )
+    np.testing.assert_allclose(other.rotation, one.rotation, atol=1e-9)
+    np.testing.assert_allclose(other.translation, one.translation, atol=1e-8)
+    # Another path: not the same last bits.
+    assert (other.rotation != one.rotation).any()
+    with pytest.raises(ValueError, match="retraction must be one of 'exponential', 'cayley'"):
+        estimators.locate(ranges, anchors, BODY, noise, "uc-ls", retraction="polar")
+    with pytest.raises(
+        ValueError, match=r"is for the methods 'procrustes' and 'uc-ls', got .*'ml'"
+    ):
+        estimators.locate(ranges, anchors, BODY, noise, "ml", retraction="cayley")
 
 
 # --- statistics -----------------------------------------------------------------------------
@@ -387,7 +443,7 @@ def test_a_package_adds_its_method_by_an_entry_point(monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"method": "best"}, "method must be one of 'cls', 'ls', .* got 'best'"),
+        ({"method": "best"}, "method must be one of 'cls', 'ctls', 'ls', .* got 'best'"),
         ({"ranges": np.ones((3, 5))}, r"ranges must have shape \(..., 6, 5\), got \(3, 5\)"),
         ({"ranges": -np.ones((6, 5))}, r"ranges must be positive where measured, got -1.0"),
         ({"tags": np.ones((5, 2))}, r"tags must have shape \(..., N, 3\), got \(5, 2\)"),
@@ -412,6 +468,25 @@ def test_reference_range_counts_100_db_as_a_millimetre_at_100_m():
     np.testing.assert_allclose(np.sqrt(noise.variance(np.array([[100.0]]))), 1e-3)
     assert noise.reference_tag == 0
     assert ranging.RangeNoise.from_reference_range_db(60, None).reference_tag is None
+
+
+def test_the_noise_of_the_static_paper_from_what_makes_it():
+    """Its (1): variance 3 c^2 r^2 / (N_s kappa SNR); its reference range in dB."""
+    c, n_samples, kappa, snr = 299_792_458.0, 1000, 2.0, 1e13
+    parts = {"speed_m_s": c, "n_samples": n_samples, "kappa": kappa, "snr": snr}
+    noise = ranging.RangeNoise.from_time_of_arrival(**parts)
+    got = noise.variance(np.array([[80.0, 90.0]]))
+    np.testing.assert_allclose(got, 3 * c**2 / (n_samples * kappa) * 80.0**2 / snr)
+    db = 10 * np.log10(n_samples * kappa * snr / (3 * c**2))
+    same = ranging.RangeNoise.from_reference_range_db(db)
+    np.testing.assert_allclose(noise.proportional, same.proportional)
+    for form in ({"kind": "time-of-arrival", **parts}, {"kind": "reference-range", "db": db}):
+        scene = scenes.get({"name": "icassp2013", "noise": form})
+        np.testing.assert_allclose(scene.noise.proportional, noise.proportional)
+    with pytest.raises(ValueError, match="snr must be a finite number"):
+        ranging.RangeNoise.from_time_of_arrival(**parts | {"snr": 0.0})
+    with pytest.raises(ValueError, match=r"scene.noise: .*missing 3 required"):
+        scenes.get({"name": "icassp2013", "noise": {"kind": "time-of-arrival", "snr": 1.0}})
 
 
 def test_of_exact_mirror_images_the_one_that_is_not_returned_is_the_alternative():

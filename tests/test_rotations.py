@@ -414,3 +414,18 @@ def test_bad_rotations_are_refused(Q, message):
 def test_an_empty_batch_is_refused_by_name():
     with pytest.raises(ValueError, match=r"^w must not be empty, got shape \(0, 3\)"):
         rotations.exp(np.zeros((0, 3)))
+
+
+def test_cayley_is_its_definition_and_the_exponential_to_second_order():
+    rng = np.random.default_rng(20)
+    w = rng.standard_normal((50, 3))
+    X = rotations.hat(w) / 2
+    want = np.linalg.solve(np.eye(3) - X, np.eye(3) + X)
+    np.testing.assert_allclose(rotations.cayley(w), want, atol=1e-13)
+    angle = np.linalg.norm(w, axis=1)
+    turned = np.linalg.norm(rotations.log(rotations.cayley(w)), axis=1)
+    np.testing.assert_allclose(turned, 2 * np.arctan(angle / 2))
+    short = 1e-3 * w
+    # The third-order terms differ by |w|^3 / 12 of the rotation.
+    gap = np.abs(rotations.cayley(short) - rotations.exp(short)).max(axis=(-2, -1))
+    assert (gap <= np.linalg.norm(short, axis=1) ** 3 / 12 * 1.01 + 1e-15).all()

@@ -28,8 +28,8 @@ COLOURS = {
 STATIC_COLOURS = {
     "LS": "#d1495b",
     "LS-projected": "#e8a33d",
-    "CLS": "#8d6cab",
-    "procrustes": "#2e86ab",
+    "CLS = CTLS": "#8d6cab",
+    "UC-LS": "#2e86ab",
     "two-step": "#6c757d",
     "ML": "#1b7f5c",
     "ML, marginalised": "#7fb800",
@@ -71,13 +71,13 @@ def camsap2013(result: dict[str, Any], example: Example) -> Figure:
     return figure
 
 
-def tracking_curves(axes: Sequence[Any], result: dict[str, Any]) -> None:
+def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bool = True) -> None:
     """RMSE of rotation and translation (Fig. 2), MAE (Fig. 3), mean NEES; each over the steps."""
     panels = (
-        ("rotation_rmse", "rotation RMSE (Frobenius)", "Fig. 2, rotation"),
-        ("translation_rmse_m", "translation RMSE [m]", "Fig. 2, translation"),
-        ("mean_angular_error_deg", "mean angular error [deg]", "Fig. 3"),
-        ("nees", "mean NEES", "NEES; grey: 95 % of an honest filter"),
+        ("rotation_rmse", "rotation RMSE (Frobenius)", "Fig. 2, rotation: "),
+        ("translation_rmse_m", "translation RMSE [m]", "Fig. 2, translation: "),
+        ("mean_angular_error_deg", "mean angular error [deg]", "Fig. 3: "),
+        ("nees", "mean NEES", ""),
     )
     steps = np.arange(1, len(result["bound"]["rotation_rmse"]) + 1)
     for ax, (key, label, title) in zip(axes, panels, strict=True):
@@ -91,6 +91,7 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any]) -> None:
         if key == "nees":
             low, high = chi2.ppf([0.025, 0.975], 6 * result["trials"]) / result["trials"]
             ax.axhspan(low, high, color="0.85", zorder=0)
+            title = "grey: 95 % of an honest filter, "
         else:
             ax.set_yscale("log")
             for axis_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
@@ -98,10 +99,12 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any]) -> None:
         ax.set_ylabel(label)
         ax.set_xlabel("time step")
         ax.set_xticks([1, 5, 10, 15, 20])
-        ax.set_title(f"{title}, {result['trials']} trials", fontsize=9)
+        prefix = title if of_paper or key == "nees" else "tracking: "
+        ax.set_title(f"{prefix}{result['trials']} trials", fontsize=9)
         ax.grid(alpha=0.25, which="both", lw=0.5)
     axes[0].legend(frameon=False, fontsize=8, ncols=2)
-    axes[1].text(0.98, 0.72, "KF, KF-ortho, ET-KF and UC-KF coincide", transform=axes[1].transAxes,
+    family = ", ".join(name for name in result["filters"] if name != "iterated EKF")
+    axes[1].text(0.98, 0.72, f"{family} coincide", transform=axes[1].transAxes,
                  ha="right", fontsize=8, color=COLOURS["UC-KF"])  # fmt: skip
 
 
@@ -164,10 +167,31 @@ def _errors(axes: Any, example: Example) -> None:
 
 @styled
 def static(result: dict[str, Any]) -> Figure:
-    """Angle and translation error over the reference range, a column for every setting."""
+    """Figs 2 and 3 of the static paper over the reference range, a column for every setting."""
     settings = result["settings"]
     figure = new_figure(3.4 * len(settings) + 1.2, 6.6)
     axes = figure.subplots(2, len(settings), squeeze=False, sharex=True)
+    _static_panels(axes, settings, ("Fig. 2: ", "Fig. 3: "))
+    _common_legend(figure, axes)
+    return figure
+
+
+def slides2013(result: dict[str, Any]) -> Figure:
+    """The static part in the first columns, the dynamic part in the last two."""
+    settings = result["settings"]
+    count = len(settings)
+    figure = new_figure(3.8 * (count + 2), 7.2)
+    axes = figure.subplots(2, count + 2)
+    _static_panels(axes[:, :count], settings)
+    _common_legend(figure, axes[:, :count])
+    panels = [axes[0, count], axes[0, count + 1], axes[1, count], axes[1, count + 1]]
+    tracking_curves(panels, result["dynamic"], of_paper=False)
+    return figure
+
+
+def _static_panels(
+    axes: Any, settings: dict[str, Any], prefixes: tuple[str, str] = ("", "")
+) -> None:
     rows = (
         ("mean_angular_error_deg", "mean angular error [deg]"),
         ("translation_rmse_m", "translation RMSE [m]"),
@@ -185,7 +209,10 @@ def static(result: dict[str, Any]) -> Figure:
             ax.grid(alpha=0.25, lw=0.5)
             ax.set_title(f"anchors in {label}" if row == 0 else "", fontsize=9)
             ax.set_xlabel("reference range [dB]" if row == 1 else "")
-            ax.set_ylabel(title if column == 0 else "")
+            ax.set_ylabel(prefixes[row] + title if column == 0 else "")
+
+
+def _common_legend(figure: Figure, axes: Any) -> None:
     handles = {
         text: handle
         for ax in axes.flat
@@ -193,7 +220,6 @@ def static(result: dict[str, Any]) -> Figure:
     }
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5,
                   frameon=False, fontsize=8)  # fmt: skip
-    return figure
 
 
 @styled

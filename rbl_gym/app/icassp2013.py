@@ -1,8 +1,7 @@
-"""The static paper's experiment and that of the slides: one epoch, every method, the bound.
+"""The static paper's experiment (Section 4): one epoch, every method, the bound.
 
-Sources: S. P. Chepuri, G. Leus, A.-J. van der Veen, "Position and orientation estimation of a
-rigid body: rigid body localization", ICASSP 2013; the authors' slides joining it with CAMSAP
-2013 (static part: 5 tags on a rectangular pyramid, 4 anchors).
+Source: S. P. Chepuri, G. Leus, A.-J. van der Veen, "Position and orientation estimation of a
+rigid body: rigid body localization", ICASSP 2013.
 """
 
 from __future__ import annotations
@@ -19,20 +18,14 @@ from rbl_gym.checks import FloatArray
 METHODS = {
     "LS": "ls",
     "LS-projected": "ls-projected",
-    "CLS": "cls",
-    "procrustes": "procrustes",
+    "CLS = CTLS": "ctls",
+    "UC-LS": "uc-ls",
     "two-step": "two-step",
     "ML": "ml",
 }
 REFERENCE_RANGES_DB = tuple(range(40, 101, 10))
 FIGURES = ("mean_angular_error_deg", "rotation_rmse", "translation_rmse_m")
 PERTURBATION_M = 1e-3
-# The slides name the shape, not its size; this is that of the static paper's body.
-SLIDES_TAGS = bodies.centred([[0, 0, 0], [5, 0, 0], [5, 4, 0], [0, 4, 0], [2.5, 2, 5]])
-
-
-# Nor the anchors' places: four alternate corners of a cube, the best that four can do.
-SLIDES_ANCHORS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1.0]])
 
 
 class Setting(NamedTuple):
@@ -60,8 +53,8 @@ class Setting(NamedTuple):
 N_ANCHORS = 10
 
 
-def icassp2013_settings() -> dict[str, Setting]:
-    """Figs 2 and 3: both anchor regions, redrawn and fixed, with and without perturbation."""
+def settings() -> dict[str, Setting]:
+    """Figs 2 and 3: both anchor regions, redrawn and fixed; (a) without, (b) with perturbation."""
     body = bodies.icassp2013()
     return {
         "[0, 100]^3": Setting(0, 100, None, 0.0, body),
@@ -69,14 +62,6 @@ def icassp2013_settings() -> dict[str, Setting]:
         "[0, 100]^3, 1 mm": Setting(0, 100, None, PERTURBATION_M, body),
         "[-50, 50]^3": Setting(-50, 50, None, 0.0, body),
         "[-50, 50]^3, 1 mm": Setting(-50, 50, None, PERTURBATION_M, body),
-    }
-
-
-def slides2013_settings() -> dict[str, Setting]:
-    """Static part of the slides: a rectangular pyramid of 5 tags among 4 anchors."""
-    return {
-        "[0, 100]^3": Setting(0, 100, 100 * SLIDES_ANCHORS, 0.0, SLIDES_TAGS),
-        "[-50, 50]^3": Setting(-50, 50, 100 * SLIDES_ANCHORS - 50, 0.0, SLIDES_TAGS),
     }
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rbl_gym.app import camsap2013, doa2019, hard, icassp2013, network2009
+from rbl_gym.app import camsap2013, doa2019, hard, icassp2013, network2009, slides2013
 
 Advance = Callable[[], None]
 
@@ -35,14 +35,6 @@ def _late(module: str, name: str) -> Callable[..., Any]:
 def _drawn(module: str, name: str) -> Callable[[dict[str, Any], int], Any]:
     """A figure that needs the result alone."""
     return lambda result, _: _late(module, name)(result)
-
-
-def _static(name: str, summary: str, settings: dict[str, icassp2013.Setting]) -> Experiment:
-    def run(trials: int, seed: int, advance: Advance) -> dict[str, Any]:
-        return icassp2013.run(name, settings, trials, seed, advance)
-
-    figure, show = _drawn("figures", "static"), _late("reports", "print_static")
-    return Experiment(summary, icassp2013.work_units(settings), run, figure, show)
 
 
 def _camsap2013_figure(result: dict[str, Any], seed: int) -> Any:
@@ -73,15 +65,19 @@ def experiments() -> dict[str, Experiment]:
             _drawn("hard_figures", "hard_figure"),
             _late("hard_figures", "print_hard"),
         ),
-        "icassp2013": _static(
-            "icassp2013",
+        "icassp2013": Experiment(
             "static: LS, CLS, Procrustes, ML at reference ranges of 40 to 100 dB (Figs 2 and 3)",
-            icassp2013.icassp2013_settings(),
+            icassp2013.work_units(icassp2013.settings()),
+            lambda *arguments: icassp2013.run("icassp2013", icassp2013.settings(), *arguments),
+            _drawn("figures", "static"),
+            _late("reports", "print_static"),
         ),
-        "slides2013": _static(
-            "slides2013",
-            "static: 5 tags on a rectangular pyramid, 4 anchors",
-            icassp2013.slides2013_settings(),
+        "slides2013": Experiment(
+            "5 tags on a rectangular pyramid, 4 anchors: static, and the tracking experiment",
+            slides2013.work_units(),
+            slides2013.run,
+            _drawn("figures", "slides2013"),
+            _late("reports", "print_slides2013"),
         ),
         "network2009": Experiment(
             "planar networks: cycle consensus against the bound, convergence (Figs 3 to 6)",
