@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, obstacles, placement, ranging
+from rbl_gym import bounds, placement, ranging
 from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.placement import Context, PlacementTask
 
@@ -86,7 +86,6 @@ def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray
     distance = ranging.distances(anchors[..., None, :, :], places[..., None, :])
     weight = 1 / task.scene.noise.squared_range_variance(np.maximum(distance, 1e-6))
     if context.racks.shape[-2]:
-        sight = obstacles.in_sight(anchors, places, context.racks)[..., None]
-        weight = np.where(sight, weight, task.blocked_information * weight)
+        weight = weight * task.obstacles(context).share(anchors, places)[..., None]
     mean = (weight * anchors[..., None, :, :]).sum(axis=-2) / weight.sum(axis=-2)
     return np.sqrt(weight) * (anchors[..., None, :, :] - mean[..., None, :])

@@ -1,4 +1,4 @@
-"""Boxes that block sight: the slab test, batched.
+"""Boxes that block sight: what they leave of a link's information, by the slab test, batched.
 
 An obstacle is a row of six numbers, centre and half size of an axis-aligned box, metres.
 """
@@ -6,13 +6,60 @@ An obstacle is a row of six numbers, centre and half size of an axis-aligned box
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, as_float, check_array
+from rbl_gym.checks import BoolArray, FloatArray, as_float, check_array
 
-__all__ = ["in_sight"]
+__all__ = ["Obstacles", "in_sight", "inside"]
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """Boxes in the way of links, and what is left of a link behind one.
+
+    Scenes, placement, its checks and transfer all ask this class.
+
+    Parameters
+    ----------
+    boxes
+        (..., K, 6), centres and half sizes, metres; K may be 0.
+    blocked_information
+        Share of its information that a link without line of sight keeps: the variance of its
+        ranges is divided by it. 0: such a link gives no range.
+    """
+
+    boxes: FloatArray
+    blocked_information: float
+
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return self.boxes.shape[-2] > 0
+
+    def share(self, anchors: FloatArray, points: FloatArray) -> FloatArray:
+        """Share (..., P, M) of its information that a link from each anchor to each point has.
+
+        Anchors (..., M, 3) and points (..., P, 3), metres: the link is that of a body with its
+        origin there.
+        """
+        return self._share(in_sight(anchors, points, self.boxes))
+
+    def share_along(self, start: Sequence[FloatArray], along: Sequence[FloatArray]) -> FloatArray:
+        """`share` (P, M, B) by the components of `clear`, boxes (B, K, 6)."""
+        return self._share(self.clear_along(start, along))
+
+    def clear_along(self, start: Sequence[FloatArray], along: Sequence[FloatArray]) -> BoolArray:
+        """Which segments (P, M, B) pass by all boxes (B, K, 6), K at least 1; see `clear`."""
+        return clear(start, along, self.boxes.transpose(1, 2, 0).copy())
+
+    def contain(self, points: FloatArray) -> BoolArray:
+        """Which points (..., 3) lie in or on one of the boxes (K, 6)."""
+        return inside(points, self.boxes)
+
+    def _share(self, sight: BoolArray) -> FloatArray:
+        return np.where(sight, 1.0, self.blocked_information)
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
@@ -28,7 +75,7 @@ def check_obstacles(obstacles: object) -> FloatArray:
     return array
 
 
-def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> np.ndarray:
+def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> BoolArray:
     """Which points each anchor sees, (..., P, M) booleans.
 
     A segment that only touches a box is not blocked; one that ends inside a box is.
@@ -48,6 +95,12 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
     along = [points[..., :, None, i] - start[i] for i in range(3)]
     boxes = np.moveaxis(obstacles, (-2, -1), (0, 1))[..., None, None]
     return free & clear(start, along, boxes)
+
+
+def inside(points: FloatArray, obstacles: FloatArray) -> BoolArray:
+    """Which points (..., 3) lie in or on a box of (K, 6)."""
+    away = np.abs(points[..., None, :] - obstacles[:, :3]) - obstacles[:, 3:]
+    return np.asarray((away.max(axis=-1) <= 1e-9).any(axis=-1))
 
 
 def clear(

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import obstacles, rotations, scenes
+from rbl_gym import rotations, scenes
 from rbl_gym.checks import (
     BoolArray,
     FloatArray,
@@ -27,8 +27,8 @@ from rbl_gym.checks import (
     check_array,
     check_count,
     check_finite,
-    check_number,
 )
+from rbl_gym.obstacles import Obstacles
 from rbl_gym.regions import Walls
 from rbl_gym.scene import Scene
 from rbl_gym.shared_poses import SharedPoses
@@ -63,7 +63,8 @@ class Context(NamedTuple):
     centre, half
         Work region (..., 3), metres.
     racks
-        (..., K, 6): centre and half size of the boxes that block sight.
+        (..., K, 6): centre and half size of all boxes that block sight: the scene's own, then
+        those of the problem.
     """
 
     centre: FloatArray
@@ -78,23 +79,22 @@ class PlacementTask:
     Parameters
     ----------
     scene
-        Gives the body, its volume, the noise, and where anchors may stand.
+        Gives the body, its volume, the noise, where anchors may stand, its own obstacles and
+        what a blocked link keeps of its information (sight is judged from the anchor to the
+        body's centre).
     n_anchors
         How many are placed.
     racks
-        Boxes on the floor that block sight, 0 to 2; only in rooms (scenes with walls).
+        Boxes on the floor that every problem draws besides, 0 to 2; only in rooms (scenes with
+        walls).
     n_poses
         Poses in the work region over which a layout is scored.
-    blocked_information
-        What is left of a link's information without line of sight. Sight is judged from the
-        anchor to the body's centre.
     """
 
     scene: Scene
     n_anchors: int
     racks: int = 0
     n_poses: int = 32
-    blocked_information: float = 0.01
 
     def __post_init__(self) -> None:
         if not isinstance(self.scene, Scene):
@@ -104,7 +104,6 @@ class PlacementTask:
         ):  # fmt: skip
             value = check_count(name, getattr(self, name), least=least, most=most)
             object.__setattr__(self, name, value)
-        check_number("blocked_information", self.blocked_information, low=0.0, high=1.0)
         if not np.ptp(self.scene.volume.bounds(), axis=0).any():
             raise ValueError(
                 f"scene must have a volume with an extent, {self.scene.name!r} has none"
@@ -113,6 +112,15 @@ class PlacementTask:
             raise ValueError(
                 f"racks must be 0 in a scene without walls, got {self.racks} in {self.scene.name!r}"
             )
+
+    @property
+    def blocked_information(self) -> float:
+        """Share of its information that a link without line of sight keeps: the scene's."""
+        return self.scene.blocked_information
+
+    def obstacles(self, context: Context) -> Obstacles:
+        """What stands in the way in a context."""
+        return Obstacles(context.racks, self.scene.blocked_information)
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
@@ -169,7 +177,8 @@ def context_uniforms(task: PlacementTask) -> int:
 def draw_contexts(
     task: PlacementTask, rng: np.random.Generator, batch: tuple[int, ...] = ()
 ) -> Context:
-    """Random contexts: work regions that fit in the volume, racks on the floor."""
+    """Random contexts: work regions that fit in the volume, racks on the floor besides the scene's
+    own obstacles."""
     return build_contexts(task, rng.random((*batch, context_uniforms(task))))
 
 
@@ -180,7 +189,10 @@ def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
     centre = (low + half) + uniforms[..., 3:6] * ((high - half) - (low + half))
     of_racks = uniforms[..., _REGION_UNIFORMS:]
     of_racks = of_racks.reshape((*uniforms.shape[:-1], task.racks, _RACK_UNIFORMS))
-    return Context(centre, half, _racks(task, of_racks) if task.racks else of_racks)
+    drawn = _racks(task, of_racks) if task.racks else of_racks
+    own = task.scene.obstruction.boxes
+    own = np.broadcast_to(own, (*uniforms.shape[:-1], *own.shape))
+    return Context(centre, half, np.concatenate([own, drawn], axis=-2))
 
 
 def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
@@ -199,9 +211,9 @@ def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
 
 
 def whole_volume(task: PlacementTask) -> Context:
-    """The context whose work region is the body's volume, without racks."""
+    """The context whose work region is the body's volume, among the scene's own obstacles."""
     low, high = task.scene.volume.bounds()
-    return Context(0.5 * (low + high), 0.5 * (high - low), np.empty((0, 6)))
+    return Context(0.5 * (low + high), 0.5 * (high - low), task.scene.obstruction.boxes.copy())
 
 
 def positions(task: PlacementTask, context: Context) -> FloatArray:
@@ -228,7 +240,7 @@ def _information(task: PlacementTask, context: Context, anchors: FloatArray) -> 
     start, away = _segments(task, context, anchors)
     share = None
     if context.racks.shape[-2]:
-        share = np.where(_sight(context, start, away), 1.0, task.blocked_information)
+        share = task.obstacles(context).share_along(start, away)
     return task.shared.information(away, task.scene.noise, share)
 
 
@@ -239,11 +251,6 @@ def _segments(
     end = positions(task, context).transpose(1, 2, 0).copy()
     start = anchors.transpose(1, 2, 0).copy()
     return [start[:, i] for i in range(3)], [end[:, None, i] - start[:, i] for i in range(3)]
-
-
-def _sight(context: Context, start: list[FloatArray], away: list[FloatArray]) -> BoolArray:
-    """Which anchor sees which place, (P, M, B); needs racks."""
-    return obstacles.clear(start, away, context.racks.transpose(1, 2, 0).copy())
 
 
 def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
@@ -346,7 +353,9 @@ def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) 
     if not context.racks.shape[-2]:
         return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
     return _in_blocks(
-        lambda some, part: _sight(some, *_segments(task, some, part)).mean(axis=0).T,
+        lambda some, part: (
+            task.obstacles(some).clear_along(*_segments(task, some, part)).mean(axis=0).T
+        ),
         context, anchors, _SIGHTS_AT_ONCE // (task.n_poses * anchors.shape[-2]),
         anchors.shape[-2:-1],
     )  # fmt: skip

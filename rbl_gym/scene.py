@@ -12,7 +12,7 @@ import numpy as np
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, check_array, check_count, check_number, check_one_of
 from rbl_gym.motion import ProcessNoise
-from rbl_gym.obstacles import check_obstacles
+from rbl_gym.obstacles import Obstacles, check_obstacles
 from rbl_gym.ranging import NOISE_LAWS, LinkModel, NoiseLaw
 from rbl_gym.regions import REGIONS, Box, Region
 
@@ -54,7 +54,7 @@ class Scene:
     obstacles, blocked_information
         Boxes (K, 6) that block sight, centre and half size; a link without line of sight from
         the anchor to the body's origin keeps this share of its information: its noise is
-        stronger.
+        stronger. 0: it gives no range.
     process
         Noise of the motion: standard deviations after 1 s.
     dt, steps
@@ -112,7 +112,7 @@ class Scene:
             check_number(name, getattr(self, name), low=1e-9)
         for name in ("anchor_speed_m_s", "speed_m_s", "spin_rad_s"):
             check_number(name, getattr(self, name), low=0.0)
-        check_number("blocked_information", self.blocked_information, low=1e-9, high=1.0)
+        check_number("blocked_information", self.blocked_information, low=0.0, high=1.0)
         if self.anchor_start_m is not None:
             check_number("anchor_start_m", self.anchor_start_m, low=0.0)
         if not isinstance(self.start_volume, Box | None):
@@ -164,6 +164,11 @@ class Scene:
         if not (high > low)[:2].all():
             raise ValueError(f"volume must have an extent in x and y for {self.trajectory!r}")
 
+    @functools.cached_property
+    def obstruction(self) -> Obstacles:
+        """The obstacles, and what they leave of a link."""
+        return Obstacles(np.array(self.obstacles).reshape(-1, 6), self.blocked_information)
+
     @property
     def prior_covariance(self) -> FloatArray:
         """Pose covariance (6, 6) of the prior."""
@@ -182,7 +187,7 @@ class Scene:
         spread = 10 * float(self.process.std()[3:].max()) * math.sqrt(duration)
         reach = np.full((1, len(self.tags)), extent + speed * (duration + self.dt) + spread + body)
         noise = 10 * float(np.sqrt(self.noise.variance(reach).max()))
-        if self.obstacles:
+        if self.obstacles and self.blocked_information > 0:
             noise /= math.sqrt(self.blocked_information)
         return float(reach[0, 0]) + noise + self.links.nlos_bias_m
 

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bodies, placement, scenes
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of
+from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.motion import ProcessNoise
+from rbl_gym.obstacles import Obstacles, inside
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.ranging import NOISE_LAWS, NoiseLaw
 from rbl_gym.regions import Box, Shell, Walls
@@ -46,7 +47,10 @@ _STEPS = 1.22074408460575947536 ** -np.arange(1.0, 4.0)
 
 
 class Problem(NamedTuple):
-    """A placement problem: the task, whose scene's volume is the work region, and its context."""
+    """A placement problem: the task and its context.
+
+    The volume of the task's scene is the work region, and its obstacles are all there are.
+    """
 
     task: PlacementTask
     context: Context
@@ -55,6 +59,11 @@ class Problem(NamedTuple):
     def name(self) -> str:
         """The scene's."""
         return self.task.scene.name
+
+    @property
+    def obstacles(self) -> Obstacles:
+        """What stands in the way."""
+        return self.task.obstacles(self.context)
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner of the work region."""
@@ -79,7 +88,8 @@ def problem(
     region
         Corners of the work region in place of the scene's volume or the file's region.
     racks, seed
-        In a named room: boxes on the floor that block sight, drawn by the seed.
+        In a named room: boxes on the floor that block sight, drawn by the seed, besides those
+        that the scene has.
 
     Raises
     ------
@@ -99,7 +109,7 @@ def problem(
     context = placement.whole_volume(task)
     if racks:
         context = placement.draw_contexts(task, np.random.default_rng([seed, racks]))
-    return _checked(known, task.n_anchors, context.racks, task.blocked_information, region)
+    return _checked(known, task.n_anchors, context.racks, region)
 
 
 def load(path: str) -> dict[str, Any]:
@@ -141,6 +151,7 @@ def of_mapping(
         n_anchors=check_n_anchors(number),
         tags=_tags(parts["body"]),
         noise=noise,
+        blocked_information=blocked,
         process=ProcessNoise(),
         dt=1.0,
         initial_rotation_rad=math.radians(
@@ -152,13 +163,12 @@ def of_mapping(
         ),
     )  # fmt: skip
     obstacles = _obstacles(tables.get("obstacles", []))
-    return _checked(scene, scene.n_anchors, obstacles, blocked, region)
+    return _checked(scene, scene.n_anchors, obstacles, region)
 
 
 def with_anchors(problem: Problem, n_anchors: int) -> Problem:
     """The same problem with another number of anchors."""
-    scene = problem.task.scene
-    return _checked(scene, n_anchors, problem.context.racks, problem.task.blocked_information, None)
+    return _checked(problem.task.scene, n_anchors, problem.context.racks, None)
 
 
 def check_n_anchors(number: Any) -> int:
@@ -187,20 +197,13 @@ def _cube(count: int) -> FloatArray:
     return (0.5 + np.arange(1, count + 1)[:, None] * _STEPS) % 1.0
 
 
-def inside(points: FloatArray, obstacles: FloatArray) -> BoolArray:
-    """Which points (..., 3) lie in or on a box of (K, 6)."""
-    away = np.abs(points[..., None, :] - obstacles[:, :3]) - obstacles[:, 3:]
-    return np.asarray((away.max(axis=-1) <= 1e-9).any(axis=-1))
-
-
 # --- checks ----------------------------------------------------------------------------------
 
 
 def _checked(
     scene: Scene,
     n_anchors: int,
-    obstacles: FloatArray,
-    blocked_information: float,
+    boxes: FloatArray,
     region: tuple[ArrayLike, ArrayLike] | None,
 ) -> Problem:
     """The problem, whose scene has the work region as its volume, if it can be solved at all."""
@@ -213,14 +216,14 @@ def _checked(
         volume = _named("region", Box, low=low, high=high)
     n_anchors = check_n_anchors(n_anchors)
     scene = dataclasses.replace(
-        scene, volume=volume, n_anchors=n_anchors, anchors=None, start_translation=None
-    )
+        scene, volume=volume, n_anchors=n_anchors, anchors=None, start_translation=None,
+        obstacles=boxes,
+    )  # fmt: skip
     _check_region(scene)
     _check_tags(np.asarray(scene.tags))
-    _check_obstacles(scene, obstacles)
-    task = PlacementTask(scene, n_anchors, blocked_information=blocked_information)
-    low, high = volume.bounds()
-    return Problem(task, Context(0.5 * (low + high), 0.5 * (high - low), obstacles))
+    _check_obstacles(scene)
+    task = PlacementTask(scene, n_anchors)
+    return Problem(task, placement.whole_volume(task))
 
 
 def _check_region(scene: Scene) -> None:
@@ -248,15 +251,16 @@ def _check_tags(tags: FloatArray) -> None:
         )
 
 
-def _check_obstacles(scene: Scene, obstacles: FloatArray) -> None:
+def _check_obstacles(scene: Scene) -> None:
     """Obstacles must leave room for the body and for anchors."""
+    obstacles = scene.obstruction
     low, high = scene.volume.bounds()
-    for index, (centre, half) in enumerate(zip(obstacles[:, :3], obstacles[:, 3:], strict=True)):
+    for index, (centre, half) in enumerate(obstacles.boxes.reshape(-1, 2, 3)):
         if (centre - half <= low).all() and (centre + half >= high).all():
             raise ValueError(f"obstacles[{index}] swallows the whole region")
-    if not len(free_points(low, high, obstacles, 1000)):
+    if not len(free_points(low, high, obstacles.boxes, 1000)):
         raise ValueError("obstacles leave no free place in the region")
-    if inside(scene.anchor_region.draw(_cube(4000)), obstacles).all():
+    if obstacles.contain(scene.anchor_region.draw(_cube(4000))).all():
         raise ValueError("anchors have no legal place: obstacles cover all of them")
 
 

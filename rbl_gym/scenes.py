@@ -37,6 +37,7 @@ SCENES: dict[str, Scene] = {
             anchors=((0, 0, 0.4), (10, 0, 2.8), (10, 8, 0.4), (0, 8, 2.8), (5, 0, 0.4), (5, 4, 3)),
             tags=as_tuples(bodies.octahedron(0.8)),
             noise=RangeNoise(0.10, 0.0),
+            blocked_information=0.01,  # behind the racks that placement draws
             process=_per_step(0.03, 1.5, 0.1),
             dt=0.1,
             speed_m_s=1.0,

@@ -13,7 +13,6 @@ import numpy as np
 
 from rbl_gym import bounds, motion, ranging, rotations, statistic
 from rbl_gym.checks import BoolArray, FloatArray, kernel
-from rbl_gym.obstacles import in_sight
 from rbl_gym.scene import Scene
 from rbl_gym.statistic import EpochStatistic
 
@@ -279,7 +278,7 @@ def measure(
     normals = at.normals
     if scene.obstacles:
         quality = link_quality(scene, at, anchors) if quality is None else quality
-        normals = normals / np.sqrt(quality)[..., None]
+        normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
     distances = _DISTANCES(anchors, positions)
     measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
     clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
@@ -288,6 +287,9 @@ def measure(
     links, nlos = np.ascontiguousarray(measured.links), np.ascontiguousarray(measured.nlos)
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     links &= ranges > 0
+    if quality is not None and not scene.blocked_information:
+        links &= quality[..., None] > 0
+        ranges[~links] = 0.0
     return ranging.Measurement(ranges, links, nlos)
 
 
@@ -313,9 +315,7 @@ def measure_statistic(scene: Scene, at: Epoch, anchors: FloatArray) -> EpochStat
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
     """Share (..., M) of its information that the sight from each anchor leaves a link."""
-    obstacles = np.array(scene.obstacles).reshape(-1, 6)
-    sight = in_sight(anchors, at.translation[..., None, :], obstacles)[..., 0, :]
-    return np.where(sight, 1.0, scene.blocked_information)
+    return scene.obstruction.share(anchors, at.translation[..., None, :])[..., 0, :]
 
 
 def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> Any:
@@ -331,7 +331,7 @@ def perceived_noise(
     `quality` (..., M) is that of `link_quality`, `ranges` and `links` are (..., M, N).
     """
     variance = scene.noise.variance(np.where(links, ranges, 1.0), links)
-    return ranging.LinkNoise(np.sqrt(variance / quality[..., None]))
+    return ranging.LinkNoise(np.sqrt(variance / np.where(quality > 0, quality, 1.0)[..., None]))
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:

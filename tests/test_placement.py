@@ -344,7 +344,8 @@ def test_blocked_links_carry_one_percent():
     shares = np.where(seen > 0, 1.0, 0.01)
     wanted = sum(share * part for share, part in zip(shares, alone, strict=True))
     np.testing.assert_allclose(placement.information(task, blocked, anchors), wanted, rtol=1e-9)
-    dark = dataclasses.replace(task, blocked_information=0.0)
+    scene = dataclasses.replace(task.scene, blocked_information=0.0)
+    dark = dataclasses.replace(task, scene=scene)
     np.testing.assert_allclose(placement.information(dark, blocked, anchors), sum(alone[1:]))
 
 
@@ -447,8 +448,6 @@ def test_bad_tasks_are_refused(arguments, message):
     [
         ({"scene": "uwb_room"}, "scene must be a Scene, got 'uwb_room'"),
         ({"n_poses": 0}, "n_poses must be"),
-        ({"blocked_information": 1.5}, "blocked_information must be a finite number in [0, 1]"),
-        ({"blocked_information": math.nan}, "blocked_information must be a finite number"),
     ],
 )
 def test_bad_fields_are_refused(fields, message):

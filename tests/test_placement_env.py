@@ -15,6 +15,7 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym import placement
 from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.placement import Context
+from rbl_gym.scenes import SCENES
 from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,
@@ -415,3 +416,32 @@ def test_bad_calls_are_named():
     env.step(np.zeros((2, 3)))
     with pytest.raises(ResetNeeded, match="reset_mask"):
         env.step(np.zeros((2, 3)))
+
+
+def test_a_hall_keeps_its_obstacles_and_its_problems_are_not_mirrored():
+    hall = SCENES["hall"]
+    env = AnchorPlacementEnv("hall", racks=1, sight=True)
+    observation, info = env.reset(seed=2)
+    np.testing.assert_array_equal(info["racks"][:4], hall.obstacles)
+    assert info["racks"].shape == (5, 6)
+    # Region 6, the drawn rack 6, 11 anchors with 3 coordinates each, 57 mounts, 11 numbers.
+    assert observation.shape == (6 + 6 + 33 + 57 + 11,)
+    low, high = hall.volume.bounds()
+    centre = (info["region"][:3] - 0.5 * (low + high)) / (0.5 * (high - low))
+    np.testing.assert_allclose(observation[:3], centre, atol=1e-6)
+    # Layouts are judged among all five.
+    task = env._batch.task
+    context = context_of(info)
+    anchors = np.array(hall.anchors)[: task.n_anchors]
+    alone = context._replace(racks=np.empty((0, 6)))
+    assert placement.score(task, context, anchors) > 1.05 * placement.score(task, alone, anchors)
+
+
+def test_frames_of_a_hall_show_its_obstacles():
+    shown = []
+    for scene in ("hall", {"name": "hall", "obstacles": []}):
+        env = AnchorPlacementEnv(scene, render_mode="rgb_array")
+        env.reset(seed=2)
+        env.step(np.zeros(3))
+        shown.append(env.render())
+    assert (shown[0] != shown[1]).any()

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, layouts, placement, scene_files
+from rbl_gym import bodies, bounds, layouts, placement, scene_files, simulation
 from rbl_gym.ranging import NOISE_LAWS, RangeNoise
 from rbl_gym.regions import Box, Shell, Walls
-from tests.helpers import ROOT
+from rbl_gym.scenes import SCENES
+from tests.helpers import ROOT, share_by_hand
 
 GOOD = {
     "anchors": {"kind": "room", "low": [0, 0, 0.3], "high": [8, 6, 3], "number": 5},
@@ -140,6 +141,51 @@ def test_named_scenes():
     first, same, other = (problem.context.racks for problem in with_racks)
     np.testing.assert_array_equal(first, same)
     assert (first != other).any()
+
+
+def test_a_named_scene_keeps_its_own_obstacles():
+    hall = SCENES["hall"]
+    problem = scene_files.problem("hall")
+    np.testing.assert_array_equal(problem.context.racks, hall.obstacles)
+    assert problem.task.scene.obstacles == hall.obstacles
+    assert problem.task.blocked_information == hall.blocked_information
+    more = scene_files.problem("hall", racks=2, seed=1).context.racks
+    assert more.shape == (6, 6)
+    np.testing.assert_array_equal(more[:4], hall.obstacles)
+    fewer = scene_files.with_anchors(scene_files.problem("hall", racks=1), 5)
+    assert fewer.context.racks.shape == (5, 6)
+
+
+def test_what_is_predicted_of_a_hall_is_what_its_simulation_tells():
+    """Information at poses of an episode, by the way of placement and by that of tracking."""
+    hall = SCENES["hall"]
+    assert hall.anchors is not None
+    episode = simulation.draw_episode(hall, np.random.default_rng(3), (20,))
+    at, anchors = simulation.epoch_of(episode, 7), np.array(hall.anchors)
+    tags = np.array(hall.tags)
+    links = np.ones((20, len(anchors), len(tags)), dtype=bool)
+    told = bounds.information_at(
+        anchors, tags, at.rotation, at.translation, hall.noise,
+        simulation.shares(hall, at, anchors, links),
+    )  # fmt: skip
+    problem = scene_files.problem("hall")
+    share = problem.obstacles.share(anchors, at.translation)
+    assert 0.1 < (share < 1).mean() < 0.9
+    mine = bounds.information_at(
+        anchors, tags, at.rotation, at.translation, problem.task.scene.noise, share[..., None]
+    )
+    np.testing.assert_allclose(mine, told, rtol=1e-12)
+    # And the score of a layout, pose by pose.
+    task = problem.task
+    places = placement.positions(task, problem.context)
+    for k in range(0, task.n_poses, 5):
+        wanted = [
+            share_by_hand(hall, anchor, places[k])
+            * bounds.information_at(anchor[None], tags, task.poses[0][k], places[k], hall.noise)
+            for anchor in anchors
+        ]
+        got = placement.information(task, problem.context, anchors)[k]
+        np.testing.assert_allclose(got, sum(wanted), rtol=1e-9, atol=1e-9)
 
 
 def test_free_points_fill_the_box_and_leave_the_obstacles_out():

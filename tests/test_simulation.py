@@ -644,3 +644,23 @@ def test_information_of_a_batch_equals_its_episodes_one_by_one():
                 alone.prior_covariance,
             )
         np.testing.assert_allclose(second[b], J, rtol=1e-10)
+
+
+def test_a_blocked_link_without_information_gives_no_range():
+    """Of two worlds alike, one has dark obstacles: what is in sight measures the same."""
+    dim, dark = (
+        scenes.get({"name": "hall", "blocked_information": share}) for share in (0.02, 0.0)
+    )
+    measured = []
+    for scene in (dim, dark):
+        episode = simulation.draw_episode(scene, np.random.default_rng(5), (50,))
+        at = simulation.epoch_of(episode, 3)
+        measured.append(simulation.measure(scene, at, episode.anchors))
+        quality = simulation.link_quality(scene, at, episode.anchors)
+    assert measured[0].links.all()
+    np.testing.assert_array_equal(measured[1].links, np.repeat(quality[..., None] > 0, 6, axis=-1))
+    assert 0.1 < measured[1].links.mean() < 0.95
+    wanted = np.where(measured[1].links, measured[0].ranges, 0.0)
+    np.testing.assert_array_equal(measured[1].ranges, wanted)
+    law = simulation.perceived_noise(dark, measured[1].ranges, measured[1].links, quality)
+    assert np.isfinite(law.std_m).all()

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import bounds, obstacles
+from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
 from rbl_gym.motion import propagate
 from rbl_gym.wrappers.tasks import AnchorSelectionVectorEnv, MobileAnchorsVectorEnv
@@ -165,9 +165,7 @@ def greedy_blind(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.
 def greedy_with_map(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
     """As `greedy_blind`, with the racks known."""
     _, translation = propagate(*env.state[:2], env.twist, env.scene.dt)
-    racks = np.array(env.scene.obstacles).reshape(-1, 6)
-    sight = obstacles.in_sight(env.anchors, translation[:, None], racks)[:, 0]
-    return _greedy(env, np.where(sight, 1.0, env.scene.blocked_information))
+    return _greedy(env, env.scene.obstruction.share(env.anchors, translation[:, None])[:, 0])
 
 
 def _greedy(env: AnchorSelectionVectorEnv, quality: FloatArray) -> np.ndarray:

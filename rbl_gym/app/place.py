@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,18 +27,14 @@ _GENERATIONS = 80
 _RANDOM_DRAWS = 25
 
 
-@dataclass(frozen=True)
 class FreeTask(PlacementTask):
-    """A task scored over poses outside of the obstacles `free_of` (K, 6), as tuples."""
-
-    free_of: tuple[tuple[float, ...], ...] = ()
+    """A task scored over poses outside of the obstacles of its scene."""
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
         """Rotations (P, 3, 3) and offsets (P, 3), spread evenly over what is free."""
         low, high = self.scene.volume.bounds()
-        boxes = np.array(self.free_of).reshape(-1, 6)
-        places = scene_files.free_points(low, high, boxes, self.n_poses)
+        places = scene_files.free_points(low, high, self.scene.obstruction.boxes, self.n_poses)
         # Few places may be free: they are then taken in turns.
         places = np.resize(places, (self.n_poses, 3))
         half = 0.5 * (high - low)
@@ -49,13 +44,7 @@ class FreeTask(PlacementTask):
 
 def free_task(problem: Problem, n_poses: int) -> FreeTask:
     """The problem's task over so many free poses."""
-    return FreeTask(
-        problem.task.scene,
-        problem.task.n_anchors,
-        n_poses=n_poses,
-        blocked_information=problem.task.blocked_information,
-        free_of=tuple(map(tuple, problem.context.racks.tolist())),
-    )
+    return FreeTask(problem.task.scene, problem.task.n_anchors, n_poses=n_poses)
 
 
 class Design(NamedTuple):
@@ -88,7 +77,7 @@ def design(
         more start.
     """
     context = problem.context
-    task = free_task(problem, _N_POSES_OBSTACLES if len(context.racks) else _N_POSES)
+    task = free_task(problem, _N_POSES_OBSTACLES if problem.obstacles else _N_POSES)
     rng = np.random.default_rng([seed, task.n_anchors])
     candidates = free_candidates(problem, rng, max(200, 4 * task.n_anchors))
     greedy = layout_search.greedy(task, context, rng, candidates, swaps=True)
@@ -116,7 +105,7 @@ def design(
     searched |= usual(task, context, rng)
     legal = {
         name: anchors for name, anchors in searched.items()
-        if not scene_files.inside(anchors, context.racks).any()
+        if not problem.obstacles.contain(anchors).any()
     }  # fmt: skip
     # Judged over more places than those that the search has seen.
     places = free_sample(problem)
@@ -137,7 +126,7 @@ def free_candidates(problem: Problem, rng: np.random.Generator, count: int) -> F
         If hardly any place is free.
     """
     drawn = problem.task.scene.anchor_region.draw(rng.random((20 * count, 3)))
-    free = drawn[~scene_files.inside(drawn, problem.context.racks)]
+    free = drawn[~problem.obstacles.contain(drawn)]
     if len(free) < problem.task.n_anchors:
         raise ValueError("anchors have no legal place: obstacles cover all of them")
     return free[:count]
@@ -199,7 +188,7 @@ def run(
     low, high = problem.corners()
     scene, task = problem.task.scene, free_task(problem, _MANY_POSES)
     seen = placement.sight_fractions(task, problem.context, found.anchors)
-    boxes = problem.context.racks
+    boxes = problem.obstacles.boxes
     result = {
         "scene": problem.name,
         "seed": seed,

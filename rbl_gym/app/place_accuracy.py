@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, obstacles, scene_files
+from rbl_gym import bounds, scene_files
 from rbl_gym.checks import FloatArray
 from rbl_gym.scene_files import Problem
 
@@ -43,8 +43,7 @@ def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray) -> Accur
     size = max(1, _BLOCK // (len(turns) * len(anchors) * len(tags)))
     for begin in range(0, len(places), size):
         part = places[begin : begin + size]
-        sight = obstacles.in_sight(anchors, part, problem.context.racks)
-        weight = np.where(sight, 1.0, task.blocked_information)[:, None, :, None]
+        weight = problem.obstacles.share(anchors, part)[:, None, :, None]
         information = bounds.information_at(
             anchors, tags, turns, part[:, None], task.scene.noise, weight
         )
@@ -58,7 +57,7 @@ def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray) -> Accur
 
 def free_sample(problem: Problem) -> FloatArray:
     """Places (L, 3) spread evenly over the work region, obstacles left out."""
-    return scene_files.free_points(*problem.corners(), problem.context.racks, _SAMPLE)
+    return scene_files.free_points(*problem.corners(), problem.obstacles.boxes, _SAMPLE)
 
 
 def free_grid(problem: Problem) -> FloatArray:
@@ -66,7 +65,7 @@ def free_grid(problem: Problem) -> FloatArray:
     low, high = problem.corners()
     axes = [np.linspace(a, b, n if b > a else 1) for a, b, n in zip(low, high, _GRID, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return places[~scene_files.inside(places, problem.context.racks)]
+    return places[~problem.obstacles.contain(places)]
 
 
 class Map(NamedTuple):
@@ -99,7 +98,7 @@ def accuracy_map(problem: Problem, anchors: FloatArray, up: int = 1, share: floa
     places = np.empty((len(centres[1]), len(centres[0]), 3))
     places[..., 0], places[..., up], places[..., third] = centres[0], centres[1][:, None], at
     found = accuracy(problem, anchors, places.reshape(-1, 3))
-    blocked = scene_files.inside(found.places, problem.context.racks)
+    blocked = problem.obstacles.contain(found.places)
     values = [
         np.where(blocked, np.nan, value).reshape(places.shape[:2])
         for value in (found.position, np.rad2deg(found.rotation))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from rbl_gym import bounds, estimators, metrics, obstacles, ranging, rotations, scene_files
+from rbl_gym import bounds, estimators, metrics, ranging, rotations
 from rbl_gym.checks import FloatArray
 from rbl_gym.scene_files import Problem
 
@@ -57,7 +57,7 @@ def run(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[s
     prior = scene.prior_covariance
     with_prior = np.linalg.inv(drawn.information + np.linalg.inv(prior))
     laws: dict[str, tuple[ranging.NoiseLaw, bool]] = {"iterated EKF": (drawn.told, False)}
-    if len(problem.context.racks):
+    if problem.obstacles:
         laws["iterated EKF, not told"] = (scene.noise, True)
     result = {}
     for name, (law, robust) in laws.items():
@@ -90,8 +90,7 @@ def simulate(
     translation = _free_places(problem, trials, rng)
     rotation = rotations.random(rng, (trials,))
     tags = np.asarray(scene.tags)
-    sight = obstacles.in_sight(anchors, translation[:, None], problem.context.racks)[:, 0]
-    weight = np.where(sight, 1.0, task.blocked_information)[..., None]
+    weight = problem.obstacles.share(anchors, translation[:, None])[:, 0, :, None]
     distance = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
     normals = rng.standard_normal(distance.shape)
     # A link with nothing left of its information gives no reading.
@@ -119,7 +118,7 @@ def _free_places(problem: Problem, count: int, rng: np.random.Generator) -> Floa
     free = np.empty((0, 3))
     while len(free) < count:
         drawn = low + rng.random((2 * count, 3)) * (high - low)
-        free = np.concatenate([free, drawn[~scene_files.inside(drawn, problem.context.racks)]])
+        free = np.concatenate([free, drawn[~problem.obstacles.contain(drawn)]])
     return free[:count]
 
 

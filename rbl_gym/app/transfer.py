@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import estimators, layout_search, metrics, motion, obstacles, placement, ranging
+from rbl_gym import estimators, layout_search, metrics, motion, placement, ranging
 from rbl_gym import rotations as rot
 from rbl_gym.app import evaluation
 from rbl_gym.app.rl_tasks import RlTask
@@ -144,22 +144,21 @@ def _tag_rmse(
     scene, tags = task.scene, np.asarray(task.scene.tags)
     kind, options, reflections = FILTERS[name]
     anchors = np.repeat(anchors, repeats, axis=0)
-    racks = np.repeat(contexts.racks, repeats, axis=0)
+    obstacles = task.obstacles(Context(*(np.repeat(field, repeats, axis=0) for field in contexts)))
     laws = {"tags": tags, "noise": scene.noise, "process": scene.process}
     filter = estimators.make(kind, **laws, **options)
     state: Any = None
     total = np.zeros(len(anchors))
     for k in range(_STEPS + 1):
         rotation, translation = bodies.rotation[k], bodies.translation[k]
-        sight = obstacles.in_sight(anchors, translation[:, None], racks)[:, 0]
-        scale = np.where(sight, 1.0, task.blocked_information**-0.5)[..., None]
+        scale = obstacles.share(anchors, translation[:, None])[:, 0, :, None] ** -0.5
         distance = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
         ranges = scene.noise.sample(distance, scale * bodies.normals[k])
         if reflections:
             ranges = ranges + NLOS_BIAS_M * bodies.reflected[k]
         ranges = np.maximum(ranges, 1e-3)
         law = None
-        if contexts.racks.shape[-2]:
+        if obstacles:
             law = ranging.LinkNoise(scale * np.sqrt(scene.noise.variance(ranges)))
         if k == 0:
             state = filter.initial(*bodies.prior, scene.prior_covariance)

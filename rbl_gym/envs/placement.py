@@ -190,10 +190,10 @@ class AnchorPlacementEnv(ScalarEnv):
 
     ## Description
     Every episode draws a problem: a work region, a box inside the scene's volume, and in rooms
-    up to two racks that block sight. The agent places M anchors on the scene's legal
-    surfaces. The score of a layout is the root mean square tag error in metres, position and
-    orientation together, that the Cramer-Rao bound promises over 32 fixed poses in the region
-    (`rbl_gym.placement.score`).
+    up to two racks that block sight, besides the obstacles that the scene has. The agent places M
+    anchors on the scene's legal surfaces. The score of a layout is the root mean square tag error
+    in metres, position and orientation together, that the Cramer-Rao bound promises over 32
+    fixed poses in the region (`rbl_gym.placement.score`).
 
     ## Action space
     ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
@@ -221,7 +221,8 @@ class AnchorPlacementEnv(ScalarEnv):
 
     ## Info
     `anchors` (M, 3), zeros where not yet placed; `region` (centre and half size, metres),
-    `racks` (K, 6); `score_m` of the complete layout, 0 before; mounts: `action_mask` (57).
+    `racks` (K, 6), the scene's own obstacles first; `score_m` of the complete layout, 0 before;
+    mounts: `action_mask` (57).
 
     ## Rendering
     ``render_mode="rgb_array"``: the problem and its anchors in space and in plan, the expected
@@ -261,7 +262,7 @@ def check_sight(sight: bool, task: placement.PlacementTask) -> bool:
     """Whether the sight of the mount points is observed: only where racks can block it."""
     if not isinstance(sight, bool):
         raise ValueError(f"sight must be True or False, got {sight!r:.80}")
-    if sight and not task.racks:
+    if sight and not task.racks and not task.scene.obstacles:
         raise ValueError("sight must be False without racks, which alone block it, got racks=0")
     return sight
 
@@ -280,7 +281,8 @@ def observation_size(task: placement.PlacementTask, mode: str, sight: bool) -> i
 def is_symmetric(task: placement.PlacementTask) -> bool:
     """Whether legal space and volume have one centre in x and y: problems may be mirrored."""
     centres = [_centre(region)[:2] for region in (task.scene.volume, task.scene.anchor_region)]
-    return bool(np.allclose(*centres, atol=1e-9))
+    # Obstacles that always stand there would have to be mirrored as well.
+    return bool(np.allclose(*centres, atol=1e-9)) and not task.scene.obstacles
 
 
 def _centre(region: Region) -> FloatArray:
@@ -311,14 +313,13 @@ def mirrored_mounts(task: placement.PlacementTask, mounts: FloatArray) -> np.nda
 
 
 def context_features(task: placement.PlacementTask, context: Context) -> FloatArray:
-    """A problem as numbers (..., 6 + 6 K) of [-1, 1]: region, then racks."""
+    """A problem as numbers (..., 6 + 6 K) of [-1, 1]: region, then the racks that it drew."""
     low, high = task.scene.volume.bounds()
     half = np.maximum(0.5 * (high - low), 1e-9)
     region = [(context.centre - 0.5 * (low + high)) / half, 2 * context.half / half - 1]
     floor, ceiling = task.scene.anchor_region.bounds()
     room = 0.5 * (ceiling - floor)
-    racks = np.concatenate(
-        [(context.racks[..., :3] - floor) / room - 1, context.racks[..., 3:] / room], axis=-1
-    )
+    drawn = context.racks[..., len(task.scene.obstacles) :, :]
+    racks = np.concatenate([(drawn[..., :3] - floor) / room - 1, drawn[..., 3:] / room], axis=-1)
     racks = racks.reshape((*racks.shape[:-2], 6 * task.racks))
     return np.clip(np.concatenate([*region, racks], axis=-1), -1, 1)

@@ -32,7 +32,6 @@ from rbl_gym.rendering.film import Film, check_mode
 _STEPS_M = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
 _COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#d7c51a", "#f2a05c")
 _NAMES = ("to 3 cm", "10 cm", "30 cm", "1 m", "3 m", "more")
-_MOST_RACKS = placement.MAX_RACKS
 
 
 class Layout(NamedTuple):
@@ -85,6 +84,11 @@ def _errors(task: PlacementTask, context: Context, anchors: FloatArray) -> Float
     return bounds.score(covariance, task.poses[0], np.asarray(task.scene.tags))
 
 
+def _boxes(task: PlacementTask) -> int:
+    """How many boxes block sight in every problem."""
+    return len(task.scene.obstacles) + task.racks
+
+
 class _Points:
     """Places coloured by their error: a line of markers for every colour."""
 
@@ -126,7 +130,7 @@ class _World:
         panel.freeze()
         self._view, self._floor = view_of(axes), low[2]
         self._racks = [panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
-                       for _ in range(6 * _MOST_RACKS)]  # fmt: skip
+                       for _ in range(6 * _boxes(task))]  # fmt: skip
         self._stems = panel.line(color="#b4bac0", lw=0.8, ls=(0, (2, 2)))
         self._region = panel.line(color=INK, lw=1.1, ls=(0, (4, 2)))
         self._points = _Points(panel)
@@ -177,7 +181,7 @@ class _Plan:
         axes.grid(alpha=0.3, lw=0.5)
         panel.freeze()
         self._racks = [panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)
-                       for _ in range(_MOST_RACKS)]  # fmt: skip
+                       for _ in range(_boxes(task))]  # fmt: skip
         self._region = panel.line(axes, color=INK, lw=1.1, ls=(0, (4, 2)))
         self._points = _Points(panel, axes)
         style = {"ls": "", "mec": "white", "mew": 0.8}
