@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, layout_criteria, layouts, placement, scene_files
+from rbl_gym import bounds, layout_criteria, layouts, obstacles, placement, scene_files
 from rbl_gym.app import place, place_accuracy, place_check, place_figures, place_html, place_report
 from rbl_gym.app.cli import main
 from tests.test_scene_files import GOOD
@@ -85,7 +85,7 @@ def test_predictions_are_the_bound_at_each_place(placed):
     for index, spot in enumerate(places):
         squares = []
         for turn in task.poses[0][: place_accuracy._TURNS]:
-            sight = placement.obstacles.in_sight(design.anchors, spot[None], problem.context.racks)
+            sight = obstacles.in_sight(design.anchors, spot[None], problem.context.racks)
             information = task.prior_information
             for seen, share in ((sight[0], 1.0), (~sight[0], task.blocked_information)):
                 mask = np.repeat(seen[:, None], len(scene.tags), axis=1)
