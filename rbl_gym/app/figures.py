@@ -176,6 +176,7 @@ def static(result: dict[str, Any]) -> Figure:
     return figure
 
 
+@styled
 def slides2013(result: dict[str, Any]) -> Figure:
     """The static part in the first columns, the dynamic part in the last two."""
     settings = result["settings"]

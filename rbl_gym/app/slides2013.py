@@ -1,6 +1,6 @@
 """The experiments of the slides: 5 tags on a rectangular pyramid, 4 anchors, static and dynamic.
 
-Source: the authors' slides "Rigid body localization and tracking", which join the static paper
+Source: the slides "Rigid body localization and tracking", which join the static paper
 (ICASSP 2013) and the tracking paper (CAMSAP 2013). They print no parameters: those are of the
 two papers, the body's size is that of the static paper's.
 """
