@@ -144,7 +144,8 @@ def are_finite(array: FloatArray, trailing: int) -> BoolArray:
 def check_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
     """`value` as a finite float in ``[low, high]``, or a ValueError that names it."""
     try:
-        if isinstance(value, (str, bytes)):
+        # Whether an array of one number is a number, NumPy's versions do not agree.
+        if isinstance(value, (str, bytes)) or getattr(value, "ndim", 0):
             raise TypeError(type(value))
         number = float(value)
     except (TypeError, ValueError, OverflowError) as error:

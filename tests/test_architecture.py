@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers import ROOT, run_python
+from tests.helpers import ROOT, needs, run_python
 
 FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
 PLAIN_MODELS = {
@@ -128,6 +128,7 @@ BEYOND = {
 }
 
 
+@needs("rich", "cmaes", "plotly")
 def test_every_module_imports_alone_and_none_under_a_second_name():
     absent = {name for name, needs in BEYOND.items() if find_spec(needs) is None} | {
         name for name in MODULES if name.endswith("__main__")

@@ -14,7 +14,7 @@ from rbl_gym import ranging
 from rbl_gym.app import place, policies
 from rbl_gym.app.cli import _parser
 from rbl_gym.estimators import belief
-from tests.helpers import ROOT
+from tests.helpers import ROOT, needs
 
 # Its blocks are files of a package: tests/test_your_estimator.py.
 OF_ITS_OWN = "your_estimator"
@@ -49,6 +49,7 @@ def write_files_that_pages_read(folder: Path) -> None:
     policies.save(policy, folder / "out" / "auv_buoys-0.npz")
 
 
+@needs("cmaes")
 @pytest.mark.parametrize(
     "page",
     [page for page in PAGES if blocks(page, "python") and page.stem != OF_ITS_OWN],

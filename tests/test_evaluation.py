@@ -17,6 +17,7 @@ from rbl_gym.app.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_t
 from rbl_gym.envs.placement import AnchorPlacementEnv
 from rbl_gym.placement import Context
 from rbl_gym.wrappers.tasks import AnchorSelectionEnv, MobileAnchorsEnv
+from tests.helpers import needs
 from tests.test_policies import random_policy
 
 SHORT: dict[str, tuple[RlTask, type, tuple[int, ...], str]] = {
@@ -168,6 +169,7 @@ def test_a_policy_as_saved_is_scored_in_the_worlds_of_evaluations(kind):
     assert evaluation.held_out_returns(task, policy, 3, 2) == got
 
 
+@needs("rich")
 def test_a_training_says_how_good_the_policy_is_that_it_saved(monkeypatch, tmp_path, capsys):
     """By a stand-in for PPO: the learning curve shines, the policy that is saved does not."""
     size = rl_task("auv_buoys").make(1).single_observation_space.shape[0]
@@ -298,6 +300,7 @@ def test_correlations_need_three():
 # --- the command line -------------------------------------------------------------------------
 
 
+@needs("rich", "cmaes")
 def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
     path = tmp_path / "mine.npz"
     policies.save(random_policy(sizes=(18, 4, 12), task="selection"), path)
@@ -317,6 +320,7 @@ def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
     assert "greedy-with-map" in capsys.readouterr().out
 
 
+@needs("rich", "cmaes")
 def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(transfer, "_STEPS", 14)
     path = tmp_path / "mine.npz"
@@ -338,6 +342,7 @@ def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     assert re.findall("greedy\\S*|random", table) == ["greedy"] * 4
 
 
+@needs("rich")
 def test_errors_are_one_line(tmp_path, capsys):
     good, same = tmp_path / "mine.npz", tmp_path / "other" / "mine.npz"
     for path in (good, same):

@@ -12,6 +12,7 @@ import pytest
 from rbl_gym import layout_search, layouts, placement
 from rbl_gym.layout_search import SEARCHES, cma_es, expand, greedy, shared_layout
 from rbl_gym.placement import Context
+from tests.helpers import needs
 
 QUICK = {"generations": 6, "population": 6}
 
@@ -121,6 +122,7 @@ def test_best_of_random_is_the_best_of_the_same_draws():
         np.testing.assert_array_equal(found[i], drawn[i, scores[i].argmin()])
 
 
+@needs("cmaes")
 @pytest.mark.parametrize("name", SEARCHES)
 @pytest.mark.parametrize("scene", ["uwb_room", "auv_buoys", "satellite"])
 def test_searches_are_legal_deterministic_and_better_than_chance(name, scene):
@@ -137,6 +139,7 @@ def test_searches_are_legal_deterministic_and_better_than_chance(name, scene):
     assert SEARCHES[name](task, single, rng(), **options).shape == (4, 3)
 
 
+@needs("cmaes")
 @pytest.mark.parametrize("scene", ["uwb_room", "auv_buoys", "satellite"])
 def test_cma_es_is_never_worse_than_its_start(scene):
     task, context = problem(scene, 4, (3,))
@@ -151,6 +154,7 @@ def test_cma_es_is_never_worse_than_its_start(scene):
     np.testing.assert_allclose(shared, np.broadcast_to(start[0], shared.shape), atol=1e-6)
 
 
+@needs("cmaes")
 def test_more_generations_are_never_worse():
     task, context = problem("drone_yard", 3, (2,))
     scores = [placement.score(task, context, cma_es(task, context, rng(), n, 6))
@@ -159,6 +163,7 @@ def test_more_generations_are_never_worse():
     assert (scores[2] <= scores[1]).all()
 
 
+@needs("cmaes")
 def test_a_shared_layout_is_good_for_all():
     task, contexts = problem("auv_buoys", 4, (6,))
     found = shared_layout(task, contexts, rng(), 15, 8)

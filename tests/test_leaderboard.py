@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+pytest.importorskip("rich", reason="needs the extra cli")
+
 from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
 from rbl_gym.app import (
     bench_figures,

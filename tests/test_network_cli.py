@@ -10,7 +10,7 @@ import pytest
 from rbl_gym.app import network, network2009
 from rbl_gym.app.cli import main
 from rbl_gym.sensing_network import proj
-from tests.helpers import ROOT, assert_table_holds
+from tests.helpers import ROOT, assert_table_holds, needs
 
 G2O = ROOT.parent / "shared" / "data" / "g2o_planar"
 
@@ -29,6 +29,7 @@ def ring(tmp_path):
     return path
 
 
+@needs("rich")
 def test_a_network_is_solved_certified_and_drawn(ring, tmp_path, capsys):
     picture = tmp_path / "new" / "ring.png"
     assert main(["network", str(ring), "--plot", str(picture)]) == 0
@@ -43,6 +44,7 @@ def test_a_network_is_solved_certified_and_drawn(ring, tmp_path, capsys):
     assert result["chordal_cost"] == pytest.approx(result["cost_rad2"], rel=1e-3)
 
 
+@needs("rich")
 def test_a_network_of_bearings_without_places(tmp_path, capsys):
     rows = [(0, 1, 0.5, -2.0), (1, 2, 1.0, 2.0), (0, 2, -0.5, 3.0)]
     path = tmp_path / "edges.csv"
@@ -111,6 +113,7 @@ def test_edges_without_information_where_none_is_needed(tmp_path, capsys):
     assert result["weights"] == "all edges alike: the file has no information"
 
 
+@needs("rich")
 def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
     path = tmp_path / "a.g2o"
     path.write_text("EDGE_SE2 5 6 1 0 0.1 1 0 0 1 0 9\nEDGE_SE2 6 5 1 0 1 1 0 0 1 0 0\n")
@@ -125,6 +128,7 @@ def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
     assert "I33 above 0" in error
 
 
+@needs("rich")
 def test_skipped_lines_and_large_keys_are_named(tmp_path, capsys):
     path = tmp_path / "a.g2o"
     key = ord("x") * 2**56
@@ -168,6 +172,7 @@ def test_manhattan(capsys):
     assert result["cost_rad2"] == pytest.approx(1.02062, rel=1e-5)
 
 
+@needs("rich")
 def test_reproduce_network2009(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(network2009, "_NETWORKS", 2)
     picture, table, figures = (tmp_path / f"x.{kind}" for kind in ("png", "csv", "json"))

@@ -9,6 +9,10 @@ import sys
 import numpy as np
 import pytest
 
+pytest.importorskip("rich", reason="needs the extra cli")
+pytest.importorskip("cmaes", reason="needs the extra placement")
+pytest.importorskip("plotly", reason="needs the extra viz")
+
 from rbl_gym import bounds, layout_criteria, layouts, obstacles, placement, scene_files
 from rbl_gym.app import place, place_accuracy, place_check, place_figures, place_html, place_report
 from rbl_gym.app.cli import main

@@ -4,7 +4,7 @@ import matplotlib
 import pytest
 
 from rbl_gym.app.cli import main
-from tests.helpers import run_python
+from tests.helpers import needs, run_python
 
 
 def test_a_checkouts_other_folders_are_no_part_of_the_package():
@@ -31,6 +31,7 @@ print({"estimators", "wrappers"} & set(sys.modules))
     ]  # fmt: skip
 
 
+@needs("rich", "cmaes")
 @pytest.mark.parametrize(
     "command",
     [

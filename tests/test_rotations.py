@@ -158,7 +158,7 @@ def test_log_takes_the_short_way(angle):
 @given(SEEDS, st.floats(1e-3, 1e3))
 def test_from_quaternion_undoes_quaternion_at_any_length_and_sign(seed, length):
     rng = np.random.default_rng(seed)
-    Q = Rotation.random(8, rng=rng).as_matrix()
+    Q = Rotation.random(8, rng).as_matrix()
     q = rotations.quaternion(Q)
     for scale in (length, -length):
         np.testing.assert_allclose(rotations.from_quaternion(scale * q), Q, atol=4e-15)
@@ -262,7 +262,7 @@ def test_nearest_is_a_rotation_that_no_other_beats(kind):
     R = rotations.nearest(M)
     rotations.check_rotation(kind, R, tolerance=1e-14)
     np.testing.assert_allclose(np.trace(R.T @ M), closeness(M), atol=1e-13)
-    drawn = Rotation.random(5000, rng=np.random.default_rng(0)).as_matrix()
+    drawn = Rotation.random(5000, np.random.default_rng(0)).as_matrix()
     assert np.linalg.norm(R - M) <= np.linalg.norm(drawn - M, axis=(-2, -1)).min() + 1e-12
 
 
