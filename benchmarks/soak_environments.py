@@ -23,10 +23,7 @@ FAST, MEDIUM, SLOW, LEAST = (2048, 300), (256, 100), (64, 100), (8, 50)
 def tracking(rng: Rng) -> tuple[dict[str, Any], tuple[int, int]]:
     name = str(rng.choice(list(scenes.SCENES)))
     scene: dict[str, Any] = {"name": name}
-    observation = "ranges"
-    if name == "camsap2013":
-        observation = str(rng.choice(["ranges", "statistic"]))
-    elif name != "icassp2013":
+    if name not in ("camsap2013", "icassp2013"):
         scene["trajectory"] = str(
             rng.choice(["waypoints", "random-twist", "orbit", "lawn-mower", "constant"])
         )
@@ -39,7 +36,7 @@ def tracking(rng: Rng) -> tuple[dict[str, Any], tuple[int, int]]:
         scene["steps"] = int(rng.integers(1, 120))
     reward = str(rng.choice(["none", "bound"], p=[0.8, 0.2]))
     size = FAST if reward == "none" and not scenes.get(scene).obstacles else MEDIUM
-    return {"scene": scene, "reward": reward, "observation": observation}, size
+    return {"scene": scene, "reward": reward}, size
 
 
 def placement(rng: Rng) -> tuple[dict[str, Any], tuple[int, int]]:

@@ -21,7 +21,7 @@ from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log,
 from rbl_gym.estimators import bias_cost
 from rbl_gym.estimators.belief import PoseBelief, register
 from rbl_gym.estimators.bias_cost import AugmentedState
-from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, law_of
+from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, law_of, plain
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState, is_vague
 from rbl_gym.link_bias import LinkBias
 from rbl_gym.motion import ProcessNoise, propagate
@@ -86,7 +86,7 @@ class AugmentedEkf:
             (..., 6) of the interval. Known, where this filter estimates none. Otherwise it is
             what the `sensor` read, or nothing to it (None), and without a sensor it is ignored.
         """
-        dt = check_number("dt", dt, low=0.0)
+        dt, state = check_number("dt", dt, low=0.0), plain(state)
         known = self.twist is None
         if twist is None and known:
             raise ValueError("twist must be given to a filter that does not estimate it, got None")
@@ -138,6 +138,7 @@ class AugmentedEkf:
         ValueError
             As `IteratedEkf.update`, and where the number of anchors changes under biases.
         """
+        state = plain(state)
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
         if not self.biases:
             return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))

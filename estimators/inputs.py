@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -18,6 +20,8 @@ from rbl_gym.ranging import NoiseLaw
 
 # Ranges that stay in the cache from one look at them to the next.
 _PART = 1 << 15
+
+State = TypeVar("State", bound=tuple[Any, ...])
 
 # Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
 VAGUE_ENTRY_VARIANCE = 1 / 3
@@ -43,12 +47,8 @@ def check_epoch(
     anchors: ArrayLike,
     links: ArrayLike | None,
     tags: FloatArray,
-    *,
-    values: bool = True,
 ) -> tuple[FloatArray, FloatArray, BoolArray | None]:
     """One epoch as (ranges, anchors, links): links None where all measured, else 0 behind False.
-
-    Without `values` the ranges of an epoch of all links still have to pass `check_ranges`.
 
     Raises
     ------
@@ -69,8 +69,7 @@ def check_epoch(
         if mask.all():
             mask = None
     check_batches(ranges=ranges.shape[:-2], anchors=anchors.shape[:-2])
-    if values or mask is not None:
-        check_ranges(ranges, mask)
+    check_ranges(ranges, mask)
     return ranges, anchors, mask
 
 
@@ -114,6 +113,11 @@ def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
     if not (variance > 0).all():
         raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
     return variance
+
+
+def plain(state: State) -> State:
+    """A state with its arrays in C order: results must not depend on how they lie in memory."""
+    return type(state)(*(np.asarray(field, order="C") for field in state))
 
 
 def law_of(noise: NoiseLaw | None, own: NoiseLaw) -> NoiseLaw:

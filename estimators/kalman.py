@@ -1,8 +1,8 @@
 """The Kalman filters of the tracking paper on the 12 states ``x = [vec Q; t]``.
 
 KF, UC-KF, ET-KF and KF-ortho are one filter with a different `constrain` step after the
-linear update. The linear algebra below is filterpy's (one body, the reference) or the batched
-engine (any leading axes); both read the compressed statistic of `squared_range`.
+linear update. The linear algebra below is filterpy's (one body) or the batched engine (any
+leading axes); both read the statistic of `squared_range`.
 """
 
 from __future__ import annotations
@@ -19,29 +19,18 @@ from rbl_gym import rotations
 from rbl_gym.bounds import symmetric
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of, kernel
 from rbl_gym.estimators.belief import PoseBelief, inverse, register
-from rbl_gym.estimators.engines import ENGINES, FEW_TRIALS, Epoch, Prediction
-from rbl_gym.estimators.four_filters import (
-    Frame,
-    join_mean,
-    principal_frame,
-    split,
-    split_mean,
-)
-from rbl_gym.estimators.from_statistic import StatisticEpoch, check_informed, check_statistic
-from rbl_gym.estimators.from_statistic import update as update_from_statistic
+from rbl_gym.estimators.engines import ENGINES, Prediction, engine_for
 from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
     check_batches,
     check_covariance,
     check_epoch,
-    check_ranges,
     check_variance,
     law_of,
 )
 from rbl_gym.estimators.least_squares import unvec, vec
-from rbl_gym.estimators.shared_covariance import shared, spread_out
-from rbl_gym.estimators.squared_range import geometric_rank
-from rbl_gym.estimators.unitary import column_fit, coupled_fit, decoupled_fit
+from rbl_gym.estimators.squared_range import Statistic, geometric_rank, statistic
+from rbl_gym.estimators.unitary import coupled_fit, decoupled_fit
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import NoiseLaw
 
@@ -57,7 +46,8 @@ class KalmanState(NamedTuple):
     mean
         (..., 12), ``[vec Q; t]``, columns of Q first.
     covariance
-        (..., 12, 12).
+        (..., 12, 12). It has fewer leading axes than the mean where it is the same for all
+        trials: a prior given once, as long as anchors, weights, links and twists are common.
     constrained
         (...), whether the last update put the rotation back onto SO(3).
     """
@@ -95,7 +85,8 @@ class KalmanFamily:
         Fixed inverse variances of the squared ranges [1/m^4], (M,) or (M, N); None: from the
         measured ranges.
     engine
-        ``"batched"`` or ``"filterpy"`` (one body).
+        ``"auto"``: filterpy for one body, where no array has leading axes, batched otherwise.
+        ``"batched"`` or ``"filterpy"``: that one always.
     """
 
     tags: FloatArray
@@ -106,7 +97,7 @@ class KalmanFamily:
     threshold: float = 0.15
     coupled: bool = False
     weights: ArrayLike | None = None
-    engine: str = "batched"
+    engine: str = "auto"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
@@ -141,20 +132,18 @@ class KalmanFamily:
         )
         mean = np.empty((*batch, 12))
         mean[..., :9], mean[..., 9:] = vec(rotation), translation
-        # A covariance of all trials stays one in memory: see `shared_covariance`.
-        covariance = spread_out(covariance.copy(), batch)
-        return KalmanState(mean, covariance, np.zeros(batch, bool))
+        return KalmanState(mean, covariance.copy(), np.zeros(batch, bool))
 
     def predict(self, state: KalmanState, twist: ArrayLike, dt: float) -> KalmanState:
         """State after `dt` seconds of the twist (..., 6): eqs (10)-(15), Omega carrying dt."""
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         step = rotations.exp(twist[..., :3] * dt)
-        mean, covariance = ENGINES[self.engine].predict(
+        engine = engine_for(self.engine, state=state.mean.shape[:-1], twist=twist.shape[:-1])
+        mean, covariance = engine.predict(
             state.mean,
             state.covariance,
             Prediction(step, twist[..., 3:] * dt, dt * self._variance_rate),
-            self._frame,
         )
         return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
 
@@ -177,18 +166,11 @@ class KalmanFamily:
             cannot determine the 12 states and the state is too vague to stand in (the
             message names the rank).
         """
-        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags, values=False)
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
         law = law_of(noise, self.noise)
         self._check_determined(state, anchors)
         if self.weights is None:
-            with np.errstate(invalid="ignore", over="ignore"):
-                variance = law.squared_range_variance(ranges, mask)
-            try:
-                weights = 1 / check_variance(variance, mask)
-            except ValueError:
-                # A range that is no range may be what stands behind a variance that is none.
-                check_ranges(ranges, mask)
-                raise
+            weights = 1 / check_variance(law.squared_range_variance(ranges, mask), mask)
         else:
             weights = np.asarray(self.weights, dtype=np.float64)
             weights = weights[..., None] if weights.ndim == 1 else weights
@@ -198,46 +180,16 @@ class KalmanFamily:
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
         check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
-        epoch = Epoch(ranges, anchors, self.tags, weights, mask)
-        mean, covariance = ENGINES[self.engine].update(
-            state.mean, state.covariance, epoch, self._frame
+        stat = statistic(ranges, anchors, self.tags, weights, mask)
+        engine = engine_for(
+            self.engine,
+            state=state.mean.shape[:-1],
+            ranges=stat.b.shape[:-2],
+            weights=stat.G.shape[:-3],
         )
-        return self._constrained(state, mean, covariance, epoch)
-
-    def update_statistic(self, state: KalmanState, G: ArrayLike, B: ArrayLike) -> KalmanState:
-        """State after one epoch of which only the statistic is known, all links measured.
-
-        Equal to `update` with the ranges behind it; noise and weights are in the two already.
-
-        Parameters
-        ----------
-        state
-            Before the epoch.
-        G, B
-            (..., 3, 3) and (..., 3, 4), `rbl_gym.statistic.EpochStatistic`.
-
-        Raises
-        ------
-        ValueError
-            On wrong shapes, NaN, a G that is not symmetric positive semidefinite, and where the
-            epoch has not rank 12 while the prior of the rotation says nothing.
-        """
-        epoch = check_statistic(G, B, self.tags)
-        check_informed(state.covariance, epoch)
-        mean, covariance = update_from_statistic(
-            state.mean, state.covariance, epoch, self._frame, self.engine
-        )
-        return self._constrained(state, mean, covariance, epoch)
-
-    def _constrained(
-        self,
-        prior: KalmanState,
-        mean: FloatArray,
-        covariance: FloatArray,
-        epoch: Epoch | StatisticEpoch,
-    ) -> KalmanState:
+        mean, covariance = engine.update(state.mean, state.covariance, stat)
         posterior = KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
-        return _CONSTRAINTS[self.constraint](self, prior, posterior, epoch)
+        return _CONSTRAINTS[self.constraint](self, state, posterior, stat)
 
     def belief(self, state: KalmanState) -> PoseBelief:
         """Pose, its covariance, and the raw matrix (copies).
@@ -261,10 +213,6 @@ class KalmanFamily:
         return PoseBelief(rotation, translation, covariance, raw)
 
     @cached_property
-    def _frame(self) -> Frame | None:
-        return principal_frame(np.asarray(self.tags, dtype=np.float64))
-
-    @cached_property
     def _variance_rate(self) -> FloatArray:
         """Process noise (12,) of the state after 1 s."""
         std = self.process.std()
@@ -272,9 +220,7 @@ class KalmanFamily:
         return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
 
     def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
-        common = shared(state.covariance)
-        covariance = state.covariance if common is None else common
-        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
         rotation = np.maximum(np.maximum(variance[..., :3], variance[..., 3:6]), variance[..., 6:9])
         vague_rotation = _largest_of_three(rotation) > VAGUE_ENTRY_VARIANCE
         largest = _largest_of_three(variance[..., 9:])
@@ -310,7 +256,7 @@ def _largest_of_three(values: FloatArray) -> FloatArray:
 
 
 def _no_constraint(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
 ) -> KalmanState:
     return posterior
 
@@ -324,35 +270,26 @@ def _project(posterior: KalmanState, where: BoolArray) -> KalmanState:
 
 
 def _always(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
 ) -> KalmanState:
     return _project(posterior, np.ones(posterior.mean.shape[:-1], bool))
 
 
 def _above_threshold(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
 ) -> KalmanState:
     matrix = unvec(posterior.mean[..., :9])
     defect = np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)
-    return _project(posterior, np.linalg.norm(defect, axis=(-2, -1)) > family.threshold)
+    return _project(posterior, np.asarray(np.linalg.norm(defect, axis=(-2, -1)) > family.threshold))
 
 
 def _newton(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch | StatisticEpoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
 ) -> KalmanState:
     """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
 
     The covariance stays that of the linear update, (22) as printed: an overestimate.
     """
-    frame, few = family._frame, posterior.mean.size < 12 * FEW_TRIALS
-    blocks = None if frame is None or few else split(frame, posterior.covariance)
-    if frame is not None and blocks is not None:
-        # Nothing across the four filters: (23) and (26)-(27) are the same problem.
-        x = split_mean(frame, posterior.mean)
-        x[:, :3] = column_fit(x[:, :3], blocks[:, :, :3])
-        mean = join_mean(frame, x, posterior.mean.shape[:-1])
-        return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
-    stat = epoch.statistic()
     if stat.is_common and not family.coupled:
         rotation, translation = decoupled_fit(prior.mean, prior.covariance, stat)
     else:

@@ -36,6 +36,7 @@ from rbl_gym.estimators.inputs import (
     check_epoch,
     check_variance,
     law_of,
+    plain,
     spanned_dimensions,
 )
 from rbl_gym.estimators.levenberg_marquardt import Linearization, Solution, minimize_pose
@@ -122,6 +123,7 @@ class IteratedEkf:
         dt = check_number("dt", dt, low=0.0)
         if state.translation.ndim > 1 or twist.ndim > 1:
             return _predict_many(state, twist, dt, self.process)
+        state = plain(state)
         rotation, translation = propagate(state.rotation, state.translation, twist, dt)
         covariance = bounds.predict_covariance(state.covariance, twist, dt, self.process)
         return PoseState(rotation, translation, covariance)
@@ -149,7 +151,7 @@ class IteratedEkf:
         """
         ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
-        epoch = (*state, ranges, weights, anchors)
+        epoch = (*plain(state), ranges, weights, anchors)
         size = block_size(ranges) if self.tags.ndim == 2 else math.inf
         return update_in_blocks(self._update, epoch, TRAILING, size)
 

@@ -12,23 +12,13 @@ No matrix larger than 12 x 12 is ever made, whatever the number of anchors and t
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from rbl_gym.bounds import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.inputs import (
-    check_ranges,
-    matrix_rank,
-    spanned_dimensions,
-)
-
-# Ranges that are squared at a time: a quarter of a megabyte stays in the cache.
-_CHUNK = 1 << 15
-# Anchors x trials that `moments` takes at a time, eight numbers each.
-_COLUMNS = 1 << 13
+from rbl_gym.estimators.inputs import matrix_rank, spanned_dimensions
 
 
 class Statistic(NamedTuple):
@@ -90,82 +80,6 @@ def statistic(
     return Statistic(G, b, tags)
 
 
-def moments(
-    ranges: FloatArray,
-    anchors: FloatArray,
-    tags: FloatArray,
-    weights: FloatArray,
-    unchecked: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """G and ``B = sum_n b_n c_n^T`` of common weights, without the b of each tag; trials last.
-
-    Parameters
-    ----------
-    ranges, anchors, weights
-        (B, M, N), (B or 1, M, 3) and (B or 1, M, 1).
-    tags
-        Extended tags (N, 4), in any frame.
-    unchecked
-        As of `squares_times`.
-
-    Returns
-    -------
-    G (3, 3, B) and B (3, 4, B).
-    """
-    n_trials, n_anchors, n_tags = ranges.shape
-    size = max(1, min(n_trials, _COLUMNS // n_anchors))
-    G, B = np.empty((3, 3, n_trials)), np.empty((3, 4, n_trials))
-    columns = np.empty((8, n_anchors, size))
-    of_tags = tags.sum(axis=0)
-    for begin in range(0, n_trials, size):
-        part = slice(begin, begin + size)
-        here = ranges[part]
-        w = np.ascontiguousarray((weights[part] if len(weights) > 1 else weights)[..., 0].T)
-        sums, spread, squared = np.split(columns[..., : len(here)], (4, 7))
-        product = squares_times(here.reshape(-1, n_tags), [tags], unchecked)
-        sums[:] = product.reshape(-1, n_anchors, 4).T
-        spread[:] = (anchors[part] if len(anchors) > 1 else anchors).T
-        total = w.sum(axis=0)
-        mean = np.einsum("imb,mb->ib", spread, w / np.where(total > 0, total, 1.0))
-        spread -= mean[:, None]
-        np.einsum("imb,imb->mb", spread, spread, out=squared[0])
-        # With the anchors about their mean a, |a_m|^2 - |a|^2 is |spread|^2 + 2 a^T spread.
-        moment = np.einsum("imb,jmb->ijb", w * spread, columns[..., : len(here)])
-        gram = moment[:, 4:7]
-        about = moment[:, 7] + 2 * np.einsum("ijb,jb->ib", gram, mean)
-        np.multiply(4, gram, out=G[..., part])
-        np.multiply(-2, moment[:, :4] - of_tags[:, None] * about[:, None], out=B[..., part])
-    return G, B
-
-
-def squares_times(
-    ranges: FloatArray, matrices: list[FloatArray], unchecked: FloatArray | None = None
-) -> FloatArray:
-    """``(r * r) @ matrix`` for ranges (K, n) and a matrix (n, p), a few rows at a time.
-
-    Of two matrices (n / q, s) and (q s, p) the first is for each of q parts of a row, and the
-    second for what comes of them. `unchecked` is the array that the ranges are rows of, if it
-    has yet to pass `check_ranges`: each part is looked at while it is in the cache. A range
-    that is not finite shows in the product, which is smaller.
-    """
-    *first, last = matrices
-    product = np.empty((len(ranges), last.shape[1]))
-    size = max(1, _CHUNK // ranges.shape[1])
-    squares = np.empty((min(size, len(ranges)), ranges.shape[1]))
-    with np.errstate(invalid="ignore"):
-        for begin in range(0, len(ranges), size):
-            part = ranges[begin : begin + size]
-            if unchecked is not None and not part.min() > 0:
-                check_ranges(unchecked)
-            here = np.multiply(part, part, out=squares[: len(part)])
-            for matrix in first:
-                here = here.reshape(-1, len(matrix)) @ matrix
-            np.matmul(here.reshape(len(part), -1), last, out=product[begin : begin + size])
-        if unchecked is not None and not math.isfinite(np.vdot(product, product)):
-            check_ranges(unchecked)
-    return product
-
-
 def extended(tags: FloatArray) -> FloatArray:
     """Tags with a fourth coordinate 1, ``c_e`` (..., N, 4)."""
     return np.concatenate([tags, np.ones((*tags.shape[:-1], 1))], axis=-1)
@@ -187,17 +101,6 @@ def information(stat: Statistic) -> tuple[FloatArray, FloatArray]:
         matrix = np.einsum("...nkl,...nij->...kilj", gram, stat.G)
     vector = np.einsum("...nk,...ni->...ki", ce, stat.b)
     return matrix.reshape(*matrix.shape[:-4], 12, 12), vector.reshape(*vector.shape[:-2], 12)
-
-
-def information_of_moments(
-    G: FloatArray, B: FloatArray, tags: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """`information`, trials first, from the `moments` of extended tags (N, 4)."""
-    gram = tags.T @ tags
-    # One product with a matrix of the tags, which is a fraction of the time of an einsum.
-    kron = np.einsum("kl,ia,jb->abkilj", gram, np.eye(3), np.eye(3)).reshape(9, 144)
-    matrix = (G.reshape(9, -1).T @ kron).reshape(-1, 12, 12)
-    return matrix, B.T.reshape(-1, 12)
 
 
 def compressed(stat: Statistic) -> tuple[FloatArray, FloatArray]:

@@ -11,14 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds, motion, ranging, rotations, statistic
+from rbl_gym import bounds, motion, ranging, rotations
 from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.scene import Scene
-from rbl_gym.statistic import EpochStatistic
 
 __all__ = [
-    "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure",
-    "measure_statistic", "move_anchors",
+    "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure", "move_anchors",
 ]  # fmt: skip
 
 # Behind the doors: what comes to these was checked, or made here.
@@ -43,8 +41,8 @@ class Episode(NamedTuple):
         Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
         unless the prior is older than it.
     normals, uniforms
-        Random numbers of the ranges (..., T + 1, M, N), or (..., T + 1, 3, 4) of the statistic
-        in their place; of the links (..., T + 1, 2, M, N) or None where they need none.
+        Random numbers of the ranges (..., T + 1, M, N); of the links (..., T + 1, 2, M, N) or
+        None where they need none.
     prior_rotation, prior_translation, prior_covariance
         Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
     anchors
@@ -78,23 +76,18 @@ _START_NORMALS = 4 + 3 + 6
 _HOLD = 10
 
 
-def draw(
-    scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = (), statistic: bool = False
-) -> Draws:
-    """The random numbers of an episode: one call for normals, one for uniforms.
-
-    `statistic`: of one whose epochs are measured by `measure_statistic`, 12 normals each.
-    """
+def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Draws:
+    """The random numbers of an episode: one call for normals, one for uniforms."""
     return Draws(
-        rng.standard_normal((*batch, sum(_normal_sizes(scene, statistic)))),
+        rng.standard_normal((*batch, sum(_normal_sizes(scene)))),
         rng.random((*batch, sum(_uniform_sizes(scene)))),
     )
 
 
-def empty_draws(scene: Scene, count: int, statistic: bool = False) -> Draws:
+def empty_draws(scene: Scene, count: int) -> Draws:
     """Room for the random numbers of `count` episodes, (count, n) and (count, m)."""
     return Draws(
-        np.empty((count, sum(_normal_sizes(scene, statistic)))),
+        np.empty((count, sum(_normal_sizes(scene)))),
         np.empty((count, sum(_uniform_sizes(scene)))),
     )
 
@@ -106,22 +99,18 @@ def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.
         generator.random(out=draws.uniforms[row])
 
 
-def of_ranges(
-    scene: Scene, draws: Draws, statistic: bool = False
-) -> tuple[FloatArray, FloatArray | None]:
+def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
     """Views of the draws: `normals` and `uniforms` of an `Episode`."""
     batch, shape = draws.normals.shape[:-1], (scene.n_anchors, len(scene.tags))
-    normals = _split(draws.normals, _normal_sizes(scene, statistic))[2]
-    normals = normals.reshape((*batch, scene.steps + 1, *((3, 4) if statistic else shape)))
+    normals = _split(draws.normals, _normal_sizes(scene))[2]
+    normals = normals.reshape((*batch, scene.steps + 1, *shape))
     if not scene.links.is_random:
         return normals, None
     uniforms = _split(draws.uniforms, _uniform_sizes(scene))[3]
     return normals, uniforms.reshape((*batch, scene.steps + 1, 2, *shape))
 
 
-def draw_episode(
-    scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = (), statistic: bool = False
-) -> Episode:
+def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:
     """An episode of a scene, or a batch of independent ones.
 
     Anchors that the scene leaves open are drawn anew for every episode of the batch.
@@ -130,10 +119,8 @@ def draw_episode(
     ----------
     scene, rng, batch
         The world, the source of all randomness, and the leading axes.
-    statistic
-        Whether the observations are `statistic` alone, which takes other numbers.
     """
-    return build_episode(scene, draw(scene, rng, batch, statistic), statistic)
+    return build_episode(scene, draw(scene, rng, batch))
 
 
 def _steps(scene: Scene) -> int:
@@ -145,11 +132,10 @@ def _links(scene: Scene) -> int:
     return scene.n_anchors * len(scene.tags)
 
 
-def _normal_sizes(scene: Scene, statistic: bool) -> tuple[int, int, int, int]:
+def _normal_sizes(scene: Scene) -> tuple[int, int, int, int]:
     """Normals of the start, the process, the ranges, the random twists."""
     held = -(-_steps(scene) // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
-    epoch = 12 if statistic else _links(scene)
-    return _START_NORMALS, 6 * _steps(scene), (scene.steps + 1) * epoch, held
+    return _START_NORMALS, 6 * _steps(scene), (scene.steps + 1) * _links(scene), held
 
 
 def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
@@ -167,10 +153,10 @@ def _n_points(scene: Scene) -> int:
     return 8 + int(np.ceil(16 * scene.speed_m_s * scene.dt * _steps(scene) / extent))
 
 
-def build_episode(scene: Scene, draws: Draws, statistic: bool = False) -> Episode:
+def build_episode(scene: Scene, draws: Draws) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, _, held = _split(draws.normals, _normal_sizes(scene, statistic))
+    start, process, _, held = _split(draws.normals, _normal_sizes(scene))
     places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = _steps(scene)
@@ -201,7 +187,7 @@ def build_episode(scene: Scene, draws: Draws, statistic: bool = False) -> Episod
     else:
         anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
     covariance = np.broadcast_to(covariance, (*batch, 6, 6))
-    random = of_ranges(scene, draws, statistic)
+    random = of_ranges(scene, draws)
     return Episode(*path, twists, *random, *prior, covariance, anchors)
 
 
@@ -291,26 +277,6 @@ def measure(
         links &= quality[..., None] > 0
         ranges[~links] = 0.0
     return ranging.Measurement(ranges, links, nlos)
-
-
-def check_has_statistic(scene: Scene) -> None:
-    """A ValueError where G and B are not all there is to know of an epoch of the scene."""
-    links, noise = scene.links, scene.noise
-    if not isinstance(noise, ranging.SquaredRangeNoise):
-        raise ValueError(f"scene must have a SquaredRangeNoise for its statistic, got {noise!r}")
-    if links.is_random or links.reach_m is not None or scene.obstacles:
-        raise ValueError(
-            "scene must have links that never fail, no reach_m and no obstacles for its "
-            f"statistic, got {links!r}, {len(scene.obstacles)} obstacles"
-        )
-
-
-def measure_statistic(scene: Scene, at: Epoch, anchors: FloatArray) -> EpochStatistic:
-    """What an epoch's ranges would tell a linear filter, G (..., 3, 3) and B (..., 3, 4)."""
-    G, B = statistic.measure_statistic(
-        anchors, np.asarray(scene.tags), at.rotation, at.translation, scene.noise, at.normals
-    )
-    return EpochStatistic(np.ascontiguousarray(G), np.ascontiguousarray(B))
 
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:

@@ -26,7 +26,6 @@ from rbl_gym import (
     rotations,
     scenes,
     sensing_network,
-    statistic,
 )
 
 TAGS, PYRAMID, CORNER = bodies.octahedron(0.8), bodies.pyramid(), bodies.doa2019()
@@ -107,7 +106,6 @@ case(metrics.pose_error, **PAIR)
 case(metrics.tag_error, **PAIR, tags=TAGS)
 case(metrics.nees, error=np.ones(6), covariance=P)
 case(metrics.mean_angular_error, matrix=Q, rotation=Q)
-case(statistic.simulate_statistic, anchors=ANCHORS, tags=PYRAMID, **POSE, noise=SQUARED, rng=Rng)
 case(obstacles.check_obstacles, obstacles=np.ones((2, 6)))
 case(regions.Box, low=np.zeros(3), high=np.ones(3))
 case(regions.Walls, low=np.zeros(3), high=np.ones(3))

@@ -20,7 +20,7 @@ from tests.test_fuzz import SIZES, WRONG
 # Of each id the arguments to spoil, with a good value, in worlds that are quickly made.
 SHORT = {"name": "uwb_room", "steps": 3}
 WORLDS: dict[str, dict[str, Any]] = {
-    "Tracking": {"scene": SHORT, "reward": "bound", "observation": "ranges"},
+    "Tracking": {"scene": SHORT, "reward": "bound"},
     "AnchorPlacement": {
         "scene": SHORT, "mode": "sequential", "racks": 1, "n_anchors": 4, "mirror": True,
         "sight": True,

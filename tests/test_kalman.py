@@ -260,7 +260,7 @@ def test_vague_priors_lose_nothing_in_the_information_form():
     ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
     H, _ = textbook_model(ranges, anchors, tags, 1 / NOISE.squared_range_variance(ranges))
     exact = np.linalg.inv(H.T @ H + 1e-8 * np.eye(12))
-    filter = estimators.make("kf", tags=tags, noise=NOISE, process=PROCESS)
+    filter = estimators.make("kf", tags=tags, noise=NOISE, process=PROCESS, engine="batched")
     state = filter.initial(rotation, translation, 1e8 * np.eye(12))
     posterior = filter.update(state, ranges, anchors)
     np.testing.assert_allclose(posterior.covariance, exact, atol=1e-9 * np.abs(exact).max())
@@ -286,12 +286,3 @@ def test_undetermined_states_raise_with_their_rank_unless_the_prior_stands_in(
         filter.update(vague, ranges, np.array(anchors, float))
     tight = filter.initial(np.eye(3), [1, 2, 3], np.diag([0.01] * 3 + [0.1] * 3))
     assert np.isfinite(filter.update(tight, ranges, np.array(anchors, float)).mean).all()
-
-
-def test_filterpy_engine_refuses_a_batch():
-    filter = estimators.make(
-        "kf", tags=bodies.pyramid(), noise=NOISE, process=PROCESS, engine="filterpy"
-    )
-    state = filter.initial(np.eye(3), np.zeros((4, 3)), np.eye(6))
-    with pytest.raises(ValueError, match="tracks one body"):
-        filter.predict(state, TWIST, 1.0)

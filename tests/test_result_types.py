@@ -17,7 +17,6 @@ from rbl_gym import (
     scenes,
     sensing_network,
     simulation,
-    statistic,
     unknown_twist,
 )
 
@@ -38,13 +37,6 @@ def wandering():
     return unknown_twist.simulate(
         np.eye(3), np.zeros(3), law, process, 0.1, 3, np.random.default_rng(0)
     )
-
-
-def told():
-    noise = ranging.SquaredRangeNoise()
-    anchors = np.array([[9, 0, 0], [0, 9, 0], [0, 0, 9], [9, 9, 9.0]])
-    body = bodies.pyramid(), np.eye(3), np.zeros(3)
-    return statistic.simulate_statistic(anchors, *body, noise, np.random.default_rng(0))
 
 
 def first_state():
@@ -84,7 +76,6 @@ CASES = {
         sensing_network.SensingNetwork,
     ),
     "path": (lambda _: wandering(), unknown_twist.WanderingPath),
-    "statistic": (lambda _: told(), statistic.EpochStatistic),
 }  # fmt: skip
 
 

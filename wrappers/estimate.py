@@ -26,9 +26,9 @@ _FLAT_LIMIT = 10.0
 class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Turns measurements into a pose belief, and the belief into the reward.
 
-    Wraps an environment whose observation has `ranges` and `links` (in scenes with obstacles
-    `quality`) or `G` and `B`, besides `anchors` and `twist`, and whose unwrapped form has a
-    `scene` (`RBL/Tracking-v0`); or `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter
+    Wraps an environment whose observation has `ranges`, `links`, `anchors` and `twist` (in
+    scenes with obstacles `quality`), and whose unwrapped form has a `scene`
+    (`RBL/Tracking-v0`); or `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter
     ``"iekf"``). For vector environments: `VectorEstimatePose`.
 
     The environment is left as it is: what stands below the wrapper sees the environment's own
@@ -88,9 +88,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._tags = np.asarray(self._scene.tags)
         self._filter = make_filter(env, self._scene, filter, options)
         self._state: Any = None
-        self.observation_space = observation_space(
-            self._kind, env.observation_space, self._scene, self._filter
-        )
+        self.observation_space = observation_space(self._kind, env.observation_space, self._scene)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -171,7 +169,7 @@ def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:
 
 def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What a filter reads of an observation."""
-    keys = "ranges", "links", "quality", "G", "B", "anchors", "angles", "station", "twist"
+    keys = "ranges", "links", "quality", "anchors", "angles", "station", "twist"
     return {key: observation[key] for key in keys if key in observation}
 
 
@@ -180,9 +178,6 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
 
     The quality makes the law of the epoch, which the filter is given as `noise`.
     """
-    if "G" in observation:
-        statistical: Any = filter
-        return statistical.update_statistic(state, observation["G"], observation["B"])
     if "angles" in observation:
         return filter.update(state, observation["angles"], observation["station"])
     ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
@@ -222,23 +217,14 @@ def present(
     }
 
 
-def observation_space(
-    kind: str, inner: spaces.Space[Any], scene: Scene, filter: Filter
-) -> spaces.Space[Any]:
+def observation_space(kind: str, inner: spaces.Space[Any], scene: Scene) -> spaces.Space[Any]:
     """The space of `present`, from that of one raw environment which the filter can read."""
     keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
-    needed = {"G", "B", "anchors"} if "G" in keys else {"ranges", "links", "anchors"}
-    if "angles" in keys:
-        needed = {"angles", "station"}
+    needed = {"angles", "station"} if "angles" in keys else {"ranges", "links", "anchors"}
     if not isinstance(inner, spaces.Dict) or not {*needed, "twist"} <= keys:
         raise ValueError(
             "env must observe ranges, links, anchors and twist, or angles, station and twist, its "
             f"space is {inner}"
-        )
-    if "G" in keys and not hasattr(filter, "update_statistic"):
-        raise ValueError(
-            "filter must have update_statistic where only the statistic is observed "
-            f"('kf' and its family do), got {type(filter).__name__}"
         )
     if kind == "flat":
         size = 21 + 4 * scene.n_anchors

@@ -65,9 +65,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         self._filter = make_filter(env, self._scene, filter, options)
         self._state: Any = None
         self._belief: PoseBelief | None = None
-        single = observation_space(
-            self._kind, env.single_observation_space, self._scene, self._filter
-        )
+        single = observation_space(self._kind, env.single_observation_space, self._scene)
         self.single_observation_space = single
         self.observation_space = batch_space(single, env.num_envs)
 

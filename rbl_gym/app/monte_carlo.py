@@ -9,25 +9,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import bounds, estimators, metrics, ranging, scene_bounds, simulation
-from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.kalman import KalmanState
 from rbl_gym.scene import Scene
-from rbl_gym.statistic import EpochStatistic, simulate_statistic
 from rbl_gym.wrappers.estimate import check_takes_obstacles
-
-OBSERVATIONS = ("ranges", "statistic")
 
 
 class World(NamedTuple):
     """A batch of episodes with its measurements and its posterior Cramer-Rao bound.
 
-    `measurements` are ranges, or their statistic where that is observed; `bound` (K, B, 6, 6)
-    is a covariance per epoch and trial, of the ranges in either case.
+    `bound` (K, B, 6, 6) is a covariance per epoch and trial.
     """
 
     scene: Scene
     episode: simulation.Episode
-    measurements: Sequence[ranging.Measurement | EpochStatistic]
+    measurements: Sequence[ranging.Measurement]
     bound: FloatArray
 
 
@@ -64,32 +60,16 @@ class Trace(NamedTuple):
     seconds: float
 
 
-def simulate_world(
-    scene: Scene, trials: int, rng: np.random.Generator, observation: str = "ranges"
-) -> World:
-    """Episodes of a scene, with anchors that stay where they start.
-
-    ``observation="statistic"``: every epoch is drawn as its `EpochStatistic`, which the KF family
-    reads; for scenes whose noise is `SquaredRangeNoise` and whose links all measure.
-    """
-    check_one_of("observation", observation, OBSERVATIONS)
-    if observation == "statistic" and (scene.links.is_random or scene.links.reach_m is not None):
-        raise ValueError(f"scene must have all its links for the statistic, got {scene.links}")
+def simulate_world(scene: Scene, trials: int, rng: np.random.Generator) -> World:
+    """Episodes of a scene, with anchors that stay where they start."""
     episode = simulation.draw_episode(scene, rng, (trials,))
-    measurements: list[ranging.Measurement | EpochStatistic] = []
-    covariances = []
+    measurements, covariances = [], []
     information = None
     for epoch in range(scene.steps + 1):
         at = simulation.epoch_of(episode, epoch)
-        if observation == "statistic":
-            pose = np.asarray(scene.tags), at.rotation, at.translation
-            measured = simulate_statistic(episode.anchors, *pose, scene.noise, rng)
-            links = np.ones(at.normals.shape, dtype=np.bool_)
-        else:
-            measured = simulation.measure(scene, at, episode.anchors)
-            links = measured.links
+        measured = simulation.measure(scene, at, episode.anchors)
         information = scene_bounds.posterior_information(
-            scene, at, episode.anchors, links, information, episode.prior_covariance
+            scene, at, episode.anchors, measured.links, information, episode.prior_covariance
         )
         measurements.append(measured)
         covariances.append(np.linalg.inv(information))
@@ -114,14 +94,9 @@ def beliefs(world: World, filter: estimators.Filter) -> Iterator[tuple[Any, esti
     for epoch, measured in enumerate(world.measurements):
         if epoch:
             state = filter.predict(state, episode.twists[:, epoch], world.scene.dt)
-        if isinstance(measured, EpochStatistic):
-            if not isinstance(filter, estimators.KalmanFamily):
-                raise ValueError(f"filter must be of the KF family to read G and B, got {filter!r}")
-            state = filter.update_statistic(state, *measured)
-        else:
-            state = filter.update(
-                state, measured.ranges, episode.anchors, measured.links, **_law(world, epoch)
-            )
+        state = filter.update(
+            state, measured.ranges, episode.anchors, measured.links, **_law(world, epoch)
+        )
         yield state, filter.belief(state)
 
 
@@ -129,7 +104,7 @@ def _law(world: World, epoch: int) -> dict[str, ranging.NoiseLaw]:
     """The argument `noise` of an epoch, where obstacles give it a law of its own."""
     if not world.scene.obstacles:
         return {}
-    measured: Any = world.measurements[epoch]
+    measured = world.measurements[epoch]
     at = simulation.epoch_of(world.episode, epoch)
     quality = simulation.link_quality(world.scene, at, world.episode.anchors)
     return {

@@ -23,11 +23,10 @@ class EpisodeStore:
     anew by every reset, not made anew: fresh memory is slow.
     """
 
-    def __init__(self, scene: Scene, num_envs: int, statistic: bool = False) -> None:
+    def __init__(self, scene: Scene, num_envs: int) -> None:
         self._scene = scene
-        self._statistic = statistic
         self._num_envs = num_envs
-        self._draws = simulation.empty_draws(scene, num_envs, statistic)
+        self._draws = simulation.empty_draws(scene, num_envs)
         self._timed: list[FloatArray] = []
 
     @property
@@ -49,13 +48,11 @@ class EpisodeStore:
             rows = _rows(block)
             draws = simulation.Draws(*(field[rows] for field in self._draws))
             with whole_rows():
-                episode = simulation.build_episode(self._scene, draws, self._statistic)
+                episode = simulation.build_episode(self._scene, draws)
                 self._write(rows, episode)
             starts.append(episode[len(simulation.Epoch._fields) :])
         # Views, taken anew because a pickled store comes back with copies of them.
-        self._normals, self._uniforms = simulation.of_ranges(
-            self._scene, self._draws, self._statistic
-        )
+        self._normals, self._uniforms = simulation.of_ranges(self._scene, self._draws)
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
             name: np.concatenate(parts)

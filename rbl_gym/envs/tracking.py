@@ -17,7 +17,6 @@ from rbl_gym.envs.batch import StatedLength, check_options
 from rbl_gym.scene import Scene
 
 REWARDS = ("bound", "none")
-OBSERVATIONS = ("ranges", "statistic")
 
 # Not a `ScalarEnv` of one world, as the other environments: a whole episode is made, and with fixed
 # anchors measured, in one go at reset, which makes an epoch several times as fast. The tests hold
@@ -48,16 +47,6 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     | `anchors` | (M, 3) | float64 | places of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
     | `quality` | (M,) | float64 | share of a link's information that an anchor's sight of the body leaves: 1 in sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
-
-    ``observation="statistic"``: what a linear filter needs of the squared ranges, in place of
-    `ranges` and `links`; no range is drawn, only 12 normals per epoch, and the law of G and B
-    is the same (`rbl_gym.statistic`). For scenes with a `SquaredRangeNoise` whose links never
-    fail.
-
-    | key | shape | type | meaning |
-    |---|---|---|---|
-    | `G` | (3, 3) | float64 | information that the anchors give about a tag, 1/m^2 |
-    | `B` | (3, 4) | float64 | moments of the squared ranges with the tags' coordinates and 1 |
 
     ## Reward
     ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square
@@ -95,8 +84,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     )
     ```
     `scene`: a name of `rbl_gym.scenes.SCENES` or a dict of overrides, see
-    `rbl_gym.scenes.get`. `reward`: ``"bound"`` or ``"none"``. `observation`: ``"ranges"`` or
-    ``"statistic"``.
+    `rbl_gym.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
 
     ## Version history
     * v0: first version.
@@ -112,14 +100,12 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         scene: str | Mapping[str, Any] = "uwb_room",
         reward: str = "bound",
         render_mode: str | None = None,
-        observation: str = "ranges",
     ) -> None:
         self.scene = scenes.get(scene)
         self.film = rendering.film_of(render_mode, self.scene)
         self.reward_mode = check_one_of("reward", reward, REWARDS)
         self.render_mode = render_mode
-        self.statistic = is_statistic(observation, self.scene)
-        self.observation_space = observation_space(self.scene, self.statistic)
+        self.observation_space = observation_space(self.scene)
         self.action_space = action_space(self.scene)
         self._episode: simulation.Episode | None = None
         self._epoch = 0
@@ -135,7 +121,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         """Start an episode; the measurements are those of epoch 0. `options` must be empty."""
         check_options(options)
         super().reset(seed=seed)
-        episode = simulation.draw_episode(self.scene, self.np_random, statistic=self.statistic)
+        episode = simulation.draw_episode(self.scene, self.np_random)
         self._episode = episode
         self._epoch = 0
         self._anchors = episode.anchors.copy()
@@ -144,9 +130,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self._measured: dict[str, np.ndarray] | None = None
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
-            self._measured = measure(
-                self.scene, self.statistic, at, episode.anchors, self._positions
-            )
+            self._measured = measure(self.scene, at, episode.anchors, self._positions)
         self._covariance = episode.prior_covariance
         if self.reward_mode == "bound":
             self._start_bound(episode)
@@ -175,24 +159,23 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         k = self._epoch
         at = simulation.Epoch(*(f if f is None else f[k] for f in self._whole))  # pyright: ignore[reportArgumentType]
         if self._measured is None:
-            observation = measure(self.scene, self.statistic, at, self._anchors, self._positions[k])
+            observation = measure(self.scene, at, self._anchors, self._positions[k])
         else:
             observation = {key: field[k].copy() for key, field in self._measured.items()}
         info: dict[str, Any] = {
             "rotation": at.rotation.copy(),
             "translation": at.translation.copy(),
             "epoch": k,
+            "nlos": observation.pop("nlos"),
         }
-        if not self.statistic:
-            info["nlos"] = observation.pop("nlos")
         reward = 0.0
         if self.reward_mode == "bound":
-            info["score_m"] = self._carry_bound(at, links_of(observation, self.scene))
+            info["score_m"] = self._carry_bound(at, observation["links"].view(np.bool_))
             reward = -math.log(info["score_m"])
         if self.film is not None:
             bound = self._covariance[None] if self.reward_mode == "bound" else None
             links, pose = (
-                links_of(observation, self.scene),
+                observation["links"].view(np.bool_),
                 (at.rotation[None], at.translation[None]),
             )
             self.film.take([k], rendering.shot(links[None], self._anchors[None], *pose, bound))
@@ -209,7 +192,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self._course = scene_bounds.posterior_course(self.scene, episode)
         self._informations: FloatArray | None = None
         if self._measured is not None:
-            links = links_of(self._measured, self.scene, (self.scene.steps + 1,))
+            links = self._measured["links"].view(np.bool_)
             shares = simulation.shares(self.scene, self._whole, episode.anchors, links)
             self._informations = self._course.information(
                 slice(None), episode.anchors, self.scene.noise, shares
@@ -228,24 +211,13 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         return self._course.score(k, self._covariance)
 
 
-def is_statistic(observation: str, scene: Scene) -> bool:
-    """Whether the statistic is to be observed, or a ValueError where the scene has none."""
-    if check_one_of("observation", observation, OBSERVATIONS) == "ranges":
-        return False
-    simulation.check_has_statistic(scene)
-    return True
-
-
 def measure(
     scene: Scene,
-    statistic: bool,
     at: simulation.Epoch,
     anchors: FloatArray,
     positions: FloatArray | None = None,
 ) -> dict[str, np.ndarray]:
-    """What an epoch tells: G and B, or ranges and links with `nlos` and maybe `quality`."""
-    if statistic:
-        return simulation.measure_statistic(scene, at, anchors)._asdict()
+    """What an epoch tells: ranges and links with `nlos`, behind obstacles `quality`."""
     quality = simulation.link_quality(scene, at, anchors) if scene.obstacles else None
     measured = simulation.measure(scene, at, anchors, positions, quality)
     told: dict[str, np.ndarray] = {
@@ -256,15 +228,6 @@ def measure(
     if quality is not None:
         told["quality"] = np.ascontiguousarray(quality)
     return told
-
-
-def links_of(
-    told: Mapping[str, np.ndarray], scene: Scene, batch: tuple[int, ...] = ()
-) -> BoolArray:
-    """Links (..., M, N) of what `measure` told: all of them where it is the statistic."""
-    if "links" in told:
-        return told["links"].view(np.bool_)
-    return np.ones((*batch, scene.n_anchors, len(scene.tags)), dtype=np.bool_)
 
 
 def check_action(action: ArrayLike, size: int) -> FloatArray:
@@ -285,7 +248,7 @@ def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
     return action.shape == shape and action.dtype.kind in "iub" and not action.any()
 
 
-def observation_space(scene: Scene, statistic: bool = False) -> spaces.Dict:
+def observation_space(scene: Scene) -> spaces.Dict:
     """Finite bounds of a scene's observations."""
     links = (scene.n_anchors, len(scene.tags))
     low, high = scene.anchor_region.bounds()
@@ -302,31 +265,12 @@ def observation_space(scene: Scene, statistic: bool = False) -> spaces.Dict:
     keys: dict[str, spaces.Space[Any]] = {
         "anchors": spaces.Box(low, high, dtype=np.float64),
         "twist": spaces.Box(-twist, twist, dtype=np.float64),
+        "ranges": spaces.Box(0.0, scene.range_limit_m, links, np.float64),
+        "links": spaces.MultiBinary(links),
     }
-    if statistic:
-        G, B = _statistic_limits(scene)
-        keys["G"] = spaces.Box(-G, G, (3, 3), np.float64)
-        keys["B"] = spaces.Box(-B, B, (3, 4), np.float64)
-        return spaces.Dict(keys)
-    keys["ranges"] = spaces.Box(0.0, scene.range_limit_m, links, np.float64)
-    keys["links"] = spaces.MultiBinary(links)
     if scene.obstacles:
         keys["quality"] = spaces.Box(0.0, 1.0, (scene.n_anchors,), np.float64)
     return spaces.Dict(keys)
-
-
-def _statistic_limits(scene: Scene) -> tuple[float, float]:
-    """Numbers that no entry of G or B exceeds.
-
-    ``tr G <= 4 sum_m |a_m - s_1|^2 / var_m = 4 M / sigma^2``; of ``G [Q t] S + L Z F^T``,
-    ``S = C_e C_e^T = F F^T``, the norms of the factors, with normals below 10.
-    """
-    assert isinstance(scene.noise, ranging.SquaredRangeNoise)
-    tags = np.asarray(scene.tags)
-    G = 4.0 * scene.n_anchors / scene.noise.sigma_m**2
-    S = float((tags**2).sum()) + len(tags)
-    place = float(np.abs(scene.volume.bounds()).max()) * math.sqrt(3) + scene.range_limit_m
-    return G, G * S * math.sqrt(3 + place**2) + math.sqrt(G * S) * 10 * math.sqrt(12)
 
 
 def action_space(scene: Scene) -> spaces.Space[Any]:

@@ -16,8 +16,6 @@ from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import (
     REWARDS,
     action_space,
-    is_statistic,
-    links_of,
     measure,
     observation_space,
 )
@@ -37,7 +35,7 @@ class TrackingVectorEnv(BatchEnv):
     ----------
     num_envs
         How many.
-    scene, reward, render_mode, observation
+    scene, reward, render_mode
         As `TrackingEnv`.
     max_episode_steps
         Truncate after so many steps, if fewer than the scene's.
@@ -53,16 +51,14 @@ class TrackingVectorEnv(BatchEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        observation: str = "ranges",
     ) -> None:
         self.scene = scenes.get(scene)
         self.reward_mode = check_one_of("reward", reward, REWARDS)
-        self.statistic = is_statistic(observation, self.scene)
-        self.single_observation_space = observation_space(self.scene, self.statistic)
+        self.single_observation_space = observation_space(self.scene)
         self.single_action_space = action_space(self.scene)
         self.film = rendering.film_of(render_mode, self.scene)
         self._configure(num_envs, render_mode, self.scene.steps, max_episode_steps, autoreset_mode)
-        self._episodes = EpisodeStore(self.scene, num_envs, self.statistic)
+        self._episodes = EpisodeStore(self.scene, num_envs)
         # Worlds last in memory, as in the store.
         self._anchors = np.empty((num_envs, self.scene.n_anchors, 3), order="F")
         self._prior_covariance = np.empty((num_envs, 6, 6))
@@ -107,7 +103,7 @@ class TrackingVectorEnv(BatchEnv):
         if self._seen is None:
             with whole_rows():
                 stored = self._episodes.at(self._epochs)
-                told = measure(self.scene, self.statistic, stored, self._anchors)
+                told = measure(self.scene, stored, self._anchors)
             at = stored._replace(
                 rotation=stored.rotation.copy(),
                 translation=stored.translation.copy(),
@@ -127,9 +123,8 @@ class TrackingVectorEnv(BatchEnv):
             "rotation": at.rotation,
             "translation": at.translation,
             "epoch": self._epochs.copy(),
+            "nlos": told["nlos"],
         }
-        if not self.statistic:
-            info["nlos"] = told["nlos"]
         if self.reward_mode == "bound":
             info["score_m"] = self._score_m.copy()
         return info
@@ -137,13 +132,13 @@ class TrackingVectorEnv(BatchEnv):
     def _shot(self) -> tuple[Any, None]:
         at, told = self._look()
         bound = np.linalg.inv(self._information) if self.reward_mode == "bound" else None
-        links = links_of(told, self.scene, (self.num_envs,))
+        links = told["links"].view(np.bool_)
         return rendering.shot(links, self._anchors, at.rotation, at.translation, bound), None
 
     def _carry_bound(self, rows: np.ndarray, *, started: bool) -> None:
         """The posterior Cramer-Rao bound of the worlds that started or stepped."""
         at, told = self._look()
-        anchors, links = self._anchors, links_of(told, self.scene, (self.num_envs,))
+        anchors, links = self._anchors, told["links"].view(np.bool_)
         information, prior = self._information, self._prior_covariance
         if len(rows) < self.num_envs:
             at = simulation.Epoch(*(None if field is None else field[rows] for field in at))  # pyright: ignore[reportArgumentType]
