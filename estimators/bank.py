@@ -40,6 +40,7 @@ from rbl_gym.estimators.robust_update import GATE, HUBER
 from rbl_gym.estimators.vague_start import is_vague
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.ranging import LinkNoise, NoiseLaw
+from rbl_gym.rotations import error as rotation_error
 
 # What a window of epochs forgets with each new one: about three of them count.
 _FORGET = 0.3
@@ -51,6 +52,8 @@ _DEVIATIONS, _MOST_STRAIN = 6.0, 4.0
 _LOST = -10.0
 # Rivals less likely than this against their leader (log odds) have lost.
 _BEATEN = -12.0
+# Rivals less likely than this against their leader (log odds, 3 sigma) do not widen its belief.
+_ALIVE = -4.5
 # A pose has six directions: fewer ranges than that determine none.
 _FEWEST_LINKS = 6
 
@@ -170,8 +173,23 @@ class IteratedEkfBank:
         return of_batch(self._elect(state), batch)
 
     def belief(self, state: BankState) -> PoseBelief:
-        """The leading hypothesis as a belief (copies); `probabilities` says how sure that is."""
-        return self._filter.belief(leader_of(state))
+        """The leader's pose with a covariance that covers the rivals alive (copies).
+
+        The covariance holds second moments about the leader, of every hypothesis weighed by its
+        probability; of rivals less likely than `_ALIVE` nothing. `probabilities` gives the odds,
+        and the state holds the leader's own covariance.
+        """
+        belief = self._filter.belief(leader_of(state))
+        odds = np.where(state.log_odds > _ALIVE, state.log_odds, -np.inf)
+        if np.isneginf(odds).all():
+            return belief
+        weight = np.exp(odds)[..., None, None]
+        turn = rotation_error(state.rotation[..., None, :, :], state.rival_rotation)
+        shift = state.translation[..., None, :] - state.rival_translation
+        gap = np.concatenate([turn, shift], axis=-1)
+        spread = weight * (state.rival_covariance + gap[..., None] * gap[..., None, :])
+        whole = belief.covariance + spread.sum(axis=-3)
+        return belief._replace(covariance=whole / (1 + weight.sum(axis=-3)))
 
     def probabilities(self, state: BankState) -> FloatArray:
         """Probability (..., 1 + K) of the leader and of each rival."""

@@ -9,14 +9,30 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import estimators, metrics, motion, ranging, recordings, rotations
+from rbl_gym import estimators, metrics, motion, ranging, rotations
+from rbl_gym.app.replay_mirror import DECIDED, Mirror, covering, is_outside, other_pose
+from rbl_gym.app.replay_truth import (
+    Judged,
+    check_overlap,
+    fault_hints,
+    judged_of,
+    matched,
+    stamp_hints,
+)
 from rbl_gym.checks import FloatArray, check_number
 from rbl_gym.estimators.belief import check_takes_noise
 from rbl_gym.link_bias import LinkBias
+from rbl_gym.mirror import mirror_pose
 from rbl_gym.recordings import Recording
 
 # What the planar constraint leaves to height (m), roll and pitch (rad).
 _PLANAR_STD = 1e-3
+# Coordinates beyond this are those of a map.
+_MAP_M = 1e4
+# How much wider than the belief its mirror image starts.
+_IMAGE_RAD, _IMAGE_M = 0.1, 0.2
+# How many extents of the anchors away from them the bank looks where the volume has no limit.
+_REACH = 10.0
 # Heights of anchors within this much are one plane.
 _PLANE_M = 0.1
 
@@ -48,6 +64,13 @@ class Settings:
     yaw_offset_deg
         Constant turn of the tag table against the truth's body frame: the yaw error is
         estimate - (truth + offset).
+    volume
+        Where the body's origin may be: xmin, xmax, ymin, ymax, zmin, zmax in metres, None where
+        there is no limit. It tells a pose from its mirror image.
+    below_anchors
+        The body stays below the anchors' mean height.
+    truth_gap_s
+        Longest gap, of the truth or of the ranges, that is bridged to compare the two.
     """
 
     filter: str = "iekf"
@@ -63,6 +86,9 @@ class Settings:
     planar: bool = False
     height_offset_m: float | None = None
     yaw_offset_deg: float = 0.0
+    volume: tuple[float | None, ...] | None = None
+    below_anchors: bool = False
+    truth_gap_s: float = 0.5
 
     def __post_init__(self) -> None:
         if self.range_std_m is not None:
@@ -75,29 +101,64 @@ class Settings:
         if check_number("height_offset_m", self.height_offset_m or 0.0) != 0 and not self.planar:
             raise ValueError("height_offset_m means nothing without planar")
         check_number("yaw_offset_deg", self.yaw_offset_deg)
+        check_number("truth_gap_s", self.truth_gap_s, low=0.0)
+        if self.volume is not None:
+            object.__setattr__(self, "volume", _six_limits(self.volume))
 
 
 DEFAULT_RANGE_STD_M = 0.12
 
 
+def _six_limits(volume: Any) -> tuple[float | None, ...]:
+    limits = tuple(volume)
+    if len(limits) != 6:
+        raise ValueError(
+            f"volume must be xmin, xmax, ymin, ymax, zmin, zmax, got {len(limits)} numbers"
+        )
+    limits = tuple(None if x is None else check_number("volume", x) for x in limits)
+    for axis, low, high in zip("xyz", limits[::2], limits[1::2], strict=True):
+        if low is not None and high is not None and low >= high:
+            raise ValueError(f"volume must have {axis}min below {axis}max, got {low:g}, {high:g}")
+    return limits
+
+
 class Track(NamedTuple):
-    """Beliefs after every epoch: times (K,), rotation, translation, covariance (K, 6, 6)."""
+    """Beliefs after every epoch: times (K,), rotation, translation, covariance (K, 6, 6).
+
+    `other`: the mirror pose where one explains the ranges too; the covariance covers it then.
+    """
 
     times: FloatArray
     rotation: FloatArray
     translation: FloatArray
     covariance: FloatArray
+    other: Mirror | None = None
 
 
 def run(
     recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
 ) -> Track:
-    """Filter a recording causally, epoch by epoch; `advance` is called after each."""
+    """Filter a recording causally, epoch by epoch; `advance` is called after each.
+
+    Where a mirror pose explains the ranges as well, the belief covers both (`replay_mirror`).
+    """
     beliefs = []
     for _, belief in steps(recording, settings, make_filter(recording, settings)):
         beliefs.append(belief)
         advance()
-    return track_of(recording, beliefs)
+    track = track_of(recording, beliefs)
+    if settings.planar:
+        # Height, roll and pitch are held: they tell the sides apart.
+        return track
+    std = None
+    if not _has_own_std(recording, settings):
+        std = settings.range_std_m or DEFAULT_RANGE_STD_M
+    judge = named_filter(recording, settings, "iekf", {"robust": settings.robust})
+    poses = track[1:4]
+    other = other_pose(recording, judge, std, poses, volume_of(recording, settings))
+    if other is None:
+        return track
+    return track._replace(covariance=covering(other, poses), other=other)
 
 
 def steps(
@@ -105,20 +166,64 @@ def steps(
 ) -> Iterator[tuple[Any, estimators.PoseBelief]]:
     """State and belief of a filter after every epoch of a recording, started from nothing.
 
-    Standard deviations that the recording reports itself are the law of their epoch.
+    Standard deviations that the recording reports itself are the law of their epoch. A belief
+    outside the settings' volume starts again from its mirror image, where that is inside.
+    Coordinates of a map are taken relative to the anchors; beliefs are of the world.
     """
-    state = filter.initial(*_prior(recording, settings))
-    before = recording.times[0]
-    for k, now in enumerate(recording.times):
+    origin = origin_of(recording)
+    local = recording._replace(anchors=recording.anchors - origin)
+    volume = volume_of(recording, settings)
+    volume = None if volume is None else volume - origin
+    state = filter.initial(*_prior(local, settings, volume))
+    before = local.times[0]
+    for k, now in enumerate(local.times):
         if now > before:
             state = filter.predict(state, np.zeros(6), now - before)
-        epoch = recording.ranges[k], recording.anchors, recording.links[k]
+        epoch = local.ranges[k], local.anchors, local.links[k]
         law = {}
-        if _has_own_std(recording, settings):
-            law["noise"] = ranging.LinkNoise(recording.range_std[k])
+        if _has_own_std(local, settings):
+            law["noise"] = ranging.LinkNoise(local.range_std[k])
         state = filter.update(state, *epoch, **law)
-        yield state, filter.belief(state)
+        belief = filter.belief(state)
+        if volume is not None and (image := _image_inside(local, belief, volume)) is not None:
+            state = filter.update(filter.initial(*image), *epoch, **law)
+            belief = filter.belief(state)
+        yield state, belief._replace(translation=belief.translation + origin)
         before = now
+
+
+def _image_inside(
+    recording: Recording, belief: estimators.PoseBelief, volume: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """The mirror image of a belief that is outside the volume, if that is inside; widened."""
+    if not is_outside(volume, belief.translation, belief.covariance):
+        return None
+    image = mirror_pose(*belief[:3], recording.anchors, recording.tags)
+    if is_outside(volume, *image[1:]):
+        return None
+    # Of anchors nearly in a plane the image is near the best pose, not at it.
+    widened = image[2] + np.diag([_IMAGE_RAD**2] * 3 + [_IMAGE_M**2] * 3)
+    return image[0], image[1], widened
+
+
+def origin_of(recording: Recording) -> FloatArray:
+    """Where coordinates (3,) are taken from: the origin, or for those of a map the anchors."""
+    if np.abs(recording.anchors).max() < _MAP_M:
+        return np.zeros(3)
+    return np.round(recording.anchors.mean(axis=0))
+
+
+def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
+    """Corners (2, 3) of where the body may be, infinite where there is no limit; None: anywhere."""
+    if settings.volume is None and not settings.below_anchors:
+        return None
+    limits = settings.volume or (None,) * 6
+    low = [-np.inf if x is None else x for x in limits[::2]]
+    high = [np.inf if x is None else x for x in limits[1::2]]
+    if settings.below_anchors:
+        seen = recording.links.any(axis=(0, 2))
+        high[2] = min(high[2], float(recording.anchors[seen, 2].mean()))
+    return np.array([low, high])
 
 
 def range_std_of(recording: Recording, settings: Settings) -> float | str:
@@ -164,6 +269,13 @@ def named_filter(
     else:
         process = motion.ProcessNoise(turn, walk)
     noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
+    volume = volume_of(recording, settings)
+    if name == "iekf-bank" and volume is not None:
+        # The bank looks for a lost body in its volume, which is finite.
+        anchors = recording.anchors
+        reach = _REACH * max(float(np.ptp(anchors, axis=0).max()), 1.0)
+        box = np.clip(volume, anchors.min(axis=0) - reach, anchors.max(axis=0) + reach)
+        options = {"volume": box - origin_of(recording), **options}
     laws = {"tags": recording.tags, "noise": noise, "process": process}
     filter = estimators.make(name, **laws, **options)
     if _has_own_std(recording, settings):
@@ -199,11 +311,18 @@ def _options(settings: Settings) -> dict[str, Any]:
     return {}
 
 
-def _prior(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _prior(
+    recording: Recording, settings: Settings, volume: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Anywhere among the anchors, turned anyhow; the plane, where there is one, is known."""
     centre = recording.anchors.mean(axis=0)
     extent = max(float(np.ptp(recording.anchors, axis=0).max()), 1.0)
     std = np.array([math.pi] * 3 + [extent] * 3)
+    if volume is not None:
+        bounded = np.isfinite(volume).all(axis=0)
+        centre = np.where(bounded, np.where(bounded, volume, 0.0).mean(axis=0), centre)
+        half = 0.5 * np.diff(np.where(bounded, volume, 0.0), axis=0)[0]
+        std[3:] = np.where(bounded, half, std[3:])
     if settings.planar:
         centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
         std[[0, 1, 5]] = _PLANAR_STD
@@ -240,24 +359,23 @@ def truth_of(
 ) -> tuple[FloatArray, FloatArray, np.ndarray] | None:
     """What the estimates are judged by: rotation (K, 3, 3), translation (K, 3), known (K,).
 
-    The recording's truth, interpolated and turned by the offset; planar: its heading alone.
+    The recording's truth (`replay_truth.matched`), turned by the offset; planar: its heading alone.
     """
     if recording.truth is None:
         return None
-    rotation, translation, known = recordings.truth_at(recording.truth, track.times)
-    if not known.any():
-        spans = [
-            f"{times[0]:g} to {times[-1]:g} s" for times in (track.times, recording.truth.times)
-        ]
-        raise ValueError(
-            f"truth shares no time with the ranges: ranges {spans[0]}, truth {spans[1]}"
-        )
+    check_overlap(recording.truth, track.times, settings.truth_gap_s)
+    rotation, translation, known = matched(recording.truth, *track[:3], settings.truth_gap_s)
+    return _as_judged(rotation, settings), translation, known
+
+
+def _as_judged(rotation: FloatArray, settings: Settings) -> FloatArray:
+    """Rotations (K, 3, 3) of the truth, turned by the offset; planar: their headings."""
     offset = rotations.exp([0.0, 0.0, math.radians(settings.yaw_offset_deg)])
     if settings.planar:
-        heading = np.zeros((len(known), 3))
+        heading = np.zeros((len(rotation), 3))
         heading[:, 2] = rotations.yaw(rotation)
         rotation = rotations.exp(heading)
-    return offset @ rotation, translation, known
+    return offset @ rotation
 
 
 def errors(recording: Recording, track: Track, settings: Settings) -> Errors | None:
@@ -299,6 +417,7 @@ def figures(
         "duration_s": float(track.times[-1] - track.times[0]),
         "links": int(recording.links.sum()),
     }
+    result |= _notes(recording, track, found, settings)
     if found is None:
         return result
     known = found.known
@@ -315,3 +434,51 @@ def figures(
     result["yaw_mean_deg"] = float(yaw.mean())
     result["anees"] = float(found.nees[known].mean() / (3 if settings.planar else 6))
     return result
+
+
+def _notes(
+    recording: Recording, track: Track, found: Errors | None, settings: Settings
+) -> dict[str, Any]:
+    """The mirror pose, and what a reader is to be warned of, a sentence each."""
+    result: dict[str, Any] = {}
+    notes = [f"Note: {hint}." for hint in stamp_hints(track.times, recording.truth)]
+    count = len(track.times)
+    if track.other is not None and np.isfinite(track.other.log_odds[-1]):
+        alive = track.other.alive
+        apart = np.linalg.norm(track.other.translation - track.translation, axis=-1)
+        result["mirror"] = {
+            "epochs": int(alive.sum()),
+            "distance_m": float(np.median(apart[alive])),
+            "log_odds": float(track.other.log_odds[alive][-1]),
+        }
+        notes.append(_mirror_note(result["mirror"], count))
+    volume = volume_of(recording, settings)
+    if volume is not None:
+        outside = int(is_outside(volume, track.translation, track.covariance).sum())
+        result["epochs_outside_volume"] = outside
+        if outside:
+            notes.append(f"Note: the track is outside the volume in {outside} of {count} epochs.")
+    if found is not None:
+        notes += [f"Note: {hint}." for hint in _fault_hints(recording, track, settings)]
+    return {**result, "notes": notes}
+
+
+def _mirror_note(found: dict[str, Any], count: int) -> str:
+    as_well = "better" if found["log_odds"] > DECIDED else "as well"
+    return (
+        f"WARNING: a mirror pose behind the anchors' plane, {found['distance_m']:.2f} m away, "
+        f"explains the ranges {as_well} in {found['epochs']} of {count} epochs. The belief covers "
+        "both. Say where the body is: --below-anchors or --volume."
+    )
+
+
+def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list[str]:
+    truth = recording.truth
+    assert truth is not None
+
+    def at(late_s: float) -> Judged:
+        moved = truth._replace(times=truth.times - late_s)
+        there = matched(moved, *track[:3], settings.truth_gap_s)
+        return judged_of(there, track, settings.planar)
+
+    return fault_hints(at, lambda rotation: _as_judged(rotation, settings), settings.planar)

@@ -47,6 +47,25 @@ def add_replay(commands: Any) -> None:
         metavar="X",
         help="yaw error = estimate - (truth + offset)",
     )
+    replay.add_argument(
+        "--truth-gap-s",
+        type=float,
+        default=0.5,
+        metavar="X",
+        help="longest gap that is bridged between truth and ranges, default 0.5",
+    )
+    replay.add_argument(
+        "--volume",
+        type=_volume,
+        metavar="xmin,xmax,ymin,ymax,zmin,zmax",
+        help="where the body's origin may be, metres: tells a pose from its mirror image; empty "
+        "where there is no limit, as in --volume=,,,,,1.8; write --volume=-1,... for a minus",
+    )
+    replay.add_argument(
+        "--below-anchors",
+        action="store_true",
+        help="the body stays below the anchors' mean height",
+    )
     replay.add_argument("--filter", metavar="NAME", help="default iekf, iekf-bias with a bias")
     replay.add_argument(
         "--range-std-m",
@@ -114,7 +133,7 @@ def add_replay(commands: Any) -> None:
 
 def _replay(options: argparse.Namespace) -> int:
     from rbl_gym import recordings
-    from rbl_gym.app import replay
+    from rbl_gym.app import replay, replay_truth
 
     check_html(options)
     settings = replay.Settings(
@@ -128,6 +147,9 @@ def _replay(options: argparse.Namespace) -> int:
         planar=options.planar,
         height_offset_m=options.height_offset_m,
         yaw_offset_deg=options.yaw_offset_deg,
+        volume=options.volume,
+        below_anchors=options.below_anchors,
+        truth_gap_s=options.truth_gap_s,
     )
     recording = recordings.read_recording(
         options.ranges, options.anchors, options.tags, options.truth, options.calibration
@@ -136,6 +158,8 @@ def _replay(options: argparse.Namespace) -> int:
     offset = replay.height_offset(recording, settings)
     settings = dataclasses.replace(settings, height_offset_m=offset)
     replay.make_filter(recording, settings)
+    if recording.truth is not None:
+        replay_truth.check_overlap(recording.truth, recording.times, settings.truth_gap_s)
     with progress("replay", len(recording.times)) as advance:
         track = replay.run(recording, settings, advance)
     found = replay.errors(recording, track, settings)
@@ -171,3 +195,16 @@ def _bias(options: argparse.Namespace) -> dict[str, Any]:
     if given and name != "iekf-bias":
         raise ValueError(f"{name} knows no biases: --raw and --bias-... are of iekf-bias")
     return {"filter": name, **given}
+
+
+def _volume(text: str) -> tuple[float | None, ...]:
+    """Six numbers with commas, some of which may be empty."""
+    try:
+        limits = [float(part) if part.strip() else None for part in text.split(",")]
+    except ValueError:
+        limits = []
+    if len(limits) != 6:
+        raise argparse.ArgumentTypeError(
+            f"must be xmin,xmax,ymin,ymax,zmin,zmax in metres, got {text!r}"
+        )
+    return tuple(limits)

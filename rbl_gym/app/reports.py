@@ -129,7 +129,9 @@ def print_replay(result: dict[str, Any]) -> None:
     )
     if "epochs_with_truth" not in result:
         console.print("no truth, no errors")
+        _print_notes(console, result)
         return
+    console.print(f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth")
     table = Table()
     for heading in ("error", "RMSE", "median", "p95"):
         table.add_column(heading, justify="left" if heading == "error" else "right")
@@ -143,6 +145,12 @@ def print_replay(result: dict[str, Any]) -> None:
         f"mean yaw error {result['yaw_mean_deg']:.2f} deg, NEES per degree of freedom "
         f"{result['anees']:.2f} (1: honest; above: overconfident)"
     )
+    _print_notes(console, result)
+
+
+def _print_notes(console: Console, result: dict[str, Any]) -> None:
+    for note in result["notes"]:
+        console.print(note, markup=False, soft_wrap=True)
 
 
 def print_training(result: dict[str, Any]) -> None:

@@ -111,7 +111,7 @@ def replay(recording: Recording, track: Track, result: dict[str, Any], settings:
     """A recording: the track, its errors where truth exists, the figures of the run."""
     truth = truth_of(recording, track, settings)
     times = track.times - track.times[0]
-    beliefs = Beliefs(*track[1:], COLOURS["iterated EKF"])
+    beliefs = Beliefs(*track[1:4], COLOURS["iterated EKF"])
     story = Story(
         times, recording.anchors, recording.anchor_ids, recording.tags, truth,
         {settings.filter: beliefs}, "xy" if settings.planar else "xyz",

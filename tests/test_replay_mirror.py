@@ -1,0 +1,182 @@
+"""Mirror poses of recordings: named where the ranges leave them, ruled out where they do not."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from rbl_gym import metrics, motion, ranging, rotations
+from rbl_gym.app import replay, reports
+from rbl_gym.recordings import Recording, Truth
+
+ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2], [8, 3, 0.5]])
+CEILING = np.array([[0, 0, 2], [0, 3, 2], [4, 3, 2], [4, 0, 2], [1.3, 1, 2], [2.6, 1.5, 2.0]])
+WALL = CEILING[:, [2, 0, 1]] - [2, 0, 0]  # in the plane x = 0
+FLAT = np.array([[0.2, 0.15, 0], [-0.2, 0.15, 0], [-0.2, -0.15, 0], [0.2, -0.15, 0]])
+SOLID = FLAT + [[0, 0, 0.3], [0, 0, 0], [0, 0, 0.2], [0, 0, -0.1]]
+OPTIONS = {"walk_m": 0.3, "walk_deg": 20.0, "range_std_m": 0.03}
+
+
+def record(anchors, tags, seed=0, epochs=25, noise_m=0.03, start=(1.5, 1.2, 0.8)):
+    """A body that turns and flies at 0.3 m/s, at 10 Hz, with its truth."""
+    rng = np.random.default_rng(seed)
+    twist = [0.05, 0, 0.3, 0.25, 0.1, 0.05]
+    first = rotations.exp(np.array([0.1, -0.1, 0.5]))
+    path = motion.simulate(
+        motion.constant_twist(first, list(start), twist, epochs - 1), 0.1, motion.ProcessNoise()
+    )
+    exact = ranging.distances(anchors, ranging.tag_positions(path.rotation, path.translation, tags))
+    ranges = exact + noise_m * rng.standard_normal(exact.shape)
+    ids = tuple(map(str, range(len(anchors)))), tuple(map(str, range(len(tags))))
+    times = 0.1 * np.arange(epochs)
+    truth = Truth(times, path.rotation, path.translation)
+    return Recording(times, ranges, ranges > 0, None, anchors, tags, *ids, truth)
+
+
+def outcome(recording, **options):
+    settings = replay.Settings(**{**OPTIONS, **options})
+    track = replay.run(recording, settings)
+    found = replay.errors(recording, track, settings)
+    return track, replay.figures(recording, track, found, settings)
+
+
+@pytest.mark.parametrize("name", ["iekf", "iekf-bank", "iekf-bias"])
+@pytest.mark.parametrize("anchors", [CEILING, WALL], ids=["ceiling", "wall"])
+def test_a_mirror_pose_is_named_and_the_belief_covers_it(name, anchors):
+    """Whichever side the filter is on: the truth is within what its belief expects."""
+    recording = record(anchors, FLAT)
+    track, result = outcome(recording, filter=name)
+    assert result["mirror"]["epochs"] > 20
+    assert any("--volume" in note for note in result["notes"])
+    assert result["anees"] < 1.5
+    height = np.sqrt(track.covariance[10, 3:, 3:].trace())
+    assert height > 0.5
+    truth = recording.truth.translation
+    nearer = np.minimum(*(
+        np.linalg.norm(pose - truth, axis=-1)
+        for pose in (track.translation, track.other.translation)
+    ))  # fmt: skip
+    assert np.sqrt((nearer[5:] ** 2).mean()) < 0.1
+
+
+@pytest.mark.parametrize("name", ["iekf", "iekf-bank", "iekf-bias"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_volume_tells_the_sides_apart(name, seed):
+    recording = record(CEILING, FLAT, seed)
+    for options in ({"below_anchors": True}, {"volume": (None, None, None, None, None, 2.0)},
+                    {"volume": (0, 4, 0, 3, 0, 1.9)}):  # fmt: skip
+        track, result = outcome(recording, filter=name, **options)
+        assert "mirror" not in result
+        assert result["notes"] == []
+        assert result["epochs_outside_volume"] == 0
+        assert result["position_rmse_m"] < 0.1
+        assert np.sqrt(track.covariance[10, 3:, 3:].trace()) < 0.2
+    _, above = outcome(recording, filter=name, volume=(None, None, None, None, 2.1, None))
+    assert "mirror" not in above
+    assert above["position_rmse_m"] > 2
+
+
+@pytest.mark.parametrize("name", ["iekf", "iekf-bank"])
+@pytest.mark.parametrize(
+    ("anchors", "tags"), [(ROOM, SOLID), (ROOM, FLAT), (CEILING, SOLID)],
+    ids=["room", "room, flat body", "ceiling, solid body"],
+)  # fmt: skip
+def test_no_word_where_the_ranges_tell_the_sides_apart(name, anchors, tags):
+    for seed in range(3):
+        # Under a ceiling a filter that began on the wrong side is told of the better pose.
+        _, result = outcome(record(anchors, tags, seed), filter=name)
+        wrong = result["position_rmse_m"] > 0.5
+        assert ("mirror" in result) == wrong
+        assert result["anees"] < 2
+        if wrong:
+            assert "better" in result["notes"][0]
+
+
+def test_ranges_decide_by_what_they_leave_not_by_the_deviation_told():
+    """Anchors nearly in a plane, ten times too wide a deviation: still no false alarm."""
+    lifted = CEILING + np.array([0, 0.3, 0, -0.3, 0, 0.2])[:, None] * [0, 0, 1]
+    _, result = outcome(record(lifted, FLAT, noise_m=0.01, epochs=40), range_std_m=0.1)
+    assert "mirror" not in result
+
+
+def test_one_range_at_a_time():
+    """Ranges of a ceiling, each with its own time and deviation; the track is given."""
+    whole = record(CEILING, FLAT, epochs=60)
+    count = len(whole.times)
+    one = np.zeros(whole.ranges.shape, bool)
+    one.reshape(count, -1)[np.arange(count), np.arange(count) * 5 % 24] = True
+    recording = whole._replace(
+        links=one, ranges=whole.ranges * one, range_std=np.where(one, 0.03, 0.0)
+    )
+    settings = replay.Settings(walk_m=0.3, walk_deg=20)
+    judge = replay.make_filter(recording, settings)
+    P = np.broadcast_to(1e-3 * np.eye(6), (count, 6, 6))
+    poses = whole.truth.rotation, whole.truth.translation, P
+    other = replay.other_pose(recording, judge, None, poses)
+    assert other.alive[-10:].all()
+    np.testing.assert_allclose(other.translation[-10:, 2] - 2, 2 - poses[1][-10:, 2], atol=0.3)
+    room = record(ROOM, FLAT, epochs=60)
+    recording = room._replace(links=one, ranges=room.ranges * one, range_std=0.03 * one)
+    other = replay.other_pose(recording, judge, None, poses)
+    assert other is None or np.isneginf(other.log_odds[-1])
+
+
+def test_a_mirrored_planar_track_is_held_by_its_height():
+    recording = record(CEILING, FLAT)
+    assert replay.run(recording, replay.Settings(planar=True, height_offset_m=1.2)).other is None
+
+
+def test_map_coordinates_give_the_track_of_local_ones():
+    shift = np.array([448_262.0, 5_411_932.0, 310.0])
+    near = record(CEILING, SOLID)
+    far = near._replace(
+        anchors=near.anchors + shift,
+        truth=near.truth._replace(translation=near.truth.translation + shift),
+    )
+    for name in ("iekf", "iekf-bank"):
+        tracks = [
+            replay.run(recording, replay.Settings(**OPTIONS, filter=name, below_anchors=True))
+            for recording in (near, far)
+        ]
+        np.testing.assert_allclose(tracks[0].rotation, tracks[1].rotation, atol=1e-4)
+        gap = tracks[1].translation - shift - tracks[0].translation
+        np.testing.assert_allclose(gap, 0, atol=1e-4)
+
+
+def test_the_note_is_printed(capsys):
+    _, result = outcome(record(CEILING, FLAT))
+    reports.print_replay(json.loads(json.dumps(result)))
+    shown = capsys.readouterr().out
+    assert "25 of 25 epochs have truth" in shown
+    assert "a mirror pose behind the anchors' plane" in shown
+
+
+@pytest.mark.parametrize(
+    ("volume", "message"),
+    [((0, 1, 0, 1), "volume must be xmin, .*, got 4"), ((1, 0, 0, 1, 0, 1), "xmin below xmax"),
+     ((0, np.nan, 0, 1, 0, 1), "volume must be")],
+)  # fmt: skip
+def test_wrong_volumes_are_named(volume, message):
+    with pytest.raises(ValueError, match=message):
+        replay.Settings(volume=volume)
+
+
+def test_the_bank_covers_its_rivals():
+    """Its covariance is the second moment about the leader of a mixture."""
+    recording = record(CEILING, FLAT)
+    settings = replay.Settings(**OPTIONS, filter="iekf-bank")
+    bank = replay.make_filter(recording, settings)
+    states = [state for state, _ in replay.steps(recording, settings, bank)]
+    state, belief = states[3], bank.belief(states[3])
+    share = bank.probabilities(state)
+    poses = [(state.rotation, state.translation, state.covariance)]
+    poses += zip(state.rival_rotation, state.rival_translation, state.rival_covariance, strict=True)
+    expected = 0
+    for p, (R, t, P) in zip(share, poses, strict=True):
+        e = metrics.pose_error(state.rotation, state.translation, R, t)
+        expected = expected + p * (P + np.outer(e, e))
+    assert share[1] > 0.1
+    np.testing.assert_allclose(belief.covariance, expected, rtol=0.05, atol=1e-3)
+    np.testing.assert_array_equal(belief.translation, state.translation)

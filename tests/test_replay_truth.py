@@ -1,0 +1,189 @@
+"""Truth beside a track: what is compared, what is said where little or nothing is, and hints."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from rbl_gym import motion, recordings, rotations
+from rbl_gym.app import replay
+from rbl_gym.app.replay_truth import check_overlap, matched, stamp_hints
+from rbl_gym.recordings import Recording, Truth
+
+STD_RAD, STD_M = 0.03, 0.03
+ANCHORS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])
+
+
+def moving(step_s, duration_s=10.0, start_s=0.0):
+    """Times and poses on a curve that speeds up and slows down, turns and tilts."""
+    times = np.arange(start_s, duration_s, step_s)
+    turn = np.stack([0.3 * np.sin(0.7 * times), 0.2 * np.cos(times), 0.4 * times], axis=-1)
+    place = np.stack(
+        [3 + 2 * np.sin(0.5 * times), 3 + 1.5 * np.sin(0.8 * times), 1 + 0.4 * np.cos(times)], -1
+    )
+    return times, rotations.exp(turn), place
+
+
+def pair(truth, step_s=0.1, seed=0):
+    """A recording with this truth, and an honest track of the curve."""
+    rng = np.random.default_rng(seed)
+    times, rotation, place = moving(step_s)
+    rotation = rotations.exp(STD_RAD * rng.standard_normal(place.shape)) @ rotation
+    place = place + STD_M * rng.standard_normal(place.shape)
+    P = np.diag([STD_RAD**2] * 3 + [STD_M**2] * 3)
+    track = replay.Track(times, rotation, place, np.tile(P, (len(times), 1, 1)))
+    links = np.ones((len(times), 4, 1), bool)
+    ids = tuple("abcd"), ("t",)
+    recording = Recording(times, 5.0 * links, links, None, ANCHORS, np.zeros((1, 3)), *ids, truth)
+    return recording, track
+
+
+def outcome(truth, settings=replay.Settings(), **options):  # noqa: B008
+    recording, track = pair(truth, **options)
+    return replay.figures(recording, track, replay.errors(recording, track, settings), settings)
+
+
+@pytest.mark.parametrize("step_s", [0.01, 0.1, 0.37])
+def test_an_honest_track_has_no_hints(step_s):
+    result = outcome(Truth(*moving(step_s)))
+    assert result["notes"] == []
+    assert result["epochs_with_truth"] >= 97
+    assert result["anees"] == pytest.approx(1, abs=0.25)
+
+
+@pytest.mark.parametrize(("start_s", "count"), [(0.05, 10), (0.0, 10), (0.41, 10)])
+def test_truth_at_1_hz_is_compared_at_its_own_poses(start_s, count):
+    result = outcome(Truth(*moving(1.0, start_s=start_s)))
+    assert result["epochs_with_truth"] == count
+    assert result["notes"] == []
+    # Halfway between two epochs errors average: half the square.
+    assert 0.2 < result["anees"] < 2
+
+
+def test_sparse_poses_are_compared_exactly_and_dense_ones_as_they_were():
+    dense, sparse = moving(0.02, 5.0), moving(1.0, 10.0, 6.03)
+    truth = Truth(*(np.concatenate(pair) for pair in zip(dense, sparse, strict=True)))
+    times, rotation, place = moving(0.1)
+    turned, moved, known = matched(truth, times, rotation, place, 0.5)
+    old = recordings.truth_at(truth, times, 0.5)
+    np.testing.assert_array_equal(turned[old[2]], old[0][old[2]])
+    np.testing.assert_array_equal(moved[old[2]], old[1][old[2]])
+    np.testing.assert_array_equal(np.flatnonzero(known & ~old[2]), [60, 70, 80, 90])
+    # The track is the truth: what is left is how far a curve is from its chords.
+    np.testing.assert_allclose(moved[known], place[known], atol=2e-3)
+    assert np.abs(rotations.error(turned[known], rotation[known])).max() < 2e-3
+
+
+def test_gaps_in_both_are_named():
+    ranges, truth = np.arange(0, 10, 1.0), Truth(*moving(1.0, start_s=0.5))
+    with pytest.raises(ValueError, match=r"gaps above 0.5 s are not bridged, .* 1 s in the truth "
+                                         r"and 1 s in the ranges .*--truth-gap-s"):  # fmt: skip
+        check_overlap(truth, ranges, 0.5)
+    check_overlap(truth, ranges, 1.0)
+    check_overlap(truth._replace(times=truth.times - 0.5), ranges, 0.5)
+
+
+def test_no_common_time_names_what_lies_between():
+    times, rotation, place = moving(0.1)
+    with pytest.raises(ValueError, match=r"shares no time with the ranges: .* 5 s apart$"):
+        check_overlap(Truth(times[:20] + 14.9, rotation[:20], place[:20]), times, 0.5)
+    with pytest.raises(ValueError, match="their clocks may differ by about -1700000000 s"):
+        check_overlap(Truth(times + 1.7e9, rotation, place), times, 0.5)
+    with pytest.raises(ValueError, match="the stamps of the truth look like milliseconds"):
+        check_overlap(Truth(1e3 * times + 50, rotation, place), times, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
+)
+def test_stamps_in_another_unit_are_hinted(scale, unit):
+    times, rotation, place = moving(0.1)
+    truth = Truth(times, rotation, place)
+    hints = [*stamp_hints(scale * times, truth)]
+    assert len(hints) == 1
+    assert f"the stamps of the ranges look like {unit}" in hints[0]
+    late = Truth(scale * times, rotation, place)
+    assert f"the stamps of the truth look like {unit}" in next(stamp_hints(times, late))
+    assert "milliseconds?" in next(stamp_hints(1e3 * times, None))
+    assert [*stamp_hints(times, truth), *stamp_hints(times, None)] == []
+    # A truth of a part of the run is no fault.
+    assert [*stamp_hints(times, Truth(times[:5], rotation[:5], place[:5]))] == []
+
+
+def transformed(world=(0, 0, 0), shift=(0, 0, 0), body=(0, 0, 0), arm=(0, 0, 0), late_s=0.0):
+    times, rotation, place = moving(0.05)
+    R, C = rotations.exp(np.array(world, float)), rotations.exp(np.array(body, float))
+    place = place + rotation @ np.array(arm, float)
+    return Truth(times + late_s, R @ rotation @ C, place @ R.T + np.array(shift, float))
+
+
+QUATERNION = rotations.quaternion(moving(0.05)[1])
+TIMES, _, PLACE = moving(0.05)
+FAULTS = {
+    "xyzw as wxyz": (
+        Truth(TIMES, rotations.from_quaternion(np.roll(QUATERNION, -1, axis=-1)), PLACE),
+        "quaternions look like x, y, z, w",
+    ),
+    "wxyz as xyzw": (
+        Truth(TIMES, rotations.from_quaternion(np.roll(QUATERNION, 1, axis=-1)), PLACE),
+        "quaternions look like w, x, y, z",
+    ),
+    "world to body": (
+        Truth(TIMES, np.swapaxes(moving(0.05)[1], 1, 2), PLACE), "rotations look inverted",
+    ),
+    "centimetres": (Truth(TIMES, moving(0.05)[1], 100 * PLACE), "places look like centimetres"),
+    "late": (transformed(late_s=0.3), r"stamps look about 0.(25|30|35) s late"),
+    "early": (transformed(late_s=-0.4), r"stamps look about 0.(35|40|45) s early"),
+    "shift": (transformed(shift=(5, -2, 0.3)), r"world frame, turned by \(.*shifted by \(-5\.0"),
+    "map": (transformed(shift=(448262, 5411932, 310)), "world frame"),
+    "north-east-down": (transformed((np.pi / 2**0.5, np.pi / 2**0.5, 0)), "world frame"),
+    "turned frame": (transformed((0, 0, 0.6), (1, 2, 0)), "world frame"),
+    "marker off the body": (transformed(arm=(0.3, 0.1, -0.2)), "body frame.*shifted by"),
+    "marker turned": (transformed(body=(0.1, 0, 0.5)), r"body frame, turned by \(-\d\.\d, "),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("step_s", [0.05, 1.0])
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_constant_fault_is_hinted(name, step_s):
+    truth, words = FAULTS[name]
+    stride = round(step_s / 0.05)
+    result = outcome(Truth(*(a[::stride] for a in truth)))
+    assert len(result["notes"]) == 1, result["notes"]
+    assert re.search(words, result["notes"][0]), result["notes"]
+
+
+def test_two_faults_are_both_hinted():
+    truth = transformed((0, 0, 0.6), (1, 2, 0))
+    q = np.roll(rotations.quaternion(truth.rotation), -1, axis=-1)
+    notes = outcome(truth._replace(rotation=rotations.from_quaternion(q)))["notes"]
+    assert len(notes) == 1
+    assert re.search("quaternions look like x, y, z, w .*, with .*world frame", notes[0])
+
+
+def test_a_planar_offset_of_the_heading_is_hinted():
+    settings = replay.Settings(planar=True, height_offset_m=0.0)
+    times, _, place = moving(0.05)
+    flat = motion.Path(rotations.exp(0.4 * times[:, None] * [0, 0, 1]), place)
+    turn = rotations.exp(np.array([0, 0, -0.2]))
+    recording, track = pair(Truth(times, flat.rotation @ turn, flat.translation))
+    track = track._replace(rotation=rotations.exp(0.4 * track.times[:, None] * [0, 0, 1]))
+    found = replay.errors(recording, track, settings)
+    notes = replay.figures(recording, track, found, settings)["notes"]
+    assert len(notes) == 1
+    assert "body frame, turned by (0.0, 0.0, 11.5) deg" in notes[0].replace("-0.0", "0.0")
+
+
+def test_another_order_of_quaternions_is_hinted_for_planar_bodies():
+    settings = replay.Settings(planar=True, height_offset_m=0.0)
+    times, _, place = moving(0.05)
+    q = rotations.quaternion(rotations.exp(0.4 * times[:, None] * [0, 0, 1]))
+    turned = rotations.from_quaternion(np.roll(q, -1, axis=-1))
+    recording, track = pair(Truth(times, turned, place))
+    track = track._replace(rotation=rotations.exp(0.4 * track.times[:, None] * [0, 0, 1]))
+    found = replay.errors(recording, track, settings)
+    notes = replay.figures(recording, track, found, settings)["notes"]
+    assert len(notes) == 1
+    assert re.search("quaternions look like x, y, z, w under the names w, x, y, z: ", notes[0])
