@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import ranging, rotations
-from rbl_gym.mirror import mirror_pose, plane_of
+from rbl_gym.mirror import Plane, mirror_pose, plane_of
 
 
 def flat(rng, count, normal):
@@ -31,6 +31,7 @@ def test_a_plane_is_found(world):
         assert abs(plane.normal @ normal) == pytest.approx(1)
         assert plane.thickness == pytest.approx(0, abs=1e-6)
         assert plane.width > 0.1
+    assert isinstance(plane, Plane)
     thick = plane_of([[0, 0, 1], [9, 0, -1], [0, 9, 1], [9, 9, -1.0]] * np.array([1, 1, 0.5]))
     assert thick.normal[2] > 0.9
     assert plane_of([[1, 0, 0], [1, 5, 0], [1, 0, 5.0]]).normal == pytest.approx([1, 0, 0])
