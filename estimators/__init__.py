@@ -32,6 +32,7 @@ from rbl_gym.estimators.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.manifold import IteratedEkf, PoseState
 from rbl_gym.estimators.network_frames import FrameEstimate, frames
 from rbl_gym.estimators.network_orientations import chordal_optimum, orientations
+from rbl_gym.estimators.network_triangle import TriangleFrames, triangle_frames
 
 # A filter is known by the `register` at the end of its own module; no list names the modules.
 for _module in iter_modules(__path__):
@@ -54,6 +55,7 @@ __all__ = [
     "PoseEstimate",
     "PoseState",
     "Stream",
+    "TriangleFrames",
     "chordal_optimum",
     "cycle_consensus",
     "cycle_iteration",
@@ -67,4 +69,5 @@ __all__ = [
     "orientations",
     "register",
     "ring_least_squares",
+    "triangle_frames",
 ]

@@ -12,7 +12,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_number
+from rbl_gym import rotations
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.network_graphs import check_connected, incidence
 from rbl_gym.sensing_network import (
     IntArray,
@@ -22,7 +23,10 @@ from rbl_gym.sensing_network import (
     directions_of,
 )
 
-__all__ = ["bearing_jacobian", "frame_covariance", "orientation_covariance", "range_jacobian"]
+__all__ = [
+    "bearing_jacobian", "frame_covariance", "orientation_covariance", "range_jacobian",
+    "space_jacobian", "space_orientation_covariance",
+]  # fmt: skip
 
 
 def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
@@ -158,3 +162,68 @@ def frame_covariance(
                          "information")  # fmt: skip
     factor = basis @ vectors / np.sqrt(values)
     return factor @ factor.T
+
+
+# --- space ------------------------------------------------------------------------------------
+
+
+def space_jacobian(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
+    """Derivative (6 m, 6 n) of bearings in space, all frames parallel to the world's.
+
+    Columns: shifts of node 0, of node 1, ..., then turns w, ``R = exp(w) R``, of node 0, and so
+    on. Rows: the direction of j seen by i, of i seen by j, edge by edge.
+
+    Parameters
+    ----------
+    positions
+        (n, 3) metres.
+    edges
+        (m, 2), both nodes of an edge measure the other's direction in their own frame.
+    """
+    positions = check_array("positions", positions, ("n", 3))
+    if positions.ndim != 2:
+        raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
+    n_nodes = len(positions)
+    edges = check_edges(edges, n_nodes)
+    rows = np.zeros((len(edges), 2, 3, 2, n_nodes, 3))
+    for k, (i, j) in enumerate(edges):
+        apart = positions[j] - positions[i]
+        length = float(np.linalg.norm(apart))
+        if length == 0:
+            raise ValueError(f"positions must differ along edges, those of nodes {i} and {j} are "
+                             "the same")  # fmt: skip
+        u = apart / length
+        # d u = (I - u u^T) (dp_j - dp_i) / length; a turn w of the observer adds -w x u.
+        shift = (np.eye(3) - np.outer(u, u)) / length
+        turn = rotations.hat(u)
+        for side, (node, sense) in enumerate(((i, 1), (j, -1))):
+            rows[k, side, :, 0, j], rows[k, side, :, 0, i] = sense * shift, -sense * shift
+            rows[k, side, :, 1, node] = sense * turn
+    return rows.reshape(-1, 6 * n_nodes)
+
+
+def space_orientation_covariance(
+    positions: ArrayLike, edges: ArrayLike, bearing_std_rad: float
+) -> FloatArray:
+    """Bound (3 (n - 1), 3 (n - 1)) of the turns of nodes 1 to n - 1 against node 0, in space.
+
+    Of mutual bearings with noise of `bearing_std_rad` about each axis across them.
+
+    Raises
+    ------
+    ValueError
+        If the bearings leave more free than a shift, a turn and the scale of the whole.
+    """
+    sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
+    J = space_jacobian(positions, edges)
+    n_nodes = J.shape[1] // 6
+    scale = np.zeros(6 * n_nodes)
+    scale[: 3 * n_nodes] = (np.asarray(positions) - np.asarray(positions)[0]).ravel()
+    kept = np.delete(np.arange(6 * n_nodes), [0, 1, 2, *range(3 * n_nodes, 3 * n_nodes + 3)])
+    # No bearing sees the scale: knowing it makes the rest regular and changes no orientation.
+    known = np.vstack([J, scale / np.linalg.norm(scale)])[:, kept]
+    values = np.linalg.svd(known, compute_uv=False)
+    if values[-1] < 1e-9 * values[0]:
+        raise ValueError("edges must determine all orientations at these positions, got "
+                         f"{int((values < 1e-9 * values[0]).sum())} free motions")  # fmt: skip
+    return sigma**2 * np.linalg.inv(known.T @ known)[3 * (n_nodes - 1) :, 3 * (n_nodes - 1) :]

@@ -18,7 +18,12 @@ from numpy.typing import ArrayLike
 
 from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, check_array, check_one_of
-from rbl_gym.network_bounds import bearing_jacobian, range_jacobian, sparse_rows
+from rbl_gym.network_bounds import (
+    bearing_jacobian,
+    range_jacobian,
+    space_jacobian,
+    sparse_rows,
+)
 from rbl_gym.network_graphs import check_connected, components
 from rbl_gym.sensing_network import check_edges, check_positions, directions_of
 
@@ -249,26 +254,8 @@ def freedom(positions: ArrayLike, edges: ArrayLike) -> Freedom:
     edges
         (m, 2), both nodes of an edge measure the other's direction in their own frame.
     """
-    positions = check_array("positions", positions, ("n", 3))
-    if positions.ndim != 2:
-        raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
-    n_nodes = len(positions)
-    edges = check_edges(edges, n_nodes)
-    rows = np.zeros((len(edges), 2, 3, 2, n_nodes, 3))
-    for k, (i, j) in enumerate(edges):
-        apart = positions[j] - positions[i]
-        length = float(np.linalg.norm(apart))
-        if length == 0:
-            raise ValueError(f"positions must differ along edges, those of nodes {i} and {j} are "
-                             "the same")  # fmt: skip
-        u = apart / length
-        # d u = (I - u u^T) (dp_j - dp_i) / length; a turn w of the observer adds -w x u.
-        shift = (np.eye(3) - np.outer(u, u)) / length
-        turn = rotations.hat(u)
-        for side, (node, sense) in enumerate(((i, 1), (j, -1))):
-            rows[k, side, :, 0, j], rows[k, side, :, 0, i] = sense * shift, -sense * shift
-            rows[k, side, :, 1, node] = sense * turn
-    matrix = rows.reshape(-1, 6 * n_nodes)
+    matrix = space_jacobian(positions, edges)
+    n_nodes = matrix.shape[1] // 6
     values, vectors = np.linalg.eigh(matrix.T @ matrix)
     null = vectors[:, values < _ZERO * max(1.0, values[-1])]
     turns = np.linalg.matrix_rank(null[3 * n_nodes :], tol=1e-6)

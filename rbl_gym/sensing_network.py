@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from rbl_gym import rotations
 from rbl_gym.checks import (
     FloatArray,
     as_float,
@@ -29,8 +30,8 @@ from rbl_gym.checks import (
 )
 
 __all__ = [
-    "SensingNetwork", "directions", "edge_angles", "measure", "proj", "random_network",
-    "true_bearings", "unit_disk_edges",
+    "SensingNetwork", "directions", "edge_angles", "measure", "measure_in_space", "proj",
+    "random_network", "true_bearings", "unit_disk_edges",
 ]  # fmt: skip
 
 IntArray = NDArray[np.intp]
@@ -212,6 +213,43 @@ def edge_angles(bearings: ArrayLike) -> FloatArray:
         return np.zeros(0)
     a, b = check_array("bearings", bearings, ("m", 2)).T
     return proj(a - b + np.pi)
+
+
+def measure_in_space(
+    positions: ArrayLike,
+    orientations: ArrayLike,
+    edges: ArrayLike,
+    bearing_std_rad: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Noisy directions (..., m, 2, 3) along the edges of nodes in space, unit vectors.
+
+    Of j in the frame of i, and of i in the frame of j; each is turned by ``exp(n)``, n of
+    N(0, sigma^2) about every axis.
+
+    Parameters
+    ----------
+    positions, orientations
+        (..., n, 3) metres and (..., n, 3, 3), from a node's frame to the world's.
+    edges
+        (m, 2).
+    bearing_std_rad, rng
+        sigma, and the source of the noise.
+    """
+    positions = check_array("positions", positions, ("n", 3))
+    n_nodes = positions.shape[-2]
+    orientations = check_array("orientations", orientations, (n_nodes, 3, 3))
+    sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
+    i, j = check_edges(edges, n_nodes).T
+    apart = positions[..., j, :] - positions[..., i, :]
+    length = np.linalg.norm(apart, axis=-1, keepdims=True)
+    if not length.all():
+        raise ValueError("positions must differ along edges, got two nodes on the same point")
+    toward = np.stack([apart, -apart], axis=-2) / length[..., None]
+    observers = np.stack([orientations[..., i, :, :], orientations[..., j, :, :]], axis=-3)
+    exact = np.einsum("...ba,...b->...a", observers, toward)
+    turns = rotations.exp(sigma * rng.standard_normal(exact.shape))
+    return (turns @ exact[..., None])[..., 0]
 
 
 def random_network(
