@@ -23,7 +23,7 @@ from rbl_gym.checks import (
 )
 from rbl_gym.estimators.doa_cost import DoaCost
 from rbl_gym.estimators.doa_global import global_search
-from rbl_gym.estimators.doa_newton import newton_iteration, unit_quaternion
+from rbl_gym.estimators.doa_newton import Places, newton_iteration, unit_quaternion
 from rbl_gym.estimators.inputs import spanned_dimensions
 from rbl_gym.estimators.localization import PoseEstimate
 from rbl_gym.estimators.locators import Fit, covariance_of
@@ -139,10 +139,10 @@ def locate_doa(
     fields[1] = fields[1] + origin
     fields[7] = fields[7] + origin[:, None]
     fields = [field.reshape((*batch, *field.shape[1:])) for field in fields]
-    rotation, translation, covariance, cost, converged, rank, *others = fields
+    rotation, translation, covariance, cost, converged, rank, *others, iterations = fields
     return PoseEstimate(
         rotation, translation, covariance, cost, converged, rank, Alternatives._make(others),
-        matrix=rotation,
+        matrix=rotation, iterations=iterations,
     )  # fmt: skip
 
 
@@ -153,7 +153,7 @@ def _rows(epoch: DoaEpoch, rows: slice) -> DoaEpoch:
 
 
 def _solve(method: Callable[[DoaEpoch], Fit], epoch: DoaEpoch) -> tuple[np.ndarray, ...]:
-    """The fields of a `PoseEstimate` (alternatives as three, no matrix) for one block of trials."""
+    """The fields of a `PoseEstimate` (alternatives as three, no matrix) of one block of trials."""
     found = method(epoch)
     known = are_finite(found.translation, 1) & are_finite(found.rotation, 2)
     cost, information = found.cost, found.information
@@ -165,8 +165,10 @@ def _solve(method: Callable[[DoaEpoch], Fit], epoch: DoaEpoch) -> tuple[np.ndarr
         cost, information = np.where(known, at.cost, np.inf), at.hessian
     rank = np.where(known, bounds.information_rank(information), 0)
     others = found.alternatives or no_alternatives(len(known))
+    iterations = np.zeros(len(known), int) if found.iterations is None else found.iterations
     return (
-        found.rotation, found.translation, found.covariance, cost, found.converged, rank, *others
+        found.rotation, found.translation, found.covariance, cost, found.converged, rank, *others,
+        iterations,
     )  # fmt: skip
 
 
@@ -182,18 +184,17 @@ def _ml(epoch: DoaEpoch) -> Fit:
 
 
 def _nia(epoch: DoaEpoch) -> Fit:
-    found = newton_iteration(epoch.angles, epoch.tags, epoch.distance_weight)
-    return fit_of_places(epoch, found.positions, found.converged)
+    return fit_of_places(epoch, newton_iteration(epoch.angles, epoch.tags, epoch.distance_weight))
 
 
-def fit_of_places(epoch: DoaEpoch, positions: FloatArray, converged: np.ndarray) -> Fit:
-    """The body laid on places (B, N, 3) of its tags, or on their mirror image across y = 0.
+def fit_of_places(epoch: DoaEpoch, places: Places) -> Fit:
+    """The body laid on the places of its tags, or on their mirror image across y = 0.
 
     On the side that is known; else on the one where the body fits better. The covariance is that
     of maximum likelihood at the pose: noise of the angles is all there is.
     """
-    known = are_finite(positions, 2)
-    positions = np.where(known[:, None, None], positions, epoch.tags)
+    known = are_finite(places.positions, 2)
+    positions = np.where(known[:, None, None], places.positions, epoch.tags)
     if epoch.side is not None:
         wrong = epoch.side * positions[..., 1].mean(axis=-1) < 0
         positions = np.where(wrong[:, None, None], bearing.MIRROR * positions, positions)
@@ -211,15 +212,16 @@ def fit_of_places(epoch: DoaEpoch, positions: FloatArray, converged: np.ndarray)
         rotation * blank[:, None, None],
         translation * blank[:, None],
         covariance_of(at.hessian) * blank[:, None, None],
-        converged & known,
+        places.converged & known,
         np.where(known, at.cost, np.inf),
         at.hessian,
+        iterations=places.iterations,
     )
 
 
 def _searched(search: ParticleSwarm | ParticipatorySearch, epoch: DoaEpoch) -> Fit:
-    found = search_places(search, epoch.angles, epoch.tags, epoch.rng)
-    return fit_of_places(epoch, found.positions, found.converged)
+    std = epoch.weights.min(axis=(-2, -1)) ** -0.5
+    return fit_of_places(epoch, search_places(search, epoch.angles, epoch.tags, std, epoch.rng))
 
 
 METHODS: dict[str, Callable[[DoaEpoch], Fit]] = {

@@ -61,6 +61,9 @@ class PoseEstimate(NamedTuple):
         mirror poses; looked for by ``ml`` and ``robust`` where the geometry is poor.
     matrix
         (..., 3, 3), the raw matrix of ``ls``; of all others the rotation.
+    iterations
+        (...), after how many steps ``nia``, ``pso`` and ``psa`` came to rest; of all others,
+        which do not count them, 0.
     """
 
     rotation: FloatArray
@@ -71,6 +74,7 @@ class PoseEstimate(NamedTuple):
     rank: np.ndarray
     alternatives: Alternatives
     matrix: FloatArray
+    iterations: np.ndarray
 
 
 def locate(
@@ -142,7 +146,7 @@ def locate(
         _check_geometry(method, anchors, tags)
     fields = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
     fields = [field.reshape((*batch, *field.shape[1:])) for field in fields]
-    return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9])
+    return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9], np.zeros(batch, int))
 
 
 def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:

@@ -51,6 +51,7 @@ class Fit(NamedTuple):
     information: FloatArray | None = None
     alternatives: Alternatives | None = None
     matrix: FloatArray | None = None
+    iterations: np.ndarray | None = None
 
 
 def _ls(epoch: Epoch) -> Fit:
