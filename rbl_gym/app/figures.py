@@ -34,7 +34,6 @@ STATIC_COLOURS = {
     "ML": "#1b7f5c",
     "ML, marginalised": "#7fb800",
 }
-DOA_COLOURS = {"NIA + UQ": "#2e86ab", "ML": "#1b7f5c", "PSO": "#e8a33d", "PSA": "#d1495b"}
 # A belief is centimetres wide on a track of tens of metres.
 _MAGNIFY = 20
 
@@ -221,41 +220,6 @@ def _common_legend(figure: Figure, axes: Any) -> None:
     }
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5,
                   frameon=False, fontsize=8)  # fmt: skip
-
-
-@styled
-def doa2019(result: dict[str, Any]) -> Figure:
-    """RMSE of R and t over the noise with the bound, and the success rates; a row a setting."""
-    settings = result["settings"]
-    figure = new_figure(12, 3.3 * len(settings) + 0.6)
-    axes = figure.subplots(len(settings), 3, squeeze=False)
-    curves = (
-        ("rotation_rmse", "rotation RMSE (Frobenius)"),
-        ("translation_rmse_m", "translation RMSE [m]"),
-    )
-    for row, (label, data) in enumerate(settings.items()):
-        sigma = data["sigma_deg"]
-        for ax, (key, title) in zip(axes[row], curves, strict=False):
-            for name, method in data["methods"].items():
-                values = np.where(np.array(method["near"]) > 0, method[key], np.nan)
-                ax.loglog(sigma, values, "o-", ms=4, lw=1.3, color=DOA_COLOURS[name], label=name)
-            ax.loglog(sigma, data["bound"][key], "k+--", ms=8, lw=0.8, label="constrained CRB")
-            ax.set_ylabel(title)
-            ax.set_title(f"{label}: trials near the truth", fontsize=9)
-            ax.grid(alpha=0.25, lw=0.5)
-        bars = axes[row, 2]
-        width = 0.8 / len(data["methods"])
-        for k, (name, method) in enumerate(data["methods"].items()):
-            at = np.arange(len(sigma)) + (k - 0.5 * (len(data["methods"]) - 1)) * width
-            bars.bar(at, 100 * np.array(method["success"]), width, color=DOA_COLOURS[name])
-            bars.plot(at, 100 * np.array(method["near"]), "k_", ms=9)
-        bars.set_xticks(range(len(sigma)), [f"{s:g}" for s in sigma])
-        bars.set_ylabel("error of t < 0.5 m [%]; black: near the truth")
-        bars.set_ylim(0, 104)
-    for ax in axes[-1]:
-        ax.set_xlabel("standard deviation of the angles [deg]")
-    axes[0, 0].legend(frameon=False, fontsize=8)
-    return figure
 
 
 def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:

@@ -55,8 +55,8 @@ def experiments() -> dict[str, Experiment]:
             "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
             doa2019.work_units(),
             doa2019.run,
-            _drawn("figures", "doa2019"),
-            _late("reports", "print_doa2019"),
+            _drawn("doa_figures", "doa2019_figure"),
+            _late("doa_figures", "print_doa2019"),
         ),
         "hard": Experiment(
             "hard conditions: lost and reflected links, wrong starts, outages (docs)",

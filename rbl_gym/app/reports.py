@@ -90,36 +90,6 @@ def print_slides2013(result: dict[str, Any]) -> None:
     print_camsap2013(result["dynamic"])
 
 
-def print_doa2019(result: dict[str, Any]) -> None:
-    """Accuracy, success and time of every method, one table for each setting."""
-    console = new_console()
-    for label, data in result["settings"].items():
-        table = Table(title=f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials")
-        table.add_column("noise (deg)")
-        table.add_column("method")
-        for heading in ("R RMSE", "R / bound", "t RMSE (m)", "t / bound", "near truth",
-                        "t < 0.5 m", "converged", "us / trial", "x NIA"):  # fmt: skip
-            table.add_column(heading, justify="right")
-        for k, sigma in enumerate(data["sigma_deg"]):
-            for name, method in data["methods"].items():
-                row = {key: values[k] for key, values in method.items()}
-                table.add_row(
-                    f"{sigma:g}", name, f"{row['rotation_rmse']:.5f}",
-                    f"{row['rotation_to_bound']:.3f}", f"{row['translation_rmse_m']:.5f}",
-                    f"{row['translation_to_bound']:.3f}",
-                    *(f"{100 * row[key]:.1f} %" for key in ("near", "success", "converged")),
-                    f"{row['microseconds_per_trial']:.0f}", f"{row['time_ratio']:.1f}",
-                )  # fmt: skip
-            bound = [data["bound"][key][k] for key in ("rotation_rmse", "translation_rmse_m")]
-            table.add_row(f"{sigma:g}", "bound", f"{bound[0]:.5f}", "1", f"{bound[1]:.5f}", "1",
-                          end_section=True)  # fmt: skip
-        console.print(table)
-    console.print(
-        "RMSE and ratios are of the trials near the truth (within 6 times the bound); success is\n"
-        "the paper's, an error of t below 0.5 m (at 1 degree the bound itself is 0.41 m for R = I)."
-    )
-
-
 def print_replay(result: dict[str, Any]) -> None:
     """The figures of a recording, one a line."""
     console = Console(highlight=False)
