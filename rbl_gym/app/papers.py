@@ -83,8 +83,8 @@ def experiments() -> dict[str, Experiment]:
             "planar networks: cycle consensus against the bound, convergence (Figs 3 to 6)",
             network2009.work_units(),
             network2009.run,
-            _drawn("network_figures", "network2009_figure"),
-            _late("network_figures", "print_network2009"),
+            _drawn("network2009_figures", "network2009_figure"),
+            _late("network2009_figures", "print_network2009"),
         ),
     }
 

@@ -1,0 +1,214 @@
+"""Picture and tables of the network paper's experiment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from rbl_gym.app import network2009
+from rbl_gym.app.figures import new_figure, styled
+from rbl_gym.app.reports import new_console
+
+_COLOURS = {"bfs": "#d1495b", "paton": "#2e86ab", "minimum": "#1b7f5c"}
+_RULE_COLOURS = {"theorem": "#2e86ab", "best": "#1b7f5c", "trace": "#d1495b", "rows": "#e8a33d"}
+# Fig. 6: solid, dotted, dashed.
+_FRAMES = (("theta", "-", "k", "true"), ("theta_measured", ":", "#d1495b", "measured"),
+           ("theta_estimated", "--", "#2e86ab", "estimated"))  # fmt: skip
+
+
+@styled
+def network2009_figure(result: dict[str, Any]) -> Figure:
+    """Figs 3 to 6 of the paper, then kappa against n, the speed of (14), three nodes in space."""
+    figure = new_figure(17, 11)
+    axes = figure.subplots(3, 4)
+    _networks(axes[0, :3], result)
+    _frames(axes[0, 3], result)
+    _accuracy(axes[1, 0], result)
+    _over_steps(axes[1, 1:3], result)
+    _space(axes[1, 3], result["space"])
+    for ax, name in zip(axes[2, :2], ("worst", "triangulation"), strict=True):
+        _growth(ax, name, result["growth"][name])
+    _distance(axes[2, 2], result)
+    _factors(axes[2, 3], result["convergence"])
+    return figure
+
+
+def _networks(axes: Any, result: dict[str, Any]) -> None:
+    """Fig. 3: the points, the largest footprint, the one of ten loops or the smallest."""
+    data = result["networks"]
+    places = np.array(data["positions"])
+    loops = [row["loops"] for row in result["accuracy"]]
+    chosen = loops.index(10) if 10 in loops else 0
+    for ax, letter, k in zip(axes, "abc", (None, len(loops) - 1, chosen), strict=True):
+        title = f"Fig. 3 ({letter}): {len(places)} points"
+        if k is not None:
+            lines = list(places[np.array(data["edges"][k])])
+            ax.add_collection(LineCollection(lines, colors="0.6", lw=0.8))
+            complete = 2 * len(lines) == len(places) * (len(places) - 1)
+            title = f"Fig. 3 ({letter}): {'complete, ' if complete else ''}{loops[k]} loops, " \
+                    f"footprint {data['footprints'][k]:.3g}"  # fmt: skip
+        ax.plot(*places.T, "ko", ms=4)
+        ax.margins(0.08)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set(xlabel="x", ylabel="y")
+        ax.set_title(title, fontsize=9)
+
+
+def _frames(ax: Axes, result: dict[str, Any]) -> None:
+    """Fig. 6: both axes of every frame at its true place."""
+    places, run = np.array(result["networks"]["positions"]), result["run"]
+    length = 0.09 * np.ptp(places, axis=0).max()
+    for key, style, colour, label in _FRAMES:
+        angle = np.array(run[key])[:, None] + [0, np.pi / 2]
+        tips = places[:, None] + length * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        lines = np.stack([np.broadcast_to(places[:, None], tips.shape), tips], axis=2)
+        ax.add_collection(LineCollection(lines.reshape(-1, 2, 2), colors=colour, ls=style, lw=1.4,
+                                         label=label))  # fmt: skip
+    ax.plot(*places[0], "ks", ms=5)
+    ax.plot(*places.T, "k.", ms=4)
+    ax.margins(0.15)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel="x", ylabel="y")
+    ax.set_title(f"Fig. 6: frames, sigma^2 = {result['variance'][1]:g}, reference square",
+                 fontsize=9)  # fmt: skip
+    ax.legend(frameon=False, fontsize=8, ncols=3, loc="lower center")
+
+
+def _accuracy(ax: Axes, result: dict[str, Any]) -> None:
+    """Fig. 4."""
+    rows = result["accuracy"]
+    edges = [row["edges"] for row in rows]
+    ax.plot(edges, [row["mse"]["measured"] for row in rows], "k--x", ms=4, label="y")
+    ax.plot(edges, [row["mse"]["consensus"] for row in rows], "k-o", ms=4, label="psi")
+    ax.plot(edges, [row["bound"] for row in rows], color="#2e86ab", lw=0.8,
+            label="2 sigma^2 (n - 1) / m")  # fmt: skip
+    ax.set(xlabel="number of edges", ylabel="mean square error [rad^2]", ylim=(0, None))
+    ax.set_title(f"Fig. 4: sigma^2 = {result['variance'][0]:g}, {result['trials']} trials",
+                 fontsize=9)  # fmt: skip
+    ax.legend(frameon=False, fontsize=8)
+
+
+def _over_steps(axes: Any, result: dict[str, Any]) -> None:
+    """Fig. 5."""
+    run = result["run"]
+    axes[0].plot(run["edge_angles"], lw=0.7)
+    axes[0].set(xlabel="iteration", ylabel="angle estimate of every edge [rad]")
+    axes[0].set_title(f"Fig. 5: kappa = {run['kappa']:.4f}, sigma^2 = {result['variance'][1]:g}",
+                      fontsize=9)  # fmt: skip
+    if run["loop_errors"]:
+        axes[1].plot(run["loop_errors"], lw=0.7)
+    axes[1].set(xlabel="iteration", ylabel="error of every loop [rad]")
+    axes[1].set_title("Fig. 5", fontsize=9)
+
+
+def _growth(ax: Axes, name: str, data: dict[str, Any]) -> None:
+    nodes = [row["nodes"] for row in data["rows"]]
+    for rule, slope in data["slope"].items():
+        ax.loglog(nodes, [row["kappa"][rule] for row in data["rows"]], "o-", ms=4, lw=1.2,
+                  color=_RULE_COLOURS[rule], label=f"{rule}: n^{slope:.2f}")  # fmt: skip
+    ax.set(xlabel="n", ylabel="kappa")
+    title = {"worst": "complete graph, cycles of a path", "triangulation": "triangulation"}[name]
+    ax.set_title(f"Section IV-E: {title}", fontsize=9)
+    ax.legend(frameon=False, fontsize=8)
+
+
+def _distance(ax: Axes, result: dict[str, Any]) -> None:
+    for basis, history in result["history"].items():
+        ax.semilogy(np.maximum(history, 1e-16), color=_COLOURS[basis], label=basis)
+        printed = result["convergence"][basis]["theorem"]["printed_factor_squared"]
+        steps = np.arange(len(history))
+        ax.semilogy(steps, history[0] * printed ** (steps / 2), color=_COLOURS[basis], ls=":", lw=1)
+    ax.set(xlabel="iteration", ylabel="distance from the limit [rad]", ylim=(1e-13, None))
+    ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: Theorem 19's factor, mean",
+                 fontsize=9)  # fmt: skip
+    ax.legend(frameon=False, fontsize=8)
+
+
+def _factors(ax: Axes, convergence: dict[str, Any]) -> None:
+    rules = list(next(iter(convergence.values())))
+    for shift, (basis, table) in enumerate(convergence.items()):
+        places = np.arange(len(rules)) + 0.25 * (shift - 1)
+        ax.bar(places, [table[rule]["true_factor"] ** 2 for rule in rules], 0.22,
+               color=_COLOURS[basis], label=basis)  # fmt: skip
+        ax.plot(places, [table[rule]["printed_factor_squared"] for rule in rules], "k_", ms=10)
+    ax.set_xticks(range(len(rules)), rules)
+    ax.set(xlabel="rule for kappa", ylabel="factor of the squared error", ylim=(0.4, 1.12))
+    ax.set_title("true (bars), (1 - kappa)^2 (dashes), means", fontsize=9)
+    ax.legend(frameon=False, ncols=3, loc="upper center", fontsize=8)
+
+
+def _space(ax: Axes, rows: list[dict[str, Any]]) -> None:
+    for shape, mark in (("equilateral", "o"), ("flat", "s")):
+        chosen = [row for row in rows if row["shape"] == shape]
+        sigma = [row["bearing_std_rad"] for row in chosen]
+        (line,) = ax.loglog(sigma, [row["rmse_rad"] for row in chosen], mark, ms=5, label=shape)
+        ax.loglog(sigma, [row["bound_rad"] for row in chosen], color=line.get_color(), lw=0.8)
+    ax.set(xlabel="sigma of a bearing [rad]", ylabel="RMS turn against node 0 [rad]")
+    ax.set_title("three nodes in space; lines: bound", fontsize=9)
+    ax.legend(frameon=False, fontsize=8)
+
+
+def print_network2009(result: dict[str, Any]) -> None:
+    """Accuracy against the bound, growth, convergence, three nodes in space."""
+    out = new_console()
+    _print_accuracy(out, result)
+    for name, data in result["growth"].items():
+        slopes = ", ".join(f"{rule} n^{slope:.2f}" for rule, slope in data["slope"].items())
+        out.print(f"kappa, {name}: {slopes}")
+    out.print("Section IV-E: the trace's kappa is O(1 / n^3) at worst, O(1 / n) in triangulations.")
+    table = Table(title=f"convergence, {network2009.EXAMPLE_LOOPS} loops")
+    for heading in ("cycles", "kappa", "steps", "lambda", "measured", "true", "true^2",
+                    "(1 - kappa)^2", "kappa <= Theorem 19's", "factor holds"):  # fmt: skip
+        table.add_column(heading, justify="right")
+    for basis, rules in result["convergence"].items():
+        for rule, row in rules.items():
+            table.add_row(basis, f"{rule} {row['kappa']:.4f}", f"{row['steps']:.0f}",
+                          f"{row['lambda_min']:.2f} to {row['lambda_max']:.2f}",
+                          f"{row['measured_factor']:.4f}", f"{row['true_factor']:.4f}",
+                          f"{row['true_factor_squared']:.4f}",
+                          f"{row['printed_factor_squared']:.4f}",
+                          f"{100 * row['within_theorem']:.0f} %",
+                          f"{100 * row['printed_holds']:.0f} %")  # fmt: skip
+    out.print(table)
+    for row in result["asynchronous"]:
+        out.print(f"one cycle at a time, {100 * row['loss']:.0f} % of the messages lost: "
+                  f"{row['rounds']:.0f} rounds, {row['largest_error_rad']:.1e} rad from the "
+                  "projection")  # fmt: skip
+    table = Table(title=f"three nodes in space, {result['trials']} trials")
+    for heading in (
+        "triangle",
+        "sigma (rad)",
+        "RMS turn (rad)",
+        "/ bound",
+        "misfit / (6^.5 sigma)",
+    ):
+        table.add_column(heading, justify="right")
+    for row in result["space"]:
+        table.add_row(row["shape"], f"{row['bearing_std_rad']:g}", f"{row['rmse_rad']:.5f}",
+                      f"{row['ratio']:.3f}", f"{row['misfit']:.3f}")  # fmt: skip
+    out.print(table)
+
+
+def _print_accuracy(out: Any, result: dict[str, Any]) -> None:
+    places = result["networks"]["positions"]
+    table = Table(title=f"Fig. 4: {len(places)} points, sigma^2 = {result['variance'][0]:g}, "
+                  f"{result['trials']} trials")  # fmt: skip
+    for heading in ("footprint", "edges", "loops", "MSE of y", "MSE of psi", "bound (rad^2)",
+                    "psi / bound", "ml / bound"):  # fmt: skip
+        table.add_column(heading, justify="right")
+    for row in result["accuracy"]:
+        ratios = [f"{row['ratio'][name]:.3f} +- {row['ratio_std_error'][name]:.3f}"
+                  for name in ("consensus", "ml")]  # fmt: skip
+        table.add_row(f"{row['footprint']:.4g}", str(row["edges"]), str(row["loops"]),
+                      f"{row['mse']['measured']:.5f}", f"{row['mse']['consensus']:.5f}",
+                      f"{row['bound']:.5f}", *ratios)  # fmt: skip
+    out.print(table)
+    run = result["run"]
+    out.print(f"Figs 5 and 6: kappa {run['kappa']:.4f}, {run['steps']} steps to 1e-12; RMS error "
+              f"of an edge {run['rms_measured']:.4f} rad measured, {run['rms_estimated']:.4f} "
+              "estimated")  # fmt: skip
