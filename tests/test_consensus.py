@@ -291,7 +291,11 @@ def test_accuracy_is_the_bounds_from_5_to_36_loops(trials):
     cycle slips by 2 pi in one trial of 600 or so, and that adds 3 % to the mean.
     """
     for loops in (5, 36):
-        row = network2009._accuracy(loops, trials, np.random.default_rng([0, loops]))
+        radius = network2009._default_footprints(network2009.PLACES)[network2009.LOOPS.index(loops)]
+        edges = network2009._seen(network2009.PLACES, radius)
+        row = network2009._accuracy(network2009.PLACES, edges, 0.1**0.5, trials,
+                                    np.random.default_rng([0, loops]))  # fmt: skip
+        assert row["loops"] == loops
         tolerance = 4 * np.sqrt(2 / 9 / trials) + 0.03
         assert row["ratio"]["consensus"] == pytest.approx(1, abs=tolerance)
         tolerance = 4 * np.sqrt(2 / row["edges"] / trials)

@@ -7,8 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from rbl_gym.app import network, network2009
+from rbl_gym.app import network, network2009, network_growth
 from rbl_gym.app.cli import main
+from rbl_gym.estimators import consensus
+from rbl_gym.network_graphs import cycle_matrix
 from rbl_gym.sensing_network import proj
 from tests.helpers import ROOT, assert_table_holds, needs
 
@@ -172,9 +174,17 @@ def test_manhattan(capsys):
     assert result["cost_rad2"] == pytest.approx(1.02062, rel=1e-5)
 
 
+@pytest.fixture
+def small(monkeypatch):
+    """Fewer networks, so that it takes a second or two."""
+    monkeypatch.setattr(network2009, "_NETWORKS", 1)
+    monkeypatch.setattr(network2009, "RULES", ("theorem", "best"))
+    monkeypatch.setattr(network_growth, "WORST_SIZES", (6, 8, 11, 16))
+    monkeypatch.setattr(network_growth, "TRIANGULATION_SIZES", (10, 20, 40, 80))
+
+
 @needs("rich")
-def test_reproduce_network2009(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(network2009, "_NETWORKS", 2)
+def test_reproduce_network2009(small, tmp_path, capsys):
     picture, table, figures = (tmp_path / f"x.{kind}" for kind in ("png", "csv", "json"))
     arguments = ["reproduce", "network2009", "--trials", "5", "--plot", str(picture)]
     assert main([*arguments, "--csv", str(table), "--json", str(figures)]) == 0
@@ -182,6 +192,7 @@ def test_reproduce_network2009(tmp_path, capsys, monkeypatch):
     assert picture.stat().st_size > 20_000
     result = json.loads(figures.read_text())
     assert_table_holds(table, result, least=200)
+    assert [row["loops"] for row in result["accuracy"]] == list(network2009.LOOPS)
     for rules in result["convergence"].values():
         for row in rules.values():
             assert row["largest_difference"] < 1e-3
@@ -190,12 +201,69 @@ def test_reproduce_network2009(tmp_path, capsys, monkeypatch):
     assert result["convergence"]["minimum"]["theorem"]["printed_holds"] < 1
     for row in result["asynchronous"]:
         assert row["largest_error_rad"] < 1e-11
+    # Figs 5 and 6: 45 edges, 36 loops that close.
+    run = result["run"]
+    assert np.shape(run["edge_angles"]) == (network2009._SHOWN_STEPS + 1, 45)
+    assert np.shape(run["loop_errors"]) == (network2009._SHOWN_STEPS + 1, 36)
+    assert np.abs(run["loop_errors"][-1]).max() < 1e-3 * np.abs(run["loop_errors"][0]).max()
+    assert run["rms_estimated"] < run["rms_measured"]
 
 
-def test_the_same_seed_gives_the_same_figures(monkeypatch):
-    monkeypatch.setattr(network2009, "_NETWORKS", 1)
+@needs("rich")
+def test_network2009_takes_points_footprints_and_a_variance(small, tmp_path, capsys):
+    points, figures = tmp_path / "points.csv", tmp_path / "x.json"
+    points.write_text("x,y\n0,0\n10,0\n10,10\n0,10\n5,4\n")
+    picture = ["--plot", str(tmp_path / "x.png"), "--json", str(figures)]
+    arguments = ["reproduce", "network2009", "--trials", "20", "--positions", str(points), *picture]
+    assert main([*arguments, "--footprint", "11", "20", "--variance", "0.02"]) == 0
+    result = json.loads(figures.read_text())
+    assert [(row["footprint"], row["edges"]) for row in result["accuracy"]] == [(11, 8), (20, 10)]
+    assert result["variance"] == pytest.approx([0.02, 0.02])
+    for row in result["accuracy"]:  # 4 standard deviations of 20 trials of m edges
+        tolerance = 4 * np.sqrt(2 / (20 * row["edges"]))
+        assert row["mse"]["measured"] == pytest.approx(0.04, rel=tolerance)
+    # Sides, half diagonals and diagonals of the square: none of the radii is a distance.
+    places = network2009.read_points(str(points))
+    assert network2009._default_footprints(places) == pytest.approx(
+        [8.905, 12.071, 14.425], abs=1e-3
+    )
+    assert main([*arguments, "--footprint", "5"]) == 2
+    assert "footprint must connect all 5 points, got 5" in capsys.readouterr().err
+    points.write_text("x,y\n0,0\n1,a\n")
+    assert main(arguments) == 2
+    assert "must have two numbers a line" in capsys.readouterr().err
+    points.write_text("0,0\n1,1\n2,0\n")
+    assert main(arguments) == 2
+    assert "must have the header x,y" in capsys.readouterr().err
+    assert main(["reproduce", "doa2019", "--variance", "0.1"]) == 2
+    assert "doa2019 takes no variance" in capsys.readouterr().err
+
+
+def test_kappa_grows_as_section_iv_e_says():
+    """O(1 / n^3) for cycles of n edges in complete graphs, O(1 / n) for triangulations."""
+    growth = network_growth.run(np.random.default_rng(0))
+    assert growth["worst"]["slope"]["trace"] == pytest.approx(-3, abs=0.15)
+    assert growth["triangulation"]["slope"]["trace"] == pytest.approx(-1, abs=0.1)
+    for row in growth["triangulation"]["rows"]:
+        assert row["edges"] <= 3 * row["nodes"] - 6  # Theorem 7
+        assert row["loops"] == row["edges"] - row["nodes"] + 1  # Theorem 5
+        assert row["lambda_max"] < 6  # a triangle shares at most three edges
+        assert row["kappa"]["theorem"] > 2 / 7
+
+
+def test_the_limit_of_all_trials_at_once_is_the_iterations():
+    rng = np.random.default_rng(2)
+    edges = network2009._seen(network2009.PLACES, 0.6)
+    C = cycle_matrix(edges, 10)
+    y = proj(rng.normal(0, 0.4, (5, len(edges))))
+    together = network2009.limit(C.toarray(), y)
+    for one, psi in zip(y, together, strict=True):
+        run = consensus.cycle_iteration(edges, one, 10, C)
+        np.testing.assert_allclose(psi, run.psi, atol=1e-8)
+
+
+def test_the_same_seed_gives_the_same_figures(small, monkeypatch):
     monkeypatch.setattr(network2009, "BASES", network2009.BASES[:1])
-    monkeypatch.setattr(network2009, "RULES", network2009.RULES[:1])
     monkeypatch.setattr(network2009, "LOOPS", network2009.LOOPS[:1])
     results = [network2009.run(2, seed, lambda: None) for seed in (3, 3, 4)]
     assert results[0] == results[1] != results[2]

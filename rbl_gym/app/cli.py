@@ -109,6 +109,13 @@ def _add_reproduce(commands: Any) -> None:
     add_trials(reproduce)
     reproduce.add_argument("--plot", metavar="F", help="default out/EXPERIMENT.png")
     reproduce.add_argument("--csv", metavar="F", help="every figure as a row")
+    network = reproduce.add_argument_group("network2009")
+    network.add_argument("--positions", metavar="F",
+                         help="CSV, header x,y: fixed points, the reference first")  # fmt: skip
+    network.add_argument("--footprint", dest="footprints", metavar="R", type=float, nargs="+",
+                         help="sensing radii, in the unit of the positions")  # fmt: skip
+    network.add_argument("--variance", metavar="S2", type=float,
+                         help="of a bearing, rad^2; default 0.1, in Figs 5 and 6 0.01")  # fmt: skip
     add_json(reproduce)
     reproduce.set_defaults(run=_reproduce)
 
@@ -154,8 +161,12 @@ def _reproduce(options: argparse.Namespace) -> int:
     from rbl_gym.app import papers
 
     experiment = papers.experiments()[options.experiment]
+    named = ("positions", "footprints", "variance")
+    given = {name: getattr(options, name) for name in named if getattr(options, name) is not None}
+    if wrong := [name for name in given if name not in experiment.options]:
+        raise ValueError(f"{options.experiment} takes no {' and no '.join(wrong)}")
     with progress(options.experiment, experiment.work_units) as advance:
-        result = experiment.run(options.trials, options.seed, advance)
+        result = experiment.run(options.trials, options.seed, advance, **given)
     from rbl_gym.app import figures
 
     plot = options.plot or f"out/{options.experiment}.png"

@@ -62,7 +62,7 @@ def run(
     seed: int,
     advance: Callable[[], None] = lambda: None,
     *,
-    positions: FloatArray | None = None,
+    positions: FloatArray | str | None = None,
     footprints: Sequence[float] | None = None,
     variance: float | None = None,
 ) -> dict[str, Any]:
@@ -75,7 +75,8 @@ def run(
     advance
         Called `work_units` times.
     positions
-        (n, 2) fixed points, the first of which is the reference; None: `PLACES`.
+        (n, 2) fixed points, the first of which is the reference, or a CSV file of them with a
+        header x,y; None: `PLACES`.
     footprints
         Sensing radii, in the unit of the positions, each of which connects the points; None: those
         that leave `LOOPS` loops (on other points: all that connect them, eight at most).
@@ -98,6 +99,8 @@ def run(
     ValueError
         If a footprint leaves the points apart, or an argument is not as described.
     """
+    if isinstance(positions, str):
+        positions = read_points(positions)
     places = PLACES if positions is None else check_positions(positions)
     radii = _default_footprints(places) if footprints is None else \
         sorted(check_number("footprint", radius, low=0.0) for radius in footprints)  # fmt: skip
@@ -136,21 +139,41 @@ def run(
     return result
 
 
+def read_points(path: str) -> FloatArray:
+    """Points (n, 2) of a CSV file with a header x,y.
+
+    Raises
+    ------
+    ValueError
+        If the file holds something else; the message names it.
+    """
+    with open(path, encoding="utf-8") as file:
+        header = file.readline().strip().replace(" ", "")
+        if header != "x,y":
+            raise ValueError(f"{path}: must have the header x,y, got {header!r:.40}")
+        try:
+            points = np.loadtxt(file, delimiter=",", ndmin=2)
+        except ValueError as error:
+            raise ValueError(f"{path}: must have two numbers a line, {error}") from error
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+        raise ValueError(f"{path}: must hold three points or more, got shape {points.shape}")
+    return points
+
+
 def _default_footprints(places: FloatArray) -> list[float]:
-    """Radii between the distances of pairs that leave `LOOPS` loops; else evenly up to all."""
+    """Radii that leave `LOOPS` loops of `PLACES`; of other points eight, from connected to all."""
     n_nodes = len(places)
     pairs = np.array(list(itertools.combinations(range(n_nodes), 2)))
     apart = np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
-    steps = np.append(np.sort(apart), 1.02 * apart.max())
-    radii = (steps[:-1] + steps[1:]) / 2
-    if places is PLACES:
-        return [float(radii[n_nodes - 2 + loops]) for loops in LOOPS]
-    first = next(
-        k
-        for k, radius in enumerate(radii)
+    steps = np.unique(apart.round(12))
+    radii = [
+        float(radius)
+        for radius in (steps + np.append(steps[1:], 1.04 * steps[-1])) / 2
         if not network_graphs.components(pairs[apart <= radius], n_nodes).any()
-    )
-    return [float(radii[k]) for k in np.unique(np.linspace(first, len(radii) - 1, 8).astype(int))]
+    ]
+    if places is PLACES:
+        return [r for r in radii if np.sum(apart <= r) - n_nodes + 1 in LOOPS]
+    return [radii[k] for k in np.unique(np.linspace(0, len(radii) - 1, 8).astype(int))]
 
 
 def _seen(places: FloatArray, radius: float) -> IntArray:

@@ -18,9 +18,10 @@ class Experiment(NamedTuple):
 
     summary: str
     work_units: int
-    run: Callable[[int, int, Advance], dict[str, Any]]  # of trials, seed, advance
+    run: Callable[..., dict[str, Any]]  # of trials, seed, advance; `options` by keyword
     figure: Callable[[dict[str, Any], int], Any]  # of the result and the seed
     show: Callable[[dict[str, Any]], None]
+    options: tuple[str, ...] = ()  # of the command line, beside trials and seed
 
 
 def _late(module: str, name: str) -> Callable[..., Any]:
@@ -80,11 +81,12 @@ def experiments() -> dict[str, Experiment]:
             _late("reports", "print_slides2013"),
         ),
         "network2009": Experiment(
-            "planar networks: cycle consensus against the bound, convergence (Figs 3 to 6)",
+            "planar networks: cycle consensus (Figs 3 to 6), convergence, kappa against n",
             network2009.work_units(),
             network2009.run,
             _drawn("network2009_figures", "network2009_figure"),
             _late("network2009_figures", "print_network2009"),
+            ("positions", "footprints", "variance"),
         ),
     }
 
