@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import scenes
-from rbl_gym.app import camsap2013
+from rbl_gym.studies.papers import camsap2013
+from rbl_gym.worlds import scenes
 
 
 def main() -> None:

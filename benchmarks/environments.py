@@ -25,9 +25,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from rbl_gym import scenes
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import VectorEstimatePose
 
 SCENES = ("camsap2013", "auv_buoys", "uwb_room")

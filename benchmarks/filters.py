@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from rbl_gym import estimators, motion, ranging, rotations
-from rbl_gym.estimators.engines import transition
+from rbl_gym import estimators, motion
+from rbl_gym.estimators.linear.engines import transition
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
 
 SIZES = {(4, 5): 20, (10, 6): 10, (50, 20): 1}  # peer trials for each (M, N)
 NOISE = ranging.SquaredRangeNoise(0.05)

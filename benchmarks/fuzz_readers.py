@@ -18,8 +18,9 @@ import tempfile
 from pathlib import Path
 
 INSTRUMENTED = [
-    "rbl_gym.recordings", "rbl_gym.scene_files", "rbl_gym.g2o", "rbl_gym.app.policies",
-    "rbl_gym.app.bench_files", "rbl_gym.app.bench_command", "csv", "json.decoder", "tomllib",
+    "rbl_gym.recordings.reading", "rbl_gym.placement.scene_files", "rbl_gym.networks.g2o",
+    "rbl_gym.studies.learning.policies",
+    "rbl_gym.studies.bench.records", "rbl_gym.app.bench_command", "csv", "json.decoder", "tomllib",
     "tomllib._parser", "numpy.lib.format", "numpy.lib._format_impl", "zipfile",
 ]  # fmt: skip
 

@@ -19,8 +19,9 @@ from typing import Any
 import filters
 import numpy as np
 
-from rbl_gym import bounds, estimators, rotations
-from rbl_gym.estimators.manifold import PoseState
+from rbl_gym import bounds, estimators
+from rbl_gym.estimators.iekf.manifold import PoseState
+from rbl_gym.geometry import rotations
 
 SIZES = ((4, 5), (10, 6))
 ITERATIONS = (2, 4)

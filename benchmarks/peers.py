@@ -24,8 +24,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym import estimators, motion, ranging, rotations
-from rbl_gym.estimators.engines import transition
+from rbl_gym import estimators, motion
+from rbl_gym.estimators.linear.engines import transition
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
 
 SIZES = ((4, 5), (10, 6))
 SQUARED = ranging.SquaredRangeNoise(0.05)

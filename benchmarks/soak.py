@@ -32,8 +32,8 @@ import numpy as np
 import soak_environments
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import scenes
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import VectorEstimatePose
 
 FAMILY = ("kf", "uc-kf", "et-kf", "kf-ortho")

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import scenes
+from rbl_gym.worlds import scenes
 
 Rng = np.random.Generator
 # How many worlds and steps: seconds, whatever a step costs.

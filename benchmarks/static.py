@@ -15,7 +15,10 @@ import side_by_side  # isort: skip
 import numpy as np
 from scipy.optimize import least_squares
 
-from rbl_gym import bodies, estimators, ranging, rotations, scenes
+from rbl_gym import estimators
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.worlds import scenes
 
 PROBLEMS, PEER_PROBLEMS = 1000, 40
 METHODS = ("ls", "cls", "procrustes", "two-step", "ml", "robust")

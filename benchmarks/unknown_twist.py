@@ -1,6 +1,6 @@
 """The filter of an unknown twist against its bound, in the drone yard; what odometry is worth.
 
-Bodies drawn from the law that the bound assumes (`rbl_gym.unknown_twist`), and bodies on the
+Bodies drawn from the law that the bound assumes (`rbl_gym.motion.unknown_twist`), and bodies on the
 scene's own way-points, whose velocity jumps where they turn: of these there is no bound, only the
 known twist's as a floor. RMSE, its ratio to the bound, NEES per degree of freedom over all epochs.
 
@@ -22,9 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import bounds, estimators, metrics, ranging, rotations, scenes, simulation
-from rbl_gym import unknown_twist as ut
-from rbl_gym.app import monte_carlo
+from rbl_gym import bounds, estimators, metrics
+from rbl_gym.bounds import twist as twist_bounds
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.motion import unknown_twist as ut
+from rbl_gym.studies import monte_carlo
+from rbl_gym.worlds import scenes, simulation
 
 SCENE = scenes.get("drone_yard")
 LAW = ut.WanderingTwist(SCENE.spin_rad_s, 3.0, 0.1, 1.0)
@@ -91,7 +95,7 @@ def drawn(sensor: ut.TwistSensor | None, options: argparse.Namespace) -> dict[st
                 reading = sensor.read(path.rotation[:, k - 1], twist)
                 reading = reading + std * rng.standard_normal((trials, 6))
             rest = SCENE.noise, twist, SCENE.dt, SCENE.process, LAW
-            J = ut.posterior_crb_step(J, anchors, tags, *pose, *rest, sensor=sensor)
+            J = twist_bounds.posterior_crb_step(J, anchors, tags, *pose, *rest, sensor=sensor)
         ranges = ranging.simulate(anchors, tags, *pose, SCENE.noise, rng).ranges
         begin = time.process_time()
         if k:

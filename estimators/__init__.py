@@ -5,12 +5,12 @@ change of name.
 """
 
 from importlib import import_module
-from pkgutil import iter_modules
+from pkgutil import walk_packages
 
 from rbl_gym.estimators.asynchronous import Asynchronous, Stream
-from rbl_gym.estimators.augmented import AugmentedEkf, AugmentedState
-from rbl_gym.estimators.bank import IteratedEkfBank
-from rbl_gym.estimators.belief import (
+from rbl_gym.estimators.bank.bank import IteratedEkfBank
+from rbl_gym.estimators.bank.hypotheses import BankState
+from rbl_gym.estimators.filter import (
     ENTRY_POINT_GROUP,
     Filter,
     PoseBelief,
@@ -18,25 +18,25 @@ from rbl_gym.estimators.belief import (
     names,
     register,
 )
-from rbl_gym.estimators.consensus import (
+from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
+from rbl_gym.estimators.iekf.doa_filter import DoaEkf
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState
+from rbl_gym.estimators.linear.kalman import KalmanFamily, KalmanState
+from rbl_gym.estimators.locating.doa import locate_doa
+from rbl_gym.estimators.locating.localization import PoseEstimate, locate, methods
+from rbl_gym.estimators.networks.consensus import (
     cycle_consensus,
     cycle_iteration,
     cycle_projection,
     ring_least_squares,
 )
-from rbl_gym.estimators.doa import locate_doa
-from rbl_gym.estimators.doa_filter import DoaEkf
-from rbl_gym.estimators.hypotheses import BankState
-from rbl_gym.estimators.kalman import KalmanFamily, KalmanState
-from rbl_gym.estimators.localization import PoseEstimate, locate, methods
-from rbl_gym.estimators.manifold import IteratedEkf, PoseState
-from rbl_gym.estimators.network_frames import FrameEstimate, frames
-from rbl_gym.estimators.network_orientations import chordal_optimum, orientations
-from rbl_gym.estimators.network_triangle import TriangleFrames, triangle_frames
+from rbl_gym.estimators.networks.frames import FrameEstimate, frames
+from rbl_gym.estimators.networks.orientations import chordal_optimum, orientations
+from rbl_gym.estimators.networks.triangle import TriangleFrames, triangle_frames
 
 # A filter is known by the `register` at the end of its own module; no list names the modules.
-for _module in iter_modules(__path__):
-    import_module(f"{__name__}.{_module.name}")
+for _module in walk_packages(__path__, f"{__name__}."):
+    import_module(_module.name)
 
 __all__ = [
     "ENTRY_POINT_GROUP",

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_count, check_number
-from rbl_gym.estimators.belief import Filter, PoseBelief
-from rbl_gym.ranging import NoiseLaw
+from rbl_gym.estimators.filter import Filter, PoseBelief
+from rbl_gym.measurements.ranging import NoiseLaw
 
 
 class TimedRange(NamedTuple):

@@ -16,7 +16,7 @@ from rbl_gym.checks import (
     check_links,
     check_shape,
 )
-from rbl_gym.ranging import NoiseLaw
+from rbl_gym.measurements.ranging import NoiseLaw
 
 # Ranges that stay in the cache from one look at them to the next.
 _PART = 1 << 15

@@ -20,8 +20,8 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from rbl_gym.app import evaluation, policies
-from rbl_gym.app.rl_tasks import rl_task
+from rbl_gym.studies.learning import evaluation, policies
+from rbl_gym.studies.learning.rl_tasks import rl_task
 
 ENVS, ROLLOUT, EPOCHS, BATCH = 64, 16, 10, 512
 LEARNING_RATE, GAMMA, LAMBDA = 1e-3, 1.0, 1.0

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 
-from rbl_gym import layout_search, layouts, placement
+from rbl_gym import placement
+from rbl_gym.placement import layouts, search
 from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
 STEPS, HELD_OUT = 100_000, 64
@@ -39,9 +40,9 @@ found = {
     "random": layouts.random(task, contexts, rng),
     "corners": layouts.corners(task, contexts, rng),
     "ring": layouts.ring(task, contexts, rng),
-    "greedy": layout_search.greedy(task, contexts, rng),
+    "greedy": search.greedy(task, contexts, rng),
     f"PPO, {STEPS:,} steps": info["anchors"],
-    "CMA-ES per problem": layout_search.cma_es(task, contexts, rng),
+    "CMA-ES per problem": search.cma_es(task, contexts, rng),
 }
 for name, anchors in found.items():
     log_score = np.log(placement.score(task, contexts, anchors)).mean()

@@ -4,6 +4,7 @@ Importing it registers the environments' ids and nothing heavy.
 """
 
 import sys
+from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_file_location
 from pathlib import Path
@@ -32,6 +33,30 @@ class _Folders:
 # which may be of another checkout.
 if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "estimators").is_dir():
     sys.meta_path.insert(0, _Folders)
+
+
+# Modules that stood at the top before they moved into packages: `from rbl_gym import scenes` works.
+_MOVED = {
+    "bearing": "measurements",
+    "g2o": "networks",
+    "layouts": "placement",
+    "link_bias": "measurements",
+    "obstacles": "geometry",
+    "regions": "geometry",
+    "rigidity": "networks",
+    "rotations": "geometry",
+    "scene_bounds": "worlds",
+    "scene_files": "placement",
+    "scenes": "worlds",
+    "simulation": "worlds",
+    "unknown_twist": "motion",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MOVED:
+        return import_module(f"rbl_gym.{_MOVED[name]}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def _register_environments() -> None:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, kernel
+from rbl_gym.geometry import rotations
 
 # Behind the doors: what comes to these was checked, or made here.
 _EXP, _LOG = kernel(rotations.exp), kernel(rotations.log)

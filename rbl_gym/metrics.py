@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import special
 
-from rbl_gym import rotations
 from rbl_gym.checks import FloatArray, checked, kernel
+from rbl_gym.geometry import rotations
 
 __all__ = [
     "expected_mean_angular_error", "length", "mean_angular_error", "nees", "pose_error",

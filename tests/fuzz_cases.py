@@ -7,26 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import (
-    bearing,
-    bodies,
-    bounds,
-    doa_bounds,
-    estimators,
-    link_bounds,
-    metrics,
-    motion,
-    network_bounds,
-    network_graphs,
-    obstacles,
-    placement,
-    ranging,
-    regions,
-    rigidity,
-    rotations,
-    scenes,
-    sensing_network,
-)
+from rbl_gym import bounds, estimators, metrics, motion, placement
+from rbl_gym.bounds import doa, links
+from rbl_gym.geometry import bodies, obstacles, regions, rotations
+from rbl_gym.measurements import bearing, ranging
+from rbl_gym.networks import bounds as network_bounds
+from rbl_gym.networks import graphs, rigidity, sensing
+from rbl_gym.worlds import scenes
 
 TAGS, PYRAMID, CORNER = bodies.octahedron(0.8), bodies.pyramid(), bodies.doa2019()
 ANCHORS = np.array([[5, 0, 0], [-5, 0, 0], [0, 5, 3], [0, -5, 3], [4, 4, 0.5]])
@@ -36,11 +23,11 @@ ANGLE_NOISE, PROCESS = bearing.AngleNoise(0.01), motion.ProcessNoise(0.1, 0.1)
 P = np.diag([0.01] * 3 + [0.1] * 3)
 RANGES = ranging.simulate(ANCHORS, TAGS, Q, T, NOISE, np.random.default_rng(0)).ranges
 ANGLES = bearing.simulate(CORNER, Q, [5, 5, 3], ANGLE_NOISE, np.random.default_rng(0))
-NET = sensing_network.random_network(12, 8.0, 0.05, np.random.default_rng(0))
-EDGE_ANGLES = sensing_network.edge_angles(NET.bearings)
+NET = sensing.random_network(12, 8.0, 0.05, np.random.default_rng(0))
+EDGE_ANGLES = sensing.edge_angles(NET.bearings)
 SQUARE = np.array([[0, 0], [1, 0], [1, 1.2], [0, 1.0]])
 TRIANGLES = np.array([[0, 1], [1, 2], [2, 3], [0, 3], [0, 2], [1, 3]])
-TRIANGLE_BEARINGS = sensing_network.true_bearings(SQUARE, np.zeros(4), TRIANGLES)
+TRIANGLE_BEARINGS = sensing.true_bearings(SQUARE, np.zeros(4), TRIANGLES)
 GRAPH = {"edges": NET.edges, "n_nodes": 12}
 POSE = {"rotation": Q, "translation": T}
 PAIR = {"rotation_hat": Q, "translation_hat": T, **POSE}
@@ -97,7 +84,7 @@ case(bearing.AngleNoise, std_rad=0.1)
 case(bearing.angles, positions=ANCHORS)
 case(bearing.simulate, tags=TAGS, **POSE, noise=ANGLE_NOISE, rng=Rng)
 case(bounds.pose_crb, anchors=ANCHORS, tags=TAGS, **POSE, noise=NOISE)
-case(doa_bounds.doa_crb, tags=CORNER, rotation=Q, translation=np.array([5, 5, 3.0]),
+case(doa.doa_crb, tags=CORNER, rotation=Q, translation=np.array([5, 5, 3.0]),
      noise=ANGLE_NOISE)  # fmt: skip
 case(bounds.posterior_crb_step, J=np.eye(6), anchors=ANCHORS, tags=TAGS, **POSE, noise=NOISE,
      twist=TWIST, dt=0.1, process=PROCESS)  # fmt: skip
@@ -126,12 +113,12 @@ for _name in estimators.names():
     case(_filter.initial, _name, **POSE, covariance=P)
     case(_filter.predict, _name, state=_state, twist=TWIST, dt=0.1)
     case(_filter.update, _name, state=_state, **_ranges)
-case(sensing_network.proj, angle=T)
-case(sensing_network.unit_disk_edges, positions=NET.positions, radius_m=2.0)
-case(sensing_network.true_bearings, positions=NET.positions, orientations=NET.orientations,
+case(sensing.proj, angle=T)
+case(sensing.unit_disk_edges, positions=NET.positions, radius_m=2.0)
+case(sensing.true_bearings, positions=NET.positions, orientations=NET.orientations,
      edges=NET.edges)  # fmt: skip
-case(sensing_network.edge_angles, bearings=NET.bearings)
-case(sensing_network.random_network, n_nodes=12, mean_degree=8.0, bearing_std_rad=0.05, rng=Rng)
+case(sensing.edge_angles, bearings=NET.bearings)
+case(sensing.random_network, n_nodes=12, mean_degree=8.0, bearing_std_rad=0.05, rng=Rng)
 for _method in ("ml", "chordal", "cycle", "spectral", "tree"):
     case(estimators.orientations, _method, **GRAPH, y=EDGE_ANGLES, method=_method)
 case(estimators.chordal_optimum, **GRAPH, y=EDGE_ANGLES)
@@ -142,20 +129,20 @@ case(estimators.frames, edges=TRIANGLES, bearings=TRIANGLE_BEARINGS, n_nodes=4, 
 case(network_bounds.orientation_covariance, **GRAPH, bearing_std_rad=0.1)
 case(network_bounds.frame_covariance, positions=SQUARE, edges=TRIANGLES, bearing_std_rad=0.1,
      known_pair=(0, 1))  # fmt: skip
-for _function in (network_graphs.cycle_matrix, network_graphs.incidence,
-                  network_graphs.spanning_tree):  # fmt: skip
+for _function in (graphs.cycle_matrix, graphs.incidence,
+                  graphs.spanning_tree):  # fmt: skip
     case(_function, **GRAPH)
 case(rigidity.localizability, positions=NET.positions, edges=NET.edges)
 case(rigidity.freedom, positions=np.eye(4)[:, :3], edges=TRIANGLES)
 PLACES = {"anchors": ANCHORS, "tags": TAGS, **POSE, "noise": NOISE}
 LINKS, LINK_MODEL = EPOCH["links"], ranging.LinkModel(0.1, nlos_probability=0.1)
 case(bounds.range_information, **PLACES, links=LINKS, tag_std_m=0.01)
-case(link_bounds.expected_information, **PLACES, link_model=LINK_MODEL, nlos_std_m=1.0)
-case(link_bounds.realised_crb, **PLACES, link_model=LINK_MODEL, rng=Rng, draws=3,
+case(links.expected_information, **PLACES, link_model=LINK_MODEL, nlos_std_m=1.0)
+case(links.realised_crb, **PLACES, link_model=LINK_MODEL, rng=Rng, draws=3,
      prior_information=np.eye(6))  # fmt: skip
-case(link_bounds.nlos_efficiency, probability=0.1, bias_m=5.0, std_m=0.1, bias_std_m=1.0)
-case(link_bounds.bias_information, **PLACES, links=LINKS)
-case(link_bounds.with_biases, pose_information=np.eye(6), bias_std_m=0.1, n_biases=3)
-case(link_bounds.marginal_information, joint=np.eye(8))
-case(link_bounds.posterior_bias_step, J=np.eye(11), **PLACES, twist=TWIST, dt=0.5,
+case(links.nlos_efficiency, probability=0.1, bias_m=5.0, std_m=0.1, bias_std_m=1.0)
+case(links.bias_information, **PLACES, links=LINKS)
+case(links.with_biases, pose_information=np.eye(6), bias_std_m=0.1, n_biases=3)
+case(links.marginal_information, joint=np.eye(8))
+case(links.posterior_bias_step, J=np.eye(11), **PLACES, twist=TWIST, dt=0.5,
      process=PROCESS, groups="anchor", bias_walk_m=0.1)  # fmt: skip

@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.app import bench_command, bench_files, policies
-from rbl_gym.g2o import read_graph
+from rbl_gym.app import bench_command
+from rbl_gym.networks.g2o import read_graph
+from rbl_gym.placement.scene_files import problem
 from rbl_gym.recordings import read_recording
-from rbl_gym.scene_files import problem
+from rbl_gym.studies.bench import records
+from rbl_gym.studies.learning import policies
 
 
 class Reader(NamedTuple):
@@ -134,10 +136,10 @@ READERS = {
         (b'{"name": "uwb_room", "steps": 9}', b'{"ranges": "r.csv", "anchors": "a.csv"}'),
         NUMBERS + JSON,
     ),
-    "bench-lines": Reader("bench.jsonl", bench_files.read, (_lines,), NUMBERS + JSON),
+    "bench-lines": Reader("bench.jsonl", records.read, (_lines,), NUMBERS + JSON),
     "bench-timings": Reader(
         "bench.timings.jsonl",
-        lambda path: bench_files.read_timings(path.with_name("bench.jsonl")), (_times,),
+        lambda path: records.read_timings(path.with_name("bench.jsonl")), (_times,),
         NUMBERS + JSON,
     ),
 }  # fmt: skip

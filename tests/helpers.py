@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import ranging, rotations
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
 
 DATA = Path(__file__).parent / "data"
 ROOT = Path(__file__).resolve().parents[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import tomllib
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -14,10 +15,15 @@ from tests.helpers import ROOT, needs, run_python
 
 FOLDERS = {"rbl_gym": "rbl_gym", "estimators": "rbl_gym.estimators", "wrappers": "rbl_gym.wrappers"}
 PLAIN_MODELS = {
-    "rotations", "ranging", "bearing", "sensing_network", "bounds", "components", "motion",
-    "checks", "network_bounds", "network_graphs", "rigidity", "unknown_twist", "link_bias",
+    "bounds",
+    "checks",
+    "components",
+    "geometry",
     "kernels",
-}  # fmt: skip
+    "measurements",
+    "motion",
+    "networks",
+}
 # numpy.random's names that are no global state.
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
 
@@ -89,16 +95,13 @@ def test_versions_of_pyproject_and_package_agree():
 
 # --- who imports whom -------------------------------------------------------------------------
 
-WORLD = [
-    name
-    for name in MODULES
-    if not any(within(name, f"rbl_gym.{above}") for above in ("estimators", "wrappers", "app"))
-]
+ABOVE = ("estimators", "wrappers", "studies", "app")
+WORLD = [name for name in MODULES if not any(within(name, f"rbl_gym.{above}") for above in ABOVE)]
 
 
 @pytest.mark.parametrize("name", WORLD)
-def test_the_world_imports_neither_estimators_nor_wrappers_nor_the_app(name):
-    for above in ("estimators", "wrappers", "app"):
+def test_the_world_imports_nothing_that_stands_above_it(name):
+    for above in ABOVE:
         assert not [m for m in imports(name) if within(m, f"rbl_gym.{above}")]
 
 
@@ -109,8 +112,30 @@ def test_estimators_import_only_the_plain_models(name):
 
 
 @pytest.mark.parametrize("name", modules_of("rbl_gym.wrappers"))
-def test_wrappers_do_not_import_the_app(name):
+def test_wrappers_import_neither_studies_nor_the_app(name):
+    for above in ("studies", "app"):
+        assert not [m for m in imports(name) if within(m, f"rbl_gym.{above}")]
+
+
+@pytest.mark.parametrize("name", modules_of("rbl_gym.studies"))
+def test_studies_do_not_import_the_app(name):
     assert not [m for m in imports(name) if within(m, "rbl_gym.app")]
+
+
+def package_of(name: str) -> str:
+    """The box a module stands in: a package below `rbl_gym` or `rbl_gym.estimators`, or itself."""
+    parts = name.split(".")
+    depth = 3 if parts[1:2] == ["estimators"] else 2
+    return ".".join(parts[:depth])
+
+
+def test_packages_import_each_other_without_a_circle():
+    boxes = graphlib.TopologicalSorter()
+    for name in MODULES:
+        for imported in imports(name) & set(MODULES):
+            if package_of(name) != package_of(imported) and imported.count("."):
+                boxes.add(package_of(name), package_of(imported))
+    boxes.prepare()  # raises CycleError, which names the circle
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -161,7 +186,8 @@ import sys, gymnasium
 env = gymnasium.make("rbl_gym:RBL/Tracking-v0")
 env.reset(seed=0)
 env.step(0)
-heavy = ("rbl_gym.estimators", "rbl_gym.wrappers", "rbl_gym.app", "filterpy", "matplotlib")
+ours = ("estimators", "wrappers", "studies", "app")
+heavy = (*(f"rbl_gym.{name}" for name in ours), "filterpy", "matplotlib")
 print([m for m in heavy if m in sys.modules])
 """)
     assert lines == ["[]"]

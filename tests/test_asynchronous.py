@@ -7,8 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations
+from rbl_gym import estimators, metrics, motion
 from rbl_gym.estimators import Asynchronous
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
 from tests.helpers import random_world, simulate
 
 NOISE = ranging.RangeNoise(0.02)

@@ -7,21 +7,15 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from rbl_gym import (
-    bodies,
-    bounds,
-    estimators,
-    link_bias,
-    metrics,
-    motion,
-    ranging,
-    rotations,
-    scenes,
-)
-from rbl_gym import unknown_twist as ut
-from rbl_gym.estimators.augmented import AugmentedEkf, AugmentedState, iekf_bias, iekf_cv
-from rbl_gym.estimators.manifold import IteratedEkf
-from rbl_gym.link_bias import LinkBias
+from rbl_gym import bounds, estimators, metrics, motion
+from rbl_gym.bounds import twist as twist_bounds
+from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState, iekf_bias, iekf_cv
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import link_bias, ranging
+from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.motion import unknown_twist as ut
+from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same, random_world, simulate
 
@@ -155,7 +149,7 @@ def test_unknown_twist_in_the_drone_yard_reaches_the_bound_and_is_consistent(sen
                 reading = reading + std * rng.standard_normal((trials, 6))
             state = filter.predict(state, reading, scene.dt)
             rest = scene.noise, twist, scene.dt, scene.process, law
-            J = ut.posterior_crb_step(J, anchors, tags, *pose, *rest, sensor=sensor)
+            J = twist_bounds.posterior_crb_step(J, anchors, tags, *pose, *rest, sensor=sensor)
         ranges = simulate(rng, anchors, tags, *pose, scene.noise)
         state = filter.update(state, ranges, anchors)
         error = metrics.pose_error(state.rotation, state.translation, *pose)

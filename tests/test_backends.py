@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from rbl_gym.app import backends
 from rbl_gym.app.cli import main
+from rbl_gym.studies import backends
 from tests import fragile
 
 pytest.importorskip("joblib", reason="needs the extra parallel")

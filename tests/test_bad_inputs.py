@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, estimators, motion, ranging
+from rbl_gym import estimators, motion
+from rbl_gym.geometry import bodies
+from rbl_gym.measurements import ranging
 
 TAGS = bodies.pyramid()
 ANCHORS = np.array([[0, 0, 0], [9, 0, 1], [0, 9, 2], [9, 9, 3.0]])

@@ -9,9 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, bounds, estimators, motion, ranging, rotations, scenes
-from rbl_gym.app import monte_carlo
-from rbl_gym.estimators.hypotheses import RIVALS
+from rbl_gym import bounds, estimators, motion
+from rbl_gym.estimators.bank.hypotheses import RIVALS
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.studies import monte_carlo
+from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import random_world, simulate
 

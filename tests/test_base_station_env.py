@@ -11,8 +11,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bearing, bounds, doa_bounds
+from rbl_gym import bounds
+from rbl_gym.bounds import doa
 from rbl_gym.envs.base_station import BaseStationEnv, BaseStationVectorEnv
+from rbl_gym.measurements import bearing
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same
 from tests.side_by_side import (
@@ -70,7 +72,7 @@ def test_angles_and_score_by_hand():
             assert reward == pytest.approx(-math.log(info["score_m"]))
         assert info["epoch"] == epoch
         pose, station = (info["rotation"], info["translation"]), observation["station"]
-        J = J + doa_bounds.doa_information(tags, *pose, noise, station)
+        J = J + doa.doa_information(tags, *pose, noise, station)
         score = bounds.score(np.linalg.inv(J), info["rotation"], tags)
         assert info["score_m"] == pytest.approx(float(score), rel=1e-9)
         true = bearing.angles(tags @ pose[0].T + pose[1], station)

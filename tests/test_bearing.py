@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bearing, bodies, doa_bounds, rotations
+from rbl_gym.bounds import doa
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import bearing
 from tests.helpers import load
 
 POINTS = np.random.default_rng(1).normal(size=(5, 4, 3))
@@ -74,11 +76,11 @@ def test_noise_is_folded_back_and_has_its_standard_deviation():
 
 def test_the_bound_has_the_reference_coefficients():
     for case in load("doa.json")["cases"]:
-        P = doa_bounds.doa_crb(case["C"], case["R"], case["t"], bearing.AngleNoise(1.0))
+        P = doa.doa_crb(case["C"], case["R"], case["t"], bearing.AngleNoise(1.0))
         want = case["ccrb_per_rad"]
         np.testing.assert_allclose(np.sqrt(2 * np.trace(P[:3, :3])), want["R_frobenius"], rtol=1e-9)
         np.testing.assert_allclose(np.sqrt(np.trace(P[3:, 3:])), want["t_m"], rtol=1e-9)
-    P = doa_bounds.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], bearing.AngleNoise(1.0))
+    P = doa.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], bearing.AngleNoise(1.0))
     np.testing.assert_allclose(np.sqrt(2 * np.trace(P[:3, :3])), 10.01873440, rtol=1e-6)
     np.testing.assert_allclose(np.sqrt(np.trace(P[3:, 3:])), 23.64240626, rtol=1e-6)
 
@@ -93,9 +95,9 @@ def test_information_is_that_of_the_measurement_model():
         return bearing.angles(turned + translation + error[3:], station).ravel()
 
     J = np.stack([(seen(d) - seen(-d)) / 2e-6 for d in 1e-6 * np.eye(6)], axis=-1)
-    found = doa_bounds.doa_information(tags, rotation, translation, noise, station)
+    found = doa.doa_information(tags, rotation, translation, noise, station)
     np.testing.assert_allclose(found, J.T @ J / 0.01**2, rtol=1e-5, atol=1e-3)
-    batch = doa_bounds.doa_information(
+    batch = doa.doa_information(
         tags, np.tile(rotation, (2, 3, 1, 1)), np.tile(translation, (3, 1)), noise, station
     )
     assert batch.shape == (2, 3, 6, 6)
@@ -104,10 +106,8 @@ def test_information_is_that_of_the_measurement_model():
 
 def test_what_does_not_determine_the_pose_is_refused_with_its_rank():
     with pytest.raises(ValueError, match="rank 4 of 6"):
-        doa_bounds.doa_crb(bodies.doa2019()[:2], np.eye(3), [5, 5, 3], bearing.AngleNoise())
-    prior = doa_bounds.doa_crb(
-        bodies.doa2019()[:2], np.eye(3), [5, 5, 3], bearing.AngleNoise(), np.eye(6)
-    )
+        doa.doa_crb(bodies.doa2019()[:2], np.eye(3), [5, 5, 3], bearing.AngleNoise())
+    prior = doa.doa_crb(bodies.doa2019()[:2], np.eye(3), [5, 5, 3], bearing.AngleNoise(), np.eye(6))
     assert np.isfinite(prior).all()
 
 
@@ -126,7 +126,7 @@ def test_bad_angles_are_refused(value, message):
     with pytest.raises(ValueError, match="std_rad must be"):
         bearing.AngleNoise(0.0)
     with pytest.raises(ValueError, match="noise must be a bearing"):
-        doa_bounds.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], 0.1)  # pyright: ignore[reportArgumentType]
+        doa.doa_crb(bodies.doa2019(), np.eye(3), [5, 5, 3], 0.1)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("scale", [1e-45, 1e-3, 1e9, 1e120, 1e150, 1e300])

@@ -7,8 +7,10 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, estimators, motion, ranging
-from rbl_gym.estimators import belief
+from rbl_gym import estimators, motion
+from rbl_gym.estimators import filter as belief
+from rbl_gym.geometry import bodies
+from rbl_gym.measurements import ranging
 
 LAWS = {
     "tags": bodies.pyramid(),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from rbl_gym import bodies
+from rbl_gym.geometry import bodies
 
 LAYOUTS = [bodies.pyramid, bodies.octahedron, bodies.cube, bodies.plate]
 

@@ -15,9 +15,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import bodies, bounds, metrics, ranging, rotations
+from rbl_gym import bounds, metrics
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.measurements.ranging import RangeNoise, SquaredRangeNoise
 from rbl_gym.motion import ProcessNoise
-from rbl_gym.ranging import RangeNoise, SquaredRangeNoise
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=30)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -12,9 +12,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, estimators, motion, ranging, recordings, rotations
-from rbl_gym.app import camsap2013, replay
+from rbl_gym import estimators, motion, recordings
 from rbl_gym.app.cli import main
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.studies import replay
+from rbl_gym.studies.papers import camsap2013
 from tests.helpers import ROOT, assert_table_holds, needs
 
 LIAS = ROOT.parent / "shared" / "data" / "lias_planar"

@@ -9,11 +9,11 @@ import pytest
 import scipy.sparse as sp
 
 from rbl_gym import estimators
-from rbl_gym.app import network2009
-from rbl_gym.estimators import consensus
-from rbl_gym.estimators.consensus import cycle_consensus, cycle_iteration, cycle_projection
-from rbl_gym.network_graphs import BASES, cycle_matrix
-from rbl_gym.sensing_network import proj, random_network
+from rbl_gym.estimators.networks import consensus
+from rbl_gym.estimators.networks.consensus import cycle_consensus, cycle_iteration, cycle_projection
+from rbl_gym.networks.graphs import BASES, cycle_matrix
+from rbl_gym.networks.sensing import proj, random_network
+from rbl_gym.studies.papers import network2009
 from tests.helpers import load
 
 GOLDEN = load("network_golden.json")

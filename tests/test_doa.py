@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bearing, bodies, doa_bounds, estimators, metrics, ranging, rotations
-from rbl_gym.estimators.doa_cost import DoaCost, SumCost
-from rbl_gym.estimators.doa_global import three_point_depths
-from rbl_gym.estimators.doa_newton import newton_iteration, unit_quaternion
-from rbl_gym.estimators.levenberg_marquardt import minimize_pose
-from rbl_gym.estimators.range_cost import RangeCost
+from rbl_gym import estimators, metrics
+from rbl_gym.bounds import doa as doa_bounds
+from rbl_gym.estimators.costs.doa_cost import DoaCost, SumCost
+from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.costs.range_cost import RangeCost
+from rbl_gym.estimators.locating.doa_global import three_point_depths
+from rbl_gym.estimators.locating.doa_newton import newton_iteration, unit_quaternion
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import bearing, ranging
 from tests.helpers import load
 
 TAGS = bodies.doa2019()

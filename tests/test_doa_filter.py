@@ -7,18 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import (
-    bearing,
-    bodies,
-    bounds,
-    doa_bounds,
-    estimators,
-    metrics,
-    motion,
-    ranging,
-    rotations,
-)
+from rbl_gym import bounds, estimators, metrics, motion
+from rbl_gym.bounds import doa
 from rbl_gym.envs.base_station import BaseStationVectorEnv
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import bearing, ranging
 
 TAGS = bodies.doa2019()
 NOISE = bearing.AngleNoise(np.deg2rad(0.1))
@@ -56,7 +49,7 @@ def tracked():
         pose, station = (info["rotation"], info["translation"]), observation["station"]
         anchors = station[:, None]
         ranges = ranging.simulate(anchors, tags, *pose, RANGES, rng).ranges
-        of_angles = doa_bounds.doa_information(tags, *pose, env.noise, station)
+        of_angles = doa.doa_information(tags, *pose, env.noise, station)
         of_ranges = bounds.range_information(anchors, tags, *pose, RANGES)
         for name, filter in filters.items():
             state = states[name]

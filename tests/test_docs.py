@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import rbl_gym
-from rbl_gym import ranging
-from rbl_gym.app import place, policies
 from rbl_gym.app.cli import _parser
-from rbl_gym.estimators import belief
+from rbl_gym.estimators import filter as belief
+from rbl_gym.measurements import ranging
+from rbl_gym.studies.learning import policies
+from rbl_gym.studies.placing import design
 from tests.helpers import ROOT, needs
 
 # Its blocks are files of a package: tests/test_your_estimator.py.
@@ -59,7 +60,7 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
     # What a block registers is forgotten after the test.
     monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(place, "_GENERATIONS", 4)  # pages show how, not how well
+    monkeypatch.setattr(design, "_GENERATIONS", 4)  # pages show how, not how well
     write_files_that_pages_read(tmp_path)
     names: dict = {}
     for block in blocks(page, "python"):

@@ -9,10 +9,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, estimators, motion, ranging, rotations
-from rbl_gym.estimators import engines
-from rbl_gym.estimators.kalman import KalmanState
-from rbl_gym.estimators.squared_range import information, statistic
+from rbl_gym import estimators, motion
+from rbl_gym.estimators.linear import engines
+from rbl_gym.estimators.linear.kalman import KalmanState
+from rbl_gym.estimators.linear.squared_range import information, statistic
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import simulate
 

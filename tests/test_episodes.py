@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import scenes, simulation
 from rbl_gym.components import whole_rows
 from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.worlds import scenes, simulation
 
 LOSSY = {"drop_probability": 0.2, "nlos_probability": 0.1}
 

@@ -8,8 +8,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym import bearing, bodies, estimators, motion, ranging, recordings, rotations, scenes
-from rbl_gym.app import bench_run, monte_carlo, replay
+from rbl_gym import estimators, motion, recordings
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import bearing, ranging
+from rbl_gym.studies import monte_carlo, replay
+from rbl_gym.studies.bench import run as bench_run
+from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import random_world, simulate
 

@@ -15,9 +15,10 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.wrappers import FlattenObservation, RecordEpisodeStatistics, TimeLimit
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import estimators, scene_bounds
-from rbl_gym.ranging import LinkNoise
-from rbl_gym.scenes import SCENES
+from rbl_gym import estimators
+from rbl_gym.measurements.ranging import LinkNoise
+from rbl_gym.worlds import scene_bounds
+from rbl_gym.worlds.scenes import SCENES
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import assert_same, score_by_hand
 

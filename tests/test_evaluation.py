@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import estimators, layout_search, layouts, placement, ranging
-from rbl_gym.app import evaluation, policies, training, transfer
+from rbl_gym import estimators, placement
 from rbl_gym.app.cli import main
-from rbl_gym.app.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
 from rbl_gym.envs.placement import AnchorPlacementEnv
-from rbl_gym.placement import Context
+from rbl_gym.measurements import ranging
+from rbl_gym.placement import Context, layouts, search
+from rbl_gym.studies.learning import evaluation, policies, training, transfer
+from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
 from rbl_gym.wrappers.tasks import AnchorSelectionEnv, MobileAnchorsEnv
 from tests.helpers import needs
 from tests.test_policies import random_policy
@@ -286,7 +287,7 @@ def test_filters_and_references_by_task():
 
 
 def test_the_strongest_search_stays_the_one_that_counts_as_1(monkeypatch):
-    monkeypatch.setitem(layout_search.SEARCHES, "later", layout_search.best_of_random)
+    monkeypatch.setitem(search.SEARCHES, "later", search.best_of_random)
     names = evaluation.references(rl_task("auv_buoys"))
     assert names[-2:] == ["later", "cma-es"]
 

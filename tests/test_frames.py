@@ -7,15 +7,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import rigidity, sensing_network
 from rbl_gym.estimators import frames
-from rbl_gym.network_bounds import (
+from rbl_gym.networks import rigidity, sensing
+from rbl_gym.networks.bounds import (
     bearing_jacobian,
     frame_covariance,
     orientation_covariance,
     range_jacobian,
 )
-from rbl_gym.sensing_network import proj, random_network, true_bearings
+from rbl_gym.networks.sensing import proj, random_network, true_bearings
 
 SQUARE = np.array([[0, 1], [1, 2], [2, 3], [0, 3]])
 
@@ -83,7 +83,7 @@ def test_errors_reach_the_bound_and_ranges_lower_it(network, trials):
     rng = np.random.default_rng(4)
     errors = {"known": [], "ranged": []}
     for _ in range(trials):
-        bearings = sensing_network.measure(positions, theta, edges, sigma, rng)
+        bearings = sensing.measure(positions, theta, edges, sigma, rng)
         # Two nodes are 5 cm apart: one range in thousands comes out below zero.
         ranges = np.abs(exact + range_std * rng.standard_normal(len(edges)))
         both = {

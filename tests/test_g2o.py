@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import g2o
+from rbl_gym.networks import g2o
 
 G2O = """# a small graph
 VERTEX_SE2 10 0 0 0

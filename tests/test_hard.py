@@ -9,10 +9,11 @@ import json
 import numpy as np
 import pytest
 
-from rbl_gym import metrics, simulation
-from rbl_gym.app import hard, monte_carlo
+from rbl_gym import metrics
 from rbl_gym.app.cli import main
-from rbl_gym.scenes import SCENES
+from rbl_gym.studies import hard, monte_carlo
+from rbl_gym.worlds import simulation
+from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import assert_table_holds, needs
 
 

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from rbl_gym import bodies, estimators, motion, ranging, rotations
-from rbl_gym.estimators.kalman import expand_covariance, state_jacobian
-from rbl_gym.estimators.least_squares import vec
+from rbl_gym import estimators, motion
+from rbl_gym.estimators.linear.kalman import expand_covariance, state_jacobian
+from rbl_gym.estimators.linear.least_squares import vec
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
 from tests.helpers import load, random_world, simulate, textbook_model
 
 FAMILY = ["kf", "uc-kf", "et-kf", "kf-ortho"]

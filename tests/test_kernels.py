@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import kernels, rotations
+from rbl_gym import kernels
+from rbl_gym.geometry import rotations
 from tests.helpers import ROOT, run_python
 
 needs_numba = pytest.mark.skipif(not kernels.enabled(), reason="kernels are off")

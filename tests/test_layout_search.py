@@ -9,9 +9,10 @@ import sys
 import numpy as np
 import pytest
 
-from rbl_gym import layout_search, layouts, placement
-from rbl_gym.layout_search import SEARCHES, cma_es, expand, greedy, shared_layout
-from rbl_gym.placement import Context
+from rbl_gym import placement
+from rbl_gym.placement import Context, layouts
+from rbl_gym.placement import search as layout_search
+from rbl_gym.placement.search import SEARCHES, cma_es, expand, greedy, shared_layout
 from tests.helpers import needs
 
 QUICK = {"generations": 6, "population": 6}

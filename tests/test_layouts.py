@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from rbl_gym import layouts, placement
-from rbl_gym.layouts import LAYOUTS
-from rbl_gym.placement import Context
+from rbl_gym import placement
+from rbl_gym.placement import Context, layouts
+from rbl_gym.placement.layouts import LAYOUTS
 
 SCENES = ("uwb_room", "drone_yard", "auv_buoys", "satellite", "icassp2013")
 every_layout = pytest.mark.parametrize("name", LAYOUTS)

@@ -12,19 +12,18 @@ from scipy import stats
 
 pytest.importorskip("rich", reason="needs the extra cli")
 
-from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
-from rbl_gym.app import (
-    bench_figures,
-    bench_files,
-    bench_report,
-    bench_worlds,
-    leaderboard,
-    replay,
-    terminal,
-)
+from rbl_gym import estimators, metrics, motion
+from rbl_gym.app import bench_report
 from rbl_gym.app.cli import main
-from rbl_gym.estimators import belief
+from rbl_gym.estimators import filter as belief
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
 from rbl_gym.recordings import read_recording
+from rbl_gym.studies import extras, replay
+from rbl_gym.studies.bench import figures as bench_figures
+from rbl_gym.studies.bench import leaderboard, records
+from rbl_gym.studies.bench import worlds as bench_worlds
+from rbl_gym.worlds import scenes
 
 SHORT = {"name": "uwb_room", "steps": 4}
 
@@ -387,7 +386,7 @@ def test_records_say_what_they_are_of_and_times_stand_apart(tmp_path, short, cap
         assert (record["trials"], record["seed"]) == (6, 0)
         assert {"rbl-gym", "code", "numpy", "scipy"} == record["versions"].keys()
     assert b"microseconds" not in data
-    times = bench_files.read_timings(tmp_path / "x.jsonl")
+    times = records.read_timings(tmp_path / "x.jsonl")
     assert len(times) == 4
     assert min(times.values()) > 0
     result = json.loads((tmp_path / "x.json").read_text())
@@ -434,7 +433,7 @@ def test_rerun_of_nothing_is_an_error(tmp_path, capsys):
 
 
 def test_a_missing_library_is_said_before_a_bar_is_drawn(tmp_path, short, capsys, monkeypatch):
-    monkeypatch.setattr(terminal.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None)
     status, data = bench(tmp_path, "--scenes", short, "--jobs", "2")
     assert (status, data) == (2, b"")
     (line,) = capsys.readouterr().err.splitlines()

@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from rbl_gym import ranging, rotations
-from rbl_gym.estimators import squared_range
-from rbl_gym.estimators.least_squares import procrustes, unvec, vec
+from rbl_gym.estimators.linear import squared_range
+from rbl_gym.estimators.linear.least_squares import procrustes, unvec, vec
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
 from tests.helpers import load
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rbl_gym import rotations
-from rbl_gym.estimators.levenberg_marquardt import Linearization, minimize_pose
+from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, minimize_pose
+from rbl_gym.geometry import rotations
 
 
 def to_pose(rotation, translation, log=rotations.error):

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from rbl_gym import bodies, bounds, link_bounds, motion, ranging, rotations
+from rbl_gym import bounds, motion
+from rbl_gym.bounds import links as link_bounds
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
 from tests.helpers import random_world
 
 NOISE = ranging.RangeNoise(0.1, 0.01)

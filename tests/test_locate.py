@@ -10,11 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
-from rbl_gym import bodies, bounds, estimators, metrics, ranging, rotations, scenes
-from rbl_gym.estimators import localization as door
-from rbl_gym.estimators import maximum_likelihood, squared_range
-from rbl_gym.estimators.levenberg_marquardt import minimize_pose
-from rbl_gym.estimators.range_cost import RangeCost
+from rbl_gym import bounds, estimators, metrics
+from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.costs.range_cost import RangeCost
+from rbl_gym.estimators.linear import squared_range
+from rbl_gym.estimators.locating import localization as door
+from rbl_gym.estimators.locating import maximum_likelihood
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.worlds import scenes
 from tests.helpers import load, random_world, simulate
 
 BODY = bodies.icassp2013()
@@ -428,7 +432,7 @@ def test_a_trial_whose_links_are_too_few_is_marked_and_spoils_no_other():
 
 
 def test_a_package_adds_its_method_by_an_entry_point(monkeypatch):
-    entry = EntryPoint("mine", "rbl_gym.estimators.locators:_cls", "rbl_gym.locators")
+    entry = EntryPoint("mine", "rbl_gym.estimators.locating.locators:_cls", "rbl_gym.locators")
     monkeypatch.setattr(door, "entry_points", lambda group: [entry])
     assert "mine" in estimators.methods()
     rng = np.random.default_rng(13)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, bounds, estimators, metrics, motion, ranging, rotations
-from rbl_gym.estimators.belief import inverse
-from rbl_gym.estimators.levenberg_marquardt import minimize_pose
-from rbl_gym.estimators.manifold import IteratedEkf, MapProblem, PoseState
-from rbl_gym.estimators.range_cost import RangeCost, huber
+from rbl_gym import bounds, estimators, metrics, motion
+from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.costs.range_cost import RangeCost, huber
+from rbl_gym.estimators.filter import inverse
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, MapProblem, PoseState
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
 from tests.helpers import load, random_world, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)

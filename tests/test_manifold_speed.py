@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, bounds, components, estimators, motion, ranging, rotations
-from rbl_gym.estimators import manifold
-from rbl_gym.estimators.manifold import PoseState
-from rbl_gym.estimators.range_cost import RangeCost, huber, lift_map
+from rbl_gym import bounds, components, estimators, motion
+from rbl_gym.estimators.costs.range_cost import RangeCost, huber, lift_map
+from rbl_gym.estimators.iekf import manifold
+from rbl_gym.estimators.iekf.manifold import PoseState
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
 from tests.helpers import random_world, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)

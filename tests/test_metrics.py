@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy import integrate
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import metrics, rotations
+from rbl_gym import metrics
+from rbl_gym.geometry import rotations
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)

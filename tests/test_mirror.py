@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import ranging, rotations
-from rbl_gym.mirror import Plane, mirror_pose, plane_of
+from rbl_gym.geometry import rotations
+from rbl_gym.geometry.mirror import Plane, mirror_pose, plane_of
+from rbl_gym.measurements import ranging
 
 
 def flat(rng, count, normal):

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from rbl_gym import motion, rotations
+from rbl_gym import motion
+from rbl_gym.geometry import rotations
 from rbl_gym.motion import ProcessNoise, Trajectory
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=30)

@@ -7,11 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from rbl_gym.app import network, network2009, network_growth
 from rbl_gym.app.cli import main
-from rbl_gym.estimators import consensus
-from rbl_gym.network_graphs import cycle_matrix
-from rbl_gym.sensing_network import proj
+from rbl_gym.estimators.networks import consensus
+from rbl_gym.networks.graphs import cycle_matrix
+from rbl_gym.networks.sensing import proj
+from rbl_gym.studies import network
+from rbl_gym.studies.papers import network2009, network_growth
 from tests.helpers import ROOT, assert_table_holds, needs
 
 G2O = ROOT.parent / "shared" / "data" / "g2o_planar"

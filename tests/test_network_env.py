@@ -11,8 +11,8 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from rbl_gym.envs.network import PRIOR_STD_RAD, PlanarNetworkEnv, PlanarNetworkVectorEnv
-from rbl_gym.network_bounds import orientation_covariance
-from rbl_gym.sensing_network import proj
+from rbl_gym.networks.bounds import orientation_covariance
+from rbl_gym.networks.sensing import proj
 from rbl_gym.wrappers import EstimateNetwork, VectorEstimateNetwork
 from rbl_gym.wrappers.estimate_network import consensus
 from tests.helpers import assert_same

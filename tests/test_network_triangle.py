@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import network_bounds, rigidity, sensing_network
 from rbl_gym.estimators import triangle_frames
-from rbl_gym.estimators.network_triangle import TRIANGLE_EDGES
+from rbl_gym.estimators.networks.triangle import TRIANGLE_EDGES
+from rbl_gym.networks import bounds, rigidity, sensing
 
 PLACES = np.array([[0.0, 0.0, 0.0], [4.0, 1.0, 0.5], [1.0, 3.0, -2.0]])
 
@@ -17,7 +17,7 @@ PLACES = np.array([[0.0, 0.0, 0.0], [4.0, 1.0, 0.5], [1.0, 3.0, -2.0]])
 def measured(sigma, rng, trials=1):
     """Truth and bearings; every node's frame is anyhow."""
     turned = Rotation.random(3 * trials, random_state=rng).as_matrix().reshape(trials, 3, 3, 3)
-    seen = sensing_network.measure_in_space(PLACES, turned, TRIANGLE_EDGES, sigma, rng)
+    seen = sensing.measure_in_space(PLACES, turned, TRIANGLE_EDGES, sigma, rng)
     return turned, seen
 
 
@@ -78,7 +78,7 @@ def test_errors_reach_the_bound_and_the_misfit_has_its_variance():
     error = Rotation.from_matrix(
         (found.rotation @ np.swapaxes(truth, -1, -2))[:, 1:].reshape(-1, 3, 3)
     ).as_rotvec().reshape(trials, 6)  # fmt: skip
-    bound = network_bounds.space_orientation_covariance(PLACES, TRIANGLE_EDGES, sigma)
+    bound = bounds.space_orientation_covariance(PLACES, TRIANGLE_EDGES, sigma)
     # In node 0's frame, which is another one in every trial: traces only.
     for node in (slice(0, 3), slice(3, 6)):
         got = np.mean(np.sum(error[:, node] ** 2, axis=1))
@@ -93,7 +93,7 @@ def test_the_bound_is_the_inverse_of_a_numeric_information():
     def seen(x):
         turns = Rotation.from_rotvec(x[9:].reshape(3, 3)).as_matrix()
         places = PLACES + x[:9].reshape(3, 3)
-        exact = sensing_network.measure_in_space(
+        exact = sensing.measure_in_space(
             places, turns, TRIANGLE_EDGES, 0.0, np.random.default_rng(0)
         )
         return exact.ravel()
@@ -101,32 +101,32 @@ def test_the_bound_is_the_inverse_of_a_numeric_information():
     for k in range(18):
         step = shift * np.eye(18)[k]
         J[:, k] = (seen(step) - seen(-step)) / (2 * shift)
-    np.testing.assert_allclose(network_bounds.space_jacobian(PLACES, TRIANGLE_EDGES), J, atol=1e-8)
+    np.testing.assert_allclose(bounds.space_jacobian(PLACES, TRIANGLE_EDGES), J, atol=1e-8)
     # The gauge by another choice: frame 0 and the place of node 1 along its direction.
     u = PLACES[1] / np.linalg.norm(PLACES[1])
     kept = np.delete(J, [0, 1, 2, 9, 10, 11], axis=1)
     length = np.concatenate([u, np.zeros(9)])
     information = kept.T @ kept + np.outer(length, length)
     want = 0.02**2 * np.linalg.inv(information)[6:, 6:]
-    got = network_bounds.space_orientation_covariance(PLACES, TRIANGLE_EDGES, 0.02)
+    got = bounds.space_orientation_covariance(PLACES, TRIANGLE_EDGES, 0.02)
     np.testing.assert_allclose(got, want, rtol=1e-5)
 
 
 def test_what_cannot_be_solved_is_said():
     on_a_line = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
-    seen = sensing_network.measure_in_space(
+    seen = sensing.measure_in_space(
         on_a_line, np.tile(np.eye(3), (3, 1, 1)), TRIANGLE_EDGES, 0.0, np.random.default_rng(0)
     )
     with pytest.raises(ValueError, match="bearings must span a triangle"):
         triangle_frames(seen)
     with pytest.raises(ValueError, match="free motions"):
-        network_bounds.space_orientation_covariance(on_a_line, TRIANGLE_EDGES, 0.1)
+        bounds.space_orientation_covariance(on_a_line, TRIANGLE_EDGES, 0.1)
     with pytest.raises(ValueError, match="bearings must have shape"):
         triangle_frames(np.ones((3, 3)))
     with pytest.raises(ValueError, match="got one of length 0"):
         triangle_frames(np.zeros((3, 2, 3)))
     with pytest.raises(ValueError, match="same point"):
-        sensing_network.measure_in_space(
+        sensing.measure_in_space(
             np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), TRIANGLE_EDGES, 0.0,
             np.random.default_rng(0),
         )  # fmt: skip

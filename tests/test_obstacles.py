@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbl_gym.obstacles import check_obstacles, in_sight
+from rbl_gym.geometry.obstacles import check_obstacles, in_sight
 
 BOX = np.array([0.0, 0, 0, 1, 2, 3])
 

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from rbl_gym import estimators, g2o
-from rbl_gym.estimators import chordal_optimum, network_orientations, orientations
-from rbl_gym.estimators.network_orientations import METHODS, cost
-from rbl_gym.network_bounds import orientation_covariance
-from rbl_gym.network_graphs import cycle_matrix
-from rbl_gym.sensing_network import proj, random_network
+from rbl_gym import estimators
+from rbl_gym.estimators import chordal_optimum, orientations
+from rbl_gym.estimators.networks import orientations as network_orientations
+from rbl_gym.estimators.networks.orientations import METHODS, cost
+from rbl_gym.networks import g2o
+from rbl_gym.networks.bounds import orientation_covariance
+from rbl_gym.networks.graphs import cycle_matrix
+from rbl_gym.networks.sensing import proj, random_network
 from tests.helpers import ROOT, load
 
 GOLDEN = load("network_golden.json")
@@ -175,7 +177,7 @@ def test_10_000_nodes_are_quick():
     code = """
 import time, numpy as np
 from rbl_gym.estimators import orientations
-from rbl_gym.sensing_network import random_network
+from rbl_gym.networks.sensing import random_network
 one = random_network(10_000, 12, 0.2, np.random.default_rng(4))
 assert len(one.edges) > 58_000
 spent = []

@@ -14,10 +14,11 @@ import pytest
 
 pytest.importorskip("plotly", reason="the extra viz is not installed")
 
-from rbl_gym import rotations
-from rbl_gym.app import camsap2013, page, solids, track_html, track_pages
+from rbl_gym.app import page, solids, track_html, track_pages
 from rbl_gym.app.cli import main
+from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import RADIUS_95
+from rbl_gym.studies.papers import camsap2013
 from tests.test_cli import arguments, files  # noqa: F401 (a fixture)
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

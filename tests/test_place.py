@@ -13,9 +13,14 @@ pytest.importorskip("rich", reason="needs the extra cli")
 pytest.importorskip("cmaes", reason="needs the extra placement")
 pytest.importorskip("plotly", reason="needs the extra viz")
 
-from rbl_gym import bounds, layout_criteria, layouts, obstacles, placement, scene_files
-from rbl_gym.app import place, place_accuracy, place_check, place_figures, place_html, place_report
+from rbl_gym import bounds, placement
+from rbl_gym.app import place_figures, place_html, place_report
 from rbl_gym.app.cli import main
+from rbl_gym.geometry import obstacles
+from rbl_gym.placement import criteria, layouts, scene_files
+from rbl_gym.studies.placing import accuracy
+from rbl_gym.studies.placing import check as place_check
+from rbl_gym.studies.placing import design as place
 from tests.test_scene_files import GOOD
 
 N_TRIALS = 60
@@ -24,7 +29,7 @@ N_TRIALS = 60
 @pytest.fixture(autouse=True)
 def short_searches(monkeypatch):
     monkeypatch.setattr(place, "_GENERATIONS", 8)
-    monkeypatch.setattr(place_accuracy, "_MAP", 12)
+    monkeypatch.setattr(accuracy, "_MAP", 12)
 
 
 @pytest.fixture(scope="module")
@@ -85,10 +90,10 @@ def test_predictions_are_the_bound_at_each_place(placed):
     problem, design, _ = placed
     task, scene = problem.task, problem.task.scene
     places = np.array([[2.0, 2.0, 1.0], [6.5, 4.5, 0.5], [3.5, 4.0, 1.0]])
-    found = place_accuracy.accuracy(problem, design.anchors, places)
+    found = accuracy.accuracy(problem, design.anchors, places)
     for index, spot in enumerate(places):
         squares = []
-        for turn in task.poses[0][: place_accuracy._TURNS]:
+        for turn in task.poses[0][: accuracy._TURNS]:
             sight = obstacles.in_sight(design.anchors, spot[None], problem.context.racks)
             information = task.prior_information
             for seen, share in ((sight[0], 1.0), (~sight[0], task.blocked_information)):
@@ -113,10 +118,10 @@ def test_the_search_scores_over_free_poses(with_rack):
 
 def test_maps_leave_obstacles_out_and_agree_with_predictions(placed):
     problem, design, _ = placed
-    plan = place_accuracy.accuracy_map(problem, design.anchors)
+    plan = accuracy.accuracy_map(problem, design.anchors)
     assert plan.at == 1.0
     spot = [plan.columns[0], plan.rows[-1], plan.at]
-    found = place_accuracy.accuracy(problem, design.anchors, np.array([spot]))
+    found = accuracy.accuracy(problem, design.anchors, np.array([spot]))
     assert plan.position[-1, 0] == pytest.approx(found.position[0])
     assert plan.rotation[-1, 0] == pytest.approx(np.rad2deg(found.rotation[0]))
     column, row = (np.abs(axis - x).argmin() for axis, x in ((plan.columns, 3.5), (plan.rows, 2.5)))
@@ -223,7 +228,7 @@ def test_the_figures_have_these_names(placed):
         figures = result["predicted"][name]
         assert set(figures) == {"rms", "median", "p95", "worst", "worst_at_m"}
         assert figures["median"] <= figures["p95"] <= figures["worst"]
-    assert set(result["criteria"]) == set(layout_criteria.Criteria._fields)
+    assert set(result["criteria"]) == set(criteria.Criteria._fields)
     assert set(result["check"]) == {"trials", "prior_rotation_deg", "prior_position_m", "filters"}
     assert set(result["check"]["filters"]["iterated EKF"]) == {
         "lost", "nees", "position_rmse_m", "position_predicted_m", "position_ratio",

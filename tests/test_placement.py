@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from rbl_gym import layout_criteria, placement, rotations, scenes
+from rbl_gym.geometry import rotations
 from rbl_gym.placement import Context, PlacementTask
+from rbl_gym.placement import criteria as layout_criteria
+from rbl_gym.placement import problem as placement
+from rbl_gym.worlds import scenes
 from tests.test_obstacles import depth_by_sampling
 
 TASKS = {

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym import placement
 from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.placement import Context
-from rbl_gym.scenes import SCENES
+from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import assert_same
 from tests.side_by_side import (
     actions_of,

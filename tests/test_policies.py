@@ -9,8 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym.app import policies
-from rbl_gym.app.policies import Policy
+from rbl_gym.studies.learning import policies
+from rbl_gym.studies.learning.policies import Policy
 
 SIZES = (5, 8, 3)
 

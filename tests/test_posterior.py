@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, posterior, rotations, scene_bounds, scenes, simulation
+from rbl_gym import bounds
+from rbl_gym.bounds import posterior
+from rbl_gym.geometry import rotations
 from rbl_gym.motion import ProcessNoise
+from rbl_gym.worlds import scene_bounds, scenes, simulation
 
 NAMES = sorted(scenes.SCENES)
 LOSSY = {"drop_probability": 0.3}

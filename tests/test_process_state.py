@@ -20,14 +20,14 @@ for folder in ("rbl_gym", "tests", "benchmarks", "examples", "docs"):
 def test_estimators_and_wrappers_are_those_of_the_same_checkout():
     told = run_python("""
 import pathlib, sys
-import rbl_gym, rbl_gym.wrappers, rbl_gym.estimators.doa
+import rbl_gym, rbl_gym.wrappers, rbl_gym.estimators.locating.doa
 root = pathlib.Path(rbl_gym.__file__).parent.parent
-for module in (rbl_gym.wrappers, rbl_gym.estimators, rbl_gym.estimators.doa):
+for module in (rbl_gym.wrappers, rbl_gym.estimators, rbl_gym.estimators.locating.doa):
     print(pathlib.Path(module.__file__).relative_to(root).as_posix())
 print({"estimators", "wrappers"} & set(sys.modules))
 """)
     assert told == [
-        "wrappers/__init__.py", "estimators/__init__.py", "estimators/doa.py", "set()",
+        "wrappers/__init__.py", "estimators/__init__.py", "estimators/locating/doa.py", "set()",
     ]  # fmt: skip
 
 

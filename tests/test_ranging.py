@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
-from rbl_gym import ranging, rotations
-from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.measurements.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=40)
 SEEDS = st.integers(0, 2**32 - 1)

@@ -7,12 +7,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym import checks, scene_files, wrappers
-from rbl_gym.app import policies
+from rbl_gym import checks, wrappers
 from rbl_gym.envs import batch
 from rbl_gym.envs.network import PlanarNetworkEnv
 from rbl_gym.envs.placement import AnchorPlacementEnv
 from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.placement import scene_files
+from rbl_gym.studies.learning import policies
 from tests.test_recordings import CALIBRATION, LONG, LONG_STD, PLANAR, TRUTH, write_and_read
 
 

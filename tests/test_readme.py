@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from rbl_gym import estimators
-from rbl_gym.estimators import belief
+from rbl_gym.estimators import filter as belief
 from tests.helpers import ROOT
 
 

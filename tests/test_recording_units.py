@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import motion, ranging
-from rbl_gym.recording_units import check_units
+from rbl_gym import motion
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings.units import check_units
 
 PATHS = "ranges.csv", "anchors.csv", "tags.csv"
 ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2], [8, 3, 0.5]])

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from rbl_gym import rotations
+from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Recording, Truth, read_recording, truth_at
 
 DATA = Path(__file__).parents[2] / "shared" / "data" / "lias_planar"

@@ -6,21 +6,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import (
-    bodies,
-    bounds,
-    estimators,
-    link_bounds,
-    motion,
-    placement,
-    posterior,
-    ranging,
-    rigidity,
-    scene_files,
-    scenes,
-)
-from rbl_gym.app import bench_command, bench_worlds, place, replay
+from rbl_gym import bounds, estimators, motion, placement
+from rbl_gym.app import bench_command
+from rbl_gym.bounds import links as link_bounds
+from rbl_gym.bounds import posterior
+from rbl_gym.geometry import bodies
+from rbl_gym.measurements import ranging
+from rbl_gym.networks import rigidity
+from rbl_gym.placement import scene_files
 from rbl_gym.recordings import Recording, Truth
+from rbl_gym.studies import replay
+from rbl_gym.studies.bench import worlds
+from rbl_gym.studies.placing import design
+from rbl_gym.worlds import scenes
 
 TAGS = bodies.pyramid()
 ANCHORS = np.array([[0, 0, 0], [9, 0, 1], [0, 9, 2], [9, 9, 3.0]])
@@ -209,7 +207,7 @@ def test_replays():
 
 def test_benchmarks():
     with pytest.raises(ValueError, match="condition noise-x2 cannot double"):
-        bench_worlds._noisier(ranging.LinkModel(), 2.0)
+        worlds._noisier(ranging.LinkModel(), 2.0)
     with pytest.raises(Exception, match="must be different names with commas, got 'kf,,iekf'"):
         bench_command._names("kf,,iekf")
     with pytest.raises(ValueError, match="--scenes: two are named 'hall': rename a file"):
@@ -223,4 +221,4 @@ def test_rooms_full_of_obstacles():
     context = placement.whole_volume(task)._replace(racks=full[None])
     problem = scene_files.Problem(task, context)
     with pytest.raises(ValueError, match="anchors have no legal place: obstacles cover all"):
-        place.free_candidates(problem, np.random.default_rng(0), 10)
+        design.free_candidates(problem, np.random.default_rng(0), 10)

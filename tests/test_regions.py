@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from rbl_gym.regions import Box, Region, Shell, Walls
+from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 
 PROPERTY = settings(deadline=None, derandomize=True)
 ROOM = Walls((0, 0, 0.3), (10, 8, 3))

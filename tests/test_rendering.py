@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import HumanRendering, RecordVideo
 
-from rbl_gym import bodies, rendering
+from rbl_gym import rendering
+from rbl_gym.geometry import bodies
 from rbl_gym.rendering import body, drawing, film
-from rbl_gym.scenes import SCENES
+from rbl_gym.worlds.scenes import SCENES
 from rbl_gym.wrappers import (
     EstimateNetwork,
     EstimatePose,

@@ -7,9 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from rbl_gym import metrics, motion, ranging, rotations
-from rbl_gym.app import replay, reports
+from rbl_gym import metrics, motion
+from rbl_gym.app import reports
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
+from rbl_gym.studies import replay
 
 ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2], [8, 3, 0.5]])
 CEILING = np.array([[0, 0, 2], [0, 3, 2], [4, 3, 2], [4, 0, 2], [1.3, 1, 2], [2.6, 1.5, 2.0]])

@@ -5,20 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import (
-    bearing,
-    bodies,
-    estimators,
-    g2o,
-    motion,
-    network_graphs,
-    ranging,
-    rigidity,
-    scenes,
-    sensing_network,
-    simulation,
-    unknown_twist,
-)
+from rbl_gym import estimators, motion
+from rbl_gym.geometry import bodies
+from rbl_gym.measurements import bearing, ranging
+from rbl_gym.motion import unknown_twist
+from rbl_gym.networks import g2o, graphs, rigidity, sensing
+from rbl_gym.worlds import scenes, simulation
 
 SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4.0]])
 EDGES = np.array([[0, 1], [1, 2], [2, 3], [0, 3], [0, 2]])
@@ -57,7 +49,7 @@ CASES = {
     "stream": (lambda _: stream(), estimators.Stream),
     "bank": (lambda _: first_state(), estimators.BankState),
     "g2o": (lambda folder: g2o.read_graph(graph_file(folder)), g2o.PoseGraph),
-    "tree": (lambda _: network_graphs.spanning_tree(EDGES, 4), network_graphs.SpanningTree),
+    "tree": (lambda _: graphs.spanning_tree(EDGES, 4), graphs.SpanningTree),
     "freedom": (lambda _: rigidity.freedom(np.eye(4)[:, :3], EDGES), rigidity.Freedom),
     "localizability": (lambda _: rigidity.localizability(SQUARE, EDGES), rigidity.Localizability),
     "locate": (
@@ -72,8 +64,8 @@ CASES = {
         estimators.FrameEstimate,
     ),
     "network": (
-        lambda _: sensing_network.random_network(12, 6, 0.1, np.random.default_rng(0)),
-        sensing_network.SensingNetwork,
+        lambda _: sensing.random_network(12, 6, 0.1, np.random.default_rng(0)),
+        sensing.SensingNetwork,
     ),
     "path": (lambda _: wandering(), unknown_twist.WanderingPath),
 }  # fmt: skip

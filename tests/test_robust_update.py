@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, estimators, metrics, motion, ranging, rotations, scenes
-from rbl_gym.app import monte_carlo
-from rbl_gym.estimators.range_cost import cut_huber
+from rbl_gym import estimators, metrics, motion
+from rbl_gym.estimators.costs.range_cost import cut_huber
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.studies import monte_carlo
+from rbl_gym.worlds import scenes
 from tests.helpers import random_world, simulate
 
 NOISE = ranging.RangeNoise(0.05, 0.001)

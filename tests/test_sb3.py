@@ -18,10 +18,10 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 
-from rbl_gym.app import policies, training
 from rbl_gym.app.cli import main
-from rbl_gym.app.rl_tasks import RlTask
 from rbl_gym.envs.placement import AnchorPlacementEnv
+from rbl_gym.studies.learning import policies, training
+from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.wrappers.sb3 import Sb3VecEnv
 from rbl_gym.wrappers.tasks import MobileAnchorsEnv
 

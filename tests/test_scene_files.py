@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, bounds, layouts, placement, scene_files, simulation
-from rbl_gym.ranging import NOISE_LAWS, RangeNoise
-from rbl_gym.regions import Box, Shell, Walls
-from rbl_gym.scenes import SCENES
+from rbl_gym import bounds, placement
+from rbl_gym.geometry import bodies
+from rbl_gym.geometry.regions import Box, Shell, Walls
+from rbl_gym.measurements.ranging import NOISE_LAWS, RangeNoise
+from rbl_gym.placement import layouts, scene_files
+from rbl_gym.worlds import simulation
+from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import ROOT, share_by_hand
 
 GOOD = {

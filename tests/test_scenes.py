@@ -12,11 +12,13 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from rbl_gym import ranging, regions, scenes
+from rbl_gym.geometry import regions
+from rbl_gym.geometry.regions import Box, Shell, Walls
+from rbl_gym.measurements import ranging
+from rbl_gym.measurements.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.motion import ProcessNoise
-from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
-from rbl_gym.regions import Box, Shell, Walls
-from rbl_gym.scene import Scene
+from rbl_gym.worlds import scenes
+from rbl_gym.worlds.scene import Scene
 
 every_scene = pytest.mark.parametrize("name", scenes.SCENES)
 

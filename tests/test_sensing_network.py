@@ -10,9 +10,10 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from rbl_gym import network_graphs, rigidity, rotations, sensing_network
-from rbl_gym.network_graphs import BASES, components, cycle_matrix, incidence, spanning_tree
-from rbl_gym.sensing_network import edge_angles, proj, random_network, unit_disk_edges
+from rbl_gym.geometry import rotations
+from rbl_gym.networks import graphs, rigidity, sensing
+from rbl_gym.networks.graphs import BASES, components, cycle_matrix, incidence, spanning_tree
+from rbl_gym.networks.sensing import edge_angles, proj, random_network, unit_disk_edges
 from tests.helpers import load
 
 GOLDEN = load("network_golden.json")
@@ -64,7 +65,7 @@ def test_exact_bearings_give_differences_of_orientations_and_noise_has_its_varia
     i, j = network.edges.T
     truth = network.orientations[j] - network.orientations[i]
     np.testing.assert_allclose(proj(network.y - truth), 0, atol=1e-12)
-    measured = sensing_network.measure(*network[:3], 0.2, rng)
+    measured = sensing.measure(*network[:3], 0.2, rng)
     off = proj(measured - network.bearings)
     assert np.std(off) == pytest.approx(0.2, rel=0.05)
     assert np.var(proj(edge_angles(measured) - truth)) == pytest.approx(2 * 0.2**2, rel=0.1)
@@ -189,14 +190,14 @@ def test_trivial_graphs():
 )
 def test_wrong_graphs_are_named(edges, n_nodes, message):
     with pytest.raises(ValueError, match=message):
-        network_graphs.check_connected(edges, n_nodes)
+        graphs.check_connected(edges, n_nodes)
 
 
 def test_wrong_numbers_are_named():
     with pytest.raises(ValueError, match="positions must be finite, got nan"):
         unit_disk_edges([[0, np.nan]], 1)
     with pytest.raises(ValueError, match=r"nodes \[0, 1\] are the same"):
-        sensing_network.directions([[0, 0], [0, 0]], [[0, 1]])
+        sensing.directions([[0, 0], [0, 0]], [[0, 1]])
     with pytest.raises(ValueError, match="bearings must have shape"):
         edge_angles([[1.0, 2.0, 3.0]])
     with pytest.raises(ValueError, match="basis must be one of"):

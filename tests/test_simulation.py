@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import bounds, scene_bounds, scenes, simulation
+from rbl_gym import bounds
+from rbl_gym.geometry.regions import Box
+from rbl_gym.measurements.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 from rbl_gym.motion import ProcessNoise
-from rbl_gym.ranging import LinkModel, RangeNoise, SquaredRangeNoise
-from rbl_gym.regions import Box
-from rbl_gym.scene import TRAJECTORIES, Scene
-from rbl_gym.scenes import SCENES
-from rbl_gym.simulation import Episode
+from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.worlds.scene import TRAJECTORIES, Scene
+from rbl_gym.worlds.scenes import SCENES
+from rbl_gym.worlds.simulation import Episode
 from tests.helpers import law_by_hand, share_by_hand
 
 NAMES = list(SCENES)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bodies, ranging
-from rbl_gym.estimators import squared_range
+from rbl_gym.estimators.linear import squared_range
+from rbl_gym.geometry import bodies
+from rbl_gym.measurements import ranging
 from tests.helpers import load, random_world, simulate, textbook_model
 
 

@@ -7,7 +7,9 @@ import pickle
 import numpy as np
 import pytest
 
-from rbl_gym import bearing, bodies, estimators, motion, ranging, rotations
+from rbl_gym import estimators, motion
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import bearing, ranging
 from tests.helpers import simulate
 
 TAGS = bodies.pyramid(1.0)

@@ -7,9 +7,11 @@ import itertools
 import numpy as np
 import pytest
 
-from rbl_gym import bearing, bodies, estimators, ranging, rotations
-from rbl_gym.estimators import swarm
-from rbl_gym.estimators.swarm import ParticipatorySearch, ParticleSwarm, search_places
+from rbl_gym import estimators
+from rbl_gym.estimators.locating import swarm
+from rbl_gym.estimators.locating.swarm import ParticipatorySearch, ParticleSwarm, search_places
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import bearing, ranging
 
 TAGS = bodies.doa2019()
 T = np.array([5.0, 5.0, 3.0])

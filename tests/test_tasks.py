@@ -13,8 +13,9 @@ from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bounds, estimators, motion, scenes, simulation
-from rbl_gym.ranging import LinkNoise
+from rbl_gym import bounds, estimators, motion
+from rbl_gym.measurements.ranging import LinkNoise
+from rbl_gym.worlds import scenes, simulation
 from rbl_gym.wrappers import controllers
 from rbl_gym.wrappers.tasks import (
     AnchorSelectionEnv,

@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rbl_gym import estimators, ranging, testing
+from rbl_gym import estimators
+from rbl_gym.measurements import ranging
 from rbl_gym.testing import check_filter, check_locator
+from rbl_gym.testing import checks as testing
 
 
 @pytest.mark.parametrize(

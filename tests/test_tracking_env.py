@@ -20,7 +20,7 @@ from gymnasium.utils.env_checker import check_env
 import rbl_gym
 from rbl_gym import bounds
 from rbl_gym.envs.tracking import TrackingEnv, observation_space
-from rbl_gym.scenes import SCENES
+from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import assert_same, law_by_hand, run_python, score_by_hand, share_by_hand
 
 ID = "rbl_gym:RBL/Tracking-v0"

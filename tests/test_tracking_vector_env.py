@@ -9,7 +9,7 @@ from gymnasium.vector import AutoresetMode
 
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
-from rbl_gym.scenes import SCENES
+from rbl_gym.worlds.scenes import SCENES
 from tests.side_by_side import (
     assert_masks_alike,
     assert_memory_is_not_shared,

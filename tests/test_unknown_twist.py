@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, motion, ranging, rotations
-from rbl_gym import unknown_twist as ut
+from rbl_gym import bounds, motion
+from rbl_gym.bounds import twist as bound
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.motion import unknown_twist as ut
 from tests.helpers import random_world
 
 LAW = ut.WanderingTwist((0.3, 0.2, 0.1), 2.0, (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
@@ -57,7 +60,7 @@ def test_prediction_of_the_covariance_by_finite_differences_of_the_model():
     A = rng.normal(size=(3, 15, 15))
     P = A @ np.swapaxes(A, -1, -2)
     twists, dt = rng.normal(size=(3, 6)), 0.4
-    got = ut.predict_covariance(P, twists, dt, PROCESS, LAW)
+    got = bound.predict_covariance(P, twists, dt, PROCESS, LAW)
     for k in range(3):
         pose = rotations.random(rng), rng.normal(size=3)
         want = numeric_prediction(P[k, :12, :12], *pose, twists[k], dt)
@@ -66,7 +69,7 @@ def test_prediction_of_the_covariance_by_finite_differences_of_the_model():
         F, _ = numeric_step(*pose, twists[k], dt)
         np.testing.assert_allclose(got[k, :12, 12:], F @ P[k, :12, 12:], rtol=1e-6, atol=1e-6)
         np.testing.assert_array_equal(got[k, 12:, 12:], P[k, 12:, 12:])
-        alone = ut.predict_covariance(P[k], twists[k], dt, PROCESS, LAW)
+        alone = bound.predict_covariance(P[k], twists[k], dt, PROCESS, LAW)
         np.testing.assert_allclose(alone, got[k], rtol=1e-12, atol=1e-12)
 
 
@@ -74,7 +77,7 @@ def test_a_known_twist_is_that_of_the_plain_bound():
     rng = np.random.default_rng(2)
     A = rng.normal(size=(6, 6))
     twist = rng.normal(size=6)
-    got = ut.predict_covariance(A @ A.T, twist, 0.3, PROCESS, None)
+    got = bound.predict_covariance(A @ A.T, twist, 0.3, PROCESS, None)
     want = bounds.predict_covariance(A @ A.T, twist, 0.3, PROCESS)
     np.testing.assert_allclose(got, want, rtol=1e-12, atol=1e-12)
 
@@ -101,7 +104,7 @@ def test_bound_by_brute_force_is_the_last_block_of_the_whole_trajectorys_informa
             rows = np.hstack([-F, np.eye(12)])
             information = np.linalg.inv(G @ noise_covariance(dt, PROCESS, LAW) @ G.T)
             whole[both, both] += rows.T @ information @ rows
-            J = ut.posterior_crb_step(J, *rest, before[2], dt, PROCESS, LAW, links[k])
+            J = bound.posterior_crb_step(J, *rest, before[2], dt, PROCESS, LAW, links[k])
         else:
             J = J.copy()
             J[:6, :6] += bounds.range_information(*rest, links[k])
@@ -121,9 +124,9 @@ def test_the_bound_of_a_batch_is_that_of_each():
     sensor = ut.TwistSensor(0.1, 0.3, "body")
     J = np.eye(12) * rng.uniform(1, 5, (3, 1, 1))
     rest = NOISE, twists, 0.2, PROCESS, LAW
-    got = ut.posterior_crb_step(J, anchors, tags, rotation, translation, *rest, sensor=sensor)
+    got = bound.posterior_crb_step(J, anchors, tags, rotation, translation, *rest, sensor=sensor)
     for k in range(3):
-        want = ut.posterior_crb_step(
+        want = bound.posterior_crb_step(
             J[k], anchors[k], tags, rotation[k], translation[k], NOISE, twists[k], 0.2, PROCESS,
             LAW, sensor=sensor,
         )  # fmt: skip
@@ -198,14 +201,14 @@ def test_drawn_trajectories_have_the_laws_moments():
             "rng must be a numpy.random.Generator, got 0",
         ),
         (
-            lambda: ut.posterior_crb_step(
+            lambda: bound.posterior_crb_step(
                 np.eye(12), np.eye(3), np.eye(3), np.eye(3), np.ones(3), NOISE,
                 np.zeros(6), 0.1, LAW, LAW,  # pyright: ignore[reportArgumentType]
             ),
             "process must be a motion.ProcessNoise, got WanderingTwist",
         ),
         (
-            lambda: ut.posterior_crb_step(
+            lambda: bound.posterior_crb_step(
                 np.zeros((12, 12)), np.eye(3), np.eye(3), np.eye(3), np.ones(3), NOISE,
                 np.zeros(6), 0.1, PROCESS, LAW,
             ),

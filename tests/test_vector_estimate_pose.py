@@ -108,7 +108,7 @@ def test_wrappers_below_see_the_environment_as_it_is(mode):
 
 
 def test_wraps_what_make_vec_gives_and_computes_no_bound_where_none_is_asked_for(monkeypatch):
-    from rbl_gym import scene_bounds
+    from rbl_gym.worlds import scene_bounds
 
     def refuse(*_):
         raise AssertionError("the bound was computed")

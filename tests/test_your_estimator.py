@@ -13,7 +13,7 @@ import pytest
 
 from rbl_gym import estimators
 from rbl_gym.app.cli import main
-from rbl_gym.estimators import localization
+from rbl_gym.estimators.locating import localization
 from rbl_gym.testing import check_locator
 from tests.helpers import ROOT, needs
 

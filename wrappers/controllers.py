@@ -13,7 +13,7 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
-from rbl_gym.motion import propagate
+from rbl_gym.motion.kinematics import propagate
 from rbl_gym.wrappers.tasks import AnchorSelectionVectorEnv, MobileAnchorsVectorEnv
 
 __all__ = [

@@ -10,12 +10,13 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from rbl_gym import bounds, estimators, metrics, rendering, simulation
-from rbl_gym.bearing import AngleNoise
+from rbl_gym import bounds, estimators, metrics, rendering
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
-from rbl_gym.estimators.belief import check_takes_noise
-from rbl_gym.scene import Scene
+from rbl_gym.estimators.filter import check_takes_noise
+from rbl_gym.measurements.bearing import AngleNoise
+from rbl_gym.worlds import simulation
+from rbl_gym.worlds.scene import Scene
 
 REWARDS = ("belief", "error")
 OBSERVATIONS = ("dict", "flat")

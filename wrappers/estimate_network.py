@@ -13,13 +13,13 @@ from gymnasium.vector.utils import batch_space
 
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.network import PRIOR_STD_RAD, PlanarNetworkEnv, PlanarNetworkVectorEnv
-from rbl_gym.estimators.consensus import cycle_iteration
-from rbl_gym.estimators.network_orientations import along_tree
-from rbl_gym.network_bounds import linked_covariance
-from rbl_gym.network_graphs import components
+from rbl_gym.estimators.networks.consensus import cycle_iteration
+from rbl_gym.estimators.networks.orientations import along_tree
+from rbl_gym.networks.bounds import linked_covariance
+from rbl_gym.networks.graphs import components
+from rbl_gym.networks.sensing import edge_angles, proj
 from rbl_gym.rendering import tell
 from rbl_gym.rendering.network import Headings
-from rbl_gym.sensing_network import edge_angles, proj
 
 REWARDS = ("belief", "error")
 _TOL = 1e-9

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import bounds, metrics, rendering, simulation
+from rbl_gym import bounds, metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.estimators import PoseBelief
-from rbl_gym.estimators.manifold import IteratedEkf, PoseState
-from rbl_gym.scene import Scene
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState
+from rbl_gym.worlds import simulation
+from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import update
 
 # Iterations of the filter; two are as good as four here, and faster.

@@ -13,10 +13,11 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import rendering, scenes, simulation
+from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
 from rbl_gym.envs.batch import ScalarEnv
-from rbl_gym.scene import Scene
+from rbl_gym.worlds import scenes, simulation
+from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.filter_loop import FilterLoop
 
 # An observation is of order one; what is far outside says no more than that.
@@ -144,7 +145,7 @@ class MobileAnchorsEnv(ScalarEnv):
 
     env = gym.make("rbl_gym:RBL/MobileAnchors-v0", difficulty="hard")
     ```
-    `scene`: a name or overrides, see `rbl_gym.scenes.get`; the anchors must move.
+    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`; the anchors must move.
 
     ## Version history
     * v0: first version.

@@ -8,7 +8,6 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.app import backends
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
@@ -19,6 +18,7 @@ from rbl_gym.app.terminal import (
     progress,
     write_json,
 )
+from rbl_gym.studies import backends
 
 
 def add_bench(commands: Any) -> None:
@@ -67,8 +67,9 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from rbl_gym import scenes
-    from rbl_gym.app import bench_files, leaderboard
+    from rbl_gym.studies.bench import leaderboard
+    from rbl_gym.studies.bench import records as bench_files
+    from rbl_gym.worlds import scenes
 
     check_html(options)
     workers = _workers(options)
@@ -97,7 +98,7 @@ def _bench(options: argparse.Namespace) -> int:
 
 
 def _rerun(options: argparse.Namespace) -> int:
-    from rbl_gym.app import bench_files
+    from rbl_gym.studies.bench import records as bench_files
 
     workers = _workers(options)
     path = Path(options.file)
@@ -129,7 +130,7 @@ def _names(text: str) -> list[str]:
 
 def _specs(names: list[str]) -> dict[str, Any]:
     """Scenes by label: names, changes of scenes and recordings from files that can be read."""
-    from rbl_gym.app import leaderboard
+    from rbl_gym.studies.bench import leaderboard
 
     specs: dict[str, Any] = {}
     for name in names:
@@ -155,7 +156,7 @@ def _from_file(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: {error}") from error
     if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
         raise ValueError(f"{path}: must have the name of a scene, or the files of a recording")
-    from rbl_gym.app.bench_recordings import FILES
+    from rbl_gym.studies.bench.recordings import FILES
 
     for key in FILES if "ranges" in spec else ():
         if not isinstance(spec.get(key, ""), str):

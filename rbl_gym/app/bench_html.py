@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from rbl_gym.app import bench_report, page
-from rbl_gym.app.leaderboard import is_recording
+from rbl_gym.studies.bench.leaderboard import is_recording
 
 _COLUMNS = 4
 # Ratios to the bound beyond this are one colour: the filter is lost.

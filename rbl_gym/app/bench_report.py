@@ -8,8 +8,8 @@ from typing import Any
 
 from rich.table import Table
 
-from rbl_gym.app.leaderboard import is_recording
 from rbl_gym.app.reports import new_console
+from rbl_gym.studies.bench.leaderboard import is_recording
 
 _HEADINGS = (
     "filter", "position (m)", "rotation (deg)", "tags (m)", "median", "p95", "x bound",

@@ -138,7 +138,7 @@ def _add_network(commands: Any) -> None:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from rbl_gym.app import camsap2013
+    from rbl_gym.studies.papers import camsap2013
 
     check_html(options)
     with progress("tracking", camsap2013.work_units()) as advance:
@@ -180,7 +180,7 @@ def _reproduce(options: argparse.Namespace) -> int:
 
 
 def _network(options: argparse.Namespace) -> int:
-    from rbl_gym.app import network
+    from rbl_gym.studies import network
 
     solved = network.run(options.file, options.weights)
     if options.plot:
@@ -198,8 +198,8 @@ def _network(options: argparse.Namespace) -> int:
 def _place(options: argparse.Namespace) -> int:
     require("cmaes", "placement")
     check_html(options)
-    from rbl_gym import scene_files
-    from rbl_gym.app import place
+    from rbl_gym.placement import scene_files
+    from rbl_gym.studies.placing import design as place
 
     numbers = options.anchors
     problem = scene_files.problem(

@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 from scipy.stats import chi2
 
-from rbl_gym.app.camsap2013 import Example
-from rbl_gym.app.replay import Errors, Track
 from rbl_gym.checks import FloatArray
-from rbl_gym.recordings import Recording, truth_at
-from rbl_gym.rotations import error as rotation_error
+from rbl_gym.geometry.rotations import error as rotation_error
+from rbl_gym.recordings.reading import Recording, truth_at
+from rbl_gym.studies.papers.camsap2013 import Example
+from rbl_gym.studies.replay import Errors, Track
 
 COLOURS = {
     "KF": "#d1495b",

@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.app.rl_tasks import TASKS, rl_task
 from rbl_gym.app.terminal import (
     MissingExtraError,
     add_json,
@@ -17,6 +16,7 @@ from rbl_gym.app.terminal import (
     write_json,
 )
 from rbl_gym.checks import check_one_of
+from rbl_gym.studies.learning.rl_tasks import TASKS, rl_task
 
 # Held-out worlds in which a trained policy is scored, those of ``evaluate``.
 _WORLDS = 256
@@ -79,7 +79,7 @@ def _add_players(
 
 
 def _train(options: argparse.Namespace) -> int:
-    from rbl_gym.app import evaluation, policies, training
+    from rbl_gym.studies.learning import evaluation, policies, training
 
     task = rl_task(options.task)
     steps = options.steps or task.steps
@@ -103,7 +103,7 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from rbl_gym.app import evaluation
+    from rbl_gym.studies.learning import evaluation
 
     task = rl_task(options.task)
     loaded = _policies(options.policy)
@@ -124,7 +124,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _transfer(options: argparse.Namespace) -> int:
     require("cmaes", "placement")
-    from rbl_gym.app import evaluation, transfer
+    from rbl_gym.studies.learning import evaluation, transfer
 
     task = rl_task(options.task)
     loaded = _policies(options.policy)
@@ -148,7 +148,7 @@ def _transfer(options: argparse.Namespace) -> int:
 
 def _references(options: argparse.Namespace, default: list[str]) -> list[str]:
     """Names of references of the task, each once; without the option, the default ones."""
-    from rbl_gym.app import evaluation
+    from rbl_gym.studies.learning import evaluation
 
     known = evaluation.references(rl_task(options.task))
     names = options.references.split(",") if options.references else default
@@ -157,7 +157,7 @@ def _references(options: argparse.Namespace, default: list[str]) -> list[str]:
 
 def _policies(paths: list[str]) -> dict[str, Any]:
     """Policies by the names of their files, or a ValueError where two share one."""
-    from rbl_gym.app import policies
+    from rbl_gym.studies.learning import policies
 
     loaded: dict[str, Any] = {}
     for path in paths:

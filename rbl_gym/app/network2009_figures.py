@@ -10,9 +10,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from rbl_gym.app import network2009
 from rbl_gym.app.figures import new_figure, styled
 from rbl_gym.app.reports import new_console
+from rbl_gym.studies.papers import network2009
 
 _COLOURS = {"bfs": "#d1495b", "paton": "#2e86ab", "minimum": "#1b7f5c"}
 _RULE_COLOURS = {"theorem": "#2e86ab", "best": "#1b7f5c", "trace": "#d1495b", "rows": "#e8a33d"}

@@ -9,8 +9,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from rbl_gym.app.figures import new_figure, styled
-from rbl_gym.app.network import Solved
 from rbl_gym.app.reports import new_console
+from rbl_gym.studies.network import Solved
 
 
 @styled

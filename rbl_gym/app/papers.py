@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rbl_gym.app import camsap2013, doa2019, hard, icassp2013, network2009, slides2013
+from rbl_gym.studies import hard
+from rbl_gym.studies.papers import camsap2013, doa2019, icassp2013, network2009, slides2013
 
 Advance = Callable[[], None]
 

@@ -11,10 +11,10 @@ import numpy as np
 import plotly.graph_objects as go
 
 from rbl_gym.app import page, solids
-from rbl_gym.app.place import Placed
-from rbl_gym.app.place_accuracy import Map, level_maps
 from rbl_gym.app.place_report import notes, tables
-from rbl_gym.regions import Shell
+from rbl_gym.geometry.regions import Shell
+from rbl_gym.studies.placing.accuracy import Map, level_maps
+from rbl_gym.studies.placing.design import Placed
 
 
 def write(placed: Placed, path: str) -> None:

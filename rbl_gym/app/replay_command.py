@@ -133,7 +133,7 @@ def add_replay(commands: Any) -> None:
 
 def _replay(options: argparse.Namespace) -> int:
     from rbl_gym import recordings
-    from rbl_gym.app import replay, replay_truth
+    from rbl_gym.studies import replay, replay_truth
 
     check_html(options)
     settings = replay.Settings(

@@ -4,23 +4,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-
-class MissingExtraError(Exception):
-    """A library is missing that one of the extras installs."""
-
-
-def require(module: str, extra: str, also: str = "") -> None:
-    """Say which extra is missing before the work begins, and what is needed `also`, of no extra."""
-    if importlib.util.find_spec(module) is None:
-        raise MissingExtraError(f"this command needs the extra {extra}: pip install "
-                                f"'rbl-gym[{extra}]' {also}".rstrip())  # fmt: skip
+from rbl_gym.studies.extras import MissingExtraError, require
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -11,9 +11,10 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 from scipy.stats import chi2
 
-from rbl_gym import metrics, rotations
+from rbl_gym import metrics
 from rbl_gym.app import page, solids
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import (
     ANCHOR,
     AXES,

@@ -10,12 +10,12 @@ from plotly.subplots import make_subplots
 from scipy.stats import chi2
 
 from rbl_gym.app import page, track_html
-from rbl_gym.app.camsap2013 import Example
 from rbl_gym.app.figures import COLOURS
-from rbl_gym.app.replay import Settings, Track, truth_of
 from rbl_gym.app.reports import CAMSAP_COLUMNS
 from rbl_gym.app.track_html import Beliefs, Story
-from rbl_gym.recordings import Recording
+from rbl_gym.recordings.reading import Recording
+from rbl_gym.studies.papers.camsap2013 import Example
+from rbl_gym.studies.replay import Settings, Track, truth_of
 
 _LEGEND = (
     "Drag to turn, wheel to zoom; play, or move the slider. Shaded: three sigma of the belief "

@@ -10,13 +10,17 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bearing, bodies, bounds, doa_bounds, ranging, rendering, scenes, simulation
+from rbl_gym import bounds, rendering
+from rbl_gym.bounds import doa
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
-from rbl_gym.ranging import LinkModel
-from rbl_gym.scene import Scene
+from rbl_gym.geometry import bodies
+from rbl_gym.measurements import bearing, ranging
+from rbl_gym.measurements.ranging import LinkModel
+from rbl_gym.worlds import scenes, simulation
+from rbl_gym.worlds.scene import Scene
 
 ANGLE_STD_RAD = math.radians(0.1)
 # What the info of a reset holds besides.
@@ -136,7 +140,7 @@ class BaseStationVectorEnv(BatchEnv):
         seen = bearing.angles(ranging.tag_positions(at.rotation, away, self._tags))
         self._angles[rows] = self.noise.sample(seen, self._normals[rows, self._epochs[rows]])
         if self.reward_mode == "bound":
-            self._information[rows] += doa_bounds.doa_information_at(
+            self._information[rows] += doa.doa_information_at(
                 self._tags, at.rotation, away, self.noise
             )
             covariance = np.linalg.inv(self._information[rows])
@@ -173,7 +177,7 @@ class BaseStationEnv(ScalarEnv):
     ## Description
     A body carries N tags at known places. At every epoch a base station at a known place
     measures, for every tag, the angle alpha of its direction to the x axis and beta to the z
-    axis (`rbl_gym.bearing`; the station's axes are the world's). Distances are not measured: the
+    axis (`rbl_gym.measurements.bearing`; the station's axes are the world's). Distances are not measured: the
     size of the body tells them, the worse the farther it is. Within a step: the station moves,
     the body moves, angles are taken, the bound and the reward follow.
 
@@ -214,7 +218,7 @@ class BaseStationEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/BaseStation-v0", scene={"steps": 50, "anchor_speed_m_s": 0})
     ```
     The wrapper `EstimatePose` runs the iterated EKF on the angles.
-    `scene`: changes of the world (`WORLD`), see `rbl_gym.scenes.get`; its noise of ranges is not
+    `scene`: changes of the world (`WORLD`), see `rbl_gym.worlds.scenes.get`; its noise of ranges is not
     used. `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``.
 
     ## Version history

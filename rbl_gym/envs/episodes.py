@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import simulation
 from rbl_gym.checks import FloatArray
 from rbl_gym.components import whole_rows
-from rbl_gym.scene import Scene
+from rbl_gym.worlds import simulation
+from rbl_gym.worlds.scene import Scene
 
 # Worlds that are drawn and built together: what they need on the way fits the cache.
 _BLOCK = 256

@@ -12,10 +12,10 @@ from gymnasium.vector import AutoresetMode
 
 from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
-from rbl_gym.network_bounds import linked_covariance
-from rbl_gym.network_graphs import components
+from rbl_gym.networks.bounds import linked_covariance
+from rbl_gym.networks.graphs import components
+from rbl_gym.networks.sensing import proj
 from rbl_gym.rendering import network as rendering
-from rbl_gym.sensing_network import proj
 
 REWARDS = ("bound", "none")
 # Of an orientation that nothing is known of: uniform on the circle.
@@ -144,7 +144,7 @@ class PlanarNetworkEnv(ScalarEnv):
     n nodes in a square, each turned by an angle that nobody knows. Nodes within sensing radius
     (and not nearer than the blind zone) measure each other's bearing in their own frames, with
     noise. Orientations relative to node 0 follow from the bearings of each edge
-    (`rbl_gym.sensing_network`); the more edges, and the better they tie the network together,
+    (`rbl_gym.networks.sensing`); the more edges, and the better they tie the network together,
     the more exact. Nodes move without turning.
 
     ## Action space

@@ -11,10 +11,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
 
-from rbl_gym import posterior, ranging, rendering, scene_bounds, scenes, simulation
+from rbl_gym import rendering
+from rbl_gym.bounds import posterior
 from rbl_gym.checks import BoolArray, FloatArray, as_array, check_array, check_one_of
 from rbl_gym.envs.batch import StatedLength, check_options
-from rbl_gym.scene import Scene
+from rbl_gym.measurements import ranging
+from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.worlds.scene import Scene
 
 REWARDS = ("bound", "none")
 
@@ -83,8 +86,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         reward="none",
     )
     ```
-    `scene`: a name of `rbl_gym.scenes.SCENES` or a dict of overrides, see
-    `rbl_gym.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
+    `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
+    `rbl_gym.worlds.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
 
     ## Version history
     * v0: first version.

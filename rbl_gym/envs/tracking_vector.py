@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import rendering, scene_bounds, scenes, simulation
+from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.components import whole_rows
 from rbl_gym.envs.batch import BatchEnv
@@ -19,6 +19,7 @@ from rbl_gym.envs.tracking import (
     measure,
     observation_space,
 )
+from rbl_gym.worlds import scene_bounds, scenes, simulation
 
 _PRIOR = ("prior_rotation", "prior_translation", "prior_covariance")
 

@@ -1,6 +1,6 @@
 """Rotations of one trial: exponential, logarithm, left Jacobian and its inverse.
 
-`rbl_gym.rotations` has the textbook forms, and the tests hold both to each other.
+`rbl_gym.geometry.rotations` has the textbook forms, and the tests hold both to each other.
 """
 
 from __future__ import annotations

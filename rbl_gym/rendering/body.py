@@ -14,7 +14,7 @@ from rbl_gym.rendering import panels
 from rbl_gym.rendering.drawing import Image
 from rbl_gym.rendering.film import Film, check_mode, mapped
 from rbl_gym.rendering.shots import Pose, Shot, Stage
-from rbl_gym.scene import Scene
+from rbl_gym.worlds.scene import Scene
 
 LABELS = ("position [m]", "rotation [deg]")
 

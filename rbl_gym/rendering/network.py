@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.networks.sensing import proj
 from rbl_gym.rendering import panels
 from rbl_gym.rendering.body import limits_of
 from rbl_gym.rendering.drawing import BELIEF, INK, Image, Panel, gapped, write
 from rbl_gym.rendering.film import Film, check_mode, mapped
-from rbl_gym.sensing_network import proj
 
 _LENGTH = 0.055  # of a heading, of the square's side
 _ARC = np.linspace(-1, 1, 13)

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import metrics, rotations
+from rbl_gym import metrics
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import (
     ANCHOR,
     AXES,

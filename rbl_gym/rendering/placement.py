@@ -10,7 +10,7 @@ import numpy as np
 
 from rbl_gym import bounds, placement
 from rbl_gym.checks import FloatArray
-from rbl_gym.placement import Context, PlacementTask
+from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.rendering import panels
 from rbl_gym.rendering.body import limits_of
 from rbl_gym.rendering.drawing import (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.scene import Points
+from rbl_gym.worlds.scene import Points
 
 
 class Pose(NamedTuple):

@@ -1,0 +1,1 @@
+"""A bank of pose filters that follows several hypotheses."""

@@ -1,0 +1,153 @@
+"""The state of a bank of filters: one hypothesis that leads, and its rivals."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.iekf.manifold import PoseState
+from rbl_gym.geometry.rotations import error as rotation_error
+
+RIVALS = 3
+# Squared distance, in the covariance of one of them, below which two hypotheses are the same.
+SAME = 1.0
+# What stands in the slots of rivals that are none.
+EMPTY = PoseState(
+    np.broadcast_to(np.eye(3), (RIVALS, 3, 3)),
+    np.zeros((RIVALS, 3)),
+    np.broadcast_to(np.eye(6), (RIVALS, 6, 6)),
+)
+
+
+class BankState(NamedTuple):
+    """The leading hypothesis and K rivals, with leading batch axes.
+
+    Attributes
+    ----------
+    rotation, translation, covariance
+        Of the leader, (..., 3, 3), (..., 3), (..., 6, 6).
+    rival_rotation, rival_translation, rival_covariance
+        (..., K, 3, 3), (..., K, 3), (..., K, 6, 6).
+    log_odds
+        (..., K) of each rival against the leader; minus infinity where there is none.
+    nis, links
+        (...): sums over a fading window of squared whitened innovations, and of links.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    rival_rotation: FloatArray
+    rival_translation: FloatArray
+    rival_covariance: FloatArray
+    log_odds: FloatArray
+    nis: FloatArray
+    links: FloatArray
+
+
+# Trailing axes of the fields of a `BankState`.
+_FIELDS = (2, 1, 2, 3, 2, 3, 1, 0, 0)
+
+
+def alone(leader: PoseState) -> BankState:
+    """The state of a leader without rivals."""
+    batch = leader.translation.shape[:-1]
+    rivals = (np.broadcast_to(a, (*batch, *a.shape)).copy() for a in EMPTY)
+    odds = np.full((*batch, RIVALS), -np.inf)
+    return BankState._make([*leader, *rivals, odds, np.zeros(batch), np.zeros(batch)])
+
+
+def with_best(
+    state: BankState,
+    rows: np.ndarray,
+    place: tuple[np.ndarray, ...],
+    candidates: int,
+    found: PoseState,
+    odds: FloatArray,
+) -> BankState:
+    """The state with the likeliest of old and new rivals; `found` (K,) at `place` (R, C)."""
+    new = np.full((len(rows), candidates), -np.inf)
+    new[place] = odds
+    everyone = np.concatenate([state.log_odds[rows], new], axis=1)
+    fields = []
+    for name, value in found._asdict().items():
+        # What no candidate fills is the stand-in of an empty slot.
+        added = np.repeat(getattr(EMPTY, name)[None, :1], len(rows), axis=0)
+        added = np.repeat(added, candidates, axis=1)
+        added[place] = value
+        fields.append(np.concatenate([getattr(state, f"rival_{name}")[rows], added], axis=1))
+    poses = PoseState(*fields)
+    order = np.argsort(-everyone, axis=1)
+    poses, everyone = _ordered(poses, everyone, order)
+    gaps = distance(PoseState(*(a[:, :, None] for a in poses)),
+                    PoseState(*(a[:, None] for a in poses)))  # fmt: skip
+    # Of those that are the same the likeliest stays.
+    likelier = np.tri(everyone.shape[1], k=-1, dtype=bool) & np.isfinite(everyone)[:, None]
+    everyone[((gaps < SAME) & likelier).any(axis=-1)] = -np.inf
+    order = np.argsort(-everyone, axis=1)[:, :RIVALS]
+    poses, everyone = _ordered(poses, everyone, order)
+    log_odds = state.log_odds.copy()
+    log_odds[rows] = everyone
+    where = tuple(index.ravel() for index in np.broadcast_arrays(rows[:, None], range(RIVALS)))
+    best = PoseState(*(a.reshape((-1, *a.shape[2:])) for a in poses))
+    return with_rivals(state._replace(log_odds=log_odds), where, best)
+
+
+def _ordered(
+    poses: PoseState, log_odds: FloatArray, order: np.ndarray
+) -> tuple[PoseState, FloatArray]:
+    """Hypotheses (R, C, ...) and their odds in an order (R, C)."""
+    row = np.arange(len(order))[:, None]
+    return PoseState(*(a[row, order] for a in poses)), log_odds[row, order]
+
+
+def distance(one: PoseState, other: PoseState) -> FloatArray:
+    """Squared distance (...) of two poses in the wider of their covariances, to first order."""
+    turn = rotation_error(one.rotation, other.rotation)
+    gap = np.concatenate([turn, one.translation - other.translation], axis=-1)[..., None]
+    return np.minimum(
+        *((gap * np.linalg.solve(P, gap)).sum(axis=(-2, -1)) for P in (one[2], other[2]))
+    )
+
+
+def leader_of(state: BankState) -> PoseState:
+    """The leading hypothesis."""
+    return PoseState(*state[:3])
+
+
+def rivals_of(state: BankState, where: tuple[np.ndarray, ...]) -> PoseState:
+    """The rivals (L, ...) at an index into trials and slots."""
+    return PoseState(*(array[where] for array in state[3:6]))
+
+
+def with_rivals(state: BankState, where: tuple[np.ndarray, ...], rivals: PoseState) -> BankState:
+    """The state with rivals (L, ...) put at an index into trials and slots."""
+    fields = {}
+    for name, value in rivals._asdict().items():
+        fields[f"rival_{name}"] = getattr(state, f"rival_{name}").copy()
+        fields[f"rival_{name}"][where] = value
+    return state._replace(**fields)
+
+
+def flat(state: BankState, batch: tuple[int, ...]) -> BankState:
+    """The state with one batch axis (B,), all of its fields broadcast to the batch."""
+    size = math.prod(batch)
+    fields = []
+    for array, n in zip(state, _FIELDS, strict=True):
+        shape = array.shape[array.ndim - n :]
+        fields.append(np.broadcast_to(array, (*batch, *shape)).reshape((size, *shape)))
+    return BankState(*fields)
+
+
+def of_batch(state: BankState, batch: tuple[int, ...]) -> BankState:
+    """A flat state with the axes of its batch again."""
+    return BankState(*(array.reshape((*batch, *array.shape[1:])) for array in state))
+
+
+def rows_of(array: FloatArray, batch: tuple[int, ...]) -> FloatArray:
+    """An array (..., m, n) of one epoch as (B, m, n)."""
+    shape = array.shape[-2:]
+    return np.broadcast_to(array, (*batch, *shape)).reshape((math.prod(batch), *shape))

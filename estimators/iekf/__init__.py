@@ -1,0 +1,1 @@
+"""Iterated extended Kalman filters of the pose, and their further states."""

@@ -1,0 +1,322 @@
+"""The iterated EKF with more states than the pose: an unknown twist, biases of the links.
+
+One core serves all of them. Given the pose, what an epoch tells of the other states is linear;
+they are eliminated, the pose is found by the damped Gauss-Newton of `levenberg_marquardt`, and
+they follow from it. An unknown twist is not seen by the ranges at all: the pose's update is then
+that of the plain `IteratedEkf`, at its speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.bounds.twist import predict_covariance
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log, product
+from rbl_gym.estimators.costs import bias_cost
+from rbl_gym.estimators.costs.bias_cost import AugmentedState
+from rbl_gym.estimators.filter import PoseBelief, register
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState, is_vague
+from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, law_of, plain
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.measurements.ranging import NoiseLaw
+from rbl_gym.motion.kinematics import ProcessNoise, propagate
+from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
+
+# Whitened innovation at which Huber's loss on biased ranges turns from squares to absolute values:
+# what is left of real ranges has heavier tails than noise (1.0 was measured better than 1.5).
+HUBER = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class AugmentedEkf:
+    """Iterated extended Kalman filter of pose, twist and biases.
+
+    Parameters
+    ----------
+    pose
+        The filter of the pose alone: tags, noise, process, iterations, robustness.
+    twist
+        Law of a twist that is not known; None: `predict` is told the twist.
+    sensor
+        Reads the twist with noise; None: what `predict` is told of an unknown twist is ignored.
+    biases
+        Laws of the links' biases, which add up; empty: there are none.
+    """
+
+    pose: IteratedEkf
+    twist: WanderingTwist | None = None
+    sensor: TwistSensor | None = None
+    biases: tuple[LinkBias, ...] = ()
+
+    @property
+    def _n_twist(self) -> int:
+        return 0 if self.twist is None else 6
+
+    def initial(
+        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
+    ) -> AugmentedState:
+        """State of a prior of the pose, covariance (..., 6, 6); the twist is at rest.
+
+        Raises
+        ------
+        ValueError
+            As `IteratedEkf.initial`.
+        """
+        pose = self.pose.initial(rotation, translation, covariance)
+        batch = pose.translation.shape[:-1]
+        n = 6 + self._n_twist
+        P = np.zeros((*batch, n, n))
+        P[..., :6, :6] = pose.covariance
+        if self.twist is not None:
+            P[..., range(6, 12), range(6, 12)] = self.twist.prior_std() ** 2
+        return AugmentedState(pose.rotation, pose.translation, np.zeros((*batch, n - 6)), P)
+
+    def predict(self, state: AugmentedState, twist: ArrayLike | None, dt: float) -> AugmentedState:
+        """State after `dt` seconds.
+
+        Parameters
+        ----------
+        twist
+            (..., 6) of the interval. Known, where this filter estimates none. Otherwise it is
+            what the `sensor` read, or nothing to it (None), and without a sensor it is ignored.
+        """
+        dt, state = check_number("dt", dt, low=0.0), plain(state)
+        known = self.twist is None
+        if twist is None and known:
+            raise ValueError("twist must be given to a filter that does not estimate it, got None")
+        if twist is not None:
+            twist = check_array("twist", twist, (6,))
+            if self.sensor is not None and not known:
+                state = _sensed(state, twist, self.sensor)  # pyright: ignore[reportArgumentType]
+        moving: FloatArray = twist if known else state.extra[..., :6]  # pyright: ignore[reportAssignmentType]
+        rotation, translation = propagate(state.rotation, state.translation, moving, dt)
+        covariance = predict_covariance(state.covariance, moving, dt, self.pose.process, self.twist)
+        extra = np.broadcast_to(state.extra, (*translation.shape[:-1], state.extra.shape[-1]))
+        moved = AugmentedState(rotation, translation, extra, covariance)
+        return self._forget(moved, dt)
+
+    def _forget(self, state: AugmentedState, dt: float) -> AugmentedState:
+        """Biases after `dt` seconds: towards zero, and wandering."""
+        start = self._n_twist
+        n = state.extra.shape[-1] - start
+        if n == 0 or all(law.time_s is None for law in self.biases):
+            return state
+        links = n // len(self.biases)
+        kept = np.ones(6 + start + n)
+        P = state.covariance.copy()
+        for k, law in enumerate(self.biases):
+            kept[6 + start + k * links :][:links] = law.decay(dt)
+        P *= kept[:, None] * kept
+        for k, law in enumerate(self.biases):
+            block = slice(6 + start + k * links, 6 + start + (k + 1) * links)
+            P[..., block, block] += (1 - law.decay(dt) ** 2) * law.covariance(links)
+        return state._replace(extra=state.extra * kept[6:], covariance=P)
+
+    def update(
+        self,
+        state: AugmentedState,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
+    ) -> AugmentedState:
+        """State after one epoch of ranges (..., M, N); links True = measured.
+
+        `noise` is the law of this epoch, None: that of the filter of the pose.
+
+        With biases every update must name the same anchors in the same order. A vague prior is
+        started as by `IteratedEkf`, the biases taken for noise.
+
+        Raises
+        ------
+        ValueError
+            As `IteratedEkf.update`, and where the number of anchors changes under biases.
+        """
+        state = plain(state)
+        pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
+        if not self.biases:
+            return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.pose.tags)
+        variance = check_variance(law_of(noise, self.pose.noise).variance(ranges, mask), mask)
+        variance = np.broadcast_to(variance, np.broadcast_shapes(variance.shape, ranges.shape))
+        check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
+        state = self._with_biases(state, ranges.shape[-2:])
+        batch = np.broadcast_shapes(
+            state.translation.shape[:-1], ranges.shape[:-2], anchors.shape[:-2]
+        )
+        state = AugmentedState(
+            *(
+                np.broadcast_to(field, (*batch, *field.shape[field.ndim - n :]))
+                for field, n in zip(state, (2, 1, 1, 2), strict=True)
+            )
+        )
+        sums = bias_cost.sums_of(self._n_twist, len(self.biases), math.prod(ranges.shape[-2:]))
+        problem = bias_cost.problem(state, sums, ranges, variance, anchors, self.pose.tags, mask)
+        start, covariance = (state.rotation, state.translation), state.covariance[..., :6, :6]
+        vague = is_vague(covariance)
+        if vague.any():
+            found = self._found_from_nothing(state, sums, ranges, variance, anchors, mask)
+            start = (
+                np.where(vague[..., None, None], found.rotation, start[0]),
+                np.where(vague[..., None], found.translation, start[1]),
+            )
+            covariance = np.where(vague[..., None, None], found.covariance, covariance)
+        threshold = HUBER if self.pose.robust else None
+        return AugmentedState(
+            *bias_cost.solve(problem, start, covariance, self.pose.iterations, threshold)
+        )
+
+    def _with_biases(self, state: AugmentedState, shape: tuple[int, ...]) -> AugmentedState:
+        """The state with room for the biases of (M, N) links."""
+        links = shape[0] * shape[1]
+        have = state.extra.shape[-1] - self._n_twist
+        if have == links * len(self.biases):
+            return state
+        if have:
+            n_tags = self.pose.tags.shape[-2]
+            raise ValueError(
+                f"anchors must be the {have // len(self.biases) // n_tags} whose biases the state "
+                f"holds, got {shape[0]}"
+            )
+        batch, n = state.extra.shape[:-1], state.covariance.shape[-1]
+        total = n + links * len(self.biases)
+        P = np.zeros((*batch, total, total))
+        P[..., :n, :n] = state.covariance
+        for k, law in enumerate(self.biases):
+            block = slice(n + k * links, n + (k + 1) * links)
+            P[..., block, block] = law.covariance(links)
+        extra = np.concatenate([state.extra, np.zeros((*batch, total - n))], axis=-1)
+        return state._replace(extra=extra, covariance=P)
+
+    def _found_from_nothing(
+        self,
+        state: AugmentedState,
+        sums: FloatArray,
+        ranges: FloatArray,
+        variance: FloatArray,
+        anchors: FloatArray,
+        mask: BoolArray | None,
+    ) -> PoseState:
+        """The pose by the plain filter, the biases taken for noise of the ranges."""
+        prior = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
+        biases = (state.extra @ sums.T).reshape((*state.extra.shape[:-1], *ranges.shape[-2:]))
+        spread = np.einsum("lk,...kj,lj->...l", sums, state.covariance[..., 6:, 6:], sums)
+        law = ranging.LinkNoise(np.sqrt(variance + spread.reshape(biases.shape)))
+        return self.pose.update(prior, np.maximum(ranges - biases, 1e-6), anchors, mask, law)
+
+    def belief(self, state: AugmentedState) -> PoseBelief:
+        """What the state says about the pose (copies)."""
+        rotation = state.rotation.copy()
+        covariance = state.covariance[..., :6, :6].copy()
+        return PoseBelief(rotation, state.translation.copy(), covariance, rotation)
+
+
+def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> AugmentedState:
+    """The state after a reading (..., 6) of the twist."""
+    rows = np.isfinite(sensor.std())
+    H = sensor.jacobian(state.extra[..., :6])[..., rows, :]
+    n = H.shape[-1]
+    crossed = state.covariance[..., :n] @ np.swapaxes(H, -1, -2)
+    S = H @ crossed[..., :n, :] + np.diag(sensor.std()[rows] ** 2)
+    gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(crossed, -1, -2)), -1, -2)
+    innovation = (sensor.in_world(state.rotation, reading) - state.extra[..., :6])[..., rows]
+    step = (gain @ innovation[..., None])[..., 0]
+    covariance = state.covariance - gain @ np.swapaxes(crossed, -1, -2)
+    return AugmentedState(
+        rotations.exp(step[..., :3]) @ state.rotation,
+        state.translation + step[..., 3:6],
+        state.extra + step[..., 6:],
+        0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
+    )
+
+
+def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
+    """The state once its pose is known better: the others follow by their correlation with it."""
+    ndim = pose.translation.ndim - 1
+    P, new = first(state.covariance, 2, ndim), first(pose.covariance, 2, ndim)
+    before, after = (first(a.rotation, 2, ndim) for a in (state, pose))
+    turn = log(product(after, before.swapaxes(0, 1)))
+    shift = first(pose.translation, 1, ndim) - first(state.translation, 1, ndim)
+    across = P[6:, :6]
+    gain = product(across, inverse(P[:6, :6]))
+    moved = np.einsum("ij...,j...->i...", gain, np.concatenate([turn, shift]))
+    # An error of the new pose is one of the old times blkdiag(Jl^-1, I).
+    slope = np.broadcast_to(gain, (*gain.shape[:2], *new.shape[2:])).copy()
+    slope[:, :3] = product(gain[:, :3], left_jacobian_inverse(turn))
+    covariance = np.empty((*P.shape[:2], *new.shape[2:]))
+    covariance[:6, :6] = new
+    covariance[6:, :6] = product(slope, new)
+    covariance[:6, 6:] = covariance[6:, :6].swapaxes(0, 1)
+    kept = P[6:, 6:] - product(gain, across.swapaxes(0, 1))
+    kept = kept + product(covariance[6:, :6], slope.swapaxes(0, 1))
+    covariance[6:, 6:] = 0.5 * (kept + kept.swapaxes(0, 1))
+    extra = state.extra + last(moved, 1)
+    return AugmentedState(pose.rotation, pose.translation, extra, last(covariance, 2))
+
+
+def iekf_cv(
+    tags: FloatArray,
+    noise: NoiseLaw,
+    process: ProcessNoise,
+    iterations: int = 4,
+    robust: bool = False,
+    turn_rate_rad_s: float | Sequence[float] = 0.5,
+    speed_m_s: float | Sequence[float] = 5.0,
+    turn_acceleration: float | Sequence[float] = 0.3,
+    acceleration: float | Sequence[float] = 1.0,
+    gyro_std_rad_s: float | None = None,
+    speed_std_m_s: float | None = None,
+    frame: str = "world",
+) -> AugmentedEkf:
+    """The filter ``"iekf-cv"``: pose and twist of a body without odometry (12 error states).
+
+    Parameters
+    ----------
+    tags, noise, process, iterations, robust
+        As `IteratedEkf`; `process` moves the pose beyond what the twist does.
+    turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration
+        As `WanderingTwist`.
+    gyro_std_rad_s, speed_std_m_s, frame
+        As `TwistSensor`: what `predict` is told is then a reading. Both None: it is ignored.
+    """
+    law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
+    sensor = TwistSensor(gyro_std_rad_s, speed_std_m_s, frame)
+    measured = gyro_std_rad_s is not None or speed_std_m_s is not None
+    pose = IteratedEkf(tags, noise, process, iterations, robust)
+    return AugmentedEkf(pose, law, sensor if measured else None)
+
+
+def iekf_bias(
+    tags: FloatArray,
+    noise: NoiseLaw,
+    process: ProcessNoise,
+    iterations: int = 4,
+    robust: bool = False,
+    bias_std_m: float = 0.05,
+    bias_time_s: float | None = None,
+    common_std_m: float = 0.1,
+) -> AugmentedEkf:
+    """The filter ``"iekf-bias"``: the pose, and a bias of every link that it learns on the way.
+
+    Parameters
+    ----------
+    tags, noise, process, iterations, robust
+        As `IteratedEkf`; `noise` is what remains of a range beside its bias.
+    bias_std_m, bias_time_s, common_std_m
+        As `LinkBias`. A short time marginalises errors that are correlated rather than learning
+        them.
+    """
+    pose = IteratedEkf(tags, noise, process, iterations, robust)
+    return AugmentedEkf(pose, biases=(LinkBias(bias_std_m, bias_time_s, common_std_m),))
+
+
+register("iekf-cv", iekf_cv)
+register("iekf-bias", iekf_bias)

@@ -1,0 +1,1 @@
+"""Linear estimators on squared ranges: the Kalman filters of the tracking paper, least squares."""

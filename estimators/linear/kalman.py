@@ -1,0 +1,337 @@
+"""The Kalman filters of the tracking paper on the 12 states ``x = [vec Q; t]``.
+
+KF, UC-KF, ET-KF and KF-ortho are one filter with a different `constrain` step after the
+linear update. The linear algebra below is filterpy's (one body) or the batched engine (any
+leading axes); both read the statistic of `squared_range`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.bounds.pose import symmetric
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of, kernel
+from rbl_gym.estimators.filter import PoseBelief, inverse, register
+from rbl_gym.estimators.inputs import (
+    VAGUE_ENTRY_VARIANCE,
+    check_batches,
+    check_covariance,
+    check_epoch,
+    check_variance,
+    law_of,
+)
+from rbl_gym.estimators.linear.engines import ENGINES, Prediction, engine_for
+from rbl_gym.estimators.linear.least_squares import unvec, vec
+from rbl_gym.estimators.linear.squared_range import Statistic, geometric_rank, statistic
+from rbl_gym.estimators.linear.unitary import coupled_fit, decoupled_fit
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements.ranging import NoiseLaw
+from rbl_gym.motion.kinematics import ProcessNoise
+
+# Behind the door: what is not determined is NaN.
+_HAT = kernel(rotations.hat)
+
+
+class KalmanState(NamedTuple):
+    """State of the family, with leading batch axes.
+
+    Attributes
+    ----------
+    mean
+        (..., 12), ``[vec Q; t]``, columns of Q first.
+    covariance
+        (..., 12, 12). It has fewer leading axes than the mean where it is the same for all
+        trials: a prior given once, as long as anchors, weights, links and twists are common.
+    constrained
+        (...), whether the last update put the rotation back onto SO(3).
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    constrained: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanFamily:
+    """A Kalman filter on squared ranges, with a constraint step (tracking paper, (16)-(27)).
+
+    Parameters
+    ----------
+    tags
+        (N, 3), metres, body frame, as given (centred tags decouple rotation and translation).
+    noise
+        Law of the ranges; weights come from the measured ranges.
+    process
+        Noise of the motion.
+    constraint
+        ``"none"`` KF; ``"newton"`` UC-KF: the rotation of the weighted problem (26), then the
+        translation (27); ``"threshold"`` ET-KF: projection where ``|Q^T Q - I|_F > threshold``;
+        ``"always"`` KF-ortho: projection after every update. The projection is fed back.
+    sigma_q_scale
+        Process noise of an entry of Q over that of the rotation; 1 as printed, sqrt(2/3) is
+        consistent.
+    threshold
+        Of the event-triggered filter.
+    coupled
+        UC-KF only: solve the coupled problem (23) in place of (26)-(27). It is what is solved
+        anyway where the tags' weights differ (lost links, per-link noise).
+    weights
+        Fixed inverse variances of the squared ranges [1/m^4], (M,) or (M, N); None: from the
+        measured ranges.
+    engine
+        ``"auto"``: filterpy for one body, where no array has leading axes, batched otherwise.
+        ``"batched"`` or ``"filterpy"``: that one always.
+    """
+
+    tags: FloatArray
+    noise: NoiseLaw
+    process: ProcessNoise
+    constraint: str = "none"
+    sigma_q_scale: float = 1.0
+    threshold: float = 0.15
+    coupled: bool = False
+    weights: ArrayLike | None = None
+    engine: str = "auto"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
+        check_one_of("constraint", self.constraint, list(_CONSTRAINTS))
+        check_one_of("engine", self.engine, list(ENGINES))
+        check_number("sigma_q_scale", self.sigma_q_scale, low=0.0)
+        check_number("threshold", self.threshold, low=0.0)
+        if self.weights is not None:
+            weights = check_array("weights", self.weights, ("M",))
+            if (weights < 0).any():
+                raise ValueError(f"weights must not be negative, got {weights.min()}")
+
+    def initial(
+        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
+    ) -> KalmanState:
+        """State of a prior; covariance (..., 6, 6) of the pose or (..., 12, 12) of the state.
+
+        A pose covariance becomes ``blkdiag(2/3 tr(P_w) I9, P_v)``: isotropic and of full rank.
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, a matrix that is no rotation, a covariance that is not positive.
+        """
+        rotation = rotations.check_rotation("rotation", rotation)
+        translation = check_array("translation", translation, (3,))
+        covariance = check_covariance(covariance, (6, 12))
+        if covariance.shape[-1] == 6:
+            covariance = expand_covariance(covariance)
+        batch = np.broadcast_shapes(
+            rotation.shape[:-2], translation.shape[:-1], covariance.shape[:-2]
+        )
+        mean = np.empty((*batch, 12))
+        mean[..., :9], mean[..., 9:] = vec(rotation), translation
+        return KalmanState(mean, covariance.copy(), np.zeros(batch, bool))
+
+    def predict(self, state: KalmanState, twist: ArrayLike, dt: float) -> KalmanState:
+        """State after `dt` seconds of the twist (..., 6): eqs (10)-(15), Omega carrying dt."""
+        twist = check_array("twist", twist, (6,))
+        dt = check_number("dt", dt, low=0.0)
+        step = rotations.exp(twist[..., :3] * dt)
+        engine = engine_for(self.engine, state=state.mean.shape[:-1], twist=twist.shape[:-1])
+        mean, covariance = engine.predict(
+            state.mean,
+            state.covariance,
+            Prediction(step, twist[..., 3:] * dt, dt * self._variance_rate),
+        )
+        return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
+
+    def update(
+        self,
+        state: KalmanState,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
+    ) -> KalmanState:
+        """State after one epoch of ranges (..., M, N); `noise` is its law, None: the filter's.
+
+        Weights that the filter was given count more than any law.
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, NaN, ranges that are not positive, and where anchors and tags
+            cannot determine the 12 states and the state is too vague to stand in (the
+            message names the rank).
+        """
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
+        law = law_of(noise, self.noise)
+        self._check_determined(state, anchors)
+        if self.weights is None:
+            weights = 1 / check_variance(law.squared_range_variance(ranges, mask), mask)
+        else:
+            weights = np.asarray(self.weights, dtype=np.float64)
+            weights = weights[..., None] if weights.ndim == 1 else weights
+            if weights.shape[-2] != ranges.shape[-2] or weights.shape[-1] not in (
+                1,
+                self.tags.shape[-2],
+            ):
+                raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
+        check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
+        stat = statistic(ranges, anchors, self.tags, weights, mask)
+        engine = engine_for(
+            self.engine,
+            state=state.mean.shape[:-1],
+            ranges=stat.b.shape[:-2],
+            weights=stat.G.shape[:-3],
+        )
+        mean, covariance = engine.update(state.mean, state.covariance, stat)
+        posterior = KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
+        return _CONSTRAINTS[self.constraint](self, state, posterior, stat)
+
+    def belief(self, state: KalmanState) -> PoseBelief:
+        """Pose, its covariance, and the raw matrix (copies).
+
+        The covariance is that of the projected output, ``J^+ P J^+T``; of UC-KF, whose mean
+        is constrained already, ``(J^T P^-1 J)^-1``.
+        """
+        matrix = unvec(state.mean[..., :9])
+        on_group = self.constraint in ("newton", "always")
+        rotation = rotations.nearest(matrix)
+        J = state_jacobian(rotation)
+        transposed = np.swapaxes(J, -1, -2)
+        if self.constraint == "newton":
+            covariance = inverse(transposed @ np.linalg.solve(state.covariance, J))
+        else:
+            # J^T J = blkdiag(2 I, I): the pseudo-inverse needs no solver.
+            pinv = transposed * np.array([0.5] * 3 + [1.0] * 3)[:, None]
+            covariance = symmetric(pinv @ state.covariance @ np.swapaxes(pinv, -1, -2))
+        translation = state.mean[..., 9:].copy()
+        raw = rotation if on_group else matrix.copy(order="K")
+        return PoseBelief(rotation, translation, covariance, raw)
+
+    @cached_property
+    def _variance_rate(self) -> FloatArray:
+        """Process noise (12,) of the state after 1 s."""
+        std = self.process.std()
+        sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
+        return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
+
+    def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
+        variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
+        rotation = np.maximum(np.maximum(variance[..., :3], variance[..., 3:6]), variance[..., 6:9])
+        vague_rotation = _largest_of_three(rotation) > VAGUE_ENTRY_VARIANCE
+        largest = _largest_of_three(variance[..., 9:])
+        # The first and last anchor bound the extent from below, and mostly settle it.
+        apart = _largest_of_three(np.abs(anchors[..., 0, :] - anchors[..., -1, :]))
+        doubted = vague_rotation | (largest > apart**2)
+        if not doubted.any():
+            return
+        if anchors.ndim > 2:
+            anchors, largest, vague_rotation = (  # pyright: ignore[reportAssignmentType]
+                np.broadcast_to(array, (*doubted.shape, *array.shape[array.ndim - core :]))[doubted]
+                for array, core in ((anchors, 2), (largest, 0), (vague_rotation, 0))
+            )
+        vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
+        if not vague.any():
+            return
+        rank = geometric_rank(anchors, self.tags)
+        if ((rank < 12) & vague).any():
+            raise ValueError(
+                f"anchors and tags determine only rank {int(rank.min())} of the filter's 12 "
+                f"states (it needs 4 anchors and 4 tags, neither coplanar), and the prior is "
+                f"too vague to stand in; got {anchors.shape[-2]} anchors, "
+                f"{self.tags.shape[-2]} tags. Use 'iekf', or a tighter prior covariance"
+            )
+
+
+def _largest_of_three(values: FloatArray) -> FloatArray:
+    """Maximum (...) over a last axis of 3, which a reduction would walk through slowly."""
+    return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
+
+
+# --- constraints: what happens to the rotation after the linear update --------------------
+
+
+def _no_constraint(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    return posterior
+
+
+def _project(posterior: KalmanState, where: BoolArray) -> KalmanState:
+    mean = posterior.mean.copy()
+    mean[..., :9] = np.where(
+        where[..., None], vec(rotations.nearest(unvec(mean[..., :9]))), mean[..., :9]
+    )
+    return KalmanState(mean, posterior.covariance, where)
+
+
+def _always(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    return _project(posterior, np.ones(posterior.mean.shape[:-1], bool))
+
+
+def _above_threshold(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    matrix = unvec(posterior.mean[..., :9])
+    defect = np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)
+    return _project(posterior, np.asarray(np.linalg.norm(defect, axis=(-2, -1)) > family.threshold))
+
+
+def _newton(
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+) -> KalmanState:
+    """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
+
+    The covariance stays that of the linear update, (22) as printed: an overestimate.
+    """
+    if stat.is_common and not family.coupled:
+        rotation, translation = decoupled_fit(prior.mean, prior.covariance, stat)
+    else:
+        rotation, translation = coupled_fit(posterior.mean, posterior.covariance)
+    mean = np.concatenate([vec(rotation), translation], axis=-1)
+    return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
+
+
+_CONSTRAINTS: dict[str, Callable[..., KalmanState]] = {
+    "none": _no_constraint,
+    "newton": _newton,
+    "threshold": _above_threshold,
+    "always": _always,
+}
+
+
+# --- between 6 and 12 states ---------------------------------------------------------------
+
+
+def state_jacobian(rotation: FloatArray) -> FloatArray:
+    """Derivative (..., 12, 6) of ``[vec Q; t]`` by the pose error (w, v)."""
+    J = np.zeros((*rotation.shape[:-2], 12, 6))
+    for k in range(3):
+        J[..., 3 * k : 3 * k + 3, :3] = -_HAT(rotation[..., :, k])
+    J[..., 9:, 3:] = np.eye(3)
+    return J
+
+
+def expand_covariance(covariance: FloatArray) -> FloatArray:
+    """Pose covariance (..., 6, 6) to that of the 12 states, ``blkdiag(2/3 tr(P_w) I9, P_v)``."""
+    expanded = np.zeros((*covariance.shape[:-2], 12, 12))
+    trace = np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1)
+    index = np.arange(9)
+    expanded[..., index, index] = (2 / 3) * trace[..., None]
+    expanded[..., 9:, 9:] = covariance[..., 3:, 3:]
+    return expanded
+
+
+for _name, _constraint in {
+    "kf": "none",
+    "uc-kf": "newton",
+    "et-kf": "threshold",
+    "kf-ortho": "always",
+}.items():
+    register(_name, partial(KalmanFamily, constraint=_constraint))

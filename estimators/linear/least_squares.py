@@ -1,0 +1,197 @@
+"""Estimators on squared ranges: LS, LS-projected, CLS (CTLS), weighted Procrustes (UC-LS).
+
+LS and CLS are of the static paper (ICASSP 2013), LS with projection and UC-LS of the slides.
+
+All read the statistic of an epoch (`squared_range`) and broadcast over leading axes. Where the
+links of a trial do not determine a solution, its entries are NaN; the caller must look.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.bounds.pose import information_rank
+from rbl_gym.checks import FloatArray, kernel
+from rbl_gym.estimators.linear.squared_range import Statistic, information
+from rbl_gym.geometry import rotations
+
+# Behind the doors: entries of what is not determined are NaN here.
+_NEAREST = kernel(rotations.nearest)
+# From a step on the tangent space to a rotation, equal to second order.
+RETRACTIONS = {"exponential": kernel(rotations.exp), "cayley": kernel(rotations.cayley)}
+
+# The generators of SO(3): E[i] = [e_i]x.
+_E = rotations.hat(np.eye(3))
+# Symmetrised products (E_i E_j + E_j E_i) / 2, the second-order term of exp.
+_EE = 0.5 * (np.einsum("iab,jbc->ijac", _E, _E) + np.einsum("jab,ibc->ijac", _E, _E))
+
+
+def vec(matrix: FloatArray) -> FloatArray:
+    """Columns of (..., 3, k) stacked, (..., 3 k)."""
+    columns = np.swapaxes(matrix, -1, -2)
+    return columns.reshape(*columns.shape[:-2], -1)
+
+
+def unvec(vector: FloatArray) -> FloatArray:
+    """Inverse of `vec` for 3 x 3 matrices."""
+    return np.swapaxes(vector.reshape(*vector.shape[:-1], 3, 3), -1, -2)
+
+
+def procrustes(
+    weight: FloatArray,
+    target: FloatArray,
+    start: FloatArray,
+    iterations: int = 30,
+    retraction: str = "exponential",
+) -> tuple[FloatArray, FloatArray]:
+    """Rotation that minimises ``(vec Q - q)^T W (vec Q - q) / 2`` by Newton's method on SO(3).
+
+    Exact Hessian, damped where it is not positive or the cost would rise; the update is
+    ``Q <- R(w) Q`` with the retraction R. Local: the caller chooses the starts (put them on a
+    batch axis).
+
+    Parameters
+    ----------
+    weight, target
+        W (..., 9, 9), positive semidefinite, and q (..., 9).
+    start
+        Rotation (..., 3, 3) to start from.
+    iterations
+        At the most; it stops when all trials stand still.
+    retraction
+        One of `RETRACTIONS`.
+
+    Returns
+    -------
+    The rotation (..., 3, 3) and its cost (...).
+    """
+    batch = np.broadcast_shapes(weight.shape[:-2], target.shape[:-1], start.shape[:-2])
+    Q = np.broadcast_to(start, (*batch, 3, 3))
+    residual = vec(Q) - target
+    pull = (weight @ residual[..., None])[..., 0]
+    cost = 0.5 * np.einsum("...i,...i->...", residual, pull)
+    damping = np.zeros(batch)
+    for _ in range(iterations):
+        tangent = vec(_E @ Q[..., None, :, :])  # (..., 3, 9): derivative of vec Q
+        gradient = (tangent @ pull[..., None])[..., 0]
+        gauss = tangent @ weight @ np.swapaxes(tangent, -1, -2)
+        curvature = np.einsum("...k,...ijk->...ij", pull, vec(_EE @ Q[..., None, None, :, :]))
+        hessian = gauss + curvature
+        smallest = np.linalg.eigvalsh(hessian)[..., 0]
+        scale = np.trace(gauss, axis1=-2, axis2=-1)
+        shift = np.maximum(0.0, 1e-9 * scale - smallest) * 1.5 + damping * scale + 1e-300
+        # Of a weight that is rounding only, as of tags in one point, nothing else is certain.
+        shift += 1e-15 * np.abs(hessian).max(axis=(-2, -1))
+        step = -np.linalg.solve(hessian + shift[..., None, None] * np.eye(3), gradient[..., None])
+        step = step[..., 0]
+        # A step past a quarter turn leaves the region the quadratic model speaks of.
+        length = np.linalg.norm(step, axis=-1, keepdims=True)
+        step = step * np.minimum(1.0, 1.5 / np.maximum(length, 1e-300))
+        candidate = RETRACTIONS[retraction](step) @ Q
+        new_residual = vec(candidate) - target
+        new_pull = (weight @ new_residual[..., None])[..., 0]
+        new_cost = 0.5 * np.einsum("...i,...i->...", new_residual, new_pull)
+        better = new_cost <= cost * (1 + 1e-12)
+        Q = np.where(better[..., None, None], candidate, Q)
+        pull = np.where(better[..., None], new_pull, pull)
+        cost = np.where(better, new_cost, cost)
+        damping = np.where(better, 0.1 * damping, np.maximum(10 * damping, 1e-3))
+        if (length[..., 0] < 1e-13).all():
+            break
+    return Q, cost
+
+
+def linear_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
+    """LS: the unconstrained 3 x 3 matrix and translation, eq. (14) of the static paper."""
+    matrix, vector = information(stat)
+    x = _solve(matrix, vector)
+    return unvec(x[..., :9]), x[..., 9:]
+
+
+def translation_fit(stat: Statistic, rotation: FloatArray) -> FloatArray:
+    """The translation of least squares for a given rotation."""
+    per_tag = stat.b - (stat.G @ (stat.tags @ np.swapaxes(rotation, -1, -2))[..., None])[..., 0]
+    return _solve(_total(stat), per_tag.sum(axis=-2))
+
+
+def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
+    """CLS, which is CTLS too: every tag located by itself, then an orthogonal Procrustes fit.
+
+    Static paper: (17)-(19) and Lemma 1, (20)-(21) and Lemma 2, Algorithm 1.
+
+    Tags whose links do not determine their place are left out; three that are not collinear
+    have to remain.
+    """
+    places = _solve(stat.G, stat.b)
+    known = np.broadcast_to(np.isfinite(places).all(axis=-1), places.shape[:-1])
+    share = known / np.maximum(known.sum(axis=-1, keepdims=True), 1)
+    places = np.where(known[..., None], places, 0.0)
+    centre = (share[..., None] * places).sum(axis=-2)
+    middle = (share[..., None] * stat.tags).sum(axis=-2)
+    weighted = share[..., None] * (stat.tags - middle[..., None, :])
+    cross = np.swapaxes(places - centre[..., None, :], -1, -2) @ weighted
+    rotation = _NEAREST(cross)
+    translation = centre - (rotation @ middle[..., None])[..., 0]
+    few = known.sum(axis=-1) < 3
+    return np.where(few[..., None, None], np.nan, rotation), np.where(
+        few[..., None], np.nan, translation
+    )
+
+
+def procrustes_fit(
+    stat: Statistic, starts: FloatArray, retraction: str = "exponential"
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted orthogonal Procrustes, searched for globally.
+
+    Remark 2 of the static paper; UC-LS in the appendix of the slides.
+
+    Parameters
+    ----------
+    starts
+        Rotations (..., S, 3, 3); Newton's method runs from the first of every trial and from
+        the two of least cost among the others.
+    retraction
+        One of `RETRACTIONS`.
+
+    Returns
+    -------
+    Rotation (..., 3, 3) and the translation (..., 3) that belongs to it.
+    """
+    matrix, vector = information(stat)
+    lower = np.linalg.solve(loaded(matrix[..., 9:, 9:]), matrix[..., 9:, :9])
+    weight = matrix[..., :9, :9] - np.swapaxes(matrix[..., 9:, :9], -1, -2) @ lower
+    pull = vector[..., :9] - (np.swapaxes(lower, -1, -2) @ vector[..., 9:, None])[..., 0]
+    # Coplanar tags leave the weight singular: the loading acts where it carries nothing.
+    target = np.linalg.solve(loaded(weight), pull[..., None])[..., 0]
+    weight, target = weight[..., None, :, :], target[..., None, :]
+    residual = vec(starts) - target
+    cost = np.einsum(
+        "...i,...i->...", residual @ np.swapaxes(weight[..., 0, :, :], -1, -2), residual
+    )
+    order = np.argsort(cost[..., 1:], axis=-1)[..., :2] + 1
+    chosen = np.concatenate([np.zeros_like(order[..., :1]), order], axis=-1)
+    starts = np.take_along_axis(starts, chosen[..., None, None], axis=-3)
+    Q, cost = procrustes(weight, target, starts, retraction=retraction)
+    best = np.argmin(cost, axis=-1)
+    rotation = np.take_along_axis(Q, best[..., None, None, None], axis=-3)[..., 0, :, :]
+    return rotation, translation_fit(stat, rotation)
+
+
+def _total(stat: Statistic) -> FloatArray:
+    n_tags = stat.b.shape[-2]
+    return stat.G[..., 0, :, :] * n_tags if stat.is_common else stat.G.sum(axis=-3)
+
+
+def loaded(matrix: FloatArray) -> FloatArray:
+    """Symmetric matrices (..., n, n) with 1e-13 of its trace on the diagonal: invertible."""
+    size = matrix.shape[-1]
+    trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
+    return matrix + (1e-13 * trace + 1e-300) * np.eye(size)
+
+
+def _solve(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Solution of symmetric positive systems, NaN where one is singular."""
+    singular = information_rank(matrix) < matrix.shape[-1]
+    safe = np.where(singular[..., None, None], np.eye(matrix.shape[-1]), matrix)
+    solved = np.linalg.solve(safe, vector[..., None])[..., 0]
+    return np.where(singular[..., None], np.nan, solved)

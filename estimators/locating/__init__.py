@@ -1,0 +1,1 @@
+"""Static localization: one epoch of ranges or angles in, a pose out."""

@@ -1,0 +1,203 @@
+"""Maximum likelihood of the pose from directions of arrival, found globally.
+
+Three tags and their directions leave a pose open up to the roots of a quartic (the
+perspective-three-point problem, Grunert 1841; coefficients as in Haralick et al., IJCV 13, 1994).
+The roots of several triples, with every sign of y that the angles leave open, are the starts;
+Levenberg-Marquardt on SO(3) x R^3 ends in the local optima around them.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.components import cross, first, last
+from rbl_gym.estimators.costs.doa_cost import DoaCost
+from rbl_gym.estimators.costs.levenberg_marquardt import Solution, minimize_pose
+from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, cheapest, merge, rivals
+from rbl_gym.measurements import bearing
+
+# Triples of tags that starts are made from: those of largest area.
+_TRIPLES = 6
+# Starts on each side of y = 0 that are refined, and those that are refined to the end: many
+# starts lead to one optimum.
+_REFINED, _FINALISTS = 6, 5
+# A cost so far above the best is not going to be the best.
+_HOPEFUL = 50.0
+
+
+def global_search(
+    angles: FloatArray, weights: FloatArray, tags: FloatArray, side: float | None
+) -> tuple[Solution, Alternatives]:
+    """The most likely pose of every trial and others about as likely.
+
+    Parameters
+    ----------
+    angles, weights, tags
+        (B, 2, K), (B, 2, K), (B, K, 3), K >= 3.
+    side
+        Sign of y of the body, None: unknown.
+    """
+    sides = (1.0, -1.0) if side is None else (side,)
+    rotation, translation = starts(angles, tags, side)
+    part = DoaCost(angles[:, None], weights[:, None], tags[:, None], np.zeros((1, 1, 3)))
+    cost = _cost_of_angles(part, rotation, translation)
+    chosen = _cheapest_of_sides(rotation, translation, cost, tags, sides, _REFINED)
+    coarse = minimize_pose(part, *chosen, iterations=6, tolerance=1e-2)
+    finalists = _cheapest_of_sides(*coarse[:2], coarse.at.cost, tags, sides, _FINALISTS)
+    refined = minimize_pose(part, *finalists, iterations=8)
+    cost = refined.at.cost
+    hopeful = cost < cost.min(axis=1, keepdims=True) + _HOPEFUL
+    slow = (hopeful & ~refined.converged).any(axis=1)
+    if slow.any():
+        rest = part.each(lambda array, _: array[slow] if len(array) == len(slow) else array)
+        more = minimize_pose(rest, refined.rotation[slow], refined.translation[slow], 60)
+        refined = merge(refined, more, slow)
+    if side is not None:
+        beyond = side * _height(refined.rotation, refined.translation, tags) <= 0
+        cost = np.where(beyond, np.inf, refined.at.cost)
+        refined = refined._replace(at=refined.at._replace(cost=cost))
+    return cheapest(refined), rivals(part.tags, refined)
+
+
+def _cheapest_of_sides(
+    rotation: FloatArray,
+    translation: FloatArray,
+    cost: FloatArray,
+    tags: FloatArray,
+    sides: tuple[float, ...],
+    count: int,
+) -> tuple[FloatArray, FloatArray]:
+    """The `count` cheapest poses of every trial on each side of y = 0."""
+    height = _height(rotation, translation, tags)
+    count = min(count, cost.shape[1])
+    keep = np.concatenate(
+        [
+            np.argpartition(np.where(side * height > 0, cost, np.inf), count - 1)[:, :count]
+            for side in sides
+        ],
+        axis=1,
+    )
+    return (
+        np.take_along_axis(rotation, keep[..., None, None], axis=1),
+        np.take_along_axis(translation, keep[..., None], axis=1),
+    )
+
+
+def starts(
+    angles: FloatArray, tags: FloatArray, side: float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (B, S, 3, 3), (B, S, 3) that three tags at a time leave open."""
+    triples = _triples(tags)
+    signs = np.full((1, 3), side or 1.0)
+    if side is None:
+        signs = np.array([(1.0, *pair) for pair in itertools.product((1.0, -1.0), repeat=2)])
+    # (B, triple, sign pattern, tag, 3), then components first.
+    rays = bearing.directions(angles)[:, triples]
+    rays = np.where(np.arange(3) == 1, rays[:, :, None] * signs[..., None], rays[:, :, None])
+    body = tags[:, triples][:, :, None]
+    batch = rays.shape[:3]
+    body = np.broadcast_to(body, rays.shape)
+    flat = [np.ascontiguousarray(a.reshape(-1, 3, 3).transpose(1, 2, 0)) for a in (rays, body)]
+    depths = three_point_depths(*flat)
+    places = depths[:, None] * flat[0][..., None]
+    Q, t = _align(places, flat[1][..., None])
+    rotation = last(Q, 2).reshape((batch[0], -1, 3, 3))
+    translation = last(t, 1).reshape((batch[0], -1, 3))
+    if side is None:
+        # Across the plane y = 0 the depths are the same and the triangle is turned over.
+        places[:, 1] *= -1
+        Q, t = _align(places, flat[1][..., None])
+        rotation = np.concatenate([rotation, last(Q, 2).reshape(rotation.shape)], axis=1)
+        translation = np.concatenate([translation, last(t, 1).reshape(translation.shape)], axis=1)
+    return rotation, translation
+
+
+def _triples(tags: FloatArray) -> np.ndarray:
+    """The triples (T, 3) of tags with the largest triangles, on average over the trials."""
+    triples = np.array(list(itertools.combinations(range(tags.shape[1]), 3)))
+    some = tags[:: max(1, len(tags) // 16)]
+    corner = some[:, triples]
+    sides = corner[:, :, 1:] - corner[:, :, :1]
+    area = np.linalg.norm(np.cross(sides[:, :, 0], sides[:, :, 1]), axis=-1).mean(axis=0)
+    return triples[np.argsort(-area, kind="stable")[:_TRIPLES]]
+
+
+def three_point_depths(rays: FloatArray, body: FloatArray) -> FloatArray:
+    """Distances (3, n, 4) of three tags along unit rays (3, 3, n), body triangles (3, 3, n).
+
+    Tag first, then component. The four roots of Grunert's quartic in v = d3 / d1; where noise
+    made a pair of them complex, its real part stands for both.
+    """
+    a, b, c = (_square(body[i] - body[j]) for i, j in ((1, 2), (0, 2), (0, 1)))
+    cos_a, cos_b, cos_c = (
+        np.einsum("i...,i...->...", rays[i], rays[j]) for i, j in ((1, 2), (0, 2), (0, 1))
+    )
+    b = np.maximum(b, 1e-300)
+    p, q, r = (a - c) / b, (a + c) / b, c / b
+    s = a / b
+    coefficients = [
+        (p - 1) ** 2 - 4 * r * cos_a**2,
+        4 * (p * (1 - p) * cos_b - (1 - q) * cos_a * cos_c + 2 * r * cos_a**2 * cos_b),
+        2 * (p**2 - 1 + 2 * p**2 * cos_b**2 + 2 * (1 - r) * cos_a**2
+             - 4 * q * cos_a * cos_b * cos_c + 2 * (1 - s) * cos_c**2),
+        4 * (-p * (1 + p) * cos_b + 2 * s * cos_c**2 * cos_b - (1 - q) * cos_a * cos_c),
+        (1 + p) ** 2 - 4 * s * cos_c**2,
+    ]  # fmt: skip
+    v = np.maximum(_quartic_roots(np.array(coefficients)), 1e-3)
+    p, cos_a, cos_b, cos_c, b = (x[:, None] for x in (p, cos_a, cos_b, cos_c, b))
+    lower = 2 * (cos_c - v * cos_a)
+    lower = np.where(np.abs(lower) > 1e-9, lower, 1e-9)
+    u = np.maximum(((p - 1) * v**2 - 2 * p * cos_b * v + 1 + p) / lower, 1e-3)
+    d = np.sqrt(b / np.maximum(1 + v * v - 2 * v * cos_b, 1e-12))
+    return np.stack([d, d * np.minimum(u, 1e3), d * np.minimum(v, 1e3)])
+
+
+def _quartic_roots(coefficients: FloatArray) -> FloatArray:
+    """Real parts (n, 4) of the roots of quartics with coefficients (5, n), highest power first."""
+    leading = coefficients[0]
+    floor = 1e-12 * np.abs(coefficients).max(axis=0) + 1e-300
+    leading = np.where(np.abs(leading) > floor, leading, floor)
+    companion = np.zeros((coefficients.shape[1], 4, 4))
+    companion[:, 0] = -(coefficients[1:] / leading).T
+    companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
+    return np.linalg.eigvals(companion).real
+
+
+def _align(places: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pose (3, 3, ...), (3, ...) that lays triangles (3, 3, ...) of a body on places, tag first."""
+    rotation = np.einsum("ik...,jk...->ij...", _frame(places), _frame(body))
+    middle = body.mean(axis=0)
+    turned = np.einsum("ij...,j...->i...", rotation, np.broadcast_to(middle, places.shape[1:]))
+    return rotation, places.mean(axis=0) - turned
+
+
+def _frame(triangle: FloatArray) -> FloatArray:
+    """Orthonormal axes (3, 3, ...), as columns, of triangles (3, 3, ...), tag first."""
+    x = _unit(triangle[1] - triangle[0])
+    z = _unit(cross(x, (triangle[2] - triangle[0])[:, None])[:, 0])
+    return np.stack([x, cross(z, x[:, None])[:, 0], z], axis=1)
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return vector / np.sqrt(np.maximum(_square(vector), 1e-300))
+
+
+def _square(vector: FloatArray) -> FloatArray:
+    return np.einsum("i...,i...->...", vector, vector)
+
+
+def _cost_of_angles(part: DoaCost, rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Half the squared whitened residuals (B, S), without derivatives."""
+    turned = np.einsum(
+        "ij...,jn...->in...", first(rotation, 2), first(part.tags, 2, 2).swapaxes(0, 1)
+    )
+    residual = bearing.seen(turned + first(translation, 1)[:, None]) - first(part.angles, 2, 2)
+    return 0.5 * np.einsum("an...,an...,an...->...", first(part.weights, 2, 2), residual, residual)
+
+
+def _height(rotation: FloatArray, translation: FloatArray, tags: FloatArray) -> FloatArray:
+    """y of the tags' centre at poses (B, S)."""
+    return translation[..., 1] + np.einsum("bsj,bj->bs", rotation[..., 1, :], tags.mean(axis=1))

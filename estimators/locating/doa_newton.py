@@ -1,0 +1,162 @@
+"""The DOA paper's method: Newton's iteration on the places of the tags, then a unit quaternion.
+
+The iteration (NIA) solves for K places in space from their 2 K angles and K (K - 1) / 2 known
+distances, as if they were not on one body; the unit quaternion method fits the body to them.
+Arrays of a batch: angles (B, 2, K), places (B, K, 3); inside, trials come last.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray, kernel
+from rbl_gym.components import solve
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import bearing
+
+# Behind the door: places far off make it large.
+_VEE = kernel(rotations.vee)
+
+# Distances are known, angles are noisy: a distance counts as an angle of this many radians for
+# an error of the body's size.
+DISTANCE_WEIGHT = 10.0
+# The start C has tags on the axes, where the angles have no derivative.
+START_SHIFT = 1e-3
+STEP_TOLERANCE = 1e-8
+MAX_ITERATIONS = 30
+# Farther off than this, in sizes of the body, an iteration has run away; and without an end this
+# far off too. Angles that tell a body at the first are exact to its 1e-6, at the second to 1e-3.
+FARTHEST = 1e6
+_FAR = 1e3
+# Below this step, in units of length, the residuals' curvature counts too (Newton proper): noise
+# leaves residuals, and with them Gauss-Newton would go on converging linearly.
+_CURVED = 1e-2
+
+
+class Places(NamedTuple):
+    """Places (B, K, 3) of the tags, iterations taken (B,), and whether the last step was small.
+
+    NaN where the iteration ran away: beyond 1e6 sizes of the body, or without an end beyond 1e3.
+    """
+
+    positions: FloatArray
+    iterations: np.ndarray
+    converged: BoolArray
+
+
+def body_size(tags: FloatArray) -> FloatArray:
+    """Largest distance (...) between two tags of a body (..., K, 3): the unit of length."""
+    gap = tags[..., :, None, :] - tags[..., None, :, :]
+    return np.sqrt(np.einsum("...i,...i->...", gap, gap).max(axis=(-2, -1)))
+
+
+def newton_iteration(
+    angles: FloatArray, tags: FloatArray, distance_weight: float | None = None
+) -> Places:
+    """Places of the tags by Newton's iteration (Gauss-Newton), from the tags shifted by 1e-3.
+
+    Parameters
+    ----------
+    angles, tags
+        (B, 2, K) and (B, K, 3), radians and metres.
+    distance_weight
+        Of an error of a distance against one of an angle, radians per metre; None:
+        `DISTANCE_WEIGHT` over the body's size, so that no unit of length matters. The paper's 1
+        is one per whatever unit the tags come in.
+
+    Notes
+    -----
+    Stops where all steps together are shorter than 1e-8 of the unit of length.
+    """
+    unit = body_size(tags) if distance_weight is None else np.ones(len(tags))
+    weight = DISTANCE_WEIGHT if distance_weight is None else distance_weight
+    body = np.ascontiguousarray((tags / unit[:, None, None]).transpose(2, 1, 0))
+    target = np.ascontiguousarray(angles.transpose(1, 2, 0))
+    pairs = np.array(list(itertools.combinations(range(body.shape[1]), 2)))
+    gap = body[:, pairs[:, 0]] - body[:, pairs[:, 1]]
+    lengths = np.sqrt(np.einsum("ipb,ipb->pb", gap, gap))
+    x = body + START_SHIFT
+    extent = lengths.max(axis=0)
+    iterations = np.full(len(tags), MAX_ITERATIONS)
+    active = np.arange(len(tags))
+    converged = np.zeros(len(tags), bool)
+    now, goal, known, size = x, target, lengths, np.full(len(tags), np.inf)
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        step = _newton_step(
+            now, goal, known, pairs, weight, (size < _CURVED * extent).astype(float)
+        )
+        # What runs away does not come back.
+        gone = ~(np.abs(now + step).max(axis=(0, 1)) < FARTHEST * extent)
+        step = np.where(gone, np.nan, step)
+        now = now + step
+        size = np.sqrt(np.einsum("ikb,ikb->b", step, step))
+        done = size < STEP_TOLERANCE
+        stop = done | gone
+        if stop.any():
+            x[:, :, active[stop]] = now[:, :, stop]
+            iterations[active[stop]] = iteration
+            converged[active[done]] = True
+            keep = ~stop
+            active, size, extent = active[keep], size[keep], extent[keep]
+            now, goal, known = now[..., keep], goal[..., keep], known[:, keep]
+        if not len(active):
+            break
+    lost = ~(np.abs(now).max(axis=(0, 1)) < _FAR * extent)
+    x[:, :, active] = np.where(lost, np.nan, now)
+    return Places(x.transpose(2, 1, 0) * unit[:, None, None], iterations, converged)
+
+
+def _newton_step(
+    x: FloatArray,
+    angles: FloatArray,
+    lengths: FloatArray,
+    pairs: np.ndarray,
+    weight: float,
+    curved: FloatArray,
+) -> FloatArray:
+    """One step (3, K, B) of the places (3, K, B); `curved` (B,): 1 Newton, 0 Gauss-Newton."""
+    n_tags, trials = x.shape[1:]
+    found, J = bearing.linearize(x)
+    residual = found - angles
+    own = np.einsum("aikb,ajkb->kijb", J, J)
+    if curved.any():
+        own += (curved * bearing.curvature(x, residual)).transpose(2, 0, 1, 3)
+    gap = x[:, pairs[:, 0]] - x[:, pairs[:, 1]]
+    distance = np.sqrt(np.maximum(np.einsum("ipb,ipb->pb", gap, gap), 1e-200))
+    along = np.ascontiguousarray((gap * (weight / distance)).swapaxes(0, 1))
+    bend = curved * (1 - lengths / distance)
+    blocks = (along * (1 - bend)[:, None])[:, :, None] * along[:, None]
+    blocks[:, range(3), range(3)] += (weight**2 * bend)[:, None]
+    pull = along * (weight * (lengths - distance))[:, None]
+    # A pair pulls its two tags apart: +1 and -1 in its row of the incidence matrix.
+    E = np.zeros((len(pairs), n_tags))
+    E[range(len(pairs)), pairs[:, 0]], E[range(len(pairs)), pairs[:, 1]] = 1.0, -1.0
+    both = (E[:, :, None] * E[:, None]).reshape(len(pairs), -1)
+    A = (both.T @ blocks.reshape(len(pairs), -1)).reshape(n_tags, n_tags, 3, 3, trials)
+    A[range(n_tags), range(n_tags)] += own
+    force = (E.T @ pull.reshape(len(pairs), -1)).reshape(n_tags, 3, trials)
+    force -= np.einsum("aikb,akb->kib", J, residual)
+    size = 3 * n_tags
+    A = A.swapaxes(1, 2).reshape(size, size, trials)
+    step = solve(A, force.reshape(size, trials), np.zeros(trials))
+    return step.reshape(n_tags, 3, trials).swapaxes(0, 1)
+
+
+def unit_quaternion(positions: FloatArray, tags: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rotation (..., 3, 3) and translation (..., 3) of the body nearest to places (..., K, 3).
+
+    DOA paper, (11)-(14) mended: with ``H = sum_k s_k c_k^T`` (centred) the quaternion maximises
+    ``q^T P q``, P the symmetric 4 x 4 matrix of H; ``t = s - R c`` of the means.
+    """
+    s_mean, c_mean = positions.mean(axis=-2), tags.mean(axis=-2)
+    s, c = positions - s_mean[..., None, :], tags - c_mean[..., None, :]
+    H = np.swapaxes(s, -1, -2) @ c
+    P = np.empty((*H.shape[:-2], 4, 4))
+    P[..., 0, 0] = np.einsum("...ii->...", H)
+    P[..., 1:, 1:] = H + np.swapaxes(H, -1, -2) - P[..., :1, :1] * np.eye(3)
+    P[..., 0, 1:] = P[..., 1:, 0] = 2 * _VEE(H)
+    rotation = rotations.from_quaternion(np.linalg.eigh(P)[1][..., 3])
+    return rotation, s_mean - (rotation @ c_mean[..., None])[..., 0]

@@ -1,0 +1,267 @@
+"""Static localization: one epoch of ranges in, a pose with its covariance out.
+
+`locate` is the door; the methods behind it are in `locators`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import bounds
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    are_finite,
+    check_array,
+    check_number,
+    check_one_of,
+    kernel,
+)
+from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, spanned_dimensions
+from rbl_gym.estimators.linear.least_squares import RETRACTIONS
+from rbl_gym.estimators.linear.squared_range import Statistic, statistic
+from rbl_gym.estimators.locating.locators import METHODS, Epoch, Fit
+from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, no_alternatives
+from rbl_gym.measurements import ranging
+from rbl_gym.measurements.ranging import NoiseLaw
+
+# Of what is not known the cost is not a number: no door here.
+_DISTANCES = kernel(ranging.distances)
+
+ENTRY_POINT_GROUP = "rbl_gym.locators"
+# Trials of a block: their arrays stay in the processor's cache.
+_BLOCK = 512
+
+
+class PoseEstimate(NamedTuple):
+    """A pose from one epoch of ranges, with leading batch axes.
+
+    Attributes
+    ----------
+    rotation, translation
+        (..., 3, 3), always a proper rotation, and (..., 3) in metres. NaN where the links of
+        a trial do not determine what the method needs.
+    covariance
+        (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``, as
+        the method's own theory has it. Enormous along directions that nothing determines.
+    cost
+        (...), half the sum of squared whitened range residuals at the pose (of `robust`: of
+        the ranges it kept).
+    converged
+        (...), whether the method ended in a solution of its own problem.
+    rank
+        (...), how many of the 6 directions of the pose the ranges determine. Below 6 the pose
+        is one of many.
+    alternatives
+        Other poses that explain the ranges about as well (within 3 sigma of the cost), such as
+        mirror poses; looked for by ``ml`` and ``robust`` where the geometry is poor.
+    matrix
+        (..., 3, 3), the raw matrix of ``ls``; of all others the rotation.
+    iterations
+        (...), after how many steps ``nia``, ``pso`` and ``psa`` came to rest; of all others,
+        which do not count them, 0.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    cost: FloatArray
+    converged: BoolArray
+    rank: np.ndarray
+    alternatives: Alternatives
+    matrix: FloatArray
+    iterations: np.ndarray
+
+
+def locate(
+    ranges: ArrayLike,
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    noise: NoiseLaw,
+    method: str = "ml",
+    links: ArrayLike | None = None,
+    tag_std_m: float = 0.0,
+    retraction: str = "exponential",
+) -> PoseEstimate:
+    """The pose of a body from one epoch of ranges; a thousand problems are one call.
+
+    Parameters
+    ----------
+    ranges
+        (..., M, N), metres.
+    anchors, tags
+        (..., M, 3) in the world frame and (..., N, 3) in the body frame, metres.
+    noise
+        Law of the ranges; variances are taken at the measured ranges.
+    method
+        ``"ls"``: least squares on the squared ranges without the constraint (static paper,
+        (14)). ``"ls-projected"``: its matrix projected onto SO(3), then the translation
+        (slides). ``"cls"``, or ``"ctls"``, the same: tag by tag, then an orthogonal Procrustes
+        fit (static paper, (17)-(21), Lemmas 1 and 2, Algorithm 1). ``"procrustes"``, or
+        ``"uc-ls"``, the same: weighted orthogonal Procrustes by Newton's method, the optimally
+        constrained least squares (static paper, Remark 2; slides, appendix). ``"ml"``: maximum
+        likelihood of the raw ranges, searched for globally where the geometry is poor.
+        ``"two-step"``: ``cls`` and two Gauss-Newton steps on the raw ranges. ``"robust"``: for
+        ranges of which some are wrong. Or a name that a package offers by the entry-point group
+        ``rbl_gym.locators``.
+    links
+        Mask (..., M, N), True = measured.
+    tag_std_m
+        Standard deviation of the tags' places on the body, per axis; marginalised by ``ml``.
+    retraction
+        How Newton's method of ``procrustes`` turns a step into a rotation: ``"exponential"``
+        or ``"cayley"`` (slides). Both end in the same pose.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, NaN, ranges that are not positive, an unknown method, a retraction
+        other than the exponential for a method that has none; and where the
+        anchors or tags cannot give what a squared-range method needs (four anchors not
+        coplanar; tags not collinear, for ``ls`` not coplanar).
+    """
+    fit = _method(method)
+    check_one_of("retraction", retraction, list(RETRACTIONS))
+    if retraction != "exponential" and fit is not METHODS["procrustes"]:
+        raise ValueError(
+            f"retraction {retraction!r} is for the methods 'procrustes' and 'uc-ls', "
+            f"got method {method!r}"
+        )
+    ranging.check_law("noise", noise)
+    tags = check_array("tags", tags, ("N", 3))
+    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
+    ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
+    check_batches(ranges=ranges.shape[:-2], tags=tags.shape[:-2])
+    epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
+    epoch = epoch._replace(retraction=retraction)
+    blocks = [
+        _solve(fit, _rows(epoch, slice(start, start + _BLOCK)))
+        for start in range(0, len(epoch.ranges), _BLOCK)
+    ]
+    if method in _NEEDS and not all(np.isfinite(block[1]).all() for block in blocks):
+        _check_geometry(method, anchors, tags)
+    fields = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+    fields = [field.reshape((*batch, *field.shape[1:])) for field in fields]
+    return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9], np.zeros(batch, int))
+
+
+def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:
+    """The fields of a `PoseEstimate` (alternatives as three) for one block of trials."""
+    found = fit(epoch)
+    rotation, translation = found.rotation, found.translation
+    known = are_finite(translation, 1) & are_finite(rotation, 2)
+    cost, information = found.cost, found.information
+    if cost is None or information is None:
+        cost = _range_cost_of(epoch, rotation, translation, known)
+        rank = _rank_of_tags(epoch.tags)
+    else:
+        rank = bounds.information_rank(information)
+    return (
+        rotation,
+        translation,
+        found.covariance,
+        cost,
+        found.converged,
+        np.where(known, rank, 0),
+        *(found.alternatives or no_alternatives(len(known))),
+        rotation if found.matrix is None else found.matrix,
+    )
+
+
+def _range_cost_of(
+    epoch: Epoch, rotation: FloatArray, translation: FloatArray, known: BoolArray
+) -> FloatArray:
+    """Half the sum of squared whitened range residuals (B,), infinite where no pose is known."""
+    turned = epoch.tags @ np.swapaxes(rotation, -1, -2)
+    residual = _DISTANCES(epoch.anchors, turned + translation[:, None]) - epoch.ranges
+    cost = 0.5 * np.einsum("bmn,bmn,bmn->b", epoch.weights, residual, residual)
+    return np.where(known, cost, np.inf)
+
+
+def _rank_of_tags(tags: FloatArray) -> np.ndarray:
+    """Rank of the pose where every tag is located: 3 for a point, 5 for a line, else 6."""
+    if tags.strides[0] == 0:
+        tags = tags[:1]
+    gram = np.einsum("bni,bnj->bij", *[tags - tags.mean(axis=1, keepdims=True)] * 2)
+    values = np.linalg.eigvalsh(gram)
+    spans = (values > 1e-18 * np.maximum(values[:, 2:], 1e-300)).sum(axis=-1)
+    return np.array([3, 5, 6, 6])[spans]
+
+
+def _rows(epoch: Epoch, rows: slice) -> Epoch:
+    """Some of the trials."""
+    return Epoch(
+        epoch.ranges[rows],
+        epoch.anchors[rows],
+        epoch.tags[rows],
+        epoch.weights[rows],
+        Statistic._make(field[rows] for field in epoch.stat),
+        epoch.tag_std_m,
+        epoch.retraction,
+    )
+
+
+def _epoch(
+    ranges: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    noise: NoiseLaw,
+    mask: BoolArray | None,
+    tag_std_m: float,
+) -> tuple[Epoch, tuple[int, ...]]:
+    """One flat batch of all leading axes, and the shape it had."""
+    variance = check_variance(noise.variance(ranges, mask), mask)
+    squared = check_variance(noise.squared_range_variance(ranges, mask), mask)
+    masks = () if mask is None else (mask.shape[:-2],)
+    batch = np.broadcast_shapes(
+        ranges.shape[:-2], anchors.shape[:-2], tags.shape[:-2], variance.shape[:-2], *masks
+    )
+
+    def flat(array: Any) -> Any:
+        shape = array.shape[-2:]
+        return np.broadcast_to(array, (*batch, *shape)).reshape(-1, *shape)
+
+    weights = np.broadcast_to(1 / variance, (*batch, *ranges.shape[-2:]))
+    flat_mask = None
+    if mask is not None:
+        weights = np.where(mask, weights, 0.0)
+        flat_mask = flat(mask)
+    stat = statistic(flat(ranges), flat(anchors), flat(tags), flat(1 / squared), flat_mask)
+    return Epoch(flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m), batch
+
+
+# Rank of the anchors and of the tags that the squared-range methods stand on.
+_NEEDS = {"ls": (3, 3), "ls-projected": (3, 3)} | dict.fromkeys(
+    ("cls", "ctls", "procrustes", "uc-ls"), (3, 2)
+)
+
+
+def _check_geometry(method: str, anchors: FloatArray, tags: FloatArray) -> None:
+    needs = zip(("anchors", "tags"), (anchors, tags), _NEEDS[method], strict=True)
+    for name, points, needed in needs:
+        rank = spanned_dimensions(points).min()
+        if rank < needed:
+            raise ValueError(
+                f"method {method!r} needs {name} that span {needed} dimensions, got "
+                f"{points.shape[-2]} of rank {rank}; 'ml' takes any geometry and says what it "
+                "determines"
+            )
+
+
+def methods() -> list[str]:
+    """Names of all methods: ours, and those of installed packages (``rbl_gym.locators``)."""
+    return sorted({*METHODS, *(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))})
+
+
+def _method(name: str) -> Callable[[Epoch], Fit]:
+    if isinstance(name, str) and name in METHODS:
+        return METHODS[name]
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        if entry.name == name:
+            return entry.load()
+    raise ValueError(f"method must be one of {', '.join(map(repr, methods()))}, got {name!r}")

@@ -1,0 +1,201 @@
+"""The methods of `locate`: functions of a flat `Epoch` (one batch axis) that return a `Fit`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds
+from rbl_gym.checks import BoolArray, FloatArray, are_finite
+from rbl_gym.estimators.costs.levenberg_marquardt import Solution, minimize_pose
+from rbl_gym.estimators.costs.range_cost import RangeCost
+from rbl_gym.estimators.linear import least_squares
+from rbl_gym.estimators.linear.kalman import state_jacobian
+from rbl_gym.estimators.linear.squared_range import Statistic, information
+from rbl_gym.estimators.locating.maximum_likelihood import (
+    Alternatives,
+    maximum_likelihood,
+    no_alternatives,
+    robust,
+)
+from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
+from rbl_gym.geometry import rotations
+
+
+class Epoch(NamedTuple):
+    """Checked arrays of B trials: ranges (B, M, N), anchors (B, M, 3), tags (B, N, 3).
+
+    `weights` (B, M, N) are inverse variances of the ranges, 0 where a link is missing;
+    `stat` is the statistic of the squared ranges; `tag_std_m` that of the tags' places;
+    `retraction` that of Newton's method in ``procrustes``.
+    """
+
+    ranges: FloatArray
+    anchors: FloatArray
+    tags: FloatArray
+    weights: FloatArray
+    stat: Statistic
+    tag_std_m: float
+    retraction: str = "exponential"
+
+
+class Fit(NamedTuple):
+    """What a method returns, (B, ...): pose, covariance, convergence; what else it knows itself."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    converged: BoolArray
+    cost: FloatArray | None = None
+    information: FloatArray | None = None
+    alternatives: Alternatives | None = None
+    matrix: FloatArray | None = None
+    iterations: np.ndarray | None = None
+
+
+def _ls(epoch: Epoch) -> Fit:
+    matrix, translation = least_squares.linear_fit(epoch.stat)
+    rotation = _nearest(matrix)
+    pinv = np.swapaxes(state_jacobian(rotation), -1, -2) * np.array([0.5] * 3 + [1.0] * 3)[:, None]
+    covariance = _propagated(pinv, epoch.stat)
+    return _linear(rotation, translation, covariance, matrix)
+
+
+def _ls_projected(epoch: Epoch) -> Fit:
+    matrix, _ = least_squares.linear_fit(epoch.stat)
+    rotation = _nearest(matrix)
+    translation = least_squares.translation_fit(epoch.stat, rotation)
+    # w = Jq^+ dq, v = dt + K (dq - Jq w), K = I_tt^-1 I_tq of the linear information.
+    J = state_jacobian(rotation)[:, :9, :3]
+    info, _ = information(epoch.stat)
+    K = np.linalg.solve(least_squares.loaded(info[:, 9:, 9:]), info[:, 9:, :9])
+    T = np.zeros((len(rotation), 6, 12))
+    T[:, :3, :9] = 0.5 * np.swapaxes(J, -1, -2)
+    T[:, 3:, :9] = K - K @ J @ T[:, :3, :9]
+    T[:, 3:, 9:] = np.eye(3)
+    return _linear(rotation, translation, _propagated(T, epoch.stat))
+
+
+def _cls(epoch: Epoch) -> Fit:
+    rotation, translation = least_squares.points_fit(epoch.stat)
+    # Unweighted fit of points: (J^T J)^-1 (sum J_n^T S_n J_n) (J^T J)^-1, S_n = G_n^-1.
+    regular = bounds.information_rank(epoch.stat.G) == 3
+    safe = np.where(regular[..., None, None], epoch.stat.G, np.eye(3))
+    known = np.broadcast_to(regular, epoch.tags.shape[:-1])[..., None, None]
+    J = (
+        bounds.tag_jacobian(np.where(np.isfinite(rotation), rotation, np.eye(3)), epoch.tags)
+        * known
+    )
+    stacked = J.reshape(len(J), -1, 6)
+    spread = np.linalg.inv(least_squares.loaded(np.swapaxes(stacked, 1, 2) @ stacked))
+    middle = bounds.lift(J, np.broadcast_to(np.linalg.inv(safe), (*J.shape[:2], 3, 3)))
+    return _linear(rotation, translation, spread @ middle @ spread)
+
+
+def _procrustes(epoch: Epoch) -> Fit:
+    first, _ = least_squares.points_fit(epoch.stat)
+    first = np.where(np.isfinite(first), first, np.eye(3))[:, None]
+    net = np.broadcast_to(ROTATION_NET, (len(first), 24, 3, 3))
+    starts = np.concatenate([first, net], axis=1)
+    rotation, translation = least_squares.procrustes_fit(epoch.stat, starts, epoch.retraction)
+    G = np.broadcast_to(epoch.stat.G, (*epoch.tags.shape[:2], 3, 3))
+    covariance = covariance_of(bounds.lift(bounds.tag_jacobian(rotation, epoch.tags), G))
+    return _linear(rotation, translation, covariance)
+
+
+def _ml(epoch: Epoch) -> Fit:
+    start = least_squares.points_fit(epoch.stat)
+    return _from_solution(*maximum_likelihood(_range_cost(epoch), *start, epoch.tag_std_m))
+
+
+def _two_step(epoch: Epoch) -> Fit:
+    rotation, translation = least_squares.points_fit(epoch.stat)
+    usable = are_finite(translation, 1)
+    solution = minimize_pose(
+        _range_cost(epoch),
+        np.where(usable[:, None, None], rotation, np.eye(3)),
+        np.where(usable[:, None], translation, 0.0),
+        iterations=2,
+    )
+    blank = np.where(usable, 1.0, np.nan)
+    return _from_solution(
+        solution._replace(
+            rotation=solution.rotation * blank[:, None, None],
+            translation=solution.translation * blank[:, None],
+            converged=usable,
+        ),
+        no_alternatives(len(usable)),
+    )
+
+
+def _robust(epoch: Epoch) -> Fit:
+    start = least_squares.points_fit(epoch.stat)
+    return _from_solution(*robust(_range_cost(epoch), *start))
+
+
+def _range_cost(epoch: Epoch) -> RangeCost:
+    return RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags)
+
+
+def _from_solution(solution: Solution, alternatives: Alternatives) -> Fit:
+    return Fit(
+        solution.rotation,
+        solution.translation,
+        covariance_of(solution.at.hessian),
+        solution.converged,
+        solution.at.cost,
+        solution.at.hessian,
+        alternatives,
+    )
+
+
+def _linear(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    matrix: FloatArray | None = None,
+) -> Fit:
+    found = are_finite(translation, 1) & are_finite(rotation, 2)
+    return Fit(rotation, translation, covariance, found, matrix=matrix)
+
+
+def _nearest(matrix: FloatArray) -> FloatArray:
+    known = are_finite(matrix, 2)[:, None, None]
+    return np.where(known, rotations.nearest(np.where(known, matrix, np.eye(3))), np.nan)
+
+
+def _propagated(T: FloatArray, stat: Statistic) -> FloatArray:
+    """``T I^-1 T^T`` with the information of the 12 linear states."""
+    info, _ = information(stat)
+    return bounds.symmetric(T @ np.linalg.solve(least_squares.loaded(info), np.swapaxes(T, -1, -2)))
+
+
+def covariance_of(hessian: FloatArray) -> FloatArray:
+    """Inverse of information (..., 6, 6); what nothing determines gets 1e12 of the rest."""
+    scale = np.sqrt(np.maximum(np.diagonal(hessian, axis1=-2, axis2=-1), 0.0))
+    largest = scale.max(axis=-1, keepdims=True)
+    scale = np.where(scale > 1e-9 * largest, scale, np.where(largest > 0, largest, 1.0))
+    outer = scale[..., :, None] * scale[..., None, :]
+    scaled = hessian / outer
+    singular = bounds.information_rank(scaled, 1e-12) < hessian.shape[-1]
+    inverse = np.linalg.inv(np.where(singular[..., None, None], np.eye(6), scaled))
+    if singular.any():
+        values, vectors = np.linalg.eigh(scaled[singular])
+        transposed = np.swapaxes(vectors, -1, -2)
+        inverse[singular] = (vectors / np.maximum(values, 1e-12)[..., None, :]) @ transposed
+    return bounds.symmetric(inverse / outer)
+
+
+METHODS: dict[str, Callable[[Epoch], Fit]] = {
+    "ls": _ls,
+    "ls-projected": _ls_projected,
+    "cls": _cls,
+    "ctls": _cls,
+    "procrustes": _procrustes,
+    "uc-ls": _procrustes,
+    "two-step": _two_step,
+    "ml": _ml,
+    "robust": _robust,
+}

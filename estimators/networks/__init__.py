@@ -1,0 +1,1 @@
+"""Estimators of planar networks: cycle consensus, orientations, frames."""

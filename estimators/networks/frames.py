@@ -1,0 +1,224 @@
+"""Frames of a planar network: orientations and positions of all nodes from raw bearings.
+
+Bearings fix the shape, one known distance (or ranges) its scale. A linear start, then the joint
+maximum likelihood: the positions share in what the bearings say about the orientations.
+"""
+
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.estimators.networks.orientations import maximum_likelihood
+from rbl_gym.networks.bounds import bearing_jacobian, free_columns, range_jacobian, sparse_rows
+from rbl_gym.networks.graphs import check_connected
+from rbl_gym.networks.rigidity import check_frames, check_joint
+from rbl_gym.networks.sensing import (
+    IntArray,
+    check_edge_values,
+    check_pair,
+    edge_angles,
+    proj,
+    true_bearings,
+)
+
+_MAX_STEPS = 200
+_DAMPING, _LEAST_DAMPING = 1e-3, 1e-9
+_SETTLED = 1e-9  # radians, and share of the network's size
+_REWEIGHTINGS = 3
+
+
+class FrameEstimate(NamedTuple):
+    """Frames of all nodes in that of node 0 (orientation 0, at the origin)."""
+
+    orientations: FloatArray  # (n,) radians in [-pi, pi)
+    positions: FloatArray  # (n, 2) metres
+    cost: float  # sum of squared residuals, each over its standard deviation
+    converged: bool
+
+
+class _Measured(NamedTuple):
+    edges: IntArray
+    bearings: FloatArray  # (m, 2)
+    bearing_std: float
+    ranges: FloatArray  # (m,), 0 where none
+    range_std: float
+    known: tuple[int, int] | None
+    length: float
+
+
+def frames(
+    edges: ArrayLike,
+    bearings: ArrayLike,
+    n_nodes: int,
+    known_pair: tuple[int, int] | None = None,
+    length_m: float | None = None,
+    *,
+    bearing_std_rad: float = 1.0,
+    ranges: ArrayLike | None = None,
+    range_std_m: float | None = None,
+) -> FrameEstimate:
+    """Orientations and positions from bearings, by joint maximum likelihood (Problems 9, 10).
+
+    Parameters
+    ----------
+    edges, bearings, n_nodes
+        (m, 2) and (m, 2): of j seen by i, of i seen by j, each in its own frame, radians.
+    known_pair, length_m
+        Two nodes and their distance, taken as exact; not beside ranges.
+    bearing_std_rad
+        Standard deviation of a bearing; it matters beside ranges only.
+    ranges, range_std_m
+        Measured lengths (m,) of the edges, metres, 0 where there is none, and their standard
+        deviation. They give the scale, and sharpen the orientations, too.
+
+    Raises
+    ------
+    ValueError
+        If the frames are not determined: the graph is not connected, or not (with ranges:
+        jointly) rigid, Proposition 16; the message names the components or the missing rank.
+    """
+    edges = check_connected(edges, n_nodes)
+    bearings = check_edge_values("bearings", bearings, edges, 2)
+    measured = _measured(edges, bearings, n_nodes, known_pair, length_m, bearing_std_rad,
+                         ranges, range_std_m)  # fmt: skip
+    if n_nodes == 1:
+        return FrameEstimate(np.zeros(1), np.zeros((1, 2)), 0.0, True)
+    # Of positions in general: the true ones are not known.
+    anywhere = np.random.default_rng(0).uniform(size=(n_nodes, 2))
+    if measured.known is None:
+        check_joint(anywhere, edges, edges[measured.ranges > 0])
+    else:
+        check_frames(anywhere, edges)
+    theta = maximum_likelihood(edges, edge_angles(bearings), n_nodes)
+    return _joint(measured, theta, _linear_start(measured, theta))
+
+
+def _measured(
+    edges: IntArray, bearings: FloatArray, n_nodes: int, known: Any, length: Any,
+    bearing_std: Any, ranges: Any, range_std: Any,
+) -> _Measured:  # fmt: skip
+    bearing_std = check_number("bearing_std_rad", bearing_std, low=1e-12)
+    lengths = np.zeros(len(edges)) if ranges is None else check_edge_values("ranges", ranges, edges)
+    if (lengths < 0).any():
+        raise ValueError(f"ranges must not be negative, got {lengths.min()}")
+    if (known is None) == (not lengths.any()) and n_nodes > 1:
+        raise ValueError("one of known_pair and ranges must give the scale, got "
+                         + ("neither" if known is None else "both"))  # fmt: skip
+    std = 1.0
+    if lengths.any():
+        std = check_number("range_std_m", range_std, low=1e-12)
+    if known is not None:
+        known = check_pair("known_pair", known, n_nodes)
+        length = check_number("length_m", length, low=1e-12)
+    return _Measured(edges, bearings, bearing_std, lengths, std, known, length or 1.0)
+
+
+def _linear_start(measured: _Measured, theta: FloatArray) -> FloatArray:
+    """Positions (n, 2), node 0 at the origin: edges have no part across their direction.
+
+    Along it they have the measured lengths, else a common scale. Weighted anew by the lengths
+    found, because a bearing's error shifts a far node more.
+    """
+    edges, bearings = measured.edges, measured.bearings
+    toward = theta[edges[:, 0]] + bearings[:, 0]
+    toward = toward + 0.5 * proj(theta[edges[:, 1]] + bearings[:, 1] + np.pi - toward)
+    unit = np.column_stack([np.cos(toward), np.sin(toward)])
+    along = _differences(edges, unit, len(theta))
+    across = _differences(edges, np.column_stack([-unit[:, 1], unit[:, 0]]), len(theta))
+    ranged = measured.ranges > 0
+    positions, weight = np.zeros((len(theta), 2)), np.ones(len(edges))
+    for _ in range(_REWEIGHTINGS):
+        flat = across.T @ sp.diags(weight) @ across
+        if ranged.any():
+            rows = along[ranged]
+            solved = scipy.sparse.linalg.spsolve(
+                sp.csc_matrix(flat + rows.T @ rows), rows.T @ measured.ranges[ranged]
+            )
+        else:
+            solved = _of_scale_one(flat, np.asarray(along.mean(axis=0)).ravel())
+        positions[1:] = solved.reshape(-1, 2)
+        apart = np.linalg.norm(positions[edges[:, 1]] - positions[edges[:, 0]], axis=1)
+        weight = 1 / np.maximum(apart / np.median(apart), 0.1) ** 2
+    return _scaled(measured, positions)
+
+
+def _of_scale_one(flat: sp.spmatrix, mean_length: FloatArray) -> FloatArray:
+    """Minimum of the quadratic form where the mean length along the edges is 1."""
+    row = sp.csr_matrix(mean_length)
+    bordered = sp.bmat([[flat, row.T], [row, None]], format="csc")
+    right = np.zeros(len(mean_length) + 1)
+    right[-1] = 1.0
+    return scipy.sparse.linalg.spsolve(bordered, right)[:-1]
+
+
+def _scaled(measured: _Measured, positions: FloatArray) -> FloatArray:
+    if measured.known is None:
+        return positions
+    i, j = measured.known
+    return positions * (measured.length / np.linalg.norm(positions[j] - positions[i]))
+
+
+def _differences(edges: IntArray, vectors: FloatArray, n_nodes: int) -> sp.csr_matrix:
+    """Rows (m, 2 n - 2): ``v' (p_j - p_i)`` of each edge's vector v, node 0 at the origin."""
+    columns = (2 * edges[:, :, None] + [0, 1]).reshape(-1, 4)
+    values = np.concatenate([-vectors, vectors], axis=1)
+    return sparse_rows(values, columns, 2 * n_nodes)[:, 2:]
+
+
+def _joint(measured: _Measured, theta: FloatArray, positions: FloatArray) -> FrameEstimate:
+    """Levenberg-Marquardt on all bearings and ranges.
+
+    Bearings see no change of scale: the damping keeps that move out, the scale is set at last.
+    """
+    n_nodes = len(theta)
+    free = free_columns(n_nodes)
+    residual = _residuals(measured, theta, positions)
+    cost, damping, converged = float(residual @ residual), _DAMPING, False
+    J = _jacobian(measured, positions)[:, free]
+    for _ in range(_MAX_STEPS):
+        information = J.T @ J
+        damped = information + sp.diags(damping * information.diagonal())
+        step = np.zeros(3 * n_nodes)
+        step[free] = scipy.sparse.linalg.spsolve(sp.csc_matrix(damped), J.T @ residual)
+        new = theta + step[:n_nodes], positions + step[n_nodes:].reshape(-1, 2)
+        size = max(np.abs(step[:n_nodes]).max(),
+                   np.abs(step[n_nodes:]).max() / np.abs(positions).max())  # fmt: skip
+        new_residual = _residuals(measured, *new)
+        if (new_cost := float(new_residual @ new_residual)) <= cost:
+            (theta, positions), residual, cost = new, new_residual, new_cost
+            J = _jacobian(measured, positions)[:, free]
+            damping = max(damping / 10, _LEAST_DAMPING)
+        elif damping > 1e6:
+            break
+        else:
+            damping *= 10
+        # At the minimum rounding alone can keep the cost from falling.
+        if size <= _SETTLED:
+            converged = True
+            break
+    return FrameEstimate(proj(theta), _scaled(measured, positions), cost, converged)
+
+
+def _residuals(measured: _Measured, theta: FloatArray, positions: FloatArray) -> FloatArray:
+    """All residuals over their standard deviations, bearings first."""
+    edges, ranged = measured.edges, measured.ranges > 0
+    angles = proj(measured.bearings - true_bearings(positions, theta, edges)) / measured.bearing_std
+    apart = positions[edges[ranged, 1]] - positions[edges[ranged, 0]]
+    lengths = (measured.ranges[ranged] - np.linalg.norm(apart, axis=1)) / measured.range_std
+    return np.concatenate([angles.ravel(), lengths])
+
+
+def _jacobian(measured: _Measured, positions: FloatArray) -> sp.csr_matrix:
+    """Derivative of the predictions over their standard deviations."""
+    ranged = measured.edges[measured.ranges > 0]
+    rows: list[Any] = [bearing_jacobian(positions, measured.edges) / measured.bearing_std]
+    rows.append(range_jacobian(positions, ranged) / measured.range_std)
+    return sp.csr_matrix(sp.vstack(rows))

@@ -1,0 +1,400 @@
+"""Cramer-Rao bounds of the pose: Fisher information on SO(3) x R^3, posterior bound, the score.
+
+The pose error is ``(w, v)``: ``Q_hat = exp(w) Q`` (world frame, rad), ``t_hat = t + v`` (m);
+information and covariance are 6 x 6 in that order.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_links,
+    check_number,
+    check_one_of,
+    checked,
+    kernel,
+)
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.motion.kinematics import ProcessNoise, check_process
+
+__all__ = [
+    "directions", "information_rank", "lift", "pose_crb", "posterior_crb_step",
+    "predict_covariance", "predict_information", "range_information",
+    "range_jacobian", "score", "symmetric", "tag_jacobian",
+]  # fmt: skip
+
+# Behind the doors: what comes to these was checked, or made here.
+_HAT, _EXP = kernel(rotations.hat), kernel(rotations.exp)
+_TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
+
+# J_n as a linear function of (c_n, 1), c_n turned: J_n[i, a] = sum_k (c_n, 1)[k] _BY_POSE[k, i, a].
+_BY_POSE = np.zeros((4, 3, 6))
+_BY_POSE[:3, :, :3] = -rotations.hat(np.eye(3))
+_BY_POSE[3, :, 3:] = np.eye(3)
+_BY_MOMENTS = np.einsum("kia,lib->klab", _BY_POSE, _BY_POSE).reshape(16, 36)
+
+
+def tag_jacobian(rotation: FloatArray, tags: FloatArray) -> FloatArray:
+    """Derivative (..., N, 3, 6) of the tag positions by the pose error: ``[-[Q c_n]x, I]``."""
+    turned = tags @ np.swapaxes(rotation, -1, -2)
+    J = np.zeros((*turned.shape, 6))
+    J[..., :3] = -_HAT(turned)
+    J[..., 3:] = np.eye(3)
+    return J
+
+
+def directions(anchors: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (..., M, N) and unit vectors (..., M, N, 3) from anchors to positions.
+
+    The unit vector is zero where an anchor and a position coincide.
+    """
+    difference = positions[..., None, :, :] - anchors[..., :, None, :]
+    distance = np.sqrt(np.einsum("...i,...i->...", difference, difference))
+    return distance, difference / np.where(distance > 0, distance, 1.0)[..., None]
+
+
+def lift(J: FloatArray, per_tag: FloatArray) -> FloatArray:
+    """Pose information ``sum_n J_n^T U_n J_n`` from that of each tag's position (..., N, 3, 3)."""
+    stacked = (*J.shape[:-3], 3 * J.shape[-3], 6)
+    weighted = per_tag @ J
+    rows = weighted.reshape((*weighted.shape[:-3], *stacked[-2:]))
+    return np.swapaxes(J.reshape(stacked), -1, -2) @ rows
+
+
+def range_jacobian(
+    anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Distances (..., M, N) and their derivative by the pose error, transposed: (..., 6, M N).
+
+    The derivative of a distance by (w, v) is ``(Q c x u, u)``, u the unit vector from anchor to
+    tag (zero where both coincide). Components come first, so that every step runs along memory.
+
+    Arguments as `range_information`.
+    """
+    if anchors.ndim == tags.ndim == rotation.ndim == 2 and translation.ndim == 1:
+        return _one_range_jacobian(anchors, tags, rotation, translation)
+    turned = tags @ np.swapaxes(rotation, -1, -2)
+    positions = turned + translation[..., None, :]
+    c = [turned[..., None, :, i] for i in range(3)]
+    d = [positions[..., None, :, i] - anchors[..., :, None, i] for i in range(3)]
+    distance = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    inverse = 1 / np.where(distance > 0, distance, 1.0)
+    J = np.empty((*distance.shape[:-2], 6, *distance.shape[-2:]))
+    for i in range(3):
+        np.multiply(d[i], inverse, out=J[..., 3 + i, :, :])
+    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
+        J[..., i, :, :] = c[j] * J[..., 3 + k, :, :] - c[k] * J[..., 3 + j, :, :]
+    return distance, J.reshape((*distance.shape[:-2], 6, -1))
+
+
+def _one_range_jacobian(
+    anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`range_jacobian` of one pose, in few calls: its rows are linear in ``(c, 1) kron u``."""
+    turned = tags @ rotation.T
+    extended = np.ones((len(tags), 4, 1))
+    extended[:, :3, 0] = turned
+    difference = turned + (translation - anchors)[:, None]
+    distance = np.sqrt(np.einsum("mni,mni->mn", difference, difference))
+    products = extended * (difference / np.maximum(distance, 1e-300)[..., None])[:, :, None]
+    return distance, (products.reshape(-1, 12) @ _BY_POSE.reshape(12, 6)).T
+
+
+def range_information(
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    links: ArrayLike | None = None,
+    *,
+    model: str = "raw",
+    tag_std_m: float = 0.0,
+) -> FloatArray:
+    """Fisher information (..., 6, 6) of one epoch of ranges about the pose.
+
+    The variance is taken at the true range; what its own dependence on the range would tell
+    is left out, as in the papers.
+
+    Parameters
+    ----------
+    anchors, tags, rotation, translation
+        (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3); metres.
+    noise
+        Law of the ranges.
+    links
+        Mask (..., M, N), True = measured.
+    model
+        ``"raw"``: of the ranges. ``"squared"``: of what is left of the squared ranges once
+        ``|s|^2`` is projected out, that is of all the papers' linear estimators and filters;
+        with the prior of the 12 states brought to the pose, the unitarily constrained bound
+        of the tracking paper's model.
+    tag_std_m
+        Standard deviation of the tags' places on the body, per axis: a nuisance, marginalised.
+
+    Raises
+    ------
+    ValueError
+        On a wrong shape or a value that is not finite.
+    """
+    check_one_of("model", model, ("raw", "squared"))
+    tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0)
+    anchors = check_array("anchors", anchors, ("M", 3))
+    tags = check_array("tags", tags, ("N", 3))
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    if not callable(getattr(noise, "variance", None)):
+        raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
+    mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
+    if model == "raw" and tag_std_m == 0:
+        information = information_at(anchors, tags, rotation, translation, noise, mask)
+    else:
+        positions = _TAG_POSITIONS(rotation, translation, tags)
+        of_tag = _raw_tag_information if model == "raw" else _squared_tag_information
+        per_tag = of_tag(anchors, positions, noise, mask)
+        damping = np.eye(3) + tag_std_m**2 * per_tag
+        information = lift(tag_jacobian(rotation, tags), np.linalg.solve(damping, per_tag))
+    return information
+
+
+def information_at(
+    anchors: FloatArray,
+    tags: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    noise: ranging.NoiseLaw,
+    links: BoolArray | None = None,
+) -> FloatArray:
+    """`range_information` on arrays that are known to be good (the environment's inner loop)."""
+    distance, J = range_jacobian(anchors, tags, rotation, translation)
+    weight = _inverse(noise.variance(distance), distance)
+    if links is not None:
+        weight = weight * links
+    flat = weight.reshape((*weight.shape[:-2], 1, -1))
+    return (J * flat) @ np.swapaxes(J, -1, -2)
+
+
+def _inverse(variance: FloatArray, distance: FloatArray) -> FloatArray:
+    """Weights (..., M, N) of ranges, squared or not: what an anchor on a tag measures has none.
+
+    There the range has no gradient: that link tells nothing.
+    """
+    with np.errstate(divide="ignore"):
+        weight = np.where(distance > 0, 1 / variance, 0.0)
+    if not np.isfinite(weight).all():
+        where = np.broadcast_to(distance, weight.shape)[~np.isfinite(weight)][0]
+        raise ValueError(f"noise must have a variance at every distance, got 0 at {where:g} m")
+    return weight
+
+
+def _raw_tag_information(
+    anchors: FloatArray, positions: FloatArray, noise: ranging.NoiseLaw, links: BoolArray | None
+) -> FloatArray:
+    """Information (..., N, 3, 3) of the ranges about the place of each tag."""
+    distance, unit = directions(anchors, positions)
+    weight = _inverse(noise.variance(distance), distance)
+    weight = weight if links is None else weight * links
+    return np.einsum("...mni,...mnj->...nij", weight[..., None] * unit, unit)
+
+
+def _squared_tag_information(
+    anchors: FloatArray, positions: FloatArray, noise: ranging.NoiseLaw, links: BoolArray | None
+) -> FloatArray:
+    """Information ``4 A Pi_n A^T`` (..., N, 3, 3) about each tag, |s|^2 projected out."""
+    distance = _DISTANCES(anchors, positions)
+    weight = _inverse(noise.squared_range_variance(distance), distance)
+    weight = weight if links is None else weight * links
+    spread, weighted = weighted_spread(anchors, weight)
+    return 4 * np.swapaxes(weighted, -1, -2) @ spread
+
+
+def weighted_spread(anchors: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Anchors less their weighted mean (..., N, M, 3), and the same times the weights (..., M, N).
+
+    Their product ``A Pi A^T`` is the projection of the common unknown ``|s|^2`` out of the
+    squared ranges, without forming Pi.
+    """
+    per_tag = np.swapaxes(weights, -1, -2)
+    total = per_tag.sum(axis=-1, keepdims=True)
+    mean = (per_tag / np.where(total > 0, total, 1.0)) @ anchors
+    spread = anchors[..., None, :, :] - mean[..., :, None, :]
+    return spread, per_tag[..., None] * spread
+
+
+def pose_crb(
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    prior_information: ArrayLike | None = None,
+    links: ArrayLike | None = None,
+    *,
+    model: str = "raw",
+    tag_std_m: float = 0.0,
+) -> FloatArray:
+    """Cramer-Rao bound (..., 6, 6) of the pose from one epoch of ranges.
+
+    The inverse of `range_information` plus the prior information (..., 6, 6), if any. Never a
+    pseudo-inverse: it would reward anchors that see nothing.
+
+    Arguments as `range_information`, and `prior_information` (..., 6, 6).
+
+    Raises
+    ------
+    ValueError
+        As `range_information`, and where the information is singular, with its rank.
+    """
+    information = range_information(
+        anchors, tags, rotation, translation, noise, links, model=model, tag_std_m=tag_std_m
+    )
+    if prior_information is not None:
+        information = information + check_array("prior_information", prior_information, (6, 6))
+    return inverted(information, "anchors or tags")
+
+
+def inverted(information: FloatArray, more: str) -> FloatArray:
+    """Inverse of a pose's information, or a ValueError that names its rank and what it lacks."""
+    rank = information_rank(information)
+    if (rank < 6).any():
+        where = tuple(int(i) for i in np.argwhere(rank < 6)[0])
+        raise ValueError(
+            f"the geometry does not determine the pose: information of rank {int(rank.min())} "
+            f"of 6 at batch index {where}; add {more}, or prior_information"
+        )
+    return np.linalg.inv(information)
+
+
+def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.ndarray:
+    """Number (...) of directions an information matrix (..., n, n) determines, free of units."""
+    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 0.0))
+    scale = np.where(scale > 0, scale, 1.0)
+    scaled = information / (scale[..., :, None] * scale[..., None, :])
+    n = information.shape[-1]
+    # With a unit diagonal no eigenvalue exceeds n: a determinant bounds the smallest one, and
+    # spares most matrices the eigenvalues.
+    rank = np.full(scaled.shape[:-2], n)
+    with np.errstate(divide="ignore"):  # of zeros, on the way to their determinant
+        determinant = np.linalg.det(scaled)
+    open_ = np.asarray(determinant <= 2 * tolerance * n ** (n - 1))
+    if open_.any():
+        rank[open_] = (np.linalg.eigvalsh(scaled[open_]) > tolerance).sum(axis=-1)
+    return rank
+
+
+def posterior_crb_step(
+    J: ArrayLike,
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    twist: ArrayLike,
+    dt: float,
+    process: ProcessNoise,
+    links: ArrayLike | None = None,
+) -> FloatArray:
+    """One step of the posterior Cramer-Rao recursion (Tichavsky et al. 1998) at the true pose.
+
+    Parameters
+    ----------
+    J
+        Posterior information (..., 6, 6) of the epoch before.
+    anchors, tags, rotation, translation, links
+        At the new epoch; the pose is the true one.
+    noise
+        Law of the ranges.
+    twist, dt, process
+        Motion of the interval that ends at the new epoch, and its noise.
+
+    Returns
+    -------
+    Information (..., 6, 6) after the new epoch; its inverse is the bound.
+    """
+    J = check_array("J", J, (6, 6))
+    twist = check_array("twist", twist, (6,))
+    if (check_array("dt", dt, ()) < 0).any():
+        raise ValueError(f"dt must not be negative, got {dt}")
+    check_process(process)
+    predicted = predict_information(J, twist, dt, process)
+    return predicted + range_information(anchors, tags, rotation, translation, noise, links)
+
+
+def predict_information(
+    J: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
+) -> FloatArray:
+    """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J.
+
+    Arguments as `predict_covariance`, with information J (..., 6, 6) for P.
+    """
+    turned = _turn(J, twist, dt)
+    Q = process.covariance(twist, dt)
+    return symmetric(np.linalg.solve(np.eye(6) + turned @ Q, turned))
+
+
+def predict_covariance(
+    P: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
+) -> FloatArray:
+    """Pose covariance after a step of motion, ``F P F^T + Q``, ``F = blkdiag(exp(w dt), I)``.
+
+    Parameters
+    ----------
+    P, twist
+        (..., 6, 6) and (..., 6).
+    dt, process
+        Seconds, and the noise of the motion.
+    """
+    return _turn(P, twist, dt) + process.covariance(twist, dt)
+
+
+def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
+    """``F matrix F^T`` of a symmetric matrix: the error is global, so its rotation part turns."""
+    step = _EXP(twist[..., :3] * np.asarray(dt, float)[..., None])
+    if matrix.ndim == step.ndim == 2:
+        F = np.eye(6).copy()
+        F[:3, :3] = step
+        return F @ matrix @ F.T
+    top = step @ matrix[..., :3, :]
+    turned = np.empty((*top.shape[:-2], 6, 6))
+    turned[..., :3, :3] = top[..., :3] @ np.swapaxes(step, -1, -2)
+    turned[..., :3, 3:] = top[..., 3:]
+    turned[..., 3:, :3] = np.swapaxes(top[..., 3:], -1, -2)
+    turned[..., 3:, 3:] = matrix[..., 3:, 3:]
+    return turned
+
+
+def symmetric(matrix: FloatArray) -> FloatArray:
+    """The symmetric part, to keep rounding from growing in recursions."""
+    return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
+
+
+@checked(covariance=(6, 6), rotation=(3, 3), tags=("N", 3))
+def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> FloatArray:
+    """Root mean square tag error b (...) in metres that a pose covariance (..., 6, 6) implies.
+
+    ``b^2 = mean_n tr(J_n P J_n^T)``, ``J_n = [-[Q c_n]x, I]``: one number for position and
+    orientation together.
+    """
+    turned = np.asarray(tags, dtype=np.float64) @ np.swapaxes(np.asarray(rotation), -1, -2)
+    extended = np.ones((*turned.shape[:-1], 4))
+    extended[..., :3] = turned
+    # The sum of J_n^T J_n is linear in the tags' second moments.
+    moments = np.swapaxes(extended, -1, -2) @ extended
+    square = moments.reshape((*moments.shape[:-2], 16)) @ _BY_MOMENTS
+    square = square.reshape((*square.shape[:-1], 6, 6)) / turned.shape[-2]
+    trace = np.einsum("...ab,...ab->...", square, covariance)
+    return root_of_trace(trace)
+
+
+def root_of_trace(trace: ArrayLike) -> FloatArray:
+    """The score (...) from its square, which is a trace; NaN and negative ones are refused."""
+    # True of NaN too.
+    if not np.min(trace) >= 0:
+        raise ValueError(f"covariance must be positive and finite, got a trace of {np.min(trace)}")
+    return np.asarray(np.sqrt(trace))

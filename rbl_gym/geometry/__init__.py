@@ -1,0 +1,1 @@
+"""Geometry: rotations, tag layouts of bodies, regions for anchors, obstacles."""

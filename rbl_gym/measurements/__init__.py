@@ -1,0 +1,1 @@
+"""Measurements: ranges with their noise laws and links, angles of arrival, link biases."""

@@ -1,0 +1,256 @@
+"""Noise laws: the variance of a range, and of a squared range, as functions of the range.
+
+Where the variance is common to all tags of an anchor it comes back as (..., M, 1).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any, Protocol
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+
+__all__ = [
+    "NOISE_LAWS", "LinkNoise", "NoiseLaw", "RangeNoise", "SquaredRangeNoise", "reference_range",
+]  # fmt: skip
+
+
+class NoiseLaw(Protocol):
+    """What every noise law offers; ranges (..., M, N) in metres, links the mask beside them."""
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of each range [m^2], (..., M, N) or (..., M, 1) where common to the tags."""
+        ...
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance of each squared range [m^4], (..., M, N) or (..., M, 1)."""
+        ...
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Noisy ranges from true distances and standard normals of the same shape."""
+        ...
+
+
+@dataclass(frozen=True)
+class RangeNoise:
+    """Gaussian noise on the range, variance ``floor_m^2 + (proportional r)^2``.
+
+    Parameters
+    ----------
+    floor_m
+        Standard deviation at zero range, metres.
+    proportional
+        Growth of the standard deviation with the range, metres per metre.
+    reference_tag
+        None: ``r`` is each link's own range. An index: ``r`` is the range of that tag, for
+        all tags of an anchor, as the papers do (static paper, eq. (2)).
+
+    Raises
+    ------
+    ValueError
+        If a parameter is negative or not finite, or both are zero.
+    """
+
+    floor_m: float = 0.05
+    proportional: float = 0.0
+    reference_tag: int | None = None
+
+    def __post_init__(self) -> None:
+        check_number("floor_m", self.floor_m, low=0.0)
+        check_number("proportional", self.proportional, low=0.0)
+        if self.floor_m == 0 and self.proportional == 0:
+            raise ValueError("floor_m and proportional must not both be zero: noise-free ranges")
+        tag = self.reference_tag
+        if tag is not None and (isinstance(tag, bool) or not isinstance(tag, Integral)):
+            raise ValueError(f"reference_tag must be None or an int, got {tag!r}")
+
+    @classmethod
+    def from_reference_range_db(cls, db: float, reference_tag: int | None = 0) -> RangeNoise:
+        """The static paper's law: a reference range of `db` decibels, 100 dB = 1 mm at 100 m.
+
+        The standard deviation is ``10^(-db / 20)`` of the range, by default that of the first
+        tag for all tags of an anchor (its eq. (2)); ``reference_tag=None``: of each link.
+        """
+        return cls(0.0, 10 ** (-check_number("db", db) / 20), reference_tag)
+
+    @classmethod
+    def from_time_of_arrival(
+        cls,
+        speed_m_s: float,
+        n_samples: float,
+        kappa: float,
+        snr: float,
+        reference_tag: int | None = 0,
+    ) -> RangeNoise:
+        """The static paper's law from what makes it, its (1) and (2).
+
+        The variance of a range r is ``3 c^2 r^2 / (N_s kappa SNR)``; the reference range is
+        ``10 log10(N_s kappa SNR / (3 c^2))`` dB.
+
+        Parameters
+        ----------
+        speed_m_s
+            Speed c of the wave, metres per second.
+        n_samples
+            Samples N_s of a ranging.
+        kappa
+            The constant of the ranging method.
+        snr
+            Signal-to-noise ratio, a ratio and not decibels.
+        reference_tag
+            As in `from_reference_range_db`.
+        """
+        values = {"speed_m_s": speed_m_s, "n_samples": n_samples, "kappa": kappa, "snr": snr}
+        c, n, k, ratio = (check_number(name, value, low=1e-300) for name, value in values.items())
+        return cls(0.0, math.sqrt(3 / (n * k * ratio)) * c, reference_tag)
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        r = self._scale(ranges, links)
+        return self.floor_m**2 + (self.proportional * r) ** 2
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
+        r = self._scale(ranges, links)
+        return 4 * r**2 * (self.floor_m**2 + (self.proportional * r) ** 2)
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of this law, never below zero."""
+        if self.proportional == 0:
+            std: Any = math.sqrt(self.floor_m**2)
+        else:
+            std = self.proportional * self._scale(distances, None)
+            std *= std
+            std += self.floor_m**2
+            np.sqrt(std, out=std)
+        fits = isinstance(std, np.ndarray) and std.shape == distances.shape == np.shape(normals)
+        ranges = np.multiply(std, normals, out=std if fits else None)
+        ranges += distances
+        return np.maximum(ranges, 0.0, out=ranges)
+
+    def _scale(self, ranges: FloatArray, links: BoolArray | None) -> FloatArray:
+        if self.reference_tag is None:
+            return ranges
+        return reference_range(ranges, self.reference_tag, links)
+
+
+@dataclass(frozen=True)
+class SquaredRangeNoise:
+    """The tracking paper's law: ``r^2 + n`` with ``n ~ N(0, (sigma_m |a_m - s_1|)^2)``.
+
+    Parameters
+    ----------
+    sigma_m
+        Ratio of the squared range's standard deviation to the range of the first tag, metres.
+    """
+
+    sigma_m: float = 0.0316
+
+    def __post_init__(self) -> None:
+        check_number("sigma_m", self.sigma_m, low=1e-300)
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order; inf at zero."""
+        r = ranges if links is None else np.where(links, ranges, 1.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return self.squared_range_variance(ranges, links) / (4 * r**2)
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance of the squared ranges [m^4], (..., M, 1)."""
+        return (self.sigma_m * reference_range(ranges, 0, links)) ** 2
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of this law; a negative square counts as zero."""
+        squares = self.sigma_m * distances[..., :1] * normals
+        squares += distances**2
+        np.maximum(squares, 0.0, out=squares)
+        return np.sqrt(squares, out=squares)
+
+
+@dataclass(frozen=True, eq=False)
+class LinkNoise:
+    """A standard deviation for every link, as radios report them.
+
+    Parameters
+    ----------
+    std_m
+        (..., M, N), metres; entries of links that are not measured do not matter.
+    """
+
+    std_m: FloatArray
+
+    def __post_init__(self) -> None:
+        std = check_array("std_m", self.std_m, ("M", "N"))
+        if (std < 0).any():
+            raise ValueError(f"std_m must not be negative, got {std.min()}")
+        object.__setattr__(self, "std_m", std)
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        return np.broadcast_to(self.std_m**2, np.broadcast_shapes(self.std_m.shape, ranges.shape))
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
+        return 4 * ranges**2 * self.std_m**2
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of this law, never below zero."""
+        return np.maximum(distances + self.std_m * normals, 0.0)
+
+
+def check_law(name: str, noise: Any) -> None:
+    """A ValueError where something does not offer what a `NoiseLaw` does."""
+    methods = ("variance", "squared_range_variance", "sample")
+    if not all(callable(getattr(noise, method, None)) for method in methods):
+        raise ValueError(f"{name} must have {', '.join(methods)}, got {noise!r:.80}")
+
+
+# The laws of scenes by the names that scene files and overrides give them.
+NOISE_LAWS: dict[str, type[NoiseLaw]] = {
+    "range": RangeNoise,
+    "squared-range": SquaredRangeNoise,
+}
+# Other ways to say a law of these.
+NOISE_FORMS: dict[str, Callable[..., NoiseLaw]] = {
+    **NOISE_LAWS,
+    "reference-range": RangeNoise.from_reference_range_db,
+    "time-of-arrival": RangeNoise.from_time_of_arrival,
+}
+
+
+def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None) -> FloatArray:
+    """Range (..., M, 1) of the reference tag to every anchor.
+
+    Where that link is missing, the mean of the anchor's measured ranges stands in for it, and
+    1 where an anchor has no link at all (its weight is zero anyway).
+
+    Raises
+    ------
+    ValueError
+        If there is no such tag.
+    """
+    n_tags = ranges.shape[-1]
+    if not -n_tags <= tag < n_tags:
+        raise ValueError(f"reference_tag must be below the number of tags {n_tags}, got {tag}")
+    reference = ranges[..., tag : tag + 1 or None]
+    if links is None or links.all():
+        return reference
+    ranges, links = np.broadcast_arrays(ranges, links)
+    reference = ranges[..., tag : tag + 1 or None]
+    count = links.sum(axis=-1, keepdims=True)
+    mean = np.where(links, ranges, 0.0).sum(axis=-1, keepdims=True) / np.maximum(count, 1)
+    stand_in = np.where(count > 0, mean, 1.0)
+    return np.where(links[..., tag : tag + 1 or None], reference, stand_in)

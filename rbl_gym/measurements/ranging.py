@@ -1,0 +1,196 @@
+"""The range model: distances from anchors to tags, links that fail, simulated ranges.
+
+Shapes: anchors (..., M, 3), tags (..., N, 3) in the body frame, ranges and links (..., M, N).
+The noise laws of `noise_laws` are handed on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_generator,
+    check_number,
+    checked,
+    kernel,
+)
+from rbl_gym.measurements.noise_laws import (
+    NOISE_LAWS,
+    LinkNoise,
+    NoiseLaw,
+    RangeNoise,
+    SquaredRangeNoise,
+    check_law,
+    reference_range,
+)
+
+__all__ = [
+    "NOISE_LAWS", "LinkModel", "LinkNoise", "Measurement", "NoiseLaw", "RangeNoise",
+    "SquaredRangeNoise", "distances", "measure", "reference_range", "simulate", "tag_positions",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LinkModel:
+    """What happens to a link besides noise; the default is that nothing does.
+
+    Parameters
+    ----------
+    drop_probability
+        Chance that a link gives no range at an epoch.
+    reach_m
+        Distance beyond which there is no range; None: unlimited.
+    nlos_probability
+        Chance that a range is taken over a reflected path.
+    nlos_bias_m
+        What a reflected path adds to the range, metres.
+    """
+
+    drop_probability: float = 0.0
+    reach_m: float | None = None
+    nlos_probability: float = 0.0
+    nlos_bias_m: float = 5.0
+
+    def __post_init__(self) -> None:
+        check_number("drop_probability", self.drop_probability, low=0.0, high=1.0)
+        check_number("nlos_probability", self.nlos_probability, low=0.0, high=1.0)
+        check_number("nlos_bias_m", self.nlos_bias_m, low=0.0)
+        if self.reach_m is not None:
+            check_number("reach_m", self.reach_m, low=0.0)
+
+    @property
+    def is_random(self) -> bool:
+        """Whether uniforms are needed to decide the links."""
+        return self.drop_probability > 0 or self.nlos_probability > 0
+
+
+class Measurement(NamedTuple):
+    """One epoch of ranges (..., M, N) [m], 0 where `links` is False; `nlos`: biased ones."""
+
+    ranges: FloatArray
+    links: BoolArray
+    nlos: BoolArray
+
+
+@checked(rotation=(3, 3), translation=(3,), tags=("N", 3))
+def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
+    """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
+    rotation, tags = np.asarray(rotation), np.asarray(tags)
+    if tags.ndim == 2 and rotation.ndim > 2 and rotation.flags.f_contiguous:
+        # Memory that runs along the trials: one product of the tags with rows of all trials.
+        columns = rotation.T.reshape(3, -1)
+        turned = (tags @ columns).reshape((len(tags), *rotation.T.shape[1:]))
+        turned += np.asarray(translation).T
+        return np.moveaxis(turned.T, -1, -2)
+    if tags.ndim == 2:
+        # Tags that all trials share: one matrix product in place of one for each trial.
+        turned = (rotation.reshape(-1, 3) @ tags.T).reshape((*rotation.shape[:-1], len(tags)))
+        turned = np.swapaxes(turned, -1, -2)
+    else:
+        turned = tags @ np.swapaxes(rotation, -1, -2)
+    # One memory order whatever the way here: a sum over it gives the same last bits.
+    return np.add(turned, np.asarray(translation)[..., None, :], order="C")
+
+
+@checked(anchors=("M", 3), positions=("N", 3))
+def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
+    """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
+    positions, anchors = np.asarray(positions), np.asarray(anchors)
+    positions, anchors = positions[..., None, :, :], anchors[..., :, None, :]
+    # Summed axis by axis: the same last bits in every memory order.
+    if positions.ndim == anchors.ndim == 3:
+        gap = np.subtract(positions, anchors, dtype=np.float64)
+        gap *= gap
+        squared = gap[..., 0] + gap[..., 1]
+        squared += gap[..., 2]
+        return np.sqrt(squared, out=squared)
+    # Of many worlds the three axes at once would not stay in the cache.
+    squared = np.subtract(positions[..., 0], anchors[..., 0], dtype=np.float64)
+    squared *= squared
+    gap = np.empty_like(squared)
+    for axis in (1, 2):
+        np.subtract(positions[..., axis], anchors[..., axis], out=gap)
+        gap *= gap
+        squared += gap
+    return np.sqrt(squared, out=squared)
+
+
+def measure(
+    true_distances: FloatArray,
+    noise: NoiseLaw,
+    normals: FloatArray,
+    link_model: LinkModel | None = None,
+    uniforms: FloatArray | None = None,
+) -> Measurement:
+    """One epoch of measurements from true distances and given random numbers.
+
+    Parameters
+    ----------
+    true_distances
+        (..., M, N), metres.
+    noise, link_model
+        The laws; without a link model every link measures.
+    normals
+        Standard normals (..., M, N).
+    uniforms
+        Uniforms on [0, 1) of shape (..., 2, M, N), for drops and NLOS; needed where
+        ``link_model.is_random``.
+    """
+    ranges = noise.sample(true_distances, normals)
+    links = np.ones(ranges.shape, dtype=np.bool_)
+    nlos = np.zeros(ranges.shape, dtype=np.bool_)
+    if link_model is None or not (link_model.is_random or link_model.reach_m is not None):
+        return Measurement(ranges, links, nlos)
+    if link_model.is_random:
+        if uniforms is None:
+            raise ValueError("uniforms must be given for a link model with probabilities, got None")
+        links &= uniforms[..., 0, :, :] >= link_model.drop_probability
+        nlos = uniforms[..., 1, :, :] < link_model.nlos_probability
+        ranges = ranges + np.where(nlos, link_model.nlos_bias_m, 0.0)
+    if link_model.reach_m is not None:
+        links &= true_distances <= link_model.reach_m
+    return Measurement(np.where(links, ranges, 0.0), links, nlos & links)
+
+
+@checked(anchors=("M", 3), tags=("N", 3), rotation=(3, 3), translation=(3,))
+def simulate(
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: NoiseLaw,
+    rng: np.random.Generator,
+    link_model: LinkModel | None = None,
+) -> Measurement:
+    """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`.
+
+    Parameters
+    ----------
+    anchors, tags, rotation, translation
+        (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3); metres.
+    noise, link_model
+        Laws of the ranges, and of what happens to links (None: nothing).
+    rng
+        Source of all randomness.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, NaN, or laws and generators that are none.
+    """
+    check_law("noise", noise)
+    check_generator("rng", rng)
+    if not isinstance(link_model, LinkModel | None):
+        raise ValueError(f"link_model must be a LinkModel or None, got {link_model!r:.80}")
+    true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
+    normals = rng.standard_normal(true.shape)
+    uniforms = None
+    if link_model is not None and link_model.is_random:
+        uniforms = rng.random((*true.shape[:-2], 2, *true.shape[-2:]))
+    return measure(true, noise, normals, link_model, uniforms)

@@ -1,0 +1,398 @@
+"""Motion of a rigid body: kinematics of the tracking paper, process noise, trajectories.
+
+A twist (..., 6) is the angular velocity in the world frame [rad/s] and the velocity [m/s].
+Kinematics (tracking paper, (10)-(15), Omega carrying the time step tau):
+``Q_k = exp(omega tau) Q_{k-1}``, ``t_k = t_{k-1} + v tau``.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import (
+    Axes,
+    FloatArray,
+    check_array,
+    check_axes,
+    check_count,
+    check_number,
+    checked,
+    kernel,
+)
+from rbl_gym.geometry import rotations
+
+__all__ = [
+    "Path", "ProcessNoise", "Trajectory", "constant_twist", "interpolate", "lawn_mower_points",
+    "orbit", "propagate", "random_twist", "recorded", "simulate", "twists_between", "waypoints",
+]  # fmt: skip
+
+_MOST_STEPS = 10**9
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
+
+
+def six(rotation: Axes, translation: Axes) -> FloatArray:
+    """Six numbers (6,): those of the rotation's axes, then those of the translation's."""
+    return np.concatenate([np.broadcast_to(rotation, 3), np.broadcast_to(translation, 3)])
+
+
+@dataclass(frozen=True)
+class ProcessNoise:
+    """Random part of the motion: standard deviations after 1 s; the variance grows with time.
+
+    Parameters
+    ----------
+    rotation_rad, translation_m
+        A float, or three of them for the world's axes (a planar body has zeros among them).
+
+    Raises
+    ------
+    ValueError
+        If a value is negative or not finite, or there are neither 1 nor 3.
+    """
+
+    rotation_rad: Axes = 0.0
+    translation_m: Axes = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_rad", "translation_m"):
+            object.__setattr__(self, name, check_axes(name, getattr(self, name)))
+
+    def std(self) -> FloatArray:
+        """The six standard deviations after 1 s: rotation (rad), then translation (m)."""
+        return six(self.rotation_rad, self.translation_m)
+
+    def covariance(self, twist: FloatArray, dt: ArrayLike) -> FloatArray:
+        """Covariance (..., 6, 6) that one step adds to the pose error (w, v).
+
+        ``dt blkdiag(Jl S_w Jl^T, S_v)`` with Jl the left Jacobian of the step's rotation:
+        the noise is on the angular velocity, the error on the rotation it makes.
+        """
+        dt = np.asarray(dt, dtype=np.float64)[..., None]
+        jacobian = _LEFT_JACOBIAN(twist[..., :3] * dt)
+        variance = dt * self._variance
+        covariance = np.zeros((*jacobian.shape[:-2], 6, 6))
+        covariance[..., :3, :3] = (jacobian * variance[..., None, :3]) @ np.swapaxes(
+            jacobian, -1, -2
+        )
+        # Every seventh entry of the 36 is on the diagonal.
+        covariance.reshape((*covariance.shape[:-2], 36))[..., 21::7] = variance[..., 3:]
+        return covariance
+
+    @functools.cached_property
+    def _variance(self) -> FloatArray:
+        """The six variances after 1 s."""
+        return self.std() ** 2
+
+
+def check_process(process: ProcessNoise) -> None:
+    """A ValueError where something else than the noise of a motion came."""
+    if not callable(getattr(process, "covariance", None)):
+        raise ValueError(f"process must be a motion.ProcessNoise, got {process!r:.80}")
+
+
+class Trajectory(NamedTuple):
+    """Nominal motion: start rotation (..., 3, 3), translation (..., 3), twists (..., T, 6)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    twists: FloatArray
+
+
+class Path(NamedTuple):
+    """Poses at T + 1 epochs: rotation (..., T + 1, 3, 3), translation (..., T + 1, 3)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+
+
+@checked(rotation=(3, 3), translation=(3,), twist=(6,), dt=())
+def propagate(
+    rotation: FloatArray, translation: FloatArray, twist: FloatArray, dt: ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """`rotation` (..., 3, 3), `translation` (..., 3) after `dt` s of the same `twist` (..., 6)."""
+    dt = np.asarray(dt, dtype=np.float64)[..., None]
+    return _EXP(twist[..., :3] * dt) @ rotation, translation + twist[..., 3:] * dt
+
+
+def simulate(
+    trajectory: Trajectory, dt: float, process: ProcessNoise, normals: FloatArray | None = None
+) -> Path:
+    """True poses along a trajectory with process noise on every step.
+
+    Parameters
+    ----------
+    trajectory
+        Start and nominal twists.
+    dt
+        Step, seconds; a ValueError where it is not positive.
+    process
+        Law of the noise; it acts on the twist, with variance growing with time.
+    normals
+        Standard normals (..., T, 6); None: no process noise.
+    """
+    dt = check_number("dt", dt, low=1e-12)
+    nominal = trajectory.twists
+    batch = np.broadcast_shapes(
+        trajectory.rotation.shape[:-2],
+        trajectory.translation.shape[:-1],
+        nominal.shape[:-2],
+        () if normals is None else normals.shape[:-2],
+    )
+    n_steps = nominal.shape[-2]
+    twists = _trials_last(batch, n_steps, 6)
+    if normals is None:
+        twists[...] = nominal
+    else:
+        twists[...] = normals
+        twists *= process.std() / np.sqrt(dt)
+        twists += nominal
+    twists *= dt
+    rotation = _trials_last(batch, n_steps + 1, 3, 3)
+    rotation[..., 0, :, :] = trajectory.rotation
+    _EXP(twists[..., :3], out=rotation[..., 1:, :, :])
+    _chain(rotation)
+    translation = _trials_last(batch, n_steps + 1, 3)
+    translation[..., 0, :] = 0.0
+    for k in range(n_steps):
+        np.add(translation[..., k, :], twists[..., k, 3:], out=translation[..., k + 1, :])
+    translation += trajectory.translation[..., None, :]
+    return Path(rotation, translation)
+
+
+def _trials_last(batch: tuple[int, ...], *trailing: int) -> FloatArray:
+    """An empty array (*batch, *trailing) whose memory runs along the trials.
+
+    Loops over inner axes of 3 or 6 are slow; these run over all trials instead.
+    """
+    return np.empty((*batch, *trailing), order="F" if batch else "C")
+
+
+def _chain(rotation: FloatArray) -> None:
+    """Turn a start and T steps (..., T + 1, 3, 3) into the rotations they lead to, in place."""
+    if rotation.ndim == 3:
+        for before, step in itertools.pairwise(rotation):
+            step[...] = step @ before
+        return
+    # Row i, column j of every trial side by side; a matrix product of each alone is slow.
+    planes = np.moveaxis(rotation, (-3, -2, -1), (0, 1, 2))
+    for before, step in itertools.pairwise(planes):
+        product = step[:, 0, None] * before[0]
+        for i in (1, 2):
+            product += step[:, i, None] * before[i]
+        step[...] = product
+
+
+def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike) -> FloatArray:
+    """Twists (..., T, 6) that lead from each pose to the next, dt a scalar or (..., T)."""
+    dt = np.asarray(dt, dtype=np.float64)[..., None]
+    turn = rotations.error(rotation[..., 1:, :, :], rotation[..., :-1, :, :])
+    return np.concatenate([turn / dt, np.diff(translation, axis=-2) / dt], axis=-1)
+
+
+def constant_twist(
+    rotation: ArrayLike, translation: ArrayLike, twist: ArrayLike, steps: int
+) -> Trajectory:
+    """The same `twist` for `steps` from `rotation`, `translation` on: the tracking paper's."""
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    twist = check_array("twist", twist, (6,))
+    steps = check_count("steps", steps, most=_MOST_STEPS)
+    twists = np.repeat(twist[..., None, :], steps, axis=-2)
+    return Trajectory(rotation, translation, twists)
+
+
+def random_twist(
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    speed_m_s: float,
+    turn_rate_rad_s: float,
+    steps: int,
+    rng: np.random.Generator,
+    hold: int = 10,
+) -> Trajectory:
+    """Constant speed in a direction, and a turn rate about an axis, drawn anew every `hold` steps.
+
+    Speed and turn rate are exact (directions are uniform on the sphere), so that the reach of
+    the body stays bounded by ``speed * time``.
+
+    From a pose (`rotation`, `translation`) on, at `speed_m_s` and `turn_rate_rad_s`; `rng` draws.
+    """
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    steps = check_count("steps", steps, most=_MOST_STEPS)
+    hold = check_count("hold", hold, most=_MOST_STEPS)
+    speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
+    turn_rate_rad_s = check_number("turn_rate_rad_s", turn_rate_rad_s, low=0.0)
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    directions = rng.standard_normal((*batch, -(-steps // hold), 2, 3))
+    twists = held_twists(directions, turn_rate_rad_s, speed_m_s, steps, hold)
+    return Trajectory(rotation, translation, twists)
+
+
+def held_twists(
+    directions: FloatArray, turn_rate_rad_s: float, speed_m_s: float, steps: int, hold: int
+) -> FloatArray:
+    """Twists (..., T, 6) along turn axes and directions (..., K, 2, 3), `hold` steps for each."""
+    units = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    twists = units * np.array([turn_rate_rad_s, speed_m_s])[:, None]
+    twists = twists.reshape((*directions.shape[:-2], 6))
+    return np.repeat(twists, hold, axis=-2)[..., :steps, :]
+
+
+def waypoints(
+    rotation: ArrayLike,
+    points: ArrayLike,
+    speed_m_s: float,
+    dt: float,
+    steps: int,
+    spin_rad_s: ArrayLike = (0.0, 0.0, 0.0),
+) -> Trajectory:
+    """Constant speed along the polyline through `points`, resting at its end, constant spin.
+
+    Parameters
+    ----------
+    rotation
+        At the start (..., 3, 3).
+    points
+        (..., K, 3), K >= 2; the first is the start.
+    speed_m_s, dt, steps
+        Speed along the line, step in seconds, number of steps.
+    spin_rad_s
+        Angular velocity (..., 3) in the world frame.
+    """
+    rotation = rotations.check_rotation("rotation", rotation)
+    points = check_array("points", points, ("K", 3))
+    if points.shape[-2] < 2:
+        raise ValueError(f"points must hold at least 2 way-points, got shape {points.shape}")
+    speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
+    dt = check_number("dt", dt, low=1e-12)
+    spin = check_array("spin_rad_s", spin_rad_s, (3,))
+    travelled = speed_m_s * dt * np.arange(check_count("steps", steps, most=_MOST_STEPS) + 1)
+    velocity = np.diff(_along(points, travelled), axis=-2) / dt
+    batch = np.broadcast_shapes(spin.shape[:-1], velocity.shape[:-2])
+    twists = _trials_last(batch, len(travelled) - 1, 6)
+    twists[..., :3], twists[..., 3:] = spin[..., None, :], velocity
+    return Trajectory(rotation, points[..., 0, :], twists)
+
+
+def _along(points: FloatArray, travelled: FloatArray) -> FloatArray:
+    """Places (..., T, 3) on polylines (..., K, 3) at the distances `travelled` (T,), rising.
+
+    The memory runs along the trials.
+    """
+    *batch, n_points, _ = points.shape
+    line = np.ascontiguousarray(points.reshape(-1, n_points, 3).transpose(2, 1, 0))
+    trials = line.shape[-1]
+    step = np.diff(line, axis=1)
+    legs = np.sqrt((step * step).sum(axis=0))
+    reached = np.cumsum(legs, axis=0)
+    # The leg at an epoch is the number of ends reached by then.
+    index = np.searchsorted(travelled, reached) * trials + np.arange(trials)
+    ends = np.bincount(index.ravel(), minlength=(len(travelled) + 1) * trials)
+    leg = np.cumsum(ends.reshape(-1, trials)[:-1], axis=0)
+    at = np.minimum(leg, n_points - 2) * trials + np.arange(trials)
+    fraction = travelled[:, None] - (reached - legs).ravel()[at]
+    fraction /= np.maximum(legs, 1e-12).ravel()[at]
+    np.clip(fraction, 0.0, 1.0, out=fraction)
+    places = np.take(step.reshape(3, -1), at, axis=1)
+    places *= fraction
+    places += np.take(line.reshape(3, -1), at, axis=1)
+    return places.transpose(2, 1, 0).reshape(*batch, len(travelled), 3)
+
+
+def lawn_mower_points(low: ArrayLike, high: ArrayLike, spacing_m: float) -> FloatArray:
+    """Way-points (K, 3) of parallel lanes along x, `spacing_m` apart, at the mid height."""
+    low, high = check_array("low", low, (3,)), check_array("high", high, (3,))
+    spacing_m = check_number("spacing_m", spacing_m, low=1e-9)
+    if (low > high).any():
+        raise ValueError(f"low must not lie above high, got low {low}, high {high}")
+    lanes = int(np.floor((high[1] - low[1]) / spacing_m + 1e-9)) + 1
+    y = np.repeat(low[1] + spacing_m * np.arange(lanes), 2)
+    x = np.where(np.arange(2 * lanes) % 4 % 3 == 0, low[0], high[0])
+    return np.stack([x, y, np.full(2 * lanes, 0.5 * (low[2] + high[2]))], axis=-1)
+
+
+def orbit(
+    centre: ArrayLike,
+    radius_m: float,
+    speed_m_s: float,
+    dt: float,
+    steps: int,
+    phase: ArrayLike = 0.0,
+) -> Trajectory:
+    """A horizontal circle, the body's x axis along the motion; `phase` (rad) may be batched.
+
+    `centre` (..., 3), `radius_m`, `speed_m_s`; `steps` of `dt` seconds.
+    """
+    centre = check_array("centre", centre, (3,))
+    radius_m = check_number("radius_m", radius_m, low=1e-9)
+    dt = check_number("dt", dt, low=1e-12)
+    rate = check_number("speed_m_s", speed_m_s, low=0.0) / radius_m
+    steps = check_count("steps", steps, most=_MOST_STEPS)
+    angle = check_array("phase", phase, ())[..., None] + rate * dt * np.arange(steps + 1)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    places = centre[..., None, :] + radius_m * circle
+    twists = np.zeros((*places.shape[:-2], steps, 6))
+    twists[..., 2] = rate
+    twists[..., 3:] = np.diff(places, axis=-2) / dt
+    heading = np.zeros((*angle.shape[:-1], 3))
+    heading[..., 2] = angle[..., 0] + np.pi / 2
+    return Trajectory(rotations.exp(heading), places[..., 0, :], twists)
+
+
+def recorded(
+    times: ArrayLike, rotation: ArrayLike, translation: ArrayLike, dt: float
+) -> Trajectory:
+    """A recorded track, resampled every `dt` seconds: linear in position, geodesic in rotation.
+
+    Parameters
+    ----------
+    times
+        (L,), seconds, strictly increasing, L >= 2.
+    rotation, translation
+        (L, 3, 3) and (L, 3).
+    """
+    times = check_array("times", times, ("L",))
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, ("L", 3))
+    if times.ndim != 1 or len(times) < 2 or (np.diff(times) <= 0).any():
+        raise ValueError("times must be (L,) with L >= 2 and strictly increasing")
+    for name, value, shape in (
+        ("rotation", rotation, (len(times), 3, 3)), ("translation", translation, (len(times), 3))
+    ):  # fmt: skip
+        if value.shape != shape:
+            raise ValueError(f"{name} must have shape {shape} as times, got {value.shape}")
+    dt = check_number("dt", dt, low=1e-12)
+    at = np.arange(times[0], times[-1] + 1e-9 * dt, dt)
+    if len(at) < 2:
+        raise ValueError(f"times must span at least one step of dt = {dt}, got {np.ptp(times)}")
+    path = interpolate(times, rotation, translation, at)
+    return Trajectory(path.rotation[0], path.translation[0], twists_between(*path, dt))
+
+
+def interpolate(
+    times: FloatArray, rotation: FloatArray, translation: FloatArray, at: FloatArray
+) -> Path:
+    """Poses at the times `at`, linear in position, geodesic in rotation; the ends are held.
+
+    The known ones: `times` (K,), `rotation` (K, 3, 3), `translation` (K, 3).
+    """
+    final = len(times) - 1
+    before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, final)
+    after = np.minimum(before + 1, final)
+    gap = times[after] - times[before]
+    # The last pose has no neighbour: its gap is 0, and so is the fraction.
+    fraction = (at - times[before]) / np.where(gap > 0, gap, np.inf)
+    fraction = np.clip(fraction, 0.0, 1.0)[..., None]
+    turn = rotations.error(rotation[after], rotation[before])
+    step = translation[after] - translation[before]
+    return Path(
+        rotations.exp(fraction * turn) @ rotation[before], translation[before] + fraction * step
+    )

@@ -1,0 +1,1 @@
+"""Planar sensing networks: graphs, cycles, rigidity, bounds, files."""

@@ -1,0 +1,229 @@
+"""Cramer-Rao bounds of planar networks: orientations from edge angles, frames from bearings.
+
+Everything is relative to node 0, whose frame is the reference: its orientation is 0 and it
+stands at the origin.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.geometry import rotations
+from rbl_gym.networks.graphs import check_connected, incidence
+from rbl_gym.networks.sensing import (
+    IntArray,
+    check_edges,
+    check_pair,
+    check_positions,
+    directions_of,
+)
+
+__all__ = [
+    "bearing_jacobian", "frame_covariance", "orientation_covariance", "range_jacobian",
+    "space_jacobian", "space_orientation_covariance",
+]  # fmt: skip
+
+
+def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
+    """Bound (n - 1, n - 1) of orientations 1 to n - 1 from edge angles of variance 2 sigma^2."""
+    sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
+    B = incidence(check_connected(edges, n_nodes), n_nodes)[:, 1:]
+    return 2 * sigma**2 * np.linalg.inv((B.T @ B).toarray())
+
+
+def edge_variance(n_edges: int, n_nodes: int, bearing_std_rad: float) -> float:
+    """Mean bound of a consistent edge angle: ``2 sigma^2 (n - 1) / m``."""
+    return 2 * bearing_std_rad**2 * (n_nodes - 1) / n_edges
+
+
+def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: float) -> FloatArray:
+    """Orientation bound (..., n - 1, n - 1) of many small networks, disconnected ones too.
+
+    Parameters
+    ----------
+    links
+        (..., n, n) symmetric: who sees whom.
+    bearing_std_rad
+        sigma of a bearing.
+    prior_std_rad
+        Of an orientation that nothing is measured of; it keeps the bound finite.
+    """
+    weight = links / (2 * bearing_std_rad**2)
+    information = np.eye(links.shape[-1]) * (weight.sum(axis=-1) + prior_std_rad**-2)[..., None]
+    return np.linalg.inv((information - weight)[..., 1:, 1:])
+
+
+def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
+    """Derivative (2 m, 3 n) of the bearings; columns: n orientations, then x and y of each node.
+
+    Rows are in the order of ``bearings.ravel()``: of j seen by i, of i seen by j, edge by edge.
+    """
+    positions = check_positions(positions)
+    n_nodes = len(positions)
+    edges = check_edges(edges, n_nodes)
+    toward = directions_of(positions, edges)
+    apart = positions[edges[:, 1]] - positions[edges[:, 0]]
+    across = np.column_stack([-np.sin(toward), np.cos(toward)])
+    length = np.linalg.norm(apart, axis=1, keepdims=True)
+    if (length == 0).any():
+        i, j = edges[int(np.argmin(length))]
+        raise ValueError(
+            f"positions must differ along edges, those of nodes {i} and {j} are the same"
+        )
+    across /= length
+    both = np.repeat(across, 2, axis=0)
+    places = n_nodes + 2 * np.repeat(edges, 2, axis=0)[:, :, None] + [0, 1]
+    columns = np.column_stack([edges.ravel(), places.reshape(-1, 4)])
+    values = np.column_stack([np.full(2 * len(edges), -1.0), -both, both])
+    return sparse_rows(values, columns, 3 * n_nodes)
+
+
+def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
+    """Derivative (k, 3 n) of the distances of pairs of nodes, columns as `bearing_jacobian`."""
+    positions = check_positions(positions)
+    n_nodes = len(positions)
+    pairs = check_edges(pairs, n_nodes)
+    toward = directions_of(positions, pairs)
+    along = np.column_stack([np.cos(toward), np.sin(toward)])
+    columns = (n_nodes + 2 * pairs[:, :, None] + [0, 1]).reshape(-1, 4)
+    return sparse_rows(np.concatenate([-along, along], axis=1), columns, 3 * n_nodes)
+
+
+def sparse_rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_matrix:
+    """The matrix (m, width) of rows with equally many entries (m, k), at columns (m, k)."""
+    rows, each = values.shape
+    return sp.csr_matrix((values.ravel(), columns.ravel(), each * np.arange(rows + 1)),
+                         shape=(rows, width))  # fmt: skip
+
+
+def free_columns(n_nodes: int) -> IntArray:
+    """Columns (3 n - 3,) of the Jacobians that are unknown: all but those of node 0."""
+    known = [0, n_nodes, n_nodes + 1]
+    return np.setdiff1d(np.arange(3 * n_nodes), known)
+
+
+def frame_covariance(
+    positions: ArrayLike,
+    edges: ArrayLike,
+    bearing_std_rad: float,
+    known_pair: tuple[int, int] | None = None,
+    ranges_of: ArrayLike | None = None,
+    range_std_m: float | None = None,
+) -> FloatArray:
+    """Bound (3 n - 3, 3 n - 3) of frames: n - 1 orientations, then x and y of nodes 1 to n - 1.
+
+    Parameters
+    ----------
+    positions
+        (n, 2) metres, in any frame: the bound is of the frame of node 0 turned like it.
+    edges
+        (m, 2), both bearings of each measured.
+    bearing_std_rad
+        sigma of a bearing.
+    known_pair
+        Two nodes whose distance is known exactly.
+    ranges_of, range_std_m
+        Pairs (k, 2) whose distances are measured, and sigma of such a range. One of the two is
+        needed: bearings have no scale.
+
+    Raises
+    ------
+    ValueError
+        If the frames are not determined.
+    """
+    positions = check_positions(positions)
+    J = bearing_jacobian(positions, edges) / check_number(
+        "bearing_std_rad", bearing_std_rad, low=1e-12
+    )
+    rows: list[Any] = [J]
+    if ranges_of is not None:
+        rows.append(range_jacobian(positions, ranges_of)
+                    / check_number("range_std_m", range_std_m, low=1e-12))  # fmt: skip
+    elif known_pair is None:
+        raise ValueError("known_pair must be given where there are no ranges, got None")
+    free = free_columns(len(positions))
+    J = sp.csr_matrix(sp.vstack(rows))[:, free].toarray()
+    if known_pair is not None:
+        # Moves that keep the known distance: the null space of its one row.
+        pair = check_pair("known_pair", known_pair, len(positions))
+        row = range_jacobian(positions, [pair])[:, free].toarray()[0]
+        basis = np.linalg.svd(row[None])[2][1:].T
+    else:
+        basis = np.eye(len(free))
+    values, vectors = np.linalg.eigh(basis.T @ (J.T @ J) @ basis)
+    if len(values) and values[0] <= 1e-12 * values[-1]:
+        missing = int((values <= 1e-12 * values[-1]).sum())
+        raise ValueError(f"edges must determine all frames, got {missing} directions without "
+                         "information")  # fmt: skip
+    factor = basis @ vectors / np.sqrt(values)
+    return factor @ factor.T
+
+
+# --- space ------------------------------------------------------------------------------------
+
+
+def space_jacobian(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
+    """Derivative (6 m, 6 n) of bearings in space, all frames parallel to the world's.
+
+    Columns: shifts of node 0, of node 1, ..., then turns w, ``R = exp(w) R``, of node 0, and so
+    on. Rows: the direction of j seen by i, of i seen by j, edge by edge.
+
+    Parameters
+    ----------
+    positions
+        (n, 3) metres.
+    edges
+        (m, 2), both nodes of an edge measure the other's direction in their own frame.
+    """
+    positions = check_array("positions", positions, ("n", 3))
+    if positions.ndim != 2:
+        raise ValueError(f"positions must have shape (n, 3), got {positions.shape}")
+    n_nodes = len(positions)
+    edges = check_edges(edges, n_nodes)
+    rows = np.zeros((len(edges), 2, 3, 2, n_nodes, 3))
+    for k, (i, j) in enumerate(edges):
+        apart = positions[j] - positions[i]
+        length = float(np.linalg.norm(apart))
+        if length == 0:
+            raise ValueError(f"positions must differ along edges, those of nodes {i} and {j} are "
+                             "the same")  # fmt: skip
+        u = apart / length
+        # d u = (I - u u^T) (dp_j - dp_i) / length; a turn w of the observer adds -w x u.
+        shift = (np.eye(3) - np.outer(u, u)) / length
+        turn = rotations.hat(u)
+        for side, (node, sense) in enumerate(((i, 1), (j, -1))):
+            rows[k, side, :, 0, j], rows[k, side, :, 0, i] = sense * shift, -sense * shift
+            rows[k, side, :, 1, node] = sense * turn
+    return rows.reshape(-1, 6 * n_nodes)
+
+
+def space_orientation_covariance(
+    positions: ArrayLike, edges: ArrayLike, bearing_std_rad: float
+) -> FloatArray:
+    """Bound (3 (n - 1), 3 (n - 1)) of the turns of nodes 1 to n - 1 against node 0, in space.
+
+    Of mutual bearings with noise of `bearing_std_rad` about each axis across them.
+
+    Raises
+    ------
+    ValueError
+        If the bearings leave more free than a shift, a turn and the scale of the whole.
+    """
+    sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
+    J = space_jacobian(positions, edges)
+    n_nodes = J.shape[1] // 6
+    scale = np.zeros(6 * n_nodes)
+    scale[: 3 * n_nodes] = (np.asarray(positions) - np.asarray(positions)[0]).ravel()
+    kept = np.delete(np.arange(6 * n_nodes), [0, 1, 2, *range(3 * n_nodes, 3 * n_nodes + 3)])
+    # No bearing sees the scale: knowing it makes the rest regular and changes no orientation.
+    known = np.vstack([J, scale / np.linalg.norm(scale)])[:, kept]
+    values = np.linalg.svd(known, compute_uv=False)
+    if values[-1] < 1e-9 * values[0]:
+        raise ValueError("edges must determine all orientations at these positions, got "
+                         f"{int((values < 1e-9 * values[0]).sum())} free motions")  # fmt: skip
+    return sigma**2 * np.linalg.inv(known.T @ known)[3 * (n_nodes - 1) :, 3 * (n_nodes - 1) :]

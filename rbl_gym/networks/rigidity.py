@@ -1,0 +1,264 @@
+"""What a network's measurements determine: orientations, frames, and what stays free.
+
+Plane: orientations need a connected graph of bearings; frames up to scale need a parallel
+rigid one, whose rigidity matrix has rank 2 n - 3. Space: bearings leave a turn about the line
+of sight free, unless triangles take it away.
+"""
+
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false, reportOperatorIssue=false
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, check_array, check_one_of
+from rbl_gym.geometry import rotations
+from rbl_gym.networks.bounds import (
+    bearing_jacobian,
+    range_jacobian,
+    space_jacobian,
+    sparse_rows,
+)
+from rbl_gym.networks.graphs import check_connected, components
+from rbl_gym.networks.sensing import check_edges, check_positions, directions_of
+
+__all__ = [
+    "Freedom", "Localizability", "feasible_rotations", "freedom", "localizability",
+    "parallel_rigidity_matrix", "parallel_rigidity_rank", "triangle_rotation",
+]  # fmt: skip
+
+# Eigenvalues of a Gram matrix of unit rows below this are zero.
+_ZERO = 1e-10
+_DENSE = 400
+
+
+class Localizability(NamedTuple):
+    """What the bearings of a planar network determine."""
+
+    components: int  # 1: the orientations, relative to one node's
+    rank: int  # of the rigidity matrix
+    full_rank: int  # 2 n - 3: all frames, but for a shift, a turn and a scale
+
+    @property
+    def orientations(self) -> bool:
+        """Whether all orientations are determined."""
+        return self.components == 1
+
+    @property
+    def frames(self) -> bool:
+        """Whether all frames are determined once a length is known."""
+        return self.orientations and self.rank == self.full_rank
+
+
+def check_orientations(edges: ArrayLike, n_nodes: int, measured: str = "bearings") -> None:
+    """Raise unless all orientations can be found from what is measured.
+
+    Parameters
+    ----------
+    edges, n_nodes
+        (m, 2), who measures whom.
+    measured
+        ``"bearings"``, ``"both"`` or ``"ranges"``. Ranges alone say nothing about orientations:
+        turning a node changes none (Proposition 15).
+
+    Raises
+    ------
+    ValueError
+        If they cannot; the message names the components.
+    """
+    check_one_of("measured", measured, ("bearings", "ranges", "both"))
+    check_connected(edges, n_nodes)
+    if measured == "ranges" and n_nodes > 1:
+        raise ValueError("orientations are not localizable from ranges alone: turning a node "
+                         "changes no range; bearings must be measured, got 'ranges'")  # fmt: skip
+
+
+def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
+    """Rows (m, 2 n): shifts of the nodes that keep the direction of an edge, to first order.
+
+    The row of edge (i, j) is ``u' (dp_j - dp_i)``, u' the unit vector across it; columns are
+    x and y of node 0, then of node 1, and so on.
+    """
+    positions = check_positions(positions)
+    edges = check_edges(edges, len(positions))
+    toward = directions_of(positions, edges)
+    across = np.column_stack([-np.sin(toward), np.cos(toward)])
+    columns = (2 * edges[:, :, None] + [0, 1]).reshape(-1, 4)
+    return sparse_rows(np.concatenate([-across, across], axis=1), columns, 2 * len(positions))
+
+
+def parallel_rigidity_rank(positions: ArrayLike, edges: ArrayLike) -> tuple[int, int]:
+    """Rank of `parallel_rigidity_matrix`, and the rank 2 n - 3 that localizes all frames."""
+    R = parallel_rigidity_matrix(positions, edges)
+    n_nodes = R.shape[1] // 2
+    return 2 * n_nodes - _null_dimension(R), max(2 * n_nodes - 3, 0)
+
+
+def localizability(positions: ArrayLike, edges: ArrayLike) -> Localizability:
+    """What the bearings of a planar network determine at these positions."""
+    positions = check_positions(positions)
+    parts = int(components(edges, len(positions)).max()) + 1
+    return Localizability(parts, *parallel_rigidity_rank(positions, edges))
+
+
+def check_frames(positions: ArrayLike, edges: ArrayLike) -> None:
+    """Raise unless all frames can be found from bearings and one length (Proposition 16).
+
+    Raises
+    ------
+    ValueError
+        If the graph is not connected, or not parallel rigid at these positions; the message
+        names the components or the missing rank.
+    """
+    check_connected(edges, len(check_positions(positions)))
+    rank, full = parallel_rigidity_rank(positions, edges)
+    if rank < full:
+        raise ValueError(f"edges must make the network parallel rigid, rank {full}, "
+                         f"got rank {rank}: {full - rank} missing")  # fmt: skip
+
+
+def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> None:
+    """Raise unless all frames can be found from bearings of `edges` and ranges of `ranged`.
+
+    Raises
+    ------
+    ValueError
+        If they cannot at these positions; the message names the missing rank.
+    """
+    J = sp.vstack([bearing_jacobian(positions, edges), range_jacobian(positions, ranged)])
+    full = J.shape[1] - 3
+    missing = _null_dimension(sp.csr_matrix(J)) - 3
+    if missing:
+        raise ValueError(f"edges and ranges must determine all frames, rank {full}, "
+                         f"got rank {full - missing}: {missing} missing")  # fmt: skip
+
+
+def _null_dimension(R: sp.csr_matrix) -> int:
+    """Dimension of the null space, by the zero eigenvalues of ``R^T R``."""
+    gram = sp.csc_matrix(R.T @ R)
+    size = gram.shape[0]
+    if size <= _DENSE:
+        return int((np.linalg.eigvalsh(gram.toarray()) < _ZERO).sum())
+    wanted = 8
+    start = np.random.default_rng(0).standard_normal(size)
+    while wanted < size - 1:
+        # The shift keeps the matrix definite; Lanczos then finds the smallest first.
+        found = scipy.sparse.linalg.eigsh(gram, k=wanted, sigma=-1e-7, v0=start,
+                                          return_eigenvectors=False)  # fmt: skip
+        if (free := int((found < _ZERO).sum())) < wanted:
+            return free
+        wanted *= 4
+    return int((np.linalg.eigvalsh(gram.toarray()) < _ZERO).sum())
+
+
+# --- space ------------------------------------------------------------------------------------
+
+
+class Freedom(NamedTuple):
+    """What bearings in space leave free, beside a shift, a turn and a scale of the whole."""
+
+    rank: int  # of the rigidity matrix (2 rows a bearing, 6 columns a node)
+    free: int  # 6 n - 7 - rank: motions of frames that no bearing sees
+    free_orientations: int  # of the orientations among them
+
+
+def feasible_rotations(u_ij: ArrayLike, u_ji: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Rotations from frame j to frame i that two opposite bearings allow (Lemma 13).
+
+    All of them are ``exp(phi [u_ij]x) R_0``: the bearings leave the turn phi about the line of
+    sight free.
+
+    Parameters
+    ----------
+    u_ij, u_ji
+        (3,) bearing of j in the frame of i, and of i in the frame of j; made unit here.
+
+    Returns
+    -------
+    R_0
+        (3, 3) with ``R_0 u_ji = -u_ij``: the smallest such turn. In the degenerate cases:
+        the identity for ``u_ji = -u_ij``; for ``u_ji = u_ij`` a half turn about an axis
+        across it, of which all are equally small.
+    axis
+        (3,) of the free turn, ``u_ij``.
+    """
+    axis, other = _unit("u_ij", u_ij), _unit("u_ji", u_ji)
+    across = np.cross(other, -axis)
+    sine, cosine = float(np.linalg.norm(across)), float(other @ -axis)
+    if sine < 1e-12:
+        if cosine > 0:
+            return np.eye(3), axis
+        helper = np.eye(3)[np.argmin(np.abs(axis))]
+        across = np.cross(axis, helper)
+        return rotations.exp(np.pi * across / np.linalg.norm(across)), axis
+    return rotations.exp(np.arctan2(sine, cosine) * across / sine), axis
+
+
+def triangle_rotation(
+    u_ij: ArrayLike, u_ji: ArrayLike, u_ik: ArrayLike, u_jk: ArrayLike
+) -> FloatArray:
+    """Rotation (3, 3) from frame j to frame i when both also see k.
+
+    Beside the line of sight the frames share the normal of the triangle's plane, so that no
+    turn stays free. With noise, the line of sight is kept and the normals agree as nearly as
+    they can.
+
+    Parameters
+    ----------
+    u_ij, u_ik
+        Directions (3,) in which i sees j and k, in the frame of i.
+    u_ji, u_jk
+        The same of j.
+
+    Raises
+    ------
+    ValueError
+        If the three nodes stand on one line: there is no plane.
+    """
+    axis, other = _unit("u_ij", u_ij), _unit("u_ji", u_ji)
+    normal_i = np.cross(axis, _unit("u_ik", u_ik))
+    # Seen from j the triangle is run the other way around.
+    normal_j = np.cross(_unit("u_jk", u_jk), other)
+    for name, normal in (("u_ik", normal_i), ("u_jk", normal_j)):
+        if np.linalg.norm(normal) < 1e-9:
+            raise ValueError(f"{name} must not be parallel to the line of sight, the nodes are "
+                             "collinear")  # fmt: skip
+    return _triad(axis, normal_i) @ _triad(-other, normal_j).T
+
+
+def _triad(direction: FloatArray, normal: FloatArray) -> FloatArray:
+    third = normal / np.linalg.norm(normal)
+    return np.column_stack([direction, third, np.cross(direction, third)])
+
+
+def _unit(name: str, vector: ArrayLike) -> FloatArray:
+    array = check_array(name, vector, (3,))
+    length = float(np.linalg.norm(array))
+    if array.shape != (3,) or length == 0:
+        raise ValueError(f"{name} must be one vector that is not zero, got {array!r:.80}")
+    return array / length
+
+
+def freedom(positions: ArrayLike, edges: ArrayLike) -> Freedom:
+    """What mutual bearings in space leave free at these positions.
+
+    Parameters
+    ----------
+    positions
+        (n, 3) metres.
+    edges
+        (m, 2), both nodes of an edge measure the other's direction in their own frame.
+    """
+    matrix = space_jacobian(positions, edges)
+    n_nodes = matrix.shape[1] // 6
+    values, vectors = np.linalg.eigh(matrix.T @ matrix)
+    null = vectors[:, values < _ZERO * max(1.0, values[-1])]
+    turns = np.linalg.matrix_rank(null[3 * n_nodes :], tol=1e-6)
+    rank = 6 * n_nodes - null.shape[1]
+    # One node alone has no size, and so no scale.
+    return Freedom(rank, max(6 * n_nodes - 7 - rank, 0), int(turns) - 3)

@@ -1,0 +1,39 @@
+"""Placement of anchors: the problem, layouts, search, criteria, files."""
+
+from rbl_gym.placement.problem import (
+    MAX_RACKS,
+    Context,
+    PlacementTask,
+    build_contexts,
+    checked_context,
+    context_uniforms,
+    draw_contexts,
+    information,
+    is_legal,
+    mounts,
+    positions,
+    score,
+    score_of,
+    sight_fractions,
+    task,
+    whole_volume,
+)
+
+__all__ = [
+    "MAX_RACKS",
+    "Context",
+    "PlacementTask",
+    "build_contexts",
+    "checked_context",
+    "context_uniforms",
+    "draw_contexts",
+    "information",
+    "is_legal",
+    "mounts",
+    "positions",
+    "score",
+    "score_of",
+    "sight_fractions",
+    "task",
+    "whole_volume",
+]

@@ -1,0 +1,368 @@
+"""Where do the anchors go so that the pose is good? The problem: contexts, legal places, scores.
+
+A task is a scene, a number of anchors and how many racks may stand in the way. A context is what
+changes from one problem to the next: the work region, a box inside the body's volume, and the
+racks. A layout is an array (..., M, 3) of anchors, and its score on a context is the root mean
+square tag error in metres that the Cramer-Rao bound promises over fixed poses in the work
+region. Everything broadcasts: layouts and contexts of one call may carry any leading axes.
+
+Solutions stand in `layouts` and `search`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.bounds.shared_poses import SharedPoses
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    as_float,
+    check_array,
+    check_count,
+    check_finite,
+)
+from rbl_gym.geometry import rotations
+from rbl_gym.geometry.obstacles import Obstacles
+from rbl_gym.geometry.regions import Walls
+from rbl_gym.worlds import scenes
+from rbl_gym.worlds.scene import Scene
+
+__all__ = [
+    "Context", "PlacementTask", "draw_contexts",
+    "information", "is_legal", "mounts", "positions", "score", "score_of", "sight_fractions",
+    "task", "whole_volume",
+]  # fmt: skip
+
+# Anchors of a task where nothing else is said: the scenes' own, and one fewer beside racks.
+MAX_RACKS = 2
+# More anchors or poses than any machine scores.
+_MOST_PLACES = 10**6
+# Rotation of the prior that regularises the bound.
+_PRIOR_ROTATION_RAD = math.radians(60)
+# The poses of a task are the same for ever, so that scores can be compared.
+_POSE_SEED = 20130821
+# Range of the work region's half size as a share of the volume's, (x, y, z).
+_LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
+# Uniforms that a context takes: region 6, each rack 6.
+_REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
+# Problems times poses times links, and so on, that are computed at a time: temporaries in cache.
+_LINKS_AT_ONCE, _POSES_AT_ONCE, _SIGHTS_AT_ONCE = 16_000, 512, 16_000
+
+
+class Context(NamedTuple):
+    """One placement problem of a task, with leading batch axes.
+
+    Attributes
+    ----------
+    centre, half
+        Work region (..., 3), metres.
+    racks
+        (..., K, 6): centre and half size of all boxes that block sight: the scene's own, then
+        those of the problem.
+    """
+
+    centre: FloatArray
+    half: FloatArray
+    racks: FloatArray
+
+
+@dataclass(frozen=True)
+class PlacementTask:
+    """A family of placement problems.
+
+    Parameters
+    ----------
+    scene
+        Gives the body, its volume, the noise, where anchors may stand, its own obstacles and
+        what a blocked link keeps of its information (sight is judged from the anchor to the
+        body's centre).
+    n_anchors
+        How many are placed.
+    racks
+        Boxes on the floor that every problem draws besides, 0 to 2; only in rooms (scenes with
+        walls).
+    n_poses
+        Poses in the work region over which a layout is scored.
+    """
+
+    scene: Scene
+    n_anchors: int
+    racks: int = 0
+    n_poses: int = 32
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.scene, Scene):
+            raise ValueError(f"scene must be a Scene, got {self.scene!r:.80}")
+        for name, least, most in (
+            ("n_anchors", 1, _MOST_PLACES), ("racks", 0, MAX_RACKS), ("n_poses", 1, _MOST_PLACES),
+        ):  # fmt: skip
+            value = check_count(name, getattr(self, name), least=least, most=most)
+            object.__setattr__(self, name, value)
+        if not np.ptp(self.scene.volume.bounds(), axis=0).any():
+            raise ValueError(
+                f"scene must have a volume with an extent, {self.scene.name!r} has none"
+            )
+        if self.racks and not isinstance(self.scene.anchor_region, Walls):
+            raise ValueError(
+                f"racks must be 0 in a scene without walls, got {self.racks} in {self.scene.name!r}"
+            )
+
+    @property
+    def blocked_information(self) -> float:
+        """Share of its information that a link without line of sight keeps: the scene's."""
+        return self.scene.blocked_information
+
+    def obstacles(self, context: Context) -> Obstacles:
+        """What stands in the way in a context."""
+        return Obstacles(context.racks, self.scene.blocked_information)
+
+    @functools.cached_property
+    def poses(self) -> tuple[FloatArray, FloatArray]:
+        """Rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size.
+
+        Read-only, as all that a task keeps.
+        """
+        rng = np.random.default_rng(_POSE_SEED)
+        offsets = rng.uniform(-1, 1, (self.n_poses, 3))
+        return _read_only(rotations.random(rng, (self.n_poses,))), _read_only(offsets)
+
+    @functools.cached_property
+    def prior_information(self) -> FloatArray:
+        """(6, 6): 60 degrees, and half of the volume's largest extent."""
+        extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
+        diagonal = [_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3
+        return _read_only(np.diag(diagonal))
+
+    @functools.cached_property
+    def shared(self) -> SharedPoses:
+        """What the poses and the tags alone decide."""
+        return SharedPoses(self.poses[0], np.asarray(self.scene.tags))
+
+
+def _read_only(array: FloatArray) -> FloatArray:
+    array.flags.writeable = False
+    return array
+
+
+def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:
+    """The task of a scene (a name or overrides, see `scenes.get`).
+
+    `n_anchors` None: as many as the scene has, and one fewer where racks stand in the room.
+
+    Raises
+    ------
+    ValueError
+        On an unknown scene, racks outside a room, a number that is none.
+    """
+    scene = scenes.get(scene)
+    racks = check_count("racks", racks, least=0, most=MAX_RACKS)
+    usual = scene.n_anchors - bool(racks)
+    return PlacementTask(scene, usual if n_anchors is None else n_anchors, racks)
+
+
+# --- contexts --------------------------------------------------------------------------------
+
+
+def context_uniforms(task: PlacementTask) -> int:
+    """How many uniforms a context takes."""
+    return _REGION_UNIFORMS + _RACK_UNIFORMS * task.racks
+
+
+def draw_contexts(
+    task: PlacementTask, rng: np.random.Generator, batch: tuple[int, ...] = ()
+) -> Context:
+    """Random contexts: work regions that fit in the volume, racks on the floor besides the scene's
+    own obstacles."""
+    return build_contexts(task, rng.random((*batch, context_uniforms(task))))
+
+
+def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
+    """Contexts of uniforms (..., `context_uniforms`)."""
+    low, high = task.scene.volume.bounds()
+    half = (_LEAST + (_MOST - _LEAST) * uniforms[..., :3]) * 0.5 * (high - low)
+    centre = (low + half) + uniforms[..., 3:6] * ((high - half) - (low + half))
+    of_racks = uniforms[..., _REGION_UNIFORMS:]
+    of_racks = of_racks.reshape((*uniforms.shape[:-1], task.racks, _RACK_UNIFORMS))
+    drawn = _racks(task, of_racks) if task.racks else of_racks
+    own = task.scene.obstruction.boxes
+    own = np.broadcast_to(own, (*uniforms.shape[:-1], *own.shape))
+    return Context(centre, half, np.concatenate([own, drawn], axis=-2))
+
+
+def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
+    """Racks (..., K, 6) on the floor, in the middle 70 % of the room, long in x or in y."""
+    low, high = task.scene.anchor_region.bounds()
+    racks = np.empty((*uniforms.shape[:-1], 6))
+    middle = 0.15 + 0.7 * uniforms[..., :2]
+    racks[..., :2] = low[:2] + middle * (high - low)[:2]
+    thin, long = 0.2 + 0.2 * uniforms[..., 2], 1 + uniforms[..., 3]
+    along_x = uniforms[..., 4] < 0.5
+    racks[..., 3] = np.where(along_x, long, thin)
+    racks[..., 4] = np.where(along_x, thin, long)
+    racks[..., 5] = 0.6 + 0.6 * uniforms[..., 5]
+    racks[..., 2] = racks[..., 5]
+    return racks
+
+
+def whole_volume(task: PlacementTask) -> Context:
+    """The context whose work region is the body's volume, among the scene's own obstacles."""
+    low, high = task.scene.volume.bounds()
+    return Context(0.5 * (low + high), 0.5 * (high - low), task.scene.obstruction.boxes.copy())
+
+
+def positions(task: PlacementTask, context: Context) -> FloatArray:
+    """Places (..., P, 3) of the body's centre at the task's poses."""
+    return context.centre[..., None, :] + task.poses[1] * context.half[..., None, :]
+
+
+# --- scores ----------------------------------------------------------------------------------
+
+
+def information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Fisher information (..., P, 6, 6) at the task's poses, without the prior.
+
+    It is a sum over the anchors: the information of a layout is that of its parts together.
+    """
+    return _in_blocks(
+        lambda *some: _information(task, *some).transpose(3, 2, 0, 1),
+        context, anchors, _problems_at_once(task, anchors), (task.n_poses, 6, 6),
+    )  # fmt: skip
+
+
+def _information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """`information` as (6, 6, P, B), of one batch axis."""
+    start, away = _segments(task, context, anchors)
+    share = None
+    if context.racks.shape[-2]:
+        share = task.obstacles(context).share_along(start, away)
+    return task.shared.information(away, task.scene.noise, share)
+
+
+def _segments(
+    task: PlacementTask, context: Context, anchors: FloatArray
+) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Components of the anchors (M, B), and of the body's places less them (P, M, B)."""
+    end = positions(task, context).transpose(1, 2, 0).copy()
+    start = anchors.transpose(1, 2, 0).copy()
+    return [start[:, i] for i in range(3)], [end[:, None, i] - start[:, i] for i in range(3)]
+
+
+def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
+    return _LINKS_AT_ONCE // (task.n_poses * anchors.shape[-2] * len(task.scene.tags))
+
+
+def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Score (...) of layouts (..., M, 3) in metres: small is good.
+
+    The root mean square over the poses of b, ``b^2 = mean_n tr(J_n P J_n^T)`` with ``P = (F +
+    prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
+    coincident anchors from winning.
+    """
+    anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
+    prior = task.prior_information[..., None, None]
+    square = _in_blocks(
+        lambda *some: task.shared.mean_square(_information(task, *some) + prior),
+        context, anchors, _problems_at_once(task, anchors), (),
+    )  # fmt: skip
+    return _root(square)
+
+
+def _in_blocks(
+    function: Callable[[Context, FloatArray], FloatArray],
+    context: Context,
+    anchors: FloatArray,
+    size: int,
+    shape: tuple[int, ...],
+) -> FloatArray:
+    """Results (..., *shape) of a function of one batch axis, `size` problems at a time."""
+    batch = np.broadcast_shapes(anchors.shape[:-2], context.centre.shape[:-1])
+    arrays = zip((*context, anchors), (1, 1, 2, 2), strict=True)
+    flat = [_flat(array, trailing, batch) for array, trailing in arrays]
+    result = np.empty((math.prod(batch), *shape))
+    for begin in range(0, len(result), max(1, size)):
+        some = slice(begin, begin + max(1, size))
+        *fields, part = (array[some] for array in flat)
+        result[some] = function(Context(*fields), part)
+    return result.reshape((*batch, *shape))
+
+
+def checked_context(context: Context) -> Context:
+    """The context with finite arrays of the right shapes, or a ValueError."""
+    centre, half = (check_array(name, getattr(context, name), (3,)) for name in ("centre", "half"))
+    racks = check_finite("racks", as_float("racks", context.racks))
+    if racks.ndim < 2 or racks.shape[-1] != 6:
+        raise ValueError(f"racks must have shape (..., K, 6), got {racks.shape}")
+    return Context(centre, half, racks)
+
+
+def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
+    """The array (..., n) with the batch as its one leading axis."""
+    shape = array.shape[array.ndim - trailing :]
+    return np.broadcast_to(array, (*batch, *shape)).reshape((math.prod(batch), *shape))
+
+
+def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
+    """Score (...) of an information (..., P, 6, 6) at the task's poses."""
+    flat = information.reshape((-1, *information.shape[-3:]))
+    square = np.empty(len(flat))
+    size = max(1, _POSES_AT_ONCE // task.n_poses)
+    for begin in range(0, len(flat), size):
+        part = flat[begin : begin + size] + task.prior_information
+        square[begin : begin + size] = task.shared.mean_square(part.transpose(2, 3, 1, 0))
+    return _root(square).reshape(information.shape[:-3])
+
+
+def _root(square: FloatArray) -> FloatArray:
+    if not np.isfinite(square).all():
+        raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
+    return np.sqrt(square)
+
+
+# --- mounts ----------------------------------------------------------------------------------
+
+
+def mounts(task: PlacementTask) -> FloatArray:
+    """Mount points (57, 3) of a room: three heights on the walls, nine on the ceiling.
+
+    Raises
+    ------
+    ValueError
+        If the scene is no room.
+    """
+    region = task.scene.anchor_region
+    if not isinstance(region, Walls):
+        raise ValueError(f"scene must have walls for mount points, got {task.scene.name!r}")
+    low, high = region.bounds()
+    x, y, _ = (np.linspace(low, high, 5)).T
+    # Half way up, to the decimetre.
+    heights = (low[2], np.round(0.5 * (low[2] + high[2]) - 1e-9, 1), high[2])
+    points = [(a, b, z) for z in heights for b in (low[1], high[1]) for a in x]
+    points += [(a, b, z) for z in heights for a in (low[0], high[0]) for b in y[1:-1]]
+    points += [(a, b, high[2]) for a in x[1:-1] for b in y[1:-1]]
+    return np.array(points)
+
+
+def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """Share (..., M) of the task's poses that each anchor sees."""
+    if not context.racks.shape[-2]:
+        return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
+    return _in_blocks(
+        lambda some, part: (
+            task.obstacles(some).clear_along(*_segments(task, some, part)).mean(axis=0).T
+        ),
+        context, anchors, _SIGHTS_AT_ONCE // (task.n_poses * anchors.shape[-2]),
+        anchors.shape[-2:-1],
+    )  # fmt: skip
+
+
+def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:
+    """Whether each anchor (..., M) stands where the scene allows it."""
+    off = np.abs(task.scene.anchor_region.project(anchors) - anchors).max(axis=-1)
+    return np.asarray(off <= tolerance_m)

@@ -1,0 +1,222 @@
+"""Layouts that look at the score: the best of many, greedy, greedy with swaps, CMA-ES.
+
+As in `layouts` a search is a function ``(task, context, rng) -> anchors (..., M, 3)``; options
+come as keywords. CMA-ES is the `cmaes` package's (extra ``placement``).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.placement.layouts import Layout
+from rbl_gym.placement.problem import Context, PlacementTask, information, score, score_of
+
+__all__ = ["SEARCHES", "best_of_random", "cma_es", "greedy", "greedy_swaps", "shared_layout"]
+
+
+def best_of_random(
+    task: PlacementTask, context: Context, rng: np.random.Generator, tries: int = 100
+) -> FloatArray:
+    """The best of `tries` random layouts.
+
+    Arguments as `cma_es`.
+    """
+    check_number("tries", tries, low=1)
+    batch = context.centre.shape[:-1]
+    drawn = task.scene.anchor_region.draw(rng.random((*batch, tries, task.n_anchors, 3)))
+    best = score(task, expand(context), drawn).argmin(axis=-1)
+    return np.take_along_axis(drawn, best[..., None, None, None], axis=-3)[..., 0, :, :]
+
+
+def greedy(
+    task: PlacementTask,
+    context: Context,
+    rng: np.random.Generator,
+    candidates: FloatArray | None = None,
+    n_candidates: int = 150,
+    swaps: bool = False,
+) -> FloatArray:
+    """One anchor after the other where it helps most, among candidates.
+
+    Parameters
+    ----------
+    task, context
+        The problem.
+    rng
+        Draws the candidates.
+    candidates
+        (K, 3); None: `n_candidates` uniform over the legal places, for each context its own.
+    swaps
+        Afterwards, as long as it helps, replace one anchor by one candidate.
+    """
+    batch = context.centre.shape[:-1]
+    if candidates is None:
+        drawn = task.scene.anchor_region.draw(rng.random((*batch, n_candidates, 3)))
+    else:
+        shared = check_array("candidates", candidates, ("K", 3))
+        drawn = np.broadcast_to(shared, (*batch, *shared.shape[-2:]))
+    if drawn.shape[-2] < task.n_anchors:
+        raise ValueError(
+            f"candidates must be at least n_anchors = {task.n_anchors}, got {drawn.shape[-2]}"
+        )
+    result = np.empty((*batch, task.n_anchors, 3))
+    for where in np.ndindex(batch):
+        one = Context(*(field[where] for field in context))
+        chosen = _greedy(task, one, drawn[where], swaps)
+        result[where] = drawn[where][chosen]
+    return result
+
+
+def greedy_swaps(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
+    """`greedy` with swaps."""
+    return greedy(task, context, rng, swaps=True)
+
+
+def _greedy(
+    task: PlacementTask, context: Context, candidates: FloatArray, swaps: bool
+) -> list[int]:
+    """Indices of the chosen candidates (K, 3) of one problem; none is chosen twice."""
+    # Information is a sum over the anchors, so each candidate's is computed once.
+    parts = information(task, context, candidates[:, None])
+    chosen: list[int] = []
+    total = np.zeros(parts.shape[1:])
+    for _ in range(task.n_anchors):
+        scores = score_of(task, total + parts)
+        scores[chosen] = math.inf
+        chosen.append(int(scores.argmin()))
+        total = total + parts[chosen[-1]]
+    best = float(score_of(task, total))
+    improved = swaps
+    while improved:
+        improved = False
+        for k, old in enumerate(chosen):
+            without = total - parts[old]
+            scores = score_of(task, without + parts)
+            scores[chosen] = math.inf
+            new = int(scores.argmin())
+            if scores[new] < best * (1 - 1e-9):
+                chosen[k], best, improved = new, float(scores[new]), True
+                total = without + parts[new]
+    return chosen
+
+
+def cma_es(
+    task: PlacementTask,
+    context: Context,
+    rng: np.random.Generator,
+    generations: int = 120,
+    population: int = 16,
+    sigma: float = 0.6,
+    start: FloatArray | None = None,
+) -> FloatArray:
+    """CMA-ES on the actions of all anchors, each context on its own.
+
+    Parameters
+    ----------
+    task, context, rng
+        The problem, contexts (...), and the source of all randomness.
+    generations, population
+        Their product is the number of layouts scored for each context.
+    sigma
+        First standard deviation, of the action box [-1, 1].
+    start
+        Anchors (..., M, 3) to start from, for instance a policy's; None: near the middle.
+
+    Returns
+    -------
+    The best layout that was scored, the start among them.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        Without the package `cmaes`.
+    """
+    batch = context.centre.shape[:-1]
+    size = 3 * task.n_anchors
+    mean = 0.1 * rng.standard_normal((*batch, size))
+    if start is not None:
+        begin = check_array("start", start, (task.n_anchors, 3))
+        mean = np.broadcast_to(task.scene.anchor_region.action(begin), (*batch, *begin.shape[-2:]))
+        mean = mean.reshape((*batch, size))
+    flat = mean.reshape(-1, size)
+    strategies = [_strategy(one, sigma, population, rng) for one in flat]
+    best = flat.copy()
+    best_score = _scores(task, context, best.reshape((*batch, size))).reshape(-1)
+    for _ in range(generations):
+        asked = np.array([[one.ask() for _ in range(population)] for one in strategies])
+        asked = asked.reshape(len(strategies), population, size)
+        scores = _scores(task, expand(context), asked.reshape((*batch, population, size)))
+        scores = scores.reshape(-1, population)
+        for one, solutions, values in zip(strategies, asked, np.log(scores), strict=True):
+            one.tell(list(zip(solutions, values.tolist(), strict=True)))
+        row = np.arange(len(asked))
+        least = scores.argmin(axis=-1)
+        better = scores[row, least] < best_score
+        best_score = np.where(better, scores[row, least], best_score)
+        best = np.where(better[:, None], asked[row, least], best)
+    return _placed(task, best.reshape((*batch, size)))
+
+
+def shared_layout(
+    task: PlacementTask,
+    contexts: Context,
+    rng: np.random.Generator,
+    generations: int = 120,
+    population: int = 16,
+    sigma: float = 0.6,
+) -> FloatArray:
+    """One layout (M, 3) for all contexts (C,): CMA-ES on the mean log score.
+
+    Arguments as `cma_es`.
+    """
+    if contexts.centre.ndim != 2:
+        raise ValueError(f"contexts must have one batch axis, got {contexts.centre.shape[:-1]}")
+    size = 3 * task.n_anchors
+    strategy = _strategy(0.1 * rng.standard_normal(size), sigma, population, rng)
+    best, best_value = np.zeros(size), math.inf
+    for _ in range(generations):
+        asked = np.array([strategy.ask() for _ in range(population)])
+        values = np.log(_scores(task, contexts, asked[:, None])).mean(axis=-1)
+        strategy.tell(list(zip(asked, values.tolist(), strict=True)))
+        if values.min() < best_value:
+            best, best_value = asked[values.argmin()], float(values.min())
+    return _placed(task, best)
+
+
+def _strategy(mean: FloatArray, sigma: float, population: int, rng: np.random.Generator) -> Any:
+    try:
+        from cmaes import CMA  # an extra
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "CMA-ES needs the package cmaes: pip install 'rbl-gym[placement]'"
+        ) from error
+    seed = int(rng.integers(2**31))
+    return CMA(mean=mean, sigma=sigma, population_size=population, seed=seed)
+
+
+def _placed(task: PlacementTask, actions: FloatArray) -> FloatArray:
+    """Anchors (..., M, 3) of flat actions (..., 3 M)."""
+    return task.scene.anchor_region.place(actions.reshape((*actions.shape[:-1], -1, 3)))
+
+
+def _scores(task: PlacementTask, context: Context, actions: FloatArray) -> FloatArray:
+    return score(task, context, _placed(task, actions))
+
+
+def expand(context: Context) -> Context:
+    """The contexts with one more batch axis, for several layouts of each."""
+    return Context(
+        context.centre[..., None, :], context.half[..., None, :], context.racks[..., None, :, :]
+    )
+
+
+SEARCHES: dict[str, Layout] = {
+    "best-of-random": best_of_random,
+    "greedy": greedy,
+    "greedy-swaps": greedy_swaps,
+    "cma-es": cma_es,
+}

@@ -1,0 +1,15 @@
+"""Recordings: real measurement logs as arrays."""
+
+from rbl_gym.recordings.reading import (
+    Recording,
+    Truth,
+    read_recording,
+    truth_at,
+)
+
+__all__ = [
+    "Recording",
+    "Truth",
+    "read_recording",
+    "truth_at",
+]

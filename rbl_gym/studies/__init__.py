@@ -1,0 +1,1 @@
+"""Studies: what the commands compute, as functions that return data."""

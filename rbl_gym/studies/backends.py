@@ -1,0 +1,144 @@
+"""The same function on many tasks: here, on several processes, or on a cluster, through joblib."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from typing import Any
+
+from rbl_gym.studies.extras import require
+
+BACKENDS = ("loky", "dask", "ray")
+# Workers may die so often in a row without one more task done, before that is an error.
+_PATIENCE = 3
+
+
+def each(
+    function: Callable[[Any], Any],
+    tasks: Sequence[Any],
+    jobs: int = 1,
+    backend: str | None = None,
+    address: str | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """``function(task)`` of every task, as (index, result), in the order they finish.
+
+    Parameters
+    ----------
+    function, tasks
+        Picklable; the function must be importable where the workers run.
+    jobs
+        Processes of this machine.
+    backend
+        None: this process where `jobs` is 1, else ``"loky"``. ``"dask"`` or ``"ray"``: the
+        cluster at `address`, or one of `jobs` local workers.
+    address
+        Of the scheduler.
+
+    Raises
+    ------
+    MissingExtraError
+        Where joblib or the backend is not installed.
+    ChildProcessError
+        When workers die again and again on the same tasks; a worker that dies otherwise loses
+        nothing but time: its tasks are run again.
+    """
+    check(jobs, backend)
+    if backend is None and jobs == 1:
+        yield from ((index, function(task)) for index, task in enumerate(tasks))
+    elif backend in (None, "loky"):
+        yield from _surviving(function, tasks, jobs)
+    elif backend == "dask":
+        yield from _dask(function, tasks, jobs, address)
+    else:
+        yield from _ray(function, tasks, jobs, address)
+
+
+def check(jobs: int, backend: str | None) -> None:
+    """A MissingExtraError where `each` lacks what it needs."""
+    if backend is None and jobs == 1:
+        return
+    require("joblib", "parallel")
+    if backend == "dask":
+        require("distributed", "parallel")
+    elif backend == "ray":
+        require("ray", "parallel", "ray")
+
+
+def _surviving(
+    function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int
+) -> Iterator[tuple[int, Any]]:
+    """Processes of this machine: after a death, a new set of them takes what is left."""
+    from joblib.externals.loky import BrokenProcessPool
+
+    open_ = set(range(len(tasks)))
+    patience = _PATIENCE
+    while open_:
+        try:
+            for index, result in _finished(function, tasks, sorted(open_), n_jobs=jobs):
+                open_.discard(index)
+                patience = _PATIENCE
+                yield index, result
+        except BrokenProcessPool as error:
+            patience -= 1
+            if not patience:
+                left = ", ".join(str(tasks[index]) for index in sorted(open_)[:jobs])
+                raise ChildProcessError(
+                    f"workers died {_PATIENCE} times in a row with {len(open_)} tasks left, "
+                    f"among them {left:.300}"
+                ) from error
+
+
+def _finished(
+    function: Callable[[Any], Any], tasks: Sequence[Any], indices: list[int], **options: Any
+) -> Iterator[tuple[int, Any]]:
+    joblib: Any = import_module("joblib")
+    # One task at a time: what is done is handed over, and safe, at once.
+    parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, **options)
+    found = parallel(joblib.delayed(_indexed)(function, index, tasks[index]) for index in indices)
+    with contextlib.closing(found):
+        yield from found
+
+
+def _indexed(function: Callable[[Any], Any], index: int, task: Any) -> tuple[int, Any]:
+    return index, function(task)
+
+
+def _dask(
+    function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, address: str | None
+) -> Iterator[tuple[int, Any]]:
+    """A dask cluster, which itself hands the tasks of a worker that dies to another."""
+    joblib: Any = import_module("joblib")
+    distributed: Any = import_module("distributed")
+    with contextlib.ExitStack() as stack:
+        if address is None:
+            address = stack.enter_context(
+                distributed.LocalCluster(
+                    n_workers=jobs, threads_per_worker=1, dashboard_address=None
+                )
+            )
+        client = stack.enter_context(distributed.Client(address))
+        stack.enter_context(joblib.parallel_config(backend="dask", client=client))
+        try:
+            yield from _finished(function, tasks, list(range(len(tasks))), n_jobs=-1)
+        except distributed.KilledWorker as error:
+            raise ChildProcessError(f"workers died again and again: {error}") from error
+
+
+def _ray(
+    function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, address: str | None
+) -> Iterator[tuple[int, Any]]:
+    """A ray cluster; its joblib backend returns lists, so the tasks go in portions."""
+    joblib: Any = import_module("joblib")
+    ray: Any = import_module("ray")
+    ray_joblib: Any = import_module("ray.util.joblib")
+    options: dict[str, Any] = {"num_cpus": jobs} if address is None else {"address": address}
+    with ray.init(ignore_reinit_error=True, log_to_driver=False, **options):
+        ray_joblib.register_ray()
+        workers = max(1, int(ray.cluster_resources().get("CPU", jobs)))
+        with joblib.parallel_config(backend="ray", n_jobs=workers):
+            for start in range(0, len(tasks), 2 * workers):
+                part = range(start, min(start + 2 * workers, len(tasks)))
+                yield from joblib.Parallel(batch_size=1)(
+                    joblib.delayed(_indexed)(function, index, tasks[index]) for index in part
+                )

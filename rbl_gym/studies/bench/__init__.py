@@ -1,0 +1,1 @@
+"""The benchmark of filters: worlds, runs, figures, records, leaderboard."""

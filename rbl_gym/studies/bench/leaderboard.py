@@ -1,0 +1,237 @@
+"""Every filter on every scene: the runs of `rbl-gym bench`, their records and their summary.
+
+A task is one world (scene and condition) and the filters that are run on it; it gives a record
+for each, plain numbers that depend on nothing but what the record itself names. Timings are kept
+apart from records.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import inspect
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from importlib.metadata import entry_points
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+
+import rbl_gym
+from rbl_gym import estimators, wrappers
+from rbl_gym.checks import check_one_of
+from rbl_gym.estimators.filter import factory_of
+from rbl_gym.studies.bench import figures, recordings, worlds
+from rbl_gym.studies.bench import run as bench_run
+from rbl_gym.studies.bench.worlds import CONDITIONS
+from rbl_gym.worlds import scenes
+
+# Options with which a filter of ours stands in the table besides its plain self.
+VARIANTS = ("iekf/robust=true",)
+# Made for what no scene has: a start that nobody knows, biased links, no odometry. They take long.
+ELSEWHERE = ("iekf-bank", "iekf-bias", "iekf-cv")
+# What makes a record another record; a finished one with the same is not run again.
+KEY = ("scene_hash", "condition", "filter", "filter_source", "trials", "seed", "versions")
+
+
+class Task(NamedTuple):
+    """One world, the filters to run on it, how many trials, and the seed."""
+
+    label: str
+    scene: str | dict[str, Any]
+    condition: str
+    filters: tuple[str, ...]
+    trials: int
+    seed: int
+
+    def __str__(self) -> str:
+        return f"{self.label} {self.condition}"
+
+
+def default_filters() -> list[str]:
+    """Filters by name, ours and those of installed packages, and `VARIANTS`; not `ELSEWHERE`."""
+    return [*(name for name in estimators.names() if name not in ELSEWHERE), *VARIANTS]
+
+
+def parse_filter(text: str) -> tuple[str, dict[str, Any]]:
+    """``name/option=value/...`` as a name and options; values are JSON, or else text."""
+    name, *parts = text.split("/")
+    options: dict[str, Any] = {}
+    for part in parts:
+        key, equals, value = part.partition("=")
+        if not key or not equals:
+            raise ValueError(f"filter {text!r} must be name/option=value/..., got {part!r}")
+        try:
+            options[key] = json.loads(value)
+        except json.JSONDecodeError:
+            options[key] = value
+    return name, options
+
+
+def tasks(
+    specs: Mapping[str, str | dict[str, Any]],
+    conditions: Sequence[str],
+    filters: Sequence[str],
+    trials: int,
+    seed: int,
+) -> list[Task]:
+    """One task for every scene and condition; scenes by the label they have in the table.
+
+    Raises
+    ------
+    ValueError
+        On a condition, filter, option or scene that is not known, before anything is run.
+    """
+    for condition in conditions:
+        check_one_of("condition", condition, list(CONDITIONS))
+    for text in filters:
+        name, options = parse_filter(text)
+        scene = scenes.get("uwb_room")
+        estimators.make(name, tags=scene.tags, noise=scene.noise, process=scene.process, **options)
+    for spec in specs.values():
+        digest_of(spec)
+    return [
+        Task(label, spec, condition, tuple(filters), trials, seed)
+        for label, spec in specs.items()
+        for condition in conditions
+    ]
+
+
+def is_recording(spec: str | Mapping[str, Any]) -> bool:
+    """Whether a scene of the benchmark is a recording."""
+    return isinstance(spec, Mapping) and "ranges" in spec
+
+
+def digest_of(spec: str | Mapping[str, Any]) -> str:
+    """The hash of a scene, or of a recording with its files."""
+    if is_recording(spec):
+        return recordings.load(spec).digest  # pyright: ignore[reportArgumentType]
+    return worlds.scene_hash(scenes.get(spec))
+
+
+def key_of(record: Mapping[str, Any]) -> str:
+    """What a record is the result of, as text."""
+    return json.dumps([record[name] for name in KEY], sort_keys=True)
+
+
+def timing_key(row: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a time belongs to within one run."""
+    return row["scene_hash"], row["condition"], row["filter"]
+
+
+def keys_of(task: Task) -> dict[str, str]:
+    """The key of every filter's record of a task."""
+    return {filter: key_of(_head(task, filter)) for filter in task.filters}
+
+
+def run(task: Task) -> list[tuple[dict[str, Any], float | None]]:
+    """Records of a task's filters, each with its microseconds per step (None: it did not finish).
+
+    Every filter meets the same world.
+    """
+    if is_recording(task.scene):
+        stage = bench_run.recording_stage(task.scene, task.condition, task.seed)  # pyright: ignore[reportArgumentType]
+    else:
+        stage = bench_run.scene_stage(task.scene, task.condition, task.trials, task.seed)
+    results = []
+    for text in task.filters:
+        found, microseconds = bench_run.run(stage, *parse_filter(text))
+        results.append((_head(task, text) | found, microseconds))
+    return results
+
+
+def _head(task: Task, filter: str) -> dict[str, Any]:
+    """What a record says of itself before its figures."""
+    return {
+        "scene": task.label,
+        "spec": task.scene,
+        "scene_hash": digest_of(task.scene),
+        "condition": task.condition,
+        "filter": filter,
+        "filter_source": source_of(parse_filter(filter)[0]),
+        "trials": task.trials,
+        "seed": task.seed,
+        "versions": versions(),
+    }
+
+
+def source_of(name: str) -> str:
+    """Where a filter comes from: a package and its version, or the digest of its module's file."""
+    factory = factory_of(name)
+    while isinstance(factory, functools.partial):
+        factory = factory.func
+    home = name.partition(":")[0] if ":" in name else factory.__module__
+    if home.startswith("rbl_gym."):
+        return "rbl-gym"
+    for entry in entry_points(group=estimators.ENTRY_POINT_GROUP):
+        if entry.name == name:
+            return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+    module = sys.modules.get(home) or import_module(home)
+    file = inspect.getsourcefile(module)
+    return _digest([Path(file)]) if file else name
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Versions of what the figures depend on; `code` is a digest of this package's own files."""
+    folders = [
+        Path(rbl_gym.__file__).parent,
+        *map(Path, (*estimators.__path__, *wrappers.__path__)),
+    ]
+    files = [file for folder in folders for file in folder.rglob("*.py")]
+    return {
+        "rbl-gym": rbl_gym.__version__,
+        "code": _digest(files),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+    }
+
+
+def _digest(files: list[Path]) -> str:
+    digest = hashlib.sha256()
+    for file in sorted(files, key=lambda file: (file.parent.name, file.name)):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def summary(
+    records: Sequence[Mapping[str, Any]], timings: Mapping[tuple[str, ...], float | None]
+) -> dict[str, Any]:
+    """The leaderboard as plain numbers.
+
+    Parameters
+    ----------
+    records
+        Of one run.
+    timings
+        Microseconds per step by `timing_key` of a record.
+
+    Returns
+    -------
+    A dict: ``conditions`` (what each is), ``rows``, one for each record without its lists per
+    trial, with ``difference`` to the best filter of the same world (see
+    `figures.differences`), and ``microseconds_per_step`` in the order of the rows.
+    """
+    rows = []
+    for _, world in groupby(records, key=lambda r: (r["scene"], r["scene_hash"], r["condition"])):
+        same = list(world)
+        compared = figures.differences(
+            {r["filter"]: r["per_trial"] for r in same if "per_trial" in r}, same[0]["seed"]
+        )
+        rows += [
+            {key: value for key, value in record.items() if key != "per_trial"}
+            | {"difference": compared.get(record["filter"], {})}
+            for record in same
+        ]
+    used = {record["condition"] for record in records}
+    return {
+        "benchmark": "rbl-gym bench",
+        "conditions": {name: text for name, text in CONDITIONS.items() if name in used},
+        "rows": rows,
+        "microseconds_per_step": [timings.get(timing_key(record)) for record in records],
+    }

@@ -1,0 +1,275 @@
+"""Records of the benchmark in a file of JSON lines: saved as they come, taken up, run again.
+
+Lines are in the order of the tasks once a run is complete, and hold nothing that changes from
+run to run; how long each filter took stands in a file beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rbl_gym.studies import backends
+from rbl_gym.studies.bench import leaderboard
+from rbl_gym.studies.bench.leaderboard import Task
+
+Records = list[dict[str, Any]]
+# What all records of one file have in common.
+_COMMON = ("trials", "seed", "versions")
+
+
+def timings_path(path: Path) -> Path:
+    """The file of the times beside a file of records."""
+    return path.with_suffix(".timings.jsonl")
+
+
+def run(
+    tasks: Sequence[Task],
+    path: Path,
+    *,
+    jobs: int = 1,
+    backend: str | None = None,
+    address: str | None = None,
+    fresh: bool = False,
+    advance: Callable[[int], None] = lambda steps: None,
+) -> tuple[Records, dict[tuple[str, ...], float]]:
+    """Run what a file lacks of some tasks; all their records, in order, and their times.
+
+    Every finished task is on disk before the next result is waited for: what was stopped, by
+    whatever, is taken up by the same call. Records of other scenes, conditions or filters of the
+    same trials, seed and versions stay in the file, behind those of the tasks.
+
+    Parameters
+    ----------
+    tasks
+        Of `leaderboard.tasks`.
+    path
+        File of the records.
+    jobs, backend, address
+        See `backends.each`.
+    fresh
+        Overwrite the file in place of taking it up.
+    advance
+        Called with the number of records that are there, as they come.
+
+    Raises
+    ------
+    ValueError
+        If the file holds records of other trials, another seed or other versions, or a worker
+        has other versions.
+    """
+    if fresh:
+        for file in (path, timings_path(path)):
+            file.unlink(missing_ok=True)
+    wanted = [key for task in tasks for key in leaderboard.keys_of(task).values()]
+    found = {leaderboard.key_of(record): record for record in read(path)} if path.exists() else {}
+    _check_same_run(path, list(found.values()), tasks)
+    # A line that a kill cut in half must not run into the next.
+    _write(path, list(found.values()))
+    advance(sum(key in found for key in wanted))
+    with path.open("a", encoding="utf-8") as file, timings_path(path).open("a") as times:
+        for _, results in backends.each(
+            leaderboard.run, _left(tasks, found), jobs, backend, address
+        ):
+            for record, microseconds in results:
+                _check_same_run("a worker", [record], tasks)
+                found[leaderboard.key_of(record)] = record
+                file.write(_line(record))
+                times.write(_line(_timing(record, microseconds)))
+            file.flush()
+            times.flush()
+            advance(len(results))
+    ordered = {key: found[key] for key in wanted}
+    _write(path, list((ordered | found).values()))
+    return list(ordered.values()), read_timings(path)
+
+
+def _left(tasks: Sequence[Task], found: Mapping[str, Any]) -> list[Task]:
+    """The tasks without the filters whose records are there."""
+    left = []
+    for task in tasks:
+        filters = tuple(f for f, key in leaderboard.keys_of(task).items() if key not in found)
+        if filters:
+            left.append(task._replace(filters=filters))
+    return left
+
+
+def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None:
+    common = {"trials": tasks[0].trials, "seed": tasks[0].seed, "versions": leaderboard.versions()}
+    for record in records:
+        for name in _COMMON:
+            if record[name] != common[name]:
+                raise ValueError(
+                    f"{where} has records of {name} {record[name]}, this run is of "
+                    f"{common[name]}: a file takes one run (write another, or --fresh), and "
+                    "workers need the same versions"
+                )
+
+
+def read(path: Path) -> Records:
+    """Records of a file; a last line that was cut off is left out.
+
+    Raises
+    ------
+    ValueError
+        On any other line that is not a record, with its number.
+    """
+    records: Records = []
+    lines = _text(path).split("\n")
+    for number, line in enumerate(lines, start=1):
+        if not line:
+            continue
+        try:
+            record = json.loads(line)
+            leaderboard.key_of(record)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            if number == len(lines):
+                break
+            raise ValueError(f"{path}, line {number}: no record of rbl-gym bench") from error
+        records.append(record)
+    return records
+
+
+def read_timings(path: Path) -> dict[tuple[str, ...], float]:
+    """Microseconds per step by scene hash, condition and filter."""
+    file = timings_path(path)
+    times: dict[tuple[str, ...], float] = {}
+    if not file.exists():
+        return times
+    for line in _text(file).splitlines():
+        try:
+            row = json.loads(line)
+            times[leaderboard.timing_key(row)] = row["microseconds_per_step"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue  # a time that cannot be read is no time
+    return times
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is not text in UTF-8: {error}") from error
+
+
+def _timing(record: Mapping[str, Any], microseconds: float | None) -> dict[str, Any]:
+    row = {name: record[name] for name in ("scene", "scene_hash", "condition", "filter")}
+    return row | {"microseconds_per_step": microseconds}
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    return json.dumps(row, allow_nan=False) + "\n"
+
+
+def _write(path: Path, records: Records) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_suffix(path.suffix + ".part")
+    beside.write_text("".join(map(_line, records)), encoding="utf-8")
+    os.replace(beside, path)
+
+
+# --- once more ------------------------------------------------------------------------------
+
+
+def tasks_of(records: Sequence[Mapping[str, Any]]) -> list[Task]:
+    """The tasks that give these records again."""
+    grouped: dict[str, Task] = {}
+    for record in records:
+        task = Task(
+            record["scene"], record["spec"], record["condition"],
+            (record["filter"],), record["trials"], record["seed"],
+        )  # fmt: skip
+        key = json.dumps(task._replace(filters=()), sort_keys=True)
+        before = grouped.get(key)
+        grouped[key] = task if before is None else before._replace(
+            filters=(*before.filters, record["filter"])
+        )  # fmt: skip
+    return list(grouped.values())
+
+
+def compare(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """What differs between two records, by path: both values; None where one has it not."""
+    before, after = dict(_flat("", old)), dict(_flat("", new))
+    return {
+        path: (before.get(path), after.get(path))
+        for path in sorted(before | after)
+        if before.get(path) != after.get(path)
+    }
+
+
+def _flat(path: str, value: Any) -> list[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        return [
+            pair for key in value for pair in _flat(f"{path}.{key}" if path else key, value[key])
+        ]
+    if isinstance(value, list):
+        return [pair for k, item in enumerate(value) for pair in _flat(f"{path}[{k}]", item)]
+    return [(path, value)]
+
+
+def relative_change(pair: tuple[Any, Any]) -> float:
+    """How far two numbers are apart beside the larger; inf of anything else that differs."""
+    if not all(isinstance(value, int | float) for value in pair):
+        return float("inf")
+    return abs(pair[0] - pair[1]) / max(abs(pair[0]), abs(pair[1]))
+
+
+def rerun(
+    records: Sequence[Mapping[str, Any]],
+    *,
+    jobs: int = 1,
+    backend: str | None = None,
+    address: str | None = None,
+    advance: Callable[[int], None] = lambda steps: None,
+) -> dict[str, Any]:
+    """Run again what made some records, and say what came out differently.
+
+    Returns
+    -------
+    A dict: ``records`` and ``identical`` (how many), ``changed``: rows with scene, condition,
+    filter, ``relative_change`` (the largest of a figure; None where something other than a
+    number changed), ``field`` (where that is), ``before`` and ``after``; ``versions``: name to
+    the two versions, where they differ; ``sources``: the same of filters and scenes whose own
+    files changed.
+    """
+    before = {_place(record): record for record in records}
+    rows, versions, sources, identical = [], {}, {}, 0
+    for _, results in backends.each(leaderboard.run, tasks_of(records), jobs, backend, address):
+        for record, _ in results:
+            old = before[_place(record)]
+            found = compare(old, record)
+            for path in [path for path in found if path.startswith("versions.")]:
+                versions[path.removeprefix("versions.")] = found.pop(path)
+            for path in [path for path in found if path in ("scene_hash", "filter_source")]:
+                name = record["scene" if path == "scene_hash" else "filter"]
+                sources[name] = found.pop(path)
+            identical += not found
+            if found:
+                rows.append(_change(record, found))
+        advance(len(results))
+    order = list(before)
+    rows.sort(key=lambda row: order.index(_place(row)))
+    return {
+        "records": len(records), "identical": identical, "changed": rows,
+        "versions": versions, "sources": sources,
+    }  # fmt: skip
+
+
+def _place(record: Mapping[str, Any]) -> tuple[str, ...]:
+    return record["scene"], record["condition"], record["filter"]
+
+
+def _change(record: Mapping[str, Any], found: dict[str, tuple[Any, Any]]) -> dict[str, Any]:
+    field = max(found, key=lambda path: relative_change(found[path]))
+    change = relative_change(found[field])
+    return {
+        **{name: record[name] for name in ("scene", "condition", "filter")},
+        "fields": len(found),
+        "field": field,
+        "before": found[field][0],
+        "after": found[field][1],
+        "relative_change": change if change < float("inf") else None,
+    }

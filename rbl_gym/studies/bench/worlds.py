@@ -1,0 +1,202 @@
+"""What filters are shown in the benchmark, the truth behind it, and how far the two differ.
+
+A world is a batch of episodes of a scene under a condition. Its random numbers do not depend on
+the filter, and those of motion, prior and ranges not on the condition either: every comparison
+is paired.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds
+from rbl_gym.checks import FloatArray
+from rbl_gym.worlds import scene_bounds, simulation
+from rbl_gym.worlds.scene import Scene
+
+NLOS_PROBABILITY, DROP_PROBABILITY = 0.1, 0.5
+NOISE_FACTOR, ANCHOR_ERROR_M, TAG_ERROR_M = 2.0, 0.5, 0.05
+CONDITIONS = {
+    "nominal": "the filter knows the scene as it is",
+    "nlos": "10 % of the ranges over a reflected path, as much longer as the scene's links say",
+    "lost-links": "half of the links give no range",
+    "noise-x2": "noise twice what the filter is told",
+    "anchor-off": "the filter's place of the first anchor is 0.5 m off, another way every trial",
+    "tag-off": "the filter's place of the first tag is 5 cm off",
+}
+# Which stream of a scene's randomness: what happens, the links besides, the errors of the told.
+_WORLD, _LINKS, _TOLD = range(3)
+
+
+class World(NamedTuple):
+    """A batch of B episodes of K epochs.
+
+    Attributes
+    ----------
+    told
+        The scene as filters are told it: tags, noise, process, dt.
+    tags
+        True places on the body (N, 3).
+    rotation, translation
+        True poses (K, B, 3, 3), (K, B, 3).
+    twists
+        Of the interval that ends at each epoch (K, B, 6).
+    observations
+        One per epoch: `ranges`, `links`, `anchors` as told, and in scenes with obstacles
+        `quality`.
+    prior
+        Rotation, translation and covariance before the first epoch.
+    bound
+        Posterior Cramer-Rao covariance (K, B, 6, 6) under the true laws and the links that
+        gave a range; reflected ones count as clean.
+    anchors
+        True places (B, M, 3).
+    """
+
+    told: Scene
+    tags: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+    twists: FloatArray
+    observations: list[dict[str, np.ndarray]]
+    prior: tuple[FloatArray, FloatArray, FloatArray]
+    bound: FloatArray
+    anchors: FloatArray
+
+
+def simulate(scene: Scene, condition: str, trials: int, seed: int) -> World:
+    """The world of a scene under one of `CONDITIONS`.
+
+    Anchors stay where they start.
+    """
+    true = _true_scene(scene, condition)
+    entropy = [seed, int(scene_hash(scene), 16)]
+    draws = _draws(scene, true, trials, entropy)
+    episode = simulation.build_episode(true, draws)
+    told, anchors = _told(
+        scene, condition, episode.anchors, np.random.default_rng([*entropy, _TOLD])
+    )
+    observations, covariances = [], []
+    information = None
+    for epoch in range(true.steps + 1):
+        at = simulation.epoch_of(episode, epoch)
+        measured = simulation.measure(true, at, episode.anchors)
+        information, _ = scene_bounds.posterior_step(
+            true, at, episode.anchors, measured.links, information, episode.prior_covariance
+        )
+        seen = {"ranges": measured.ranges, "links": measured.links, "anchors": anchors}
+        if true.obstacles:
+            seen["quality"] = simulation.link_quality(true, at, episode.anchors)
+        observations.append(seen)
+        covariances.append(np.linalg.inv(information))
+    return World(
+        told,
+        np.asarray(scene.tags),
+        np.moveaxis(episode.rotation, 1, 0),
+        np.moveaxis(episode.translation, 1, 0),
+        np.moveaxis(np.broadcast_to(episode.twists, (*episode.translation.shape[:2], 6)), 1, 0),
+        observations,
+        (episode.prior_rotation, episode.prior_translation, episode.prior_covariance),
+        np.array(covariances),
+        np.asarray(episode.anchors),
+    )
+
+
+def _true_scene(scene: Scene, condition: str) -> Scene:
+    links = scene.links
+    if condition == "nlos":
+        probability = max(links.nlos_probability, NLOS_PROBABILITY)
+        return dataclasses.replace(
+            scene, links=dataclasses.replace(links, nlos_probability=probability)
+        )
+    if condition == "lost-links":
+        probability = max(links.drop_probability, DROP_PROBABILITY)
+        return dataclasses.replace(
+            scene, links=dataclasses.replace(links, drop_probability=probability)
+        )
+    if condition == "noise-x2":
+        return dataclasses.replace(scene, noise=_noisier(scene.noise, NOISE_FACTOR))
+    return scene
+
+
+def _noisier(noise: Any, factor: float) -> Any:
+    scaled = {
+        field.name: factor * getattr(noise, field.name)
+        for field in dataclasses.fields(noise)
+        if field.name in ("floor_m", "proportional", "sigma_m")
+    }
+    if not scaled:
+        raise ValueError(f"condition noise-x2 cannot double {noise!r:.80}")
+    return dataclasses.replace(noise, **scaled)
+
+
+def _draws(scene: Scene, true: Scene, trials: int, entropy: list[int]) -> simulation.Draws:
+    """The scene's own random numbers; what the condition's links need besides comes after."""
+    draws = simulation.draw(scene, np.random.default_rng([*entropy, _WORLD]), (trials,))
+    more = simulation.empty_draws(true, 1).uniforms.shape[-1] - draws.uniforms.shape[-1]
+    besides = np.random.default_rng([*entropy, _LINKS]).random((trials, more))
+    return simulation.Draws(draws.normals, np.concatenate([draws.uniforms, besides], axis=-1))
+
+
+def _told(
+    scene: Scene, condition: str, anchors: FloatArray, rng: np.random.Generator
+) -> tuple[Scene, FloatArray]:
+    """The scene and the anchors (B, M, 3) that filters are told."""
+    if condition == "anchor-off":
+        return scene, off_by(anchors, ANCHOR_ERROR_M, rng)
+    if condition == "tag-off":
+        return dataclasses.replace(
+            scene, tags=off_by(np.array(scene.tags), TAG_ERROR_M, rng)
+        ), anchors
+    return scene, anchors
+
+
+def off_by(points: FloatArray, distance_m: float, rng: np.random.Generator) -> FloatArray:
+    """Points (..., N, 3), the first of them moved by a distance in a random direction."""
+    direction = rng.standard_normal((*points.shape[:-2], 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    moved = np.array(points)
+    moved[..., 0, :] += distance_m * direction
+    return moved
+
+
+def pose_rank(world: World) -> int:
+    """How many of the 6 directions of the pose the first epoch's full links determine."""
+    information = bounds.information_at(
+        world.anchors, world.tags, world.rotation[0], world.translation[0], world.told.noise
+    )
+    return int(bounds.information_rank(information).min())
+
+
+def mirrored(world: World) -> FloatArray | None:
+    """Images (K, B, 3) of the true positions behind the plane of the anchors, if they have one."""
+    centre = world.anchors.mean(axis=-2)
+    _, size, axes = np.linalg.svd(world.anchors - centre[:, None], full_matrices=False)
+    if world.anchors.shape[-2] < 3 or not (size[:, 2] <= 1e-6 * size[:, 0]).all():
+        return None
+    normal = axes[:, 2]
+    height = np.einsum("kbi,bi->kb", world.translation - centre, normal)
+    return world.translation - 2 * height[..., None] * normal
+
+
+def scene_hash(scene: Scene) -> str:
+    """Sixteen hexadecimal digits of everything that makes the scene."""
+    text = json.dumps(scene_facts(scene), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def scene_facts(value: Any) -> Any:
+    """A scene as plain numbers, lists and dicts; parts of several kinds carry their `kind`."""
+    if dataclasses.is_dataclass(value):
+        fields = {f.name: scene_facts(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"kind": type(value).__name__, **fields}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [scene_facts(item) for item in value]
+    return value

@@ -1,0 +1,210 @@
+"""Hard conditions: lost and reflected links, wrong starts, outages; filters against bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.studies import monte_carlo
+from rbl_gym.studies.monte_carlo import World
+from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.worlds.scene import Scene
+
+LINK_SCENES = ("uwb_room", "drone_yard")
+CONDITIONS: dict[str, dict[str, float]] = {
+    "all links": {},
+    "10 % NLOS": {"nlos_probability": 0.1},
+    "20 % NLOS": {"nlos_probability": 0.2},
+    "50 % lost": {"drop_probability": 0.5},
+    "50 % lost, 10 % NLOS": {"drop_probability": 0.5, "nlos_probability": 0.1},
+}
+FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "iekf": ("iekf", {}),
+    "iekf, robust": ("iekf", {"robust": True}),
+    "bank, robust": ("iekf-bank", {"robust": True}),
+}
+START_SCENES = ("uwb_room", "drone_yard", "satellite", "auv_buoys")
+STARTS = ("wrong", "nothing", "outage", "wrong, 10 % NLOS")
+START_FILTERS = ("iekf", "bank")
+# Where anchors in a plane leave a mirror pose, a bank that knows the side besides.
+_COPLANAR = ("auv_buoys",)
+# An error whose square in the bound's covariance is above this is no chance (mean 6).
+LOST = 100.0
+# Epochs of the wrong starts; the outage's links and odometry are gone for `_GONE` of them.
+_START_STEPS, _GONE = 20, range(5, 50)
+_WRONG_RAD, _WRONG_M = np.pi, 10.0
+# Epochs after a wrong start, or after an outage, at which it is asked who is back.
+AFTER = (0, 1, 2, 5, 10)
+
+
+class _Case(NamedTuple):
+    """A world, its bound by which errors are judged, and the epoch at which links are back."""
+
+    world: World
+    information: FloatArray
+    back: int
+
+
+def work_units() -> int:
+    """How often `run` calls `advance`."""
+    links = len(LINK_SCENES) * len(CONDITIONS) * len(FILTERS)
+    return links + len(STARTS) * sum(len(_start_filters(name)) for name in START_SCENES)
+
+
+def _start_filters(scene: str) -> tuple[str, ...]:
+    return (*START_FILTERS, "bank, volume") if scene in _COPLANAR else START_FILTERS
+
+
+def run(trials: int, seed: int, advance: Callable[[], None] = lambda: None) -> dict[str, Any]:
+    """All filters under all conditions, and all starts.
+
+    Returns
+    -------
+    A dict of plain numbers. ``links[scene][condition]``: `share_good`, of links that measured on
+    a straight path; `filters`, each with its RMSE over two posterior Cramer-Rao bounds, averaged
+    over the epochs (``clean``: all links on straight paths; ``good``: the straight ones that
+    were there), NEES, the largest errors, `lost` (share of trials with an error of more than
+    `LOST` in the bound's covariance at the end, or ever), microseconds a step.
+    ``starts[scene][start][filter]``: share of the trials that are back `AFTER` so many epochs.
+    """
+    result: dict[str, Any] = {"experiment": "hard", "trials": trials, "seed": seed}
+    result["links"] = {}
+    for i, name in enumerate(LINK_SCENES):
+        table = result["links"][name] = {}
+        for k, (condition, links) in enumerate(CONDITIONS.items()):
+            scene = scenes.get({"name": name, "links": links})
+            rng = np.random.default_rng([seed, 0, i, k])
+            table[condition] = _links(scene, trials, rng, advance)
+    result["starts"] = {"after": list(AFTER), "scenes": {}}
+    for i, name in enumerate(START_SCENES):
+        rows = result["starts"]["scenes"][name] = {}
+        for k, start in enumerate(STARTS):
+            case = _start(name, start, trials, np.random.default_rng([seed, 1, i, k]))
+            rows[start] = {
+                label: _back(case, label, "NLOS" in start, advance)
+                for label in _start_filters(name)
+            }
+    return result
+
+
+# --- links ---------------------------------------------------------------------------------------
+
+
+def _links(
+    scene: Scene, trials: int, rng: np.random.Generator, advance: Callable[[], None]
+) -> dict[str, Any]:
+    """All filters on the same episodes of one scene and condition."""
+    world = monte_carlo.simulate_world(scene, trials, rng)
+    measured = _ranges(world)
+    good = [m.links & ~m.nlos for m in measured]
+    clean = _bound(world, [np.ones_like(m.links) for m in measured])
+    straight = _bound(world, good)
+    row: dict[str, Any] = {"share_good": float(np.mean(good)), "filters": {}}
+    for label, (name, options) in FILTERS.items():
+        trace = monte_carlo.run(world, name, options)
+        distance = _squared_distance(trace.error, straight)
+        row["filters"][label] = {
+            "clean": _ratios(trace.error, clean),
+            "good": _ratios(trace.error, straight),
+            "nees": float(trace.nees.mean()),
+            "largest_error_m": float(np.linalg.norm(trace.error[..., 3:], axis=-1).max()),
+            "largest_error_deg": float(
+                np.rad2deg(np.linalg.norm(trace.error[..., :3], axis=-1).max())
+            ),
+            "lost_at_the_end": float((distance[-1] > LOST).mean()),
+            "lost_ever": float((distance > LOST).any(axis=0).mean()),
+            "microseconds_per_step": 1e6 * trace.seconds,
+        }
+        advance()
+    return row
+
+
+def _ranges(world: World) -> list[ranging.Measurement]:
+    return [m for m in world.measurements if isinstance(m, ranging.Measurement)]
+
+
+def _bound(world: World, links: list[Any]) -> FloatArray:
+    """Posterior Cramer-Rao bound (K, B, 6, 6) of an episode's true poses with these links."""
+    episode, rows, information = world.episode, [], None
+    for epoch, mask in enumerate(links):
+        at = simulation.epoch_of(episode, epoch)
+        information = scene_bounds.posterior_information(
+            world.scene, at, episode.anchors, mask, information, episode.prior_covariance
+        )
+        rows.append(np.linalg.inv(information))
+    return np.array(rows)
+
+
+def _ratios(error: FloatArray, bound: FloatArray) -> dict[str, float]:
+    """RMSE over the bound's, per epoch, averaged over the epochs: rotation and translation."""
+    variance = np.diagonal(bound, axis1=-2, axis2=-1).mean(axis=1)
+    square = np.square(error).mean(axis=1)
+    return {
+        name: float(np.sqrt(square[:, axes].sum(-1) / variance[:, axes].sum(-1)).mean())
+        for name, axes in (("rotation", slice(0, 3)), ("translation", slice(3, 6)))
+    }
+
+
+def _squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    return np.einsum("...i,...i->...", error, np.linalg.solve(covariance, error[..., None])[..., 0])
+
+
+# --- starts --------------------------------------------------------------------------------------
+
+
+def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Case:
+    """Episodes whose filters are told something wrong, nothing, or lose sight on the way."""
+    links = {"nlos_probability": 0.1} if "NLOS" in start else {}
+    back = _GONE.stop if start == "outage" else 0
+    scene = scenes.get({"name": name, "links": links, "steps": back + _START_STEPS})
+    world = monte_carlo.simulate_world(scene, trials, rng)
+    information = np.linalg.inv(world.bound)
+    episode = world.episode
+    if start == "outage":
+        twists = episode.twists.copy()
+        twists[:, _GONE.start : _GONE.stop + 1] = 0.0
+        measurements = [
+            m._replace(links=np.zeros_like(m.links)) if epoch in _GONE else m
+            for epoch, m in enumerate(_ranges(world))
+        ]
+        return _Case(
+            world._replace(episode=episode._replace(twists=twists), measurements=measurements),
+            information,
+            back,
+        )
+    if start == "nothing":
+        low, high = scene.volume.bounds()
+        std = [np.pi] * 3 + [float(np.ptp([low, high], axis=0).max())] * 3
+        rotation = np.broadcast_to(np.eye(3), (trials, 3, 3))
+        translation = np.broadcast_to(0.5 * (low + high), (trials, 3))
+        covariance = np.broadcast_to(np.diag(np.square(std)), (trials, 6, 6))
+    else:
+        units = rng.standard_normal((2, trials, 3))
+        turn, shift = units / np.linalg.norm(units, axis=-1, keepdims=True)
+        rotation = rotations.exp(_WRONG_RAD * turn) @ episode.rotation[:, 0]
+        translation = episode.translation[:, 0] + _WRONG_M * shift
+        covariance = episode.prior_covariance
+    episode = episode._replace(
+        prior_rotation=rotation, prior_translation=translation, prior_covariance=covariance
+    )
+    return _Case(world._replace(episode=episode), information, back)
+
+
+def _back(case: _Case, label: str, robust: bool, advance: Callable[[], None]) -> dict[str, Any]:
+    """Who is back when, and what a step took."""
+    options: dict[str, Any] = {"robust": robust}
+    if label == "bank, volume":
+        options["volume"] = case.world.scene.volume.bounds()
+    trace = monte_carlo.run(case.world, "iekf" if label == "iekf" else "iekf-bank", options)
+    distance = np.einsum("...i,...ij,...j->...", trace.error, case.information, trace.error)
+    share = (distance < LOST).mean(axis=1)
+    advance()
+    return {
+        "back": [float(share[case.back + k]) for k in AFTER],
+        "microseconds_per_step": 1e6 * trace.seconds,
+    }

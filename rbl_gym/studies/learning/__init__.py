@@ -1,0 +1,1 @@
+"""Learning tasks: training, policies, evaluation on held-out worlds, transfer to filters."""

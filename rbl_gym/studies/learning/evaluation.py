@@ -1,0 +1,312 @@
+"""Policies and references on held-out worlds, side by side, with confidence intervals.
+
+The loss L of a policy in a world is the mean of log b: of the final layout in a placement task, of
+all steps in a task with a filter in the loop; where anchors have a price, minus the mean
+reward. Normalised = (L_random - L) / (L_random - L_best), L_best that of the strongest
+reference.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rbl_gym import placement
+from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.placement import layouts, search
+from rbl_gym.placement.problem import Context, PlacementTask
+from rbl_gym.studies.learning.policies import Policy, check_fit
+from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
+from rbl_gym.wrappers import controllers
+
+# The reference that is one layout for all contexts, and the contexts it is optimised over.
+_ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
+# The search that counts as 1.
+_STRONGEST = "cma-es"
+# Random layouts of each context; and generations of CMA-ES that refine a policy's proposal.
+_RANDOM_TRIES = 8
+REFINE_GENERATIONS = 12
+_REFINE_SIGMA = 0.1
+_RESAMPLES = 2000
+
+
+def references(task: RlTask) -> list[str]:
+    """Names of a task's references; the last is the strongest."""
+    if task.env_id == "RBL/AnchorPlacement-v0":
+        if task.arguments.get("mode") == "mounts":
+            return ["random", "greedy", "greedy-swaps"]
+        searches = sorted(search.SEARCHES, key=lambda name: name == _STRONGEST)
+        return [*layouts.LAYOUTS, _ONE_LAYOUT, *searches]
+    return list(_controllers(task))
+
+
+def _controllers(task: RlTask) -> dict[str, controllers.Controller]:
+    mobile = task.env_id == "RBL/MobileAnchors-v0"
+    return controllers.MOBILE if mobile else controllers.SELECTION
+
+
+def evaluate(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> dict[str, Any]:
+    """Losses of policies and references on the same `worlds` held-out worlds.
+
+    Parameters
+    ----------
+    task
+        What is played.
+    policies
+        By the label they are to have. In a placement task each also comes refined by a few
+        generations of CMA-ES, ``LABEL + cma-es``.
+    names
+        Of `references`; ``random`` and the strongest come in any case.
+    worlds, seed
+        How many, and which.
+    advance
+        Called after each.
+
+    Raises
+    ------
+    ValueError
+        On an unknown reference, or a policy that does not fit the task.
+    """
+    known = references(task)
+    names = [check_one_of("reference", name, known) for name in names]
+    names = [name for name in known if name in {*names, known[0], known[-1]}]
+    play = _placement_losses if task.env_id == "RBL/AnchorPlacement-v0" else _loop_losses
+    losses = play(task, policies, names, worlds, seed, advance)
+    rng = np.random.default_rng([seed, len(known) + 1])
+    resamples = rng.integers(worlds, size=(_RESAMPLES, worlds))
+    methods: dict[str, dict[str, Any]] = {
+        name: _figures(loss, losses["random"], losses[known[-1]], resamples)
+        for name, loss in losses.items()
+    }
+    for figures in methods.values():
+        # With a price in it, a loss is no longer the logarithm of metres.
+        priced = task.arguments.get("mode") == "priced"
+        figures["score_m"] = None if priced else math.exp(figures["loss"])
+    return {
+        "worlds": worlds,
+        "seed": seed,
+        "best_reference": known[-1],
+        "methods": methods,
+    }
+
+
+def held_out_returns(task: RlTask, policy: Policy, worlds: int, seed: int) -> dict[str, Any]:
+    """Returns of the policy as it is saved, and of random actions, in the worlds of `evaluate`.
+
+    A training's own returns are those of actions drawn about the policy's, in other worlds.
+    """
+    check_fit(policy, str(policy.meta.get("task")), task.make(1))
+
+    def by_chance(env: Any, _: np.ndarray) -> np.ndarray:
+        return env.action_space.sample()
+
+    result: dict[str, Any] = {"worlds": worlds}
+    for name, act in (("policy", lambda _, seen: policy(seen)), ("random", by_chance)):
+        returns = _returns(task, act, worlds, seed)[0]
+        result[f"{name}_mean_return"] = float(returns.mean())
+        spread = float(returns.std(ddof=1)) if worlds > 1 else 0.0
+        result[f"{name}_std_error"] = spread / math.sqrt(worlds)
+    return result
+
+
+def work_units(task: RlTask, names: list[str], n_policies: int) -> int:
+    """How often `evaluate` calls `advance`."""
+    known = references(task)
+    refined = task.env_id == "RBL/AnchorPlacement-v0" and task.arguments.get("mode") != "mounts"
+    return len({*names, known[0], known[-1]}) + n_policies * (2 if refined else 1)
+
+
+def _figures(
+    loss: FloatArray, random: FloatArray, best: FloatArray, resamples: np.ndarray
+) -> dict[str, float]:
+    """Mean loss, and the normalised value with a paired bootstrap interval."""
+    means = [array[resamples].mean(axis=-1) for array in (random, loss, best)]
+    normalised = (means[0] - means[1]) / (means[0] - means[2])
+    low, high = np.quantile(normalised, [0.025, 0.975])
+    return {
+        "loss": float(loss.mean()),
+        "loss_std_error": float(loss.std(ddof=1) / math.sqrt(len(loss))) if len(loss) > 1 else 0.0,
+        "normalised": float((random.mean() - loss.mean()) / (random.mean() - best.mean())),
+        "normalised_low": float(low),
+        "normalised_high": float(high),
+    }
+
+
+def _check_policies(task: RlTask, policies: dict[str, Policy]) -> None:
+    """Before hours of references: a ValueError on a policy that cannot be played or told apart."""
+    envs = task.make(1)
+    for label, policy in policies.items():
+        if label in references(task):
+            raise ValueError(f"policy {label!r} has the name of a reference: rename its file")
+        check_fit(policy, label, envs)
+
+
+def _held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str, Any]]:
+    """An environment at the start of its held-out episodes, its observation and info."""
+    env = task.make(worlds, "Disabled")
+    return env, *env.reset(seed=HELD_OUT_SEED + SEED_STRIDE * seed)
+
+
+def _of_all(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    seed: int,
+    advance: Callable[[], None],
+    of_reference: Callable[[str, np.random.Generator], FloatArray],
+    of_policy: Callable[[Policy], FloatArray],
+) -> dict[str, FloatArray]:
+    """What two functions give of references, each with a generator of its own, and of policies."""
+    _check_policies(task, policies)
+    found = {}
+    for name in names:
+        rng = np.random.default_rng([seed, references(task).index(name)])
+        found[name] = of_reference(name, rng)
+        advance()
+    for label, policy in policies.items():
+        found[label] = of_policy(policy)
+        advance()
+    return found
+
+
+# --- tasks played step by step ----------------------------------------------------------------
+
+
+def _loop_losses(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> dict[str, FloatArray]:
+    def reference(name: str, rng: np.random.Generator) -> FloatArray:
+        controller = _controllers(task)[name]
+        return _rollout(task, lambda env, _: controller(env, rng), worlds, seed)
+
+    def policy(played: Policy) -> FloatArray:
+        return _rollout(task, lambda _, seen: played(seen), worlds, seed)
+
+    return _of_all(task, policies, names, seed, advance, reference, policy)
+
+
+def _rollout(
+    task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
+) -> FloatArray:
+    """Losses (worlds,) of one episode of each world."""
+    returns, steps = _returns(task, act, worlds, seed)
+    return -returns / steps
+
+
+def _returns(
+    task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
+) -> tuple[FloatArray, int]:
+    """Sums of the rewards (worlds,) of one episode of each world, and its steps."""
+    env, observation, _ = _held_out(task, worlds, seed)
+    env.action_space.seed(seed)
+    total, steps = np.zeros(worlds), 0
+    done = np.zeros(worlds, dtype=np.bool_)
+    while not done.all():
+        observation, reward, terminated, truncated, _ = env.step(act(env, observation))
+        total += reward
+        steps += 1
+        done = terminated | truncated
+    return total, steps
+
+
+# --- placement --------------------------------------------------------------------------------
+
+
+def _placement_losses(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> dict[str, FloatArray]:
+    problem, contexts, found = layouts_of(task, policies, names, worlds, seed, advance)
+    if task.arguments.get("mode") != "mounts":
+        for label in policies:
+            rng = np.random.default_rng([seed, len(references(task))])
+            found[f"{label} + cma-es"] = _refined(problem, contexts, found[label], rng)
+            advance()
+    return {name: _loss_of(problem, contexts, anchors) for name, anchors in found.items()}
+
+
+def layouts_of(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> tuple[PlacementTask, Context, dict[str, FloatArray]]:
+    """The problem, held-out contexts, and layouts (C, M, 3) of references and policies.
+
+    The random ones are (C, 8, M, 3).
+    """
+    env, _, _ = _held_out(task, worlds, seed)
+    found = _of_all(
+        task, policies, names, seed, advance,
+        lambda name, rng: _reference_layout(task, env, name, rng),
+        lambda policy: _policy_layout(task, policy, worlds, seed),
+    )  # fmt: skip
+    return env.task, env.contexts, found
+
+
+def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generator) -> FloatArray:
+    problem, contexts = env.task, env.contexts
+    worlds = len(contexts.centre)
+    if task.arguments.get("mode") == "mounts":
+        candidates = placement.mounts(problem)
+        if name == "random":
+            draws = rng.random((worlds, _RANDOM_TRIES, len(candidates)))
+            return candidates[draws.argsort(axis=-1)[..., : problem.n_anchors]]
+        return search.greedy(
+            problem, contexts, rng, candidates=candidates, swaps=name == "greedy-swaps"
+        )
+    if name == "random":
+        shape = (worlds, _RANDOM_TRIES, problem.n_anchors, 3)
+        return problem.scene.anchor_region.draw(rng.random(shape))
+    if name == _ONE_LAYOUT:
+        training = placement.draw_contexts(problem, rng, (_TRAINING_CONTEXTS,))
+        one = search.shared_layout(problem, training, rng)
+        return np.broadcast_to(one, (worlds, *one.shape))
+    return {**layouts.LAYOUTS, **search.SEARCHES}[name](problem, contexts, rng)
+
+
+def _policy_layout(task: RlTask, policy: Policy, worlds: int, seed: int) -> FloatArray:
+    env, observation, info = _held_out(task, worlds, seed)
+    done = np.zeros(worlds, dtype=np.bool_)
+    while not done.all():
+        observation, _, done, _, info = env.step(policy(observation))
+    return info["anchors"]
+
+
+def _loss_of(problem: PlacementTask, contexts: Context, anchors: FloatArray) -> FloatArray:
+    """Log scores (C,) of layouts, of several the mean."""
+    if anchors.ndim == 4:
+        scores = placement.score(problem, search.expand(contexts), anchors)
+        return np.log(scores).mean(axis=-1)
+    return np.log(placement.score(problem, contexts, anchors))
+
+
+def _refined(
+    problem: PlacementTask, contexts: Context, anchors: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Layouts after a tenth of the generations that CMA-ES alone takes."""
+    return search.cma_es(
+        problem, contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
+        start=anchors,
+    )  # fmt: skip

@@ -1,0 +1,176 @@
+"""Do layouts that are good by the bound track well? They are rolled through real filters.
+
+Bodies move through way-points in each work region among anchors that a method placed; a filter
+tracks them from the scene's prior, told which links lack sight. Compared are the score b, which
+the layouts were made for, and the filter's root mean square tag error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import estimators, metrics, motion, placement
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry import rotations as rot
+from rbl_gym.measurements import ranging
+from rbl_gym.placement import search
+from rbl_gym.placement.problem import Context, PlacementTask
+from rbl_gym.studies.learning import evaluation
+from rbl_gym.studies.learning.rl_tasks import RlTask
+
+# Steps of an episode, of which the first are the filter's settling; way-points of an episode.
+_STEPS, _SETTLING, _POINTS = 40, 10, 12
+# Links over a reflected path in the column of that name: how many, and how much longer.
+NLOS_PROBABILITY, NLOS_BIAS_M = 0.1, 5.0
+FILTERS = {
+    "iekf": ("iekf", {"iterations": 2}, False),
+    "iekf-bank": ("iekf-bank", {}, False),
+    "iekf, reflections": ("iekf", {"iterations": 4, "robust": True}, True),
+    "uc-kf": ("uc-kf", {}, False),
+}
+
+
+def references(task: RlTask) -> list[str]:
+    """Layouts besides those of policies, as far as the task knows them."""
+    known = evaluation.references(task)
+    return [name for name in ("random", "ring", "greedy-swaps", "cma-es") if name in known]
+
+
+def filters(task: RlTask) -> list[str]:
+    """Filters that can track in the task's scene: UC-KF needs anchors that are not coplanar."""
+    low, high = placement.task(task.arguments["scene"]).scene.anchor_region.bounds()
+    return [name for name in FILTERS if name != "uc-kf" or (high > low).all()]
+
+
+class Bodies(NamedTuple):
+    """Moving bodies (T + 1, B, ...): poses, twists into each epoch, normals of their ranges."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    twists: FloatArray
+    normals: FloatArray
+    reflected: BoolArray
+    prior: tuple[FloatArray, FloatArray]
+
+
+def run(
+    task: PlacementTask,
+    contexts: Context,
+    layouts: dict[str, FloatArray],
+    filters: list[str],
+    repeats: int,
+    seed: int,
+    advance: Callable[[], None],
+) -> dict[str, Any]:
+    """Scores and filter errors of layouts (C, M, 3) or (C, L, M, 3) of contexts (C,).
+
+    Every layout meets the same bodies. Returns, for each filter and label, the mean logarithms of
+    score and error, and their correlation over the layouts (None of fewer than three).
+    """
+    bodies = _bodies(task, contexts, repeats, np.random.default_rng([seed, 2]))
+    scores = {
+        label: placement.score(
+            task, search.expand(contexts) if anchors.ndim == 4 else contexts, anchors
+        )
+        for label, anchors in layouts.items()
+    }
+    result: dict[str, Any] = {"steps": _STEPS, "repeats": repeats, "filters": {}}
+    for name in filters:
+        rows = {}
+        for label, anchors in layouts.items():
+            several = anchors if anchors.ndim == 4 else anchors[:, None]
+            errors = np.stack(
+                [
+                    _tag_rmse(task, contexts, several[:, k], bodies, name, repeats)
+                    for k in range(several.shape[1])
+                ],
+                axis=1,
+            )
+            score = scores[label].reshape(errors.shape)
+            rows[label] = {
+                "score_m": float(np.exp(np.log(score).mean())),
+                "tag_rmse_m": float(np.exp(np.log(errors).mean())),
+                "correlation": _correlation(np.log(score).ravel(), np.log(errors).ravel()),
+            }
+            advance()
+        result["filters"][name] = rows
+    return result
+
+
+def _correlation(first: FloatArray, second: FloatArray) -> float | None:
+    return float(np.corrcoef(first, second)[0, 1]) if len(first) > 2 else None
+
+
+def _bodies(
+    task: PlacementTask, contexts: Context, repeats: int, rng: np.random.Generator
+) -> Bodies:
+    """`repeats` bodies in each work region, flat over both."""
+    scene = task.scene
+    centre, half = (np.repeat(array, repeats, axis=0) for array in contexts[:2])
+    batch = len(centre)
+    points = centre[:, None] + half[:, None] * rng.uniform(-1, 1, (batch, _POINTS, 3))
+    spin = scene.spin_rad_s * rng.standard_normal((batch, 3))
+    start = rot.random(rng, (batch,))
+    nominal = motion.waypoints(start, points, scene.speed_m_s, scene.dt, _STEPS, spin)
+    path = motion.simulate(
+        nominal, scene.dt, scene.process, rng.standard_normal((batch, _STEPS, 6))
+    )
+    offset = rng.standard_normal((batch, 6))
+    shape = (_STEPS + 1, batch, task.n_anchors, len(scene.tags))
+    prior = (
+        rot.exp(scene.initial_rotation_rad * offset[:, :3]) @ path.rotation[:, 0],
+        path.translation[:, 0] + scene.initial_translation_m * offset[:, 3:],
+    )
+    return Bodies(
+        np.moveaxis(path.rotation, 1, 0),
+        np.moveaxis(path.translation, 1, 0),
+        np.moveaxis(np.broadcast_to(nominal.twists, (batch, _STEPS, 6)), 1, 0),
+        rng.standard_normal(shape),
+        rng.random(shape) < NLOS_PROBABILITY,
+        prior,
+    )
+
+
+def _tag_rmse(
+    task: PlacementTask,
+    contexts: Context,
+    anchors: FloatArray,
+    bodies: Bodies,
+    name: str,
+    repeats: int,
+) -> FloatArray:
+    """Root mean square tag error (C,) of a filter, after settling."""
+    scene, tags = task.scene, np.asarray(task.scene.tags)
+    kind, options, reflections = FILTERS[name]
+    anchors = np.repeat(anchors, repeats, axis=0)
+    obstacles = task.obstacles(Context(*(np.repeat(field, repeats, axis=0) for field in contexts)))
+    laws = {"tags": tags, "noise": scene.noise, "process": scene.process}
+    filter = estimators.make(kind, **laws, **options)
+    state: Any = None
+    total = np.zeros(len(anchors))
+    for k in range(_STEPS + 1):
+        rotation, translation = bodies.rotation[k], bodies.translation[k]
+        scale = obstacles.share(anchors, translation[:, None])[:, 0, :, None] ** -0.5
+        distance = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
+        ranges = scene.noise.sample(distance, scale * bodies.normals[k])
+        if reflections:
+            ranges = ranges + NLOS_BIAS_M * bodies.reflected[k]
+        ranges = np.maximum(ranges, 1e-3)
+        law = None
+        if obstacles:
+            law = ranging.LinkNoise(scale * np.sqrt(scene.noise.variance(ranges)))
+        if k == 0:
+            state = filter.initial(*bodies.prior, scene.prior_covariance)
+        else:
+            state = filter.predict(state, bodies.twists[k - 1], scene.dt)
+        state = filter.update(state, ranges, anchors, noise=law)
+        if k > _SETTLING:
+            belief = filter.belief(state)
+            error = metrics.tag_error(
+                belief.rotation, belief.translation, rotation, translation, tags
+            )
+            total += error**2
+    return np.sqrt(total.reshape(-1, repeats).mean(axis=-1) / (_STEPS - _SETTLING))

@@ -1,0 +1,170 @@
+"""rbl-gym network: orientations of a planar network or pose graph from a file."""
+
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportArgumentType=false, reportCallIssue=false
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+
+from rbl_gym import estimators
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.networks.orientations import cost, residuals
+from rbl_gym.networks import g2o, graphs
+from rbl_gym.networks.g2o import PoseGraph
+from rbl_gym.networks.sensing import IntArray
+
+WEIGHTS = ("information", "unit")
+_WORST = 5  # edges that are listed
+
+
+class Solved(NamedTuple):
+    """A network and its orientations."""
+
+    result: dict[str, Any]  # plain numbers
+    graph: PoseGraph
+    theta: FloatArray  # (n,)
+    residual: FloatArray  # (m,) radians
+    positions: FloatArray | None  # (n, 2), where the file has displacements
+
+
+def run(path: str, weights: str = "information") -> Solved:
+    """Read a file, solve, certify.
+
+    Parameters
+    ----------
+    path
+        The file.
+    weights
+        ``"information"``: the information of theta, I33, of each edge; a file that has none at
+        all leaves all edges alike. ``"unit"``: all edges alike, whatever the file says.
+
+    Raises
+    ------
+    ValueError
+        If the file is not as described, the graph is not connected, or the information of
+        theta is missing where it matters. The message names the file and its nodes.
+    """
+    graph = g2o.read_graph(path)
+    try:
+        return _solved(path, graph, weights)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _solved(path: str, graph: PoseGraph, weights: str) -> Solved:
+    n_nodes = len(graph.ids)
+    graphs.check_connected(graph.edges, n_nodes, graph.ids)
+    weight = edge_weights(graph) if weights == "information" else np.ones(len(graph.edges))
+    used = weight > 0
+    edges, y, w = graph.edges[used], graph.y[used], weight[used]
+    if not used.all():
+        try:
+            graphs.check_connected(edges, n_nodes, graph.ids)
+        except ValueError as error:
+            raise ValueError(f"of those with information of theta (I33 above 0): {error}; "
+                             "--weights unit takes all edges alike") from error  # fmt: skip
+    begin = time.perf_counter()
+    theta = estimators.orientations(edges, y, n_nodes, weights=w)
+    solved = time.perf_counter()
+    optimum = estimators.chordal_optimum(edges, y, n_nodes, start=theta, weights=w)
+    certified = time.perf_counter()
+    residual = residuals(graph.edges, graph.y, theta)
+    tree = estimators.orientations(edges, y, n_nodes, method="tree")
+    worst = np.argsort(-np.abs(residual), kind="stable")[:_WORST]
+    result = {
+        "file": path,
+        "nodes": n_nodes,
+        "edges": len(graph.edges),
+        "loops": len(graph.edges) - n_nodes + 1,
+        "skipped_lines": graph.skipped,
+        "weights": _said(graph, weights),
+        "edges_without_weight": int((~used).sum()),
+        "cost": cost(edges, y, theta, w),
+        "tree_cost": cost(edges, y, tree, w),
+        "chordal_cost": optimum.cost,
+        "certified": optimum.certified,
+        "cost_rad2": cost(graph.edges, graph.y, theta),
+        "tree_cost_rad2": cost(graph.edges, graph.y, tree),
+        "residual_rms_deg": float(np.degrees(np.sqrt(np.mean(residual**2)))),
+        "residual_weighted_rms_deg": float(np.degrees(np.sqrt(cost(edges, y, theta, w) / w.sum()))),
+        "residual_max_deg": float(np.degrees(np.abs(residual).max())),
+        "worst_edges": [
+            {
+                "i": int(graph.ids[graph.edges[row, 0]]),
+                "j": int(graph.ids[graph.edges[row, 1]]),
+                "residual_deg": float(np.degrees(residual[row])),
+                "weight": float(weight[row]),
+            }
+            for row in worst
+        ],
+        "seconds": solved - begin,
+        "certificate_seconds": certified - solved,
+    }
+    return Solved(result, graph, theta, residual, _positions(graph, theta, weights))
+
+
+def edge_weights(graph: PoseGraph) -> FloatArray:
+    """Information of theta (m,), I33 of each edge; 1 where the file has none at all.
+
+    An edge on no cycle needs none: its angle is taken as it is.
+
+    Raises
+    ------
+    ValueError
+        If some edges on cycles have information and others not; the first of those is named.
+    """
+    if graph.information is None:
+        return np.ones(len(graph.edges))
+    weight = graph.information[:, 2, 2]
+    missing = np.isnan(weight)
+    if not missing.any():
+        return weight
+    needed = missing & _on_cycles(graph.edges, len(graph.ids))
+    if needed.any():
+        i, j = graph.ids[graph.edges[np.argmax(needed)]]
+        raise ValueError(f"every edge on a cycle must have information (I11 to I33), got none in "
+                         f"edge {i} {j}; --weights unit takes all edges alike")  # fmt: skip
+    return np.where(missing, np.nanmax(weight) or 1.0, weight)
+
+
+def _on_cycles(edges: IntArray, n_nodes: int) -> np.ndarray:
+    """Whether an edge (m,) is part of a cycle."""
+    cycles = graphs.cycle_matrix(edges, n_nodes)
+    return np.bincount(cycles.indices, minlength=len(edges)) > 0
+
+
+def _said(graph: PoseGraph, weights: str) -> str:
+    if weights == "unit":
+        return "all edges alike, as asked for"
+    if graph.information is None:
+        return "all edges alike: the file has no information"
+    return "information of theta"
+
+
+def _positions(graph: PoseGraph, theta: FloatArray, weights: str) -> FloatArray | None:
+    """Least squares of the displacements, once turned by the orientations.
+
+    Weighted by their information, where all edges have it; None where it is not definite.
+    """
+    if graph.displacement is None:
+        return None
+    edges, n_nodes = graph.edges, len(theta)
+    c, s = np.cos(theta[edges[:, 0]]), np.sin(theta[edges[:, 0]])
+    turn = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
+    information = np.broadcast_to(np.eye(2), turn.shape)
+    if weights == "information" and graph.information is not None:
+        information = graph.information[:, :2, :2]
+        if not (np.isfinite(information).all() and (np.linalg.eigvalsh(information) > 0).all()):
+            return None
+    W = turn @ information @ turn.swapaxes(1, 2)
+    m = len(edges)
+    B = sp.kron(graphs.incidence(edges, n_nodes)[:, 1:], sp.eye(2), format="csr")
+    weighted = B.T @ sp.bsr_matrix((W, np.arange(m), np.arange(m + 1)), shape=(2 * m, 2 * m))
+    displacement = (turn @ graph.displacement[..., None]).ravel()
+    places = scipy.sparse.linalg.spsolve(sp.csc_matrix(weighted @ B), weighted @ displacement)
+    return np.concatenate([np.zeros((1, 2)), np.reshape(places, (-1, 2))])

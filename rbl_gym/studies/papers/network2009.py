@@ -1,0 +1,343 @@
+"""The sensing-network paper's experiment: its Figs 3 to 6, kappa against n, three nodes in space.
+
+Source: G. Piovan, I. Shames, B. Fidan, F. Bullo, B. D. O. Anderson, "On frame and orientation
+localization for relative sensing networks". The variance is read as that of a bearing, sigma^2, so
+that an edge angle has 2 sigma^2; a mean square error is the mean over the edges. The paper's ten
+points are drawn, not printed: `PLACES` are ours. Beside the paper's figures: the speed of (14) on
+networks of ten nodes uniform in a square.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import estimators
+from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.estimators.networks import consensus
+from rbl_gym.estimators.networks.orientations import along_tree
+from rbl_gym.networks import graphs as network_graphs
+from rbl_gym.networks import sensing
+from rbl_gym.networks.bounds import edge_variance
+from rbl_gym.networks.sensing import IntArray, check_positions, proj, unit_disk_edges
+from rbl_gym.studies.papers import network_growth
+
+# Node 0, the reference, is the one at the bottom left, as in Fig. 6.
+PLACES = np.array([[0.07, 0.13], [0.13, 0.50], [0.60, 0.03], [0.37, 0.51], [0.14, 0.79],
+                   [0.66, 0.28], [0.15, 0.93], [0.67, 0.51], [0.82, 0.55],
+                   [0.95, 0.62]])  # fmt: skip
+LOOPS = (5, 10, 15, 20, 25, 30, 36)  # of Fig. 4, where no footprints are asked for
+VARIANCE, RUN_VARIANCE = 0.1, 0.01  # sigma^2 of Fig. 4, of Figs 5 and 6
+_SHOWN_LOOPS, _SHOWN_STEPS = 10, 60
+_TOL = 1e-9
+
+N_NODES = 10
+BEARING_STD_RAD = float(np.sqrt(VARIANCE))
+EXAMPLE_LOOPS = 15
+BASES = network_graphs.BASES
+RULES = consensus.STEP_RULES
+LOSSES = (0.0, 0.2, 0.5)
+# Networks that convergence is measured on.
+_NETWORKS = 10
+_STRETCHES = 6
+
+
+class Sample(NamedTuple):
+    """A network of the experiment."""
+
+    positions: FloatArray
+    theta: FloatArray
+    edges: IntArray
+    y: FloatArray
+
+
+def work_units() -> int:
+    """How often `run` calls `advance`."""
+    return 4
+
+
+def run(
+    trials: int,
+    seed: int,
+    advance: Callable[[], None] = lambda: None,
+    *,
+    positions: FloatArray | str | None = None,
+    footprints: Sequence[float] | None = None,
+    variance: float | None = None,
+) -> dict[str, Any]:
+    """The paper's figures, and convergence.
+
+    Parameters
+    ----------
+    trials, seed
+        Of Fig. 4 and of three nodes in space.
+    advance
+        Called `work_units` times.
+    positions
+        (n, 2) fixed points, the first of which is the reference, or a CSV file of them with a
+        header x,y; None: `PLACES`.
+    footprints
+        Sensing radii, in the unit of the positions, each of which connects the points; None: those
+        that leave `LOOPS` loops (on other points: all that connect them, eight at most).
+    variance
+        sigma^2 of a bearing; None: the paper's, 0.1 in Fig. 4, 0.01 in Figs 5 and 6.
+
+    Returns
+    -------
+    A dict of plain numbers. ``networks`` (Fig. 3): points, footprints and edges. ``accuracy`` (Fig.
+    4): for each footprint the mean square error of y, of the limit psi of (14) and of maximum
+    likelihood, the bound ``2 sigma^2 (n - 1) / m`` and ratios to it. ``run`` (Figs 5 and 6): on the
+    largest footprint every edge's angle and every loop's error over the steps, and true, measured
+    and estimated orientations. ``convergence``: for each cycle basis and rule for kappa lambda_min
+    and lambda_max, the measured and the true factor, and Theorem 19's, with the share of networks
+    where it holds. ``asynchronous``: rounds for each share of lost messages. ``history``: errors of
+    a run. ``growth``: `network_growth.run`. ``space``: three nodes in space.
+
+    Raises
+    ------
+    ValueError
+        If a footprint leaves the points apart, or an argument is not as described.
+    """
+    if isinstance(positions, str):
+        positions = read_points(positions)
+    places = PLACES if positions is None else check_positions(positions)
+    radii = _default_footprints(places) if footprints is None else \
+        sorted(check_number("footprint", radius, low=0.0) for radius in footprints)  # fmt: skip
+    if not radii:
+        raise ValueError("footprint must be at least one radius, got none")
+    graphs = [_seen(places, radius) for radius in radii]
+    result: dict[str, Any] = {"experiment": "network2009", "trials": trials, "seed": seed}
+    result["networks"] = {
+        "positions": places.tolist(),
+        "footprints": [float(radius) for radius in radii],
+        "edges": [edges.tolist() for edges in graphs],
+    }
+    sigma = [np.sqrt(check_number("variance", VARIANCE if variance is None else variance, low=0.0)),
+             np.sqrt(RUN_VARIANCE if variance is None else variance)]  # fmt: skip
+    result["variance"] = [float(one**2) for one in sigma]
+    result["accuracy"] = [
+        {"footprint": float(radius), **_accuracy(places, edges, float(sigma[0]), trials,
+                                                 np.random.default_rng([seed, len(edges)]))}
+        for radius, edges in zip(radii, graphs, strict=True)
+    ]  # fmt: skip
+    advance()
+    result["run"] = _run(places, graphs[-1], float(sigma[1]), np.random.default_rng([seed, 500]))
+    samples = [sample(EXAMPLE_LOOPS, np.random.default_rng([seed, 1000, k]))
+               for k in range(_NETWORKS)]  # fmt: skip
+    result["convergence"] = {
+        basis: {rule: _convergence(samples, basis, rule) for rule in RULES} for basis in BASES
+    }
+    rng = np.random.default_rng([seed, 2000])
+    result["asynchronous"] = [_asynchronous(samples, loss, rng) for loss in LOSSES]
+    result["history"] = {basis: _history(samples[0], basis) for basis in BASES}
+    advance()
+    result["growth"] = network_growth.run(np.random.default_rng([seed, 3000]))
+    advance()
+    result["space"] = network_growth.three_in_space(trials, np.random.default_rng([seed, 4000]))
+    advance()
+    return result
+
+
+def read_points(path: str) -> FloatArray:
+    """Points (n, 2) of a CSV file with a header x,y.
+
+    Raises
+    ------
+    ValueError
+        If the file holds something else; the message names it.
+    """
+    with open(path, encoding="utf-8") as file:
+        header = file.readline().strip().replace(" ", "")
+        if header != "x,y":
+            raise ValueError(f"{path}: must have the header x,y, got {header!r:.40}")
+        try:
+            points = np.loadtxt(file, delimiter=",", ndmin=2)
+        except ValueError as error:
+            raise ValueError(f"{path}: must have two numbers a line, {error}") from error
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
+        raise ValueError(f"{path}: must hold three points or more, got shape {points.shape}")
+    return points
+
+
+def _default_footprints(places: FloatArray) -> list[float]:
+    """Radii that leave `LOOPS` loops of `PLACES`; of other points eight, from connected to all."""
+    n_nodes = len(places)
+    pairs = np.array(list(itertools.combinations(range(n_nodes), 2)))
+    apart = np.linalg.norm(places[pairs[:, 1]] - places[pairs[:, 0]], axis=1)
+    steps = np.unique(apart.round(12))
+    radii = [
+        float(radius)
+        for radius in (steps + np.append(steps[1:], 1.04 * steps[-1])) / 2
+        if not network_graphs.components(pairs[apart <= radius], n_nodes).any()
+    ]
+    if places is PLACES:
+        return [r for r in radii if np.sum(apart <= r) - n_nodes + 1 in LOOPS]
+    return [radii[k] for k in np.unique(np.linspace(0, len(radii) - 1, 8).astype(int))]
+
+
+def _seen(places: FloatArray, radius: float) -> IntArray:
+    edges = unit_disk_edges(places, radius)
+    if network_graphs.components(edges, len(places)).any():
+        raise ValueError(f"footprint must connect all {len(places)} points, got {radius:g}")
+    return edges
+
+
+def sample(loops: int, rng: np.random.Generator) -> Sample:
+    """A connected unit-disk graph with this many loops, its truth and its edge angles."""
+    pairs = np.array(list(itertools.combinations(range(N_NODES), 2)))
+    while True:
+        positions = rng.uniform(0, 1, (N_NODES, 2))
+        apart = np.linalg.norm(positions[pairs[:, 1]] - positions[pairs[:, 0]], axis=1)
+        edges = pairs[np.sort(np.argsort(apart)[: N_NODES - 1 + loops])]
+        if not network_graphs.components(edges, N_NODES).any():
+            break
+    theta = rng.uniform(-np.pi, np.pi, N_NODES)
+    theta = proj(theta - theta[0])
+    bearings = sensing.measure(positions, theta, edges, BEARING_STD_RAD, rng)
+    return Sample(positions, theta, edges, sensing.edge_angles(bearings))
+
+
+def _accuracy(
+    places: FloatArray, edges: IntArray, sigma: float, trials: int, rng: np.random.Generator
+) -> dict[str, Any]:
+    """One footprint of Fig. 4, over orientations and noise drawn anew."""
+    n_nodes, m = len(places), len(edges)
+    i, j = edges.T
+    theta = rng.uniform(-np.pi, np.pi, (trials, n_nodes))
+    true = theta[:, j] - theta[:, i]
+    # (8): the noise of the two bearings of an edge.
+    y = proj(true + sigma * rng.standard_normal((2, trials, m)).sum(axis=0))
+    psi = limit(network_graphs.cycle_matrix(edges, n_nodes).toarray(), y)
+    found = np.array([estimators.orientations(edges, one, n_nodes) for one in y])
+    errors = {
+        name: np.mean(proj(one - true) ** 2, axis=1)
+        for name, one in (("measured", y), ("consensus", psi), ("ml", found[:, j] - found[:, i]))
+    }
+    bound = edge_variance(m, n_nodes, sigma)
+    return {
+        "loops": m - n_nodes + 1,
+        "edges": m,
+        "bound": bound,
+        "mse": {name: float(values.mean()) for name, values in errors.items()},
+        "ratio": {name: float(values.mean()) / bound for name, values in errors.items()},
+        "ratio_std_error": {
+            name: float(values.std()) / bound / trials**0.5 for name, values in errors.items()
+        },
+    }
+
+
+def limit(C: FloatArray, y: FloatArray) -> FloatArray:
+    """Limits (trials, m) of (14) from y, all trials at once, by Theorem 19's bound of kappa."""
+    if not len(C):
+        return y
+    kappa, psi = 2 / (1 + np.linalg.eigvalsh(C @ C.T)[-1]), y.copy()
+    while np.abs(off := proj(psi @ C.T)).max() > _TOL:
+        psi -= kappa * off @ C
+    return psi
+
+
+def _run(
+    places: FloatArray, edges: IntArray, sigma: float, rng: np.random.Generator
+) -> dict[str, Any]:
+    """One run of (14): Fig. 5's curves, Fig. 6's frames."""
+    n_nodes = len(places)
+    theta = rng.uniform(-np.pi, np.pi, n_nodes)
+    theta = proj(theta - theta[0])
+    y = sensing.edge_angles(sensing.measure(places, theta, edges, sigma, rng))
+    C = network_graphs.cycle_matrix(edges, n_nodes)
+    run = consensus.cycle_iteration(edges, y, n_nodes, C, history=True)
+    assert run.history is not None
+    shown = run.history[: _SHOWN_STEPS + 1]
+    i, j = edges.T
+    return {
+        "kappa": run.kappa,
+        "steps": run.steps,
+        "edge_angles": shown.tolist(),
+        "loop_errors": proj((C @ shown.T).T).tolist() if C.shape[0] else [],
+        "theta": theta.tolist(),
+        "theta_measured": along_tree(edges, y, n_nodes).tolist(),
+        "theta_estimated": along_tree(edges, run.psi, n_nodes).tolist(),
+        "rms_measured": float(np.sqrt(np.mean(proj(y - theta[j] + theta[i]) ** 2))),
+        "rms_estimated": float(np.sqrt(np.mean(proj(run.psi - theta[j] + theta[i]) ** 2))),
+    }
+
+
+def _convergence(samples: list[Sample], basis: str, rule: str) -> dict[str, Any]:
+    """Means over the networks; the measured factor against the true one at its worst."""
+    rows = [_one_convergence(one, basis, rule) for one in samples]
+    table = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+    return {
+        **{key: float(values.mean()) for key, values in table.items()},
+        "largest_difference": float(np.abs(table["measured_factor"] - table["true_factor"]).max()),
+    }
+
+
+def _one_convergence(one: Sample, basis: str, rule: str) -> dict[str, float]:
+    C = network_graphs.cycle_matrix(one.edges, N_NODES, basis)
+    low, high = consensus.eigenvalues(C)
+    run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, rule, history=True)
+    assert run.kappa is not None
+    printed = consensus.printed_factor(run.kappa)
+    true = consensus.convergence_factor(C, run.kappa)
+    return {
+        "kappa": run.kappa,
+        "lambda_min": low,
+        "lambda_max": high,
+        "steps": float(run.steps),
+        "measured_factor": measured_factor(one, C, run),
+        "true_factor": true,
+        "true_factor_squared": true**2,
+        "printed_factor_squared": printed,
+        "printed_holds": float(true**2 <= printed + 1e-12),
+        "within_theorem": float(run.kappa <= (2 + 1e-9) / (1 + high)),
+    }
+
+
+def errors(C: Any, y: FloatArray, run: consensus.CycleRun) -> FloatArray:
+    """Distance of every psi of a run from the limit on its branch."""
+    assert run.history is not None
+    limit = consensus.cycle_projection(C, y, run.branch)
+    return np.linalg.norm(run.history - limit, axis=1)
+
+
+def measured_factor(one: Sample, C: Any, run: consensus.CycleRun) -> float:
+    """Factor of a step, from late errors that rounding does not yet touch.
+
+    They are stretched to their first size and iterated on, until one mode is left.
+    """
+    psi, factor = one.y, 0.0
+    nothing = np.zeros(C.shape[0])
+    limit = consensus.cycle_projection(C, one.y, run.branch)
+    for _ in range(_STRETCHES):
+        again = consensus.cycle_iteration(one.edges, psi, N_NODES, C, run.kappa, history=True,
+                                          branch=run.branch)  # fmt: skip
+        distance = errors(C, one.y, again)
+        late = np.flatnonzero(distance > 1e-8 * distance[0])
+        first, last = late[len(late) // 2], late[-1]
+        factor = float((distance[last] / distance[first]) ** (1 / (last - first)))
+        assert again.history is not None
+        stretched = (again.history[last] - limit) * (distance[0] / distance[last])
+        # Rounding off the cycles is stretched as well, and no step would take it away.
+        psi = limit + stretched - consensus.cycle_projection(C, stretched, nothing)
+    return factor
+
+
+def _asynchronous(samples: list[Sample], loss: float, rng: np.random.Generator) -> dict[str, Any]:
+    steps, off = [], []
+    for one in samples:
+        C = network_graphs.cycle_matrix(one.edges, N_NODES, "paton")
+        run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, order="asynchronous",
+                                        rng=rng, loss=loss)  # fmt: skip
+        steps.append(run.steps)
+        limit = consensus.cycle_projection(C, one.y, run.branch)
+        off.append(float(np.abs(run.psi - limit).max()))
+    return {"loss": loss, "rounds": float(np.mean(steps)), "largest_error_rad": max(off)}
+
+
+def _history(one: Sample, basis: str) -> list[float]:
+    C = network_graphs.cycle_matrix(one.edges, N_NODES, basis)
+    run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, history=True)
+    return errors(C, one.y, run).tolist()

@@ -1,0 +1,1 @@
+"""Placement studies: design of a layout, its predicted accuracy, the check by filters."""

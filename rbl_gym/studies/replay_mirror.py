@@ -1,0 +1,201 @@
+"""Does a mirror pose explain a recording as well? Both are followed, and the ranges judge."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry import mirror, rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings.reading import Recording
+
+# Anchors whose distance from their plane is below this share of their width in it are tried.
+_THICK = 0.5
+# A place in the plane is known once its standard deviation is below this share of the scene's
+# size; both poses start from such a share, and from such a rotation (rad).
+_KNOWN, _START, _START_RAD = 0.2, 0.1, 0.3
+# A rotation that no range determines stays within this (rad): no filter searches for it.
+_MOST_RAD = 0.45
+# A squared whitened residual counts so much and no more, whoever leaves it behind.
+_MOST_RESIDUAL = 9.0
+# So many ranges that fit as they should are supposed to have come before.
+_PRIOR_LINKS = 10.0
+# Log odds below which a pose is given up for good, and above which it is alive (3 sigma).
+_DEAD, _ALIVE = -30.0, -4.5
+# Log odds beyond which ranges have decided.
+DECIDED = 12.0
+# Poses are apart from so many standard deviations on; they are one where so many epochs in a row
+# put their tags within this share of the scene's size.
+_APART = 3.0
+_SAME, _SAME_EPOCHS = 5e-3, 20
+
+
+class Mirror(NamedTuple):
+    """The other pose after every epoch: rotation, translation (K, ...), covariance (K, 6, 6).
+
+    `log_odds` (K,) are those of the other pose against the track's by all ranges so far, whitened
+    by what the better of the two leaves of them; minus infinity where there is no other. `alive`
+    (K,): it explains the ranges as well, and the two are apart. An image that the ranges ruled
+    out in the end was alive before.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    log_odds: FloatArray
+    alive: BoolArray
+
+
+class _Two(NamedTuple):
+    """A pose (2, ...) and its image after an epoch."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+
+
+def other_pose(
+    recording: Recording,
+    filter: Any,
+    range_std: float | None,
+    track: tuple[FloatArray, FloatArray, FloatArray],
+    volume: FloatArray | None = None,
+) -> Mirror | None:
+    """The mirror pose of a track where the ranges do not rule it out at once; else None.
+
+    Parameters
+    ----------
+    recording
+        Ranges; the anchors and tags that were ever seen count.
+    filter
+        An iterated EKF with the recording's tags and motion.
+    range_std
+        Standard deviation of a range [m]; None: the recording's own.
+    track
+        Rotation, translation, covariance (K, ...) of the beliefs.
+    volume
+        Corners (2, 3) of where the body may be: a pose outside is not counted.
+    """
+    seen = recording.links.any(axis=0)
+    anchors = recording.anchors[seen.any(axis=1)]
+    tags = recording.tags[seen.any(axis=0)]
+    plane = mirror.plane_of(anchors)
+    if plane.width < 1e-6 or plane.thickness > _THICK * plane.width:
+        return None
+    size = max(np.ptp(anchors, axis=0).max(), np.median(recording.ranges[recording.links]))
+    start = _first_known(track[2], plane.normal, _KNOWN * size)
+    if start is None:
+        return None
+    here = track[0][start], track[1][start]
+    P = np.diag([_START_RAD**2] * 3 + [(_START * size) ** 2] * 3)
+    there = mirror.mirror_pose(*here, P, anchors, tags)
+    poses = _Two(
+        np.stack([here[0], there[0]]), np.stack([here[1], there[1]]), np.stack([P, there[2]])
+    )
+    return _followed(recording, filter, range_std, track, volume, start, poses, _SAME * size)
+
+
+def _first_known(covariance: FloatArray, normal: FloatArray, std: float) -> int | None:
+    """The first epoch whose place is known along the plane; across it, both poses are alike."""
+    along = np.linalg.svd(normal[None])[2][1:]
+    variance = along @ covariance[:, 3:, 3:] @ along.T
+    known = np.linalg.eigvalsh(variance)[:, -1] < std**2
+    return int(known.argmax()) if known.any() else None
+
+
+def _followed(
+    recording: Recording,
+    filter: Any,
+    range_std: float | None,
+    track: tuple[FloatArray, FloatArray, FloatArray],
+    volume: FloatArray | None,
+    start: int,
+    poses: _Two,
+    same_m: float,
+) -> Mirror | None:
+    """Both poses through all epochs from `start` on, until the image is out of the question."""
+    count = len(recording.times)
+    result = Mirror(
+        *(np.array(a) for a in track), np.full(count, -np.inf), np.zeros(count, dtype=np.bool_)
+    )
+    gain, cost, links, same = np.zeros(2), np.zeros(2), _PRIOR_LINKS, 0
+    state = filter.initial(*poses)
+    spread = np.diag(filter.process.std() ** 2)
+    hold = np.diag([_MOST_RAD**-2] * 3 + [0.0] * 3)
+    for k in range(start, count):
+        elapsed = recording.times[k] - recording.times[k - 1] if k > start else 0.0
+        P = np.linalg.inv(np.linalg.inv(state.covariance + elapsed * spread) + hold)
+        before = state._replace(covariance=0.5 * (P + P.swapaxes(1, 2)))
+        std = recording.range_std[k] if range_std is None else range_std  # pyright: ignore
+        state, likelihood, spent = _update(filter, before, recording, k, std)
+        gain += likelihood
+        cost += spent
+        links += recording.links[k].sum()
+        scale = (2 * cost.min() + _PRIOR_LINKS) / links
+        odds = float(gain[1] - gain[0]) / scale
+        points = ranging.tag_positions(state.rotation, state.translation, recording.tags)
+        same = same + 1 if np.abs(points[1] - points[0]).max() < same_m else 0
+        if same == _SAME_EPOCHS:
+            return None
+        if odds < _DEAD:
+            break
+        # What the track stands for is the nearer of the two.
+        off = np.linalg.norm(state.translation - track[1][k], axis=-1)
+        far = int(off[1] >= off[0])
+        if volume is not None and is_outside(volume, state.translation[far], state.covariance[far]):
+            continue
+        for field, value in zip(result[:3], state, strict=True):
+            field[k] = value[far]
+        result.log_odds[k] = odds if far else -odds
+        gap = state.translation[1] - state.translation[0]
+        squared = gap @ np.linalg.solve(state.covariance[:, 3:, 3:].sum(axis=0), gap)
+        result.alive[k] = result.log_odds[k] > _ALIVE and squared > _APART**2
+    return result if result.alive.any() else None
+
+
+def _update(
+    filter: Any, before: Any, recording: Recording, k: int, std: FloatArray | float
+) -> tuple[Any, FloatArray, FloatArray]:
+    """Both states (2,) after epoch `k`, the log evidence of its ranges (Laplace), the cost."""
+    links, ranges, anchors = recording.links[k], recording.ranges[k], recording.anchors
+    told = np.where(links, std, 1.0)
+    law = ranging.LinkNoise(told)
+    state = filter.update(before, np.where(links, ranges, 1.0), anchors, links, noise=law)
+    points = ranging.tag_positions(state.rotation, state.translation, recording.tags)
+    residual = (ranging.distances(anchors, points) - ranges) / told
+    squares = np.minimum(residual**2, _MOST_RESIDUAL) * links
+    error = np.concatenate(
+        [rotations.error(state.rotation, before.rotation), state.translation - before.translation],
+        axis=-1,
+    )
+    pull = np.linalg.solve(before.covariance, error[..., None])[..., 0]
+    cost = 0.5 * (squares.sum(axis=(1, 2)) + (error * pull).sum(axis=-1))
+    volumes = [np.linalg.slogdet(P)[1] for P in (state.covariance, before.covariance)]
+    return state, 0.5 * (volumes[0] - volumes[1]) - cost, cost
+
+
+def covering(other: Mirror, track: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
+    """Covariances (K, 6, 6) of the track's beliefs, of both poses where both are alive.
+
+    Second moments about the track's pose, each pose weighed by its odds. A belief that is wide
+    enough already stays.
+    """
+    rotation, translation, covariance = track
+    step = np.concatenate(
+        [rotations.error(rotation, other.rotation), translation - other.translation], axis=-1
+    )
+    pull = np.linalg.solve(covariance, step[..., None])[..., 0]
+    sharp = np.einsum("ki,ki->k", step, pull) > _APART**2
+    where = other.alive & sharp
+    share = 1 / (1 + np.exp(-np.clip(other.log_odds, -50, 50)))[:, None, None]
+    spread = other.covariance + step[..., None] * step[:, None]
+    return np.where(where[:, None, None], (1 - share) * covariance + share * spread, covariance)
+
+
+def is_outside(volume: FloatArray, translation: FloatArray, covariance: FloatArray) -> BoolArray:
+    """Where places (..., 3) are outside a box (2, 3) by more than three standard deviations."""
+    margin = _APART * np.sqrt(np.einsum("...ii->...i", covariance)[..., 3:])
+    off = (translation < volume[0] - margin) | (translation > volume[1] + margin)
+    return np.asarray(off.any(axis=-1))

@@ -1,0 +1,258 @@
+"""Truth beside a track: which epochs have it, and what constant fault would explain the errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import motion, recordings
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry import rotations
+from rbl_gym.recordings.reading import Truth
+
+# Epochs further apart than this are seldom a log in seconds.
+_LONG_STEP_S = 10.0
+# A fault is named where the errors are so many times what the beliefs expect, and where mending
+# it leaves less than this share of the mean square.
+_LARGE, _EXPLAINED = 4.0, 0.25
+# Of faults that explain about as much, the one named first is taken.
+_AS_GOOD = 1.5
+# Fewest poses that tell a fault, and the shifts of time that are tried (s).
+_FEWEST = 5
+_SHIFTS = np.linspace(-3.0, 3.0, 121)
+_SI = ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds"))
+
+
+def matched(
+    truth: Truth, times: FloatArray, rotation: FloatArray, translation: FloatArray, gap_s: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """The truth at the epochs of a track: rotation (K, 3, 3), translation (K, 3), known (K,).
+
+    Between two of its poses it is interpolated where they are at most `gap_s` apart. A pose of the
+    truth without such a neighbour is compared with the track at its own time: it counts for the
+    epoch that is nearest, moved there as the track moves.
+    """
+    there = recordings.truth_at(truth, times, gap_s)
+    turned, moved, known = (np.array(a) for a in there)
+    alone = np.diff(truth.times, prepend=-np.inf, append=np.inf) > gap_s
+    at = np.flatnonzero(alone[:-1] & alone[1:])
+    after = np.clip(np.searchsorted(times, truth.times[at]), 0, len(times) - 1)
+    before = np.maximum(after - 1, 0)
+    inside = (truth.times[at] >= times[before]) & (truth.times[at] <= times[after])
+    near = np.minimum(
+        np.abs(truth.times[at] - times[before]), np.abs(times[after] - truth.times[at])
+    )
+    bridged = inside & ((times[after] - times[before] <= gap_s) | (near == 0))
+    if not bridged.any():
+        return turned, moved, known
+    at, before, after = at[bridged], before[bridged], after[bridged]
+    later = times[after] - truth.times[at] <= truth.times[at] - times[before]
+    epoch = np.where(later, after, before)
+    path = motion.interpolate(times, rotation, translation, truth.times[at])
+    onward = rotation[epoch] @ np.swapaxes(path.rotation, -1, -2)
+    turned[epoch] = onward @ truth.rotation[at]
+    moved[epoch] = truth.translation[at] + translation[epoch] - path.translation
+    known[epoch] = True
+    return turned, moved, known
+
+
+def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
+    """A ValueError that names the gap where no epoch would have truth."""
+    still = np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros((len(times), 3))
+    if matched(truth, times, *still, gap_s)[2].any():
+        return
+    spans = [f"{t[0]:.10g} to {t[-1]:.10g} s" for t in (times, truth.times)]
+    where = f"ranges {spans[0]}, truth {spans[1]}"
+    apart = max(truth.times[0] - times[-1], times[0] - truth.times[-1])
+    hints = "".join(f"; {hint}" for hint in stamp_hints(times, truth))
+    if apart > 0:
+        shift = times[0] - truth.times[0]
+        longest = max(np.ptp(times), np.ptp(truth.times))
+        if not hints and abs(np.ptp(times) - np.ptp(truth.times)) < 0.2 * longest < 0.2 * abs(
+            shift
+        ):
+            hints = f"; their clocks may differ by about {shift:.10g} s"
+        raise ValueError(
+            f"no epoch has truth: the truth shares no time with the ranges: {where}, "
+            f"{apart:.4g} s apart{hints}"
+        )
+    gaps = [f"{np.diff(t).min():.4g} s" if len(t) > 1 else "one pose" for t in (truth.times, times)]
+    raise ValueError(
+        f"no epoch has truth: gaps above {gap_s:g} s are not bridged, and the shortest are "
+        f"{gaps[0]} in the truth and {gaps[1]} in the ranges ({where}); see --truth-gap-s{hints}"
+    )
+
+
+def stamp_hints(times: FloatArray, truth: Truth | None) -> Iterator[str]:
+    """Words on time stamps that look like another unit than seconds."""
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    if truth is not None and len(truth.times) > 1 and len(times) > 1:
+        ratio = float(np.ptp(times) / np.ptp(truth.times))
+        for name, value in (("ranges", ratio), ("truth", 1 / max(ratio, 1e-30))):
+            for scale, unit in _SI:
+                # Logs of one run are about equally long.
+                if 0.2 < value * scale < 5:
+                    yield (
+                        f"the stamps of the {name} look like {unit}: they span {value:.3g} times "
+                        "what the others span"
+                    )
+                    return
+    if step >= _LONG_STEP_S:
+        yield f"epochs are {step:.4g} s apart (median): are their stamps milliseconds?"
+
+
+class Judged(NamedTuple):
+    """Estimates and truth (L, ...) at the epochs that have truth, and the beliefs' variances.
+
+    `turn_variance`, `place_variance` (L,): traces of the rotation's and of the place's covariance.
+    """
+
+    times: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+    true_rotation: FloatArray
+    true_translation: FloatArray
+    turn_variance: FloatArray
+    place_variance: FloatArray
+
+    def excess(self) -> float:
+        """Mean squared errors over what the beliefs expect of them: 1 where they are honest."""
+        turn = rotations.error(self.rotation, self.true_rotation)
+        place = self.translation - self.true_translation
+        turn, place = ((a**2).sum(axis=-1) for a in (turn, place))
+        return 0.5 * float((turn / self.turn_variance + place / self.place_variance).mean())
+
+    def rmse(self) -> str:
+        turn = rotations.error(self.rotation, self.true_rotation)
+        place = self.translation - self.true_translation
+        turn_deg, place_m = (np.sqrt((a**2).sum(-1).mean()) for a in (np.rad2deg(turn), place))
+        return f"{place_m:.3g} m and {turn_deg:.3g} deg"
+
+
+def fault_hints(
+    at: Callable[[float], Judged], seen: Callable[[FloatArray], FloatArray], planar: bool
+) -> list[str]:
+    """Constant faults of the truth that explain most of the errors, at most two.
+
+    Tried: the order and the direction of the quaternions, the unit of the places, a shift of
+    time, and, alone or on top of these, a rigid transform of the world frame or of the body frame.
+
+    Parameters
+    ----------
+    at
+        What is judged, with the truth's rotations as they are in the file, its stamps taken to be
+        late by so many seconds.
+    seen
+        Rotations (L, 3, 3) of the file as they are judged.
+    planar
+        The place is of x and y alone.
+    """
+
+    def mended(judged: Judged) -> Judged:
+        return judged._replace(true_rotation=seen(judged.true_rotation))
+
+    as_read = at(0.0)
+    if len(as_read.times) < _FEWEST:
+        return []
+    judged = mended(as_read)
+    faults = [(text, mended(other)) for text, other in (*_faults(as_read), *_late(at))]
+    hints: list[str] = []
+    while judged.excess() >= _LARGE and len(hints) < 2:
+        best: tuple[float, str, Judged] | None = None
+        # A frame comes alone, or on top of another fault: neither explains much without the other.
+        tried = [*faults, *_frames(judged, planar)]
+        for text, other in faults:
+            tried += [(f"{text}, with {frame}", both) for frame, both in _frames(other, planar)]
+        for text, other in tried:
+            left = other.excess()
+            if left < _EXPLAINED * judged.excess() and (best is None or left * _AS_GOOD < best[0]):
+                best = left, text, other
+        if best is None:
+            break
+        hints.append(f"{best[1]}: the errors would be {best[2].rmse()} in place of {judged.rmse()}")
+        judged, faults = best[2], []
+    return hints
+
+
+def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
+    """Quaternions in another order, rotations the other way, places in another unit."""
+    Q = judged.true_rotation
+    q = rotations.quaternion(Q)
+    for text, other in (
+        ("the truth's quaternions look like x, y, z, w under the names w, x, y, z",
+         rotations.from_quaternion(q[..., [3, 0, 1, 2]])),
+        ("the truth's quaternions look like w, x, y, z under the names x, y, z, w",
+         rotations.from_quaternion(q[..., [1, 2, 3, 0]])),
+        ("the truth's rotations look inverted (from the world to the body)", np.swapaxes(Q, 1, 2)),
+    ):  # fmt: skip
+        yield text, judged._replace(true_rotation=other)
+    for scale, unit in ((0.01, "centimetres"), (0.001, "millimetres")):
+        moved = scale * judged.true_translation
+        yield f"the truth's places look like {unit}", judged._replace(true_translation=moved)
+
+
+def _late(at: Callable[[float], Judged]) -> Iterator[tuple[str, Judged]]:
+    """The shift of time that leaves least, by the places."""
+    best: tuple[float, float, Judged] | None = None
+    for shift in _SHIFTS:
+        other = at(shift)
+        if len(other.times) < _FEWEST:
+            continue
+        place = ((other.translation - other.true_translation) ** 2).sum(axis=-1)
+        left = float((place / other.place_variance).mean())
+        if best is None or left < best[0]:
+            best = left, shift, other
+    if best is not None and abs(best[1]) > 0.01:
+        side = "late" if best[1] > 0 else "early (or the filter lags: see --walk-m)"
+        yield f"the truth's stamps look about {abs(best[1]):.2f} s {side}", best[2]
+
+
+def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
+    """The rigid transforms of the world and of the body that leave least."""
+    p, q, Q = judged.translation, judged.true_translation, judged.true_rotation
+    # Beliefs of the start, which are wide, count for less.
+    w, u = (1 / np.maximum(a, np.median(a)) for a in (judged.place_variance, judged.turn_variance))
+    w, u = w / w.sum(), u / u.sum()
+    spread = [a - w @ a for a in (p, q)]
+    turns = np.einsum("k,kij,klj->il", u, judged.rotation, Q)
+    # How much a path tells of a turn, against the rotations: nothing where it goes nowhere.
+    trust = np.median(judged.turn_variance) / np.median(judged.place_variance)
+    R = rotations.nearest(turns + trust * np.einsum("k,ki,kj->ij", w, *spread))
+    shift = w @ (p - q @ R.T)
+    yield (
+        f"a constant offset of the truth's world frame, {_words(R, shift)}",
+        judged._replace(true_rotation=R @ Q, true_translation=q @ R.T + shift),
+    )
+    turned = np.swapaxes(Q, 1, 2)
+    C = rotations.nearest(np.einsum("k,kij->ij", u, turned @ judged.rotation))
+    arm = w @ (turned @ (p - q)[..., None])[..., 0]
+    if planar:
+        arm[2] = 0.0
+    yield (
+        f"a constant offset of the truth's body frame, {_words(C, arm)}",
+        judged._replace(true_rotation=Q @ C, true_translation=q + Q @ arm),
+    )
+
+
+def _words(rotation: FloatArray, shift: FloatArray) -> str:
+    turn, place = (
+        ", ".join(f"{x:.{n}f}" for x in a)
+        for a, n in ((np.rad2deg(rotations.log(rotation)), 1), (shift, 3))
+    )
+    return f"turned by ({turn}) deg about x, y, z and shifted by ({place}) m"
+
+
+def judged_of(truth: tuple[FloatArray, FloatArray, BoolArray], track: Any, planar: bool) -> Judged:
+    """What `fault_hints` reads, of a truth at the epochs of a track; planar: place in x and y."""
+    rotation, translation, known = truth
+    place = translation[known].copy()
+    if planar:
+        place[:, 2] = track.translation[known, 2]
+    variance = np.einsum("kii->ki", track.covariance[known])
+    return Judged(
+        track.times[known], track.rotation[known], track.translation[known], rotation[known], place,
+        variance[:, 2 if planar else 0 : 3].sum(axis=-1),
+        variance[:, 3 : 5 if planar else 6].sum(axis=-1),
+    )  # fmt: skip

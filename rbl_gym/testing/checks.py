@@ -1,0 +1,376 @@
+"""Conformance of estimators: what a package that brings its own runs in its tests.
+
+`check_filter` and `check_locator` try an estimator on small worlds of their own and raise an
+AssertionError that says what it did and what it should do. They import no estimator.
+
+>>> from rbl_gym import estimators
+>>> from rbl_gym.testing import check_filter, check_locator
+>>> check_filter(lambda **laws: estimators.make("uc-kf", **laws))
+>>> check_locator(estimators.locate)
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rbl_gym import metrics
+from rbl_gym.checks import FloatArray
+from rbl_gym.measurements import ranging
+from rbl_gym.testing.worlds import (
+    ANCHORS,
+    DT,
+    NOISE,
+    PROCESS,
+    TAGS,
+    Epochs,
+    call,
+    check_links,
+    check_nees,
+    check_pose,
+    check_pure,
+    check_refuses_nan,
+    check_same,
+    check_shapes,
+    moved,
+    moved_world,
+    require,
+    simulate,
+    take,
+    trial,
+)
+
+__all__ = ["check_filter", "check_locator"]
+
+_EPOCHS, _TRIALS = 12, 64
+
+
+def check_filter(
+    make_filter: Callable[..., Any], *, skip: Sequence[str] = (), seed: int = 0
+) -> None:
+    """Check that a filter does what `rbl_gym.estimators.Filter` says.
+
+    Parameters
+    ----------
+    make_filter
+        Called as ``make_filter(tags=..., noise=..., process=...)``; the same that is registered
+        or named by an entry point of the group ``rbl_gym.filters``.
+    skip
+        Checks to leave out, by the names below.
+    seed
+        Of the worlds it is tried in.
+
+    Raises
+    ------
+    AssertionError
+        With what is wrong, by check: ``interface``, ``shapes`` (of beliefs, for no, one and two
+        leading axes), ``pose`` (proper rotations, covariances symmetric and positive definite),
+        ``batching`` (a batch is a loop), ``purity`` (arguments and states are never changed),
+        ``determinism``, ``pickling``, ``invariance`` (the world moved and turned), ``links``
+        (a missing link has no weight), ``noise`` (the law of an epoch is an argument of
+        `update`, for that epoch alone), ``nan`` (is refused by a ValueError), ``nees`` (the
+        belief is honest and better than the prior).
+    """
+    _try_all(_FILTER_CHECKS, make_filter, skip, seed)
+
+
+def check_locator(locate: Callable[..., Any], *, skip: Sequence[str] = (), seed: int = 0) -> None:
+    """Check that a static estimator does what `rbl_gym.estimators.locate` says.
+
+    Parameters
+    ----------
+    locate
+        Called as ``locate(ranges, anchors, tags, noise, links=...)``; what it returns has the
+        attributes `rotation`, `translation` and `covariance`. A method of the entry-point group
+        ``rbl_gym.locators`` is checked as ``functools.partial(estimators.locate,
+        method="its-name")``.
+    skip, seed
+        As of `check_filter`.
+
+    Raises
+    ------
+    AssertionError
+        With what is wrong; the checks are those of `check_filter`.
+    """
+    _try_all(_LOCATOR_CHECKS, locate, skip, seed)
+
+
+def _try_all(
+    checks: dict[str, Callable[[Any, np.random.Generator], None]],
+    subject: Callable[..., Any],
+    skip: Sequence[str],
+    seed: int,
+) -> None:
+    unknown = [name for name in skip if name not in checks]
+    if unknown:
+        raise ValueError(f"skip must be of {', '.join(checks)}, got {unknown[0]!r}")
+    for name, check in checks.items():
+        if name not in skip:
+            check(subject, np.random.default_rng(seed))
+
+
+# --- filters --------------------------------------------------------------------------------
+
+
+def _filter_interface(make_filter: Any, rng: np.random.Generator) -> None:
+    filter = _made(make_filter)
+    for name in ("initial", "predict", "update", "belief"):
+        require(
+            callable(getattr(filter, name, None)),
+            f"a filter must have the method {name!r}, {type(filter).__name__} has none",
+        )
+
+
+def _filter_shapes(make_filter: Any, rng: np.random.Generator) -> None:
+    for batch in ((), (3,), (2, 2)):
+        epochs = simulate(rng, batch, 2)
+        belief = _beliefs(_made(make_filter), epochs)[-1]
+        check_shapes("belief", belief, batch, ("rotation", "translation", "covariance", "matrix"))
+
+
+def _filter_pose(make_filter: Any, rng: np.random.Generator) -> None:
+    for belief in _beliefs(_made(make_filter), simulate(rng, (8,), 4)):
+        check_pose("belief", belief)
+
+
+def _filter_batching(make_filter: Any, rng: np.random.Generator) -> None:
+    filter, epochs = _made(make_filter), simulate(rng, (4,), 3)
+    together = _beliefs(filter, epochs)[-1]
+    for index in range(4):
+        alone = _beliefs(filter, trial(epochs, index))[-1]
+        check_same(
+            f"a batch must give what its trials give alone; of trial {index}",
+            take(together, index), alone,
+        )  # fmt: skip
+    each = np.broadcast_to(ANCHORS, (4, *ANCHORS.shape)).copy()
+    apart = _beliefs(filter, epochs, anchors=each)[-1]
+    check_same("anchors (M, 3) must mean the same as (B, M, 3) alike", together, apart)
+
+
+def _filter_purity(make_filter: Any, rng: np.random.Generator) -> None:
+    filter, epochs = _made(make_filter), simulate(rng, (3,), 2)
+    anchors, links = ANCHORS, np.ones(epochs.ranges.shape[1:], dtype=np.bool_)
+    links[..., 0, 0] = False
+    prior = tuple(array.copy() for array in epochs.prior)
+    state = check_pure("initial", filter.initial, *prior)
+    moved = check_pure("predict", filter.predict, state, epochs.twists[1].copy(), DT)
+    updated = check_pure("update", filter.update, moved, epochs.ranges[1].copy(), anchors, links)
+    check_pure("belief", filter.belief, updated)
+
+
+def _filter_determinism(make_filter: Any, rng: np.random.Generator) -> None:
+    epochs = simulate(rng, (3,), 3)
+    filter = _made(make_filter)
+    first = _beliefs(filter, epochs)[-1]
+    for label, other in (("a second run", filter), ("a filter made alike", _made(make_filter))):
+        check_same(f"{label} must give the same bytes", first, _beliefs(other, epochs)[-1], 0.0)
+
+
+def _filter_pickling(make_filter: Any, rng: np.random.Generator) -> None:
+    epochs = simulate(rng, (3,), 2)
+    filter = _made(make_filter)
+    state = call("initial", filter.initial, *epochs.prior)
+    copies = []
+    for label, thing in (("filter", filter), ("state", state)):
+        try:
+            copies.append(pickle.loads(pickle.dumps(thing)))
+        except Exception as error:
+            raise AssertionError(f"the {label} must pickle, raised {error!r}") from error
+    copy, copied = copies
+    after = filter.belief(filter.update(state, epochs.ranges[0], ANCHORS))
+    again = copy.belief(copy.update(copied, epochs.ranges[0], ANCHORS))
+    check_same("a filter and a state out of a pickle must give the same bytes", after, again, 0.0)
+
+
+def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
+    filter, epochs = _made(make_filter), simulate(rng, (3,), 3)
+    turn, shift = moved_world(rng)
+    both = np.kron(np.eye(2), turn)
+    rotation, translation, covariance = epochs.prior
+    elsewhere = epochs._replace(
+        twists=epochs.twists @ both.T,
+        prior=(turn @ rotation, translation @ turn.T + shift, both @ covariance @ both.T),
+    )
+    expected = moved(_beliefs(filter, epochs)[-1], turn, shift)
+    found = _beliefs(filter, elsewhere, anchors=ANCHORS @ turn.T + shift)[-1]
+    check_same("a world moved and turned must move and turn the belief", expected, found)
+
+
+def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
+    filter, epochs = _made(make_filter), simulate(rng, (3,), 1)
+    anchors, ranges = ANCHORS, epochs.ranges[0]
+    state = call("initial", filter.initial, *epochs.prior)
+
+    def update(ranges: FloatArray, anchors: FloatArray, links: Any) -> Any:
+        return filter.belief(call("update", filter.update, state, ranges, anchors, links))
+
+    full = np.ones(ranges.shape, dtype=np.bool_)
+    check_links(update, ranges)
+    nothing = update(np.zeros_like(ranges), anchors, ~full)
+    before = filter.belief(state)
+    check_same("an epoch without a link must leave the belief as it was", before, nothing)
+
+
+def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
+    filter, epochs = _made(make_filter), simulate(rng, (3,), 2)
+    links = np.ones(epochs.ranges.shape[1:], dtype=np.bool_)
+    links[..., 1, 0] = False
+    state = call("initial", filter.initial, *epochs.prior)
+
+    def belief(filter: Any, state: Any, noise: Any = None) -> Any:
+        name = f"update(..., noise={'None' if noise is None else type(noise).__name__})"
+        update = partial(filter.update, noise=noise)
+        return filter.belief(call(name, update, state, epochs.ranges[0], ANCHORS, links))
+
+    own = filter.belief(filter.update(state, epochs.ranges[0], ANCHORS, links))
+    check_same("noise None must mean the law that the filter was made with",
+               own, belief(filter, state))  # fmt: skip
+    each = ranging.LinkNoise(NOISE.floor_m * rng.uniform(0.5, 3.0, epochs.ranges.shape[1:]))
+    for law in (ranging.RangeNoise(3 * NOISE.floor_m), each):
+        other = _made(make_filter, law)
+        twin = call("initial", other.initial, *epochs.prior)
+        check_same(
+            f"update(..., noise=law) must give what a filter made with that {type(law).__name__} "
+            "gives",
+            belief(other, twin), belief(filter, state, law),
+        )  # fmt: skip
+    check_same("the noise of one update must not stay for the next",
+               own, belief(filter, state))  # fmt: skip
+
+
+def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
+    filter, epochs = _made(make_filter), simulate(rng, (3,), 1)
+    state = call("initial", filter.initial, *epochs.prior)
+    calls = {
+        "initial": (filter.initial, ("rotation", "translation", "covariance"), epochs.prior),
+        "predict": (
+            lambda twist: filter.predict(state, twist, DT), ("twist",), (epochs.twists[0],)
+        ),
+        "update": (
+            lambda ranges, anchors: filter.update(state, ranges, anchors),
+            ("ranges", "anchors"), (epochs.ranges[0], ANCHORS),
+        ),
+    }  # fmt: skip
+    for name, (function, arguments, values) in calls.items():
+        check_refuses_nan(name, function, arguments, values)
+
+
+def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
+    epochs = simulate(rng, (_TRIALS,), _EPOCHS)
+    beliefs = _beliefs(_made(make_filter), epochs)
+    check_nees(beliefs, epochs.rotation, epochs.translation)
+    last = (epochs.rotation[-1], epochs.translation[-1], TAGS)
+    found = metrics.tag_error(beliefs[-1].rotation, beliefs[-1].translation, *last)
+    first = (epochs.rotation[0], epochs.translation[0], TAGS)
+    prior = metrics.tag_error(*epochs.prior[:2], *first)
+    require(
+        np.median(found) < np.median(prior),
+        f"after {_EPOCHS} epochs the tags must be nearer to the truth than before the first, got "
+        f"{np.median(found):.3g} m, of the prior {np.median(prior):.3g} m",
+    )
+
+
+def _made(make_filter: Callable[..., Any], noise: ranging.NoiseLaw = NOISE) -> Any:
+    laws = {"tags": TAGS, "noise": noise, "process": PROCESS}
+    return call("make_filter(tags=, noise=, process=)", make_filter, **laws)
+
+
+def _beliefs(filter: Any, epochs: Epochs, anchors: FloatArray | None = None) -> list[Any]:
+    """The belief after every epoch."""
+    anchors = ANCHORS if anchors is None else anchors
+    state = call("initial", filter.initial, *epochs.prior)
+    beliefs = []
+    for k, ranges in enumerate(epochs.ranges):
+        if k:
+            state = call("predict", filter.predict, state, epochs.twists[k], DT)
+        state = call("update", filter.update, state, ranges, anchors)
+        beliefs.append(call("belief", filter.belief, state))
+    return beliefs
+
+
+# --- locators -------------------------------------------------------------------------------
+
+
+def _locator_shapes(locate: Any, rng: np.random.Generator) -> None:
+    for batch in ((), (3,), (2, 2)):
+        found = _located(locate, simulate(rng, batch, 1).ranges[0])
+        check_shapes("estimate", found, batch, ("rotation", "translation", "covariance"))
+
+
+def _locator_pose(locate: Any, rng: np.random.Generator) -> None:
+    check_pose("estimate", _located(locate, simulate(rng, (8,), 1).ranges[0]))
+
+
+def _locator_batching(locate: Any, rng: np.random.Generator) -> None:
+    ranges = simulate(rng, (4,), 1).ranges[0]
+    together = _located(locate, ranges)
+    for index in range(4):
+        check_same(
+            f"a batch must give what its trials give alone; of trial {index}",
+            take(together, index), _located(locate, ranges[index]),
+        )  # fmt: skip
+
+
+def _locator_purity(locate: Any, rng: np.random.Generator) -> None:
+    ranges = simulate(rng, (3,), 1).ranges[0]
+    links = np.ones(ranges.shape, dtype=np.bool_)
+    links[..., 0, 0] = False
+    check_pure("locate", locate, ranges.copy(), ANCHORS, TAGS, NOISE, links=links)
+
+
+def _locator_determinism(locate: Any, rng: np.random.Generator) -> None:
+    ranges = simulate(rng, (3,), 1).ranges[0]
+    first, second = _located(locate, ranges), _located(locate, ranges)
+    check_same("a second call must give the same bytes", first, second, 0.0)
+
+
+def _locator_invariance(locate: Any, rng: np.random.Generator) -> None:
+    ranges = simulate(rng, (3,), 1).ranges[0]
+    turn, shift = moved_world(rng)
+    expected = moved(_located(locate, ranges), turn, shift)
+    found = _located(locate, ranges, ANCHORS @ turn.T + shift)
+    check_same("a world moved and turned must move and turn the estimate", expected, found)
+
+
+def _locator_links(locate: Any, rng: np.random.Generator) -> None:
+    ranges = simulate(rng, (3,), 1).ranges[0]
+    check_links(lambda ranges, anchors, links: _located(locate, ranges, anchors, links), ranges)
+
+
+def _locator_nan(locate: Any, rng: np.random.Generator) -> None:
+    check_refuses_nan(
+        "locate",
+        lambda ranges, anchors, tags: locate(ranges, anchors, tags, NOISE),
+        ("ranges", "anchors", "tags"),
+        (simulate(rng, (3,), 1).ranges[0], ANCHORS, TAGS),
+    )
+
+
+def _locator_nees(locate: Any, rng: np.random.Generator) -> None:
+    epochs = simulate(rng, (4 * _TRIALS,), 1)
+    check_nees([_located(locate, epochs.ranges[0])], epochs.rotation, epochs.translation)
+
+
+def _located(
+    locate: Any, ranges: FloatArray, anchors: FloatArray | None = None, links: Any = None
+) -> Any:
+    anchors = ANCHORS if anchors is None else anchors
+    return call("locate", locate, ranges, anchors, TAGS, NOISE, links=links)
+
+
+_FILTER_CHECKS = {
+    "interface": _filter_interface, "shapes": _filter_shapes, "pose": _filter_pose,
+    "batching": _filter_batching, "purity": _filter_purity, "determinism": _filter_determinism,
+    "pickling": _filter_pickling, "invariance": _filter_invariance, "links": _filter_links,
+    "noise": _filter_noise, "nan": _filter_nan, "nees": _filter_nees,
+}  # fmt: skip
+_LOCATOR_CHECKS = {
+    "shapes": _locator_shapes, "pose": _locator_pose, "batching": _locator_batching,
+    "purity": _locator_purity, "determinism": _locator_determinism,
+    "invariance": _locator_invariance, "links": _locator_links, "nan": _locator_nan,
+    "nees": _locator_nees,
+}  # fmt: skip

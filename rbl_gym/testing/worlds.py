@@ -1,0 +1,205 @@
+"""Small worlds and single checks behind `rbl_gym.testing`; each raises an AssertionError."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import metrics, motion
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.measurements import ranging
+
+# Neither coplanar, nor when any one of them is left out.
+ANCHORS = np.array([[-6, -5, 0.5], [6, -5, 4], [6, 5, 0], [-6, 5, 3.5], [0, -6, 2], [1, 6, 5.0]])
+TAGS = bodies.octahedron(1.0)
+NOISE, PROCESS = ranging.RangeNoise(0.05), motion.ProcessNoise(0.1, 0.1)
+DT = 0.1
+_PRIOR_STD = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
+# Results of one computation in another order may differ by so much, in units of themselves.
+_SAME = 1e-6
+# Average NEES per degree of freedom that is still sane, without any model error.
+_NEES = (1 / 3, 3.0)
+_FIELDS = ("rotation", "translation", "covariance")
+
+
+class Epochs(NamedTuple):
+    """A batch of bodies over some epochs, (K, B, ...) but for the prior (B, ...)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    twists: FloatArray
+    ranges: FloatArray
+    prior: tuple[FloatArray, FloatArray, FloatArray]
+
+
+def simulate(rng: np.random.Generator, batch: tuple[int, ...], count: int) -> Epochs:
+    """Bodies that drift and turn among `ANCHORS`, their ranges, and a prior drawn around them."""
+    twists = np.zeros((*batch, count, 6))
+    twists[..., 1:, :] = 0.5 * rng.standard_normal((*batch, 1, 6))
+    start = rotations.random(rng, batch), rng.uniform(-2, 2, (*batch, 3))
+    # No motion leads to the first epoch: its twist is of no interval.
+    path = motion.simulate(
+        motion.Trajectory(*start, twists[..., 1:, :]), DT, PROCESS,
+        rng.standard_normal((*batch, count - 1, 6)),
+    )  # fmt: skip
+    ranges = ranging.simulate(
+        ANCHORS, TAGS, path.rotation, path.translation, NOISE, rng
+    ).ranges  # fmt: skip
+    offset = _PRIOR_STD * rng.standard_normal((*batch, 6))
+    covariance = np.broadcast_to(np.diag(_PRIOR_STD**2), (*batch, 6, 6)).copy()
+    prior = rotations.exp(offset[..., :3]) @ start[0], start[1] + offset[..., 3:], covariance
+    rotation, translation, twists, measured = (
+        np.ascontiguousarray(np.moveaxis(array, len(batch), 0))
+        for array in (path.rotation, path.translation, twists, ranges)
+    )
+    return Epochs(rotation, translation, twists, measured, prior)
+
+
+def require(condition: Any, message: str) -> None:
+    """An AssertionError with the message, also under ``python -O``."""
+    if not condition:
+        raise AssertionError(message)
+
+
+def call(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """What a function returns; what it raises on arguments that are right is a failure."""
+    try:
+        return function(*arguments, **options)
+    except Exception as error:
+        shapes = ", ".join(str(np.shape(a)) for a in arguments if isinstance(a, np.ndarray))
+        raise AssertionError(
+            f"{name} must take arguments that are right, raised {error!r}"
+            + (f" on shapes {shapes}" if shapes else "")
+        ) from error
+
+
+def trial(epochs: Epochs, index: int) -> Epochs:
+    """One trial of a batch with one axis."""
+    rotation, translation, covariance = (array[index] for array in epochs.prior)
+    rows = [array[:, index] for array in epochs[:4]]
+    return Epochs(rows[0], rows[1], rows[2], rows[3], (rotation, translation, covariance))
+
+
+def take(pose: Any, index: int) -> dict[str, FloatArray]:
+    """One trial of a belief."""
+    return {name: np.asarray(getattr(pose, name))[index] for name in _FIELDS}
+
+
+def moved_world(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """A turn (3, 3) and a shift (3,) of the world."""
+    return rotations.random(rng), np.array([30.0, -20.0, 10.0])
+
+
+def moved(pose: Any, turn: FloatArray, shift: FloatArray) -> dict[str, FloatArray]:
+    """A belief as it is in the world that was turned and shifted."""
+    both = np.kron(np.eye(2), turn)
+    return {
+        "rotation": turn @ pose.rotation,
+        "translation": pose.translation @ turn.T + shift,
+        "covariance": both @ pose.covariance @ both.T,
+    }
+
+
+def check_shapes(name: str, pose: Any, batch: tuple[int, ...], fields: Sequence[str]) -> None:
+    """Float arrays of the shapes that leading axes `batch` ask for."""
+    cores = {"rotation": (3, 3), "translation": (3,), "covariance": (6, 6), "matrix": (3, 3)}
+    for field in fields:
+        value = getattr(pose, field, None)
+        want = (*batch, *cores[field])
+        require(
+            isinstance(value, np.ndarray) and value.dtype == np.float64 and value.shape == want,
+            f"{name}.{field} must be a float64 array of shape {want}, got "
+            + (f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else f"{value!r}"),
+        )
+
+
+def check_pose(name: str, pose: Any) -> None:
+    """A proper rotation, and a covariance that is symmetric and positive definite."""
+    Q, P = np.asarray(pose.rotation), np.asarray(pose.covariance)
+    require(np.isfinite(Q).all(), f"{name}.rotation must be finite, got {Q}")
+    defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max()
+    require(defect < _SAME, f"{name}.rotation must be orthogonal, Q Q^T is off I by {defect:.3g}")
+    worst = np.linalg.det(Q).min()
+    require(worst > 0, f"{name}.rotation must be proper, got a reflection (det {worst:.3g})")
+    require(np.isfinite(P).all(), f"{name}.covariance must be finite, got {P}")
+    skew = np.abs(P - np.swapaxes(P, -1, -2)).max() / np.abs(P).max()
+    require(skew < _SAME, f"{name}.covariance must be symmetric, is off by {skew:.3g} of itself")
+    least = np.linalg.eigvalsh(P).min()
+    require(least > 0, f"{name}.covariance must be positive definite, least eigenvalue {least:.3g}")
+
+
+def check_same(rule: str, expected: Any, found: Any, tolerance: float = _SAME) -> None:
+    """The same pose and covariance, to a tolerance in units of themselves (0: the same bytes)."""
+    for field in _FIELDS:
+        want = np.asarray(expected[field] if isinstance(expected, dict)
+                          else getattr(expected, field))  # fmt: skip
+        got = np.asarray(getattr(found, field))
+        require(got.shape == want.shape, f"{rule}: {field} has shape {got.shape}, not {want.shape}")
+        scale = np.abs(want).max() if field == "covariance" else 1.0
+        gap = np.abs(got - want).max(initial=0.0) / scale
+        require(gap <= tolerance, f"{rule}: {field} is off by {gap:.3g}")
+
+
+def check_pure(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """What a function returns, after a look whether it changed what it was given."""
+    before = [pickle.dumps(value) for value in (*arguments, *options.values())]
+    result = call(name, function, *arguments, **options)
+    for k, (value, old) in enumerate(zip((*arguments, *options.values()), before, strict=True)):
+        require(
+            pickle.dumps(value) == old, f"{name} must not change its arguments, changed no. {k}"
+        )
+    return result
+
+
+def check_links(estimate: Callable[[FloatArray, FloatArray, Any], Any], ranges: FloatArray) -> None:
+    """`estimate` (ranges, anchors, links) gives a link that is False no weight."""
+    full = np.ones(ranges.shape, dtype=np.bool_)
+    plain = estimate(ranges, ANCHORS, None)
+    check_same("links all True must mean the same as none", plain, estimate(ranges, ANCHORS, full))
+    links = full.copy()
+    links[..., 2, :] = False
+    without = estimate(np.delete(ranges, 2, axis=-2), np.delete(ANCHORS, 2, axis=0), None)
+    for value in (0.0, 7.0, 1e3):
+        behind = np.where(links, ranges, value)
+        check_same(
+            f"an anchor without a link, {value:g} in its place, must count like no anchor",
+            without, estimate(behind, ANCHORS, links),
+        )  # fmt: skip
+
+
+def check_refuses_nan(
+    name: str, function: Callable[..., Any], arguments: Sequence[str], values: Sequence[Any]
+) -> None:
+    """A ValueError on NaN in any one of the arguments."""
+    for k, argument in enumerate(arguments):
+        wrong = [np.array(value, dtype=np.float64) for value in values]
+        wrong[k].flat[0] = math.nan
+        try:
+            function(*wrong)
+        except ValueError:
+            continue
+        except Exception as error:
+            raise AssertionError(
+                f"{name} must raise a ValueError on NaN in {argument}, raised {error!r}"
+            ) from error
+        raise AssertionError(f"{name} must raise a ValueError on NaN in {argument}, raised nothing")
+
+
+def check_nees(poses: Sequence[Any], rotation: FloatArray, translation: FloatArray) -> None:
+    """Average NEES per degree of freedom within sane limits."""
+    values = []
+    for k, pose in enumerate(poses):
+        error = metrics.pose_error(pose.rotation, pose.translation, rotation[k], translation[k])
+        values.append(metrics.nees(error, pose.covariance))
+    average = float(np.mean(values)) / 6
+    low, high = _NEES
+    require(
+        low <= average <= high,
+        f"beliefs must be honest, NEES per degree of freedom between {low:.2g} and {high:.2g}, "
+        f"got {average:.3g}: errors are {'larger' if average > high else 'smaller'} than claimed",
+    )

@@ -1,0 +1,1 @@
+"""Worlds: the scene, the named scenes, overrides, and the simulation of episodes."""

@@ -1,0 +1,219 @@
+"""Named worlds, and overrides from plain dicts.
+
+`get` turns a name, or a JSON-able dict of overrides with the key ``"name"``, into a `Scene`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import check_array, check_one_of
+from rbl_gym.geometry import bodies, rotations
+from rbl_gym.geometry.regions import Box, Shell, Walls
+from rbl_gym.measurements.ranging import RangeNoise, SquaredRangeNoise
+from rbl_gym.motion.kinematics import ProcessNoise
+from rbl_gym.worlds import overrides
+from rbl_gym.worlds.scene import Scene, as_tuples
+
+__all__ = ["SCENES", "get"]
+
+
+def _per_step(translation_m: float, rotation_deg: float, dt: float) -> ProcessNoise:
+    """Process noise stated as standard deviations of one step of `dt` seconds."""
+    return ProcessNoise(math.radians(rotation_deg) / dt**0.5, translation_m / dt**0.5)
+
+
+SCENES: dict[str, Scene] = {
+    scene.name: scene
+    for scene in (
+        Scene(
+            name="uwb_room",
+            volume=Box((1, 1, 0.5), (9, 7, 2.2)),
+            anchor_region=Walls((0, 0, 0.3), (10, 8, 3)),
+            n_anchors=6,
+            anchors=((0, 0, 0.4), (10, 0, 2.8), (10, 8, 0.4), (0, 8, 2.8), (5, 0, 0.4), (5, 4, 3)),
+            tags=as_tuples(bodies.octahedron(0.8)),
+            noise=RangeNoise(0.10, 0.0),
+            blocked_information=0.01,  # behind the racks that placement draws
+            process=_per_step(0.03, 1.5, 0.1),
+            dt=0.1,
+            speed_m_s=1.0,
+            spin_rad_s=0.29,
+            initial_rotation_rad=math.radians(10),
+            initial_translation_m=0.5,
+        ),
+        Scene(
+            name="drone_yard",
+            volume=Box((-50, -50, 5), (50, 50, 40)),
+            anchor_region=Box((-60, -60, 0), (60, 60, 6)),
+            n_anchors=6,
+            anchors=(
+                (-60, -60, 0), (60, -60, 6), (60, 60, 0), (-60, 60, 6), (0, -60, 0), (0, 60, 6),
+            ),
+            tags=as_tuples(bodies.octahedron(1.0)),
+            noise=RangeNoise(0.10, 0.001),
+            process=_per_step(0.1, 1.5, 0.1),
+            dt=0.1,
+            speed_m_s=5.0,
+            spin_rad_s=0.29,
+            initial_rotation_rad=math.radians(10),
+            initial_translation_m=1.0,
+        ),
+        Scene(
+            name="auv_buoys",
+            volume=Box((-150, -150, -80), (150, 150, -20)),
+            anchor_region=Box((-200, -200, 0), (200, 200, 0)),
+            n_anchors=4,
+            anchors=((-150, -150, 0), (150, -150, 0), (150, 150, 0), (-150, 150, 0)),
+            anchor_speed_m_s=4.0,
+            tags=as_tuples(bodies.pyramid(2.0)),
+            noise=RangeNoise(0.05, 0.001),
+            process=_per_step(0.3, 2.0, 1.0),
+            dt=1.0,
+            speed_m_s=1.5,
+            spin_rad_s=0.03,
+            initial_rotation_rad=math.radians(10),
+            initial_translation_m=3.0,
+        ),
+        Scene(
+            name="satellite",
+            volume=Box((-5, -5, -5), (5, 5, 5)),
+            anchor_region=Shell(50, 300),
+            n_anchors=5,
+            anchors=((100, 0, -35), (-35, 94, -35), (-65, -67, -35), (0, 0, 100), (60, 60, 60)),
+            anchor_speed_m_s=1.0,
+            tags=as_tuples(bodies.octahedron(2.0)),
+            noise=RangeNoise(0.02, 0.0002),
+            process=_per_step(0.02, 1.0, 1.0),
+            dt=1.0,
+            speed_m_s=0.05,
+            spin_rad_s=0.012,
+            initial_rotation_rad=math.radians(5),
+            initial_translation_m=0.5,
+        ),
+        Scene(
+            name="auv_craft",
+            volume=Box((-150, -150, -80), (150, 150, -20)),
+            start_volume=Box((-100, -100, -80), (100, 100, -20)),
+            anchor_region=Box((-600, -600, 0), (600, 600, 0)),
+            n_anchors=3,
+            anchor_start_m=150.0,
+            anchor_speed_m_s=4.0,
+            tags=as_tuples(bodies.pyramid(2.0)),
+            noise=RangeNoise(0.05, 0.002),
+            process=_per_step(0.3, 2.0, 2.0),
+            dt=2.0,
+            speed_m_s=1.5,
+            spin_rad_s=0.03,
+            initial_rotation_rad=math.radians(10),
+            initial_translation_m=3.0,
+        ),
+        Scene(
+            name="hall",
+            volume=Box((-17, -8, 0.5), (17, 8, 3)),
+            anchor_region=Walls((-20, -10, 0), (20, 10, 6)),
+            n_anchors=12,
+            anchors=(
+                (20, 2.679, 4.125), (20, 10, 5.486), (5.359, 10, 4.878), (-5.359, 10, 2.126),
+                (-20, 10, 2.501), (-20, 2.679, 5.368), (-20, -2.679, 1.026), (-20, -10, 5.106),
+                (-5.359, -10, 4.985), (5.359, -10, 3.34), (20, -10, 2.515), (20, -2.679, 2.392),
+            ),
+            obstacles=(
+                (-8, 2, 1.5, 0.5, 5, 1.5), (0, -3, 2, 0.5, 4, 2),
+                (9, 1, 1.5, 4, 0.5, 1.5), (5, -6, 1.2, 3, 0.5, 1.2),
+            ),
+            tags=as_tuples(bodies.octahedron(0.8)),
+            noise=RangeNoise(0.10, 0.005),
+            process=_per_step(0.05, 2.0, 0.2),
+            dt=0.2,
+            speed_m_s=2.0,
+            spin_rad_s=0.2,
+            initial_rotation_rad=math.radians(10),
+            initial_translation_m=0.5,
+        ),
+        Scene(
+            name="camsap2013",
+            volume=Box((0, 0, 0), (0, 0, 0)),
+            anchor_region=Box((-1000, -1000, -1000), (1000, 1000, 1000)),
+            n_anchors=4,
+            # One draw from the cube, the same for all trials, as the paper's figures need it.
+            anchors=(
+                (738.506, -150.447, 822.880),
+                (165.416, 353.081, 912.661),
+                (101.213, -0.828, -201.236),
+                (-309.327, 950.538, -572.864),
+            ),
+            tags=as_tuples(bodies.pyramid(1.0)),
+            noise=SquaredRangeNoise(0.0316),
+            process=ProcessNoise(math.radians(0.1), 1.0),
+            dt=1.0,  # not printed: an assumption
+            steps=20,
+            trajectory="constant",
+            twist=(*[math.radians(1.0)] * 3, 1.0, 1.0, 1.0),  # 1_3 deg/s and 1_3 m/s
+            start_rotation=as_tuples(np.eye(3)),
+            start_translation=(0.0, 0.0, 0.0),
+            # 100 I12 of the paper: pose information .02 and .01, that is 50 and 100.
+            initial_rotation_rad=math.sqrt(50.0),
+            initial_translation_m=10.0,
+            prior="start",
+        ),
+        Scene(
+            name="icassp2013",
+            volume=Box((0, 0, 0), (10, 10, 10)),
+            anchor_region=Box((0, 0, 0), (100, 100, 100)),
+            n_anchors=10,
+            tags=as_tuples(bodies.icassp2013()),
+            # A reference range of 80 dB: a standard deviation of 1e-4 of the range.
+            noise=RangeNoise(0.0, 1e-4, reference_tag=0),
+            process=ProcessNoise(),
+            dt=1.0,
+            trajectory="constant",
+            start_rotation=as_tuples(
+                rotations.from_euler_zyx(*np.deg2rad([10.0, -25.0, 20.0]))
+            ),
+            start_translation=(5.0, 5.0, 5.0),
+            initial_rotation_rad=math.radians(60),
+            initial_translation_m=5.0,
+        ),
+    )
+}  # fmt: skip
+
+
+def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
+    """A scene by its name, or a named one with overrides.
+
+    Parameters
+    ----------
+    scene
+        A name of `SCENES`; or a mapping with the key ``"name"`` and fields of `Scene` to
+        change. Nested fields take mappings of their own: ``{"name": "uwb_room", "steps": 50,
+        "links": {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``. A region or noise of
+        another kind is named by ``"kind"`` (``"box"``, ``"walls"``, ``"shell"``; a name of
+        `ranging.NOISE_FORMS`: ``"range"``, ``"squared-range"``, ``"reference-range"`` with its
+        `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`, `kappa` and `snr`). Another
+        number of anchors than the scene has, without their places, draws them anew in the region
+        at every reset.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name or field, or a value that its field refuses.
+    """
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, str):
+        scene = {"name": scene}
+    if not isinstance(scene, Mapping) or "name" not in scene:
+        raise ValueError(f"scene must be a name or a dict with the key 'name', got {scene!r:.120}")
+    changes = {key: value for key, value in scene.items() if key != "name"}
+    base = SCENES[check_one_of("scene", scene["name"], list(SCENES))]
+    if changes.get("n_anchors", base.n_anchors) != base.n_anchors:
+        changes.setdefault("anchors", None)
+    anchors = changes.get("anchors")
+    if anchors is not None:
+        changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))
+    return overrides.replace(base, changes, "scene")

@@ -1,0 +1,316 @@
+"""Episodes of a scene: what the environment and the Monte-Carlo experiments share.
+
+An episode's randomness is drawn at once from one Generator, in a fixed order; everything after
+is arithmetic on arrays with leading batch axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds, motion
+from rbl_gym.checks import BoolArray, FloatArray, kernel
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.worlds.scene import Scene
+
+__all__ = [
+    "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure", "move_anchors",
+]  # fmt: skip
+
+# Behind the doors: what comes to these was checked, or made here.
+_TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
+
+
+class Draws(NamedTuple):
+    """All random numbers of an episode: standard normals (..., n) and uniforms (..., m)."""
+
+    normals: FloatArray
+    uniforms: FloatArray
+
+
+class Episode(NamedTuple):
+    """All of an episode that does not depend on actions, with leading batch axes.
+
+    Attributes
+    ----------
+    rotation, translation
+        True poses at epochs 0 ... T, (..., T + 1, 3, 3) and (..., T + 1, 3).
+    twists
+        Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
+        unless the prior is older than it.
+    normals, uniforms
+        Random numbers of the ranges (..., T + 1, M, N); of the links (..., T + 1, 2, M, N) or
+        None where they need none.
+    prior_rotation, prior_translation, prior_covariance
+        Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
+    anchors
+        At epoch 0, (..., M, 3).
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    twists: FloatArray
+    normals: FloatArray
+    uniforms: FloatArray | None
+    prior_rotation: FloatArray
+    prior_translation: FloatArray
+    prior_covariance: FloatArray
+    anchors: FloatArray
+
+
+class Epoch(NamedTuple):
+    """An episode at one epoch: the first five fields of `Episode` without their time axis."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    twist: FloatArray
+    normals: FloatArray
+    uniforms: FloatArray | None
+
+
+# Standard normals of an episode besides those of steps and ranges: rotation, spin, prior.
+_START_NORMALS = 4 + 3 + 6
+# Steps for which a random twist is held.
+_HOLD = 10
+
+
+def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Draws:
+    """The random numbers of an episode: one call for normals, one for uniforms."""
+    return Draws(
+        rng.standard_normal((*batch, sum(_normal_sizes(scene)))),
+        rng.random((*batch, sum(_uniform_sizes(scene)))),
+    )
+
+
+def empty_draws(scene: Scene, count: int) -> Draws:
+    """Room for the random numbers of `count` episodes, (count, n) and (count, m)."""
+    return Draws(
+        np.empty((count, sum(_normal_sizes(scene)))),
+        np.empty((count, sum(_uniform_sizes(scene)))),
+    )
+
+
+def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.Generator]) -> None:
+    """`draw` into some rows, each by its own generator: what a vector environment resets with."""
+    for row, generator in zip(rows, generators, strict=True):
+        generator.standard_normal(out=draws.normals[row])
+        generator.random(out=draws.uniforms[row])
+
+
+def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
+    """Views of the draws: `normals` and `uniforms` of an `Episode`."""
+    batch, shape = draws.normals.shape[:-1], (scene.n_anchors, len(scene.tags))
+    normals = _split(draws.normals, _normal_sizes(scene))[2]
+    normals = normals.reshape((*batch, scene.steps + 1, *shape))
+    if not scene.links.is_random:
+        return normals, None
+    uniforms = _split(draws.uniforms, _uniform_sizes(scene))[3]
+    return normals, uniforms.reshape((*batch, scene.steps + 1, 2, *shape))
+
+
+def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:
+    """An episode of a scene, or a batch of independent ones.
+
+    Anchors that the scene leaves open are drawn anew for every episode of the batch.
+
+    Parameters
+    ----------
+    scene, rng, batch
+        The world, the source of all randomness, and the leading axes.
+    """
+    return build_episode(scene, draw(scene, rng, batch))
+
+
+def _steps(scene: Scene) -> int:
+    """Steps of motion: one more than the episode's where the prior is older than epoch 0."""
+    return scene.steps + (scene.prior == "start")
+
+
+def _links(scene: Scene) -> int:
+    return scene.n_anchors * len(scene.tags)
+
+
+def _normal_sizes(scene: Scene) -> tuple[int, int, int, int]:
+    """Normals of the start, the process, the ranges, the random twists."""
+    held = -(-_steps(scene) // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
+    return _START_NORMALS, 6 * _steps(scene), (scene.steps + 1) * _links(scene), held
+
+
+def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
+    """Uniforms of the way-points, the orbit's phase, the anchors, the links."""
+    anchors = 3 * scene.n_anchors if scene.anchors is None else 0
+    links = 2 * (scene.steps + 1) * _links(scene) if scene.links.is_random else 0
+    return 3 * _n_points(scene), int(scene.trajectory == "orbit"), anchors, links
+
+
+def _n_points(scene: Scene) -> int:
+    if scene.trajectory != "waypoints":
+        return 1
+    extent = max(float(np.linalg.norm(np.ptp(scene.volume.bounds(), axis=0))), 1e-9)
+    # Legs average above a quarter of the extent: four times as many as that calls for, and 8.
+    return 8 + int(np.ceil(16 * scene.speed_m_s * scene.dt * _steps(scene) / extent))
+
+
+def build_episode(scene: Scene, draws: Draws) -> Episode:
+    """The episodes that these random numbers make; batched over their leading axes."""
+    batch = draws.normals.shape[:-1]
+    start, process, _, held = _split(draws.normals, _normal_sizes(scene))
+    places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
+    trajectory = _trajectory(scene, start[..., :7], places, phase, held)
+    steps = _steps(scene)
+    path = motion.simulate(trajectory, scene.dt, scene.process, process.reshape((*batch, steps, 6)))
+    twists = np.broadcast_to(trajectory.twists, (*batch, steps, 6))
+    offset = start[..., 7:]
+    covariance = scene.prior_covariance
+    rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
+    if scene.prior == "start":
+        # The same for all episodes of a constant twist: its leading axes are few or none.
+        first = trajectory.twists[..., 0, :]
+        prior = motion.propagate(rotation, translation, first, scene.dt)
+        covariance = bounds.predict_covariance(covariance, first, scene.dt, scene.process)
+        path = motion.Path(path.rotation[..., 1:, :, :], path.translation[..., 1:, :])
+    else:
+        prior = (
+            rotations.exp(scene.initial_rotation_rad * offset[..., :3]) @ rotation,
+            translation + scene.initial_translation_m * offset[..., 3:],
+        )
+        twists = np.concatenate([np.zeros((*batch, 1, 6)), twists], axis=-2)
+    if scene.anchors is None:
+        spots = spots.reshape((*batch, scene.n_anchors, 3))
+        if scene.anchor_start_m is None:
+            anchors = scene.anchor_region.draw(spots)
+        else:
+            around = path.translation[..., :1, :] + scene.anchor_start_m * (2 * spots - 1)
+            anchors = scene.anchor_region.project(around)
+    else:
+        anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
+    covariance = np.broadcast_to(covariance, (*batch, 6, 6))
+    random = of_ranges(scene, draws)
+    return Episode(*path, twists, *random, *prior, covariance, anchors)
+
+
+def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
+    return np.split(block, np.cumsum(sizes)[:-1], axis=-1)
+
+
+def _trajectory(
+    scene: Scene, start: FloatArray, places: FloatArray, phase: FloatArray, held: FloatArray
+) -> motion.Trajectory:
+    """The scene's nominal motion; way-points and the start are uniform in its volume."""
+    batch, steps = start.shape[:-1], _steps(scene)
+    if scene.start_rotation is None:
+        rotation = rotations.from_quaternion(start[..., :4])
+    else:
+        rotation = np.asarray(scene.start_rotation)
+    low, high = scene.volume.bounds()
+    places = places.reshape((*batch, -1, 3))
+    points = low + places * (high - low)
+    if scene.start_volume is not None:
+        points[..., 0, :] = scene.start_volume.draw(places[..., 0, :])
+    first = points[..., 0, :]
+    if scene.start_translation is not None:
+        first = np.asarray(scene.start_translation)
+        points[..., 0, :] = first
+    if scene.trajectory == "constant":
+        return motion.constant_twist(rotation, first, scene.twist, steps)
+    if scene.trajectory == "random-twist":
+        rates = (scene.spin_rad_s, scene.speed_m_s)
+        twists = motion.held_twists(held.reshape((*batch, -1, 2, 3)), *rates, steps, _HOLD)
+        return motion.Trajectory(rotation, first, twists)
+    if scene.trajectory == "orbit":
+        radius = 0.35 * float((high - low)[:2].min())
+        turn = 2 * np.pi * phase[..., 0]
+        return motion.orbit(0.5 * (low + high), radius, scene.speed_m_s, scene.dt, steps, turn)
+    if scene.trajectory == "lawn-mower":
+        lanes = motion.lawn_mower_points(low, high, max(0.2 * float((high - low)[1]), 1e-9))
+        points = np.broadcast_to(lanes, (*batch, *lanes.shape))
+    spin = scene.spin_rad_s * start[..., 4:7]
+    return motion.waypoints(rotation, points, scene.speed_m_s, scene.dt, steps, spin)
+
+
+def epoch_of(episode: Episode, epoch: int) -> Epoch:
+    """Views of an episode at one epoch, the same for the whole batch."""
+    return Epoch(
+        episode.rotation[..., epoch, :, :],
+        episode.translation[..., epoch, :],
+        episode.twists[..., epoch, :],
+        episode.normals[..., epoch, :, :],
+        None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
+    )
+
+
+def whole(episode: Episode) -> Epoch:
+    """All epochs of an episode at once: the time axis is the last of the batch's."""
+    return Epoch(*episode[: len(Epoch._fields)])  # pyright: ignore[reportArgumentType]
+
+
+def measure(
+    scene: Scene,
+    at: Epoch,
+    anchors: FloatArray,
+    positions: FloatArray | None = None,
+    quality: FloatArray | None = None,
+) -> ranging.Measurement:
+    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
+
+    `positions` of the tags (..., N, 3) and `quality` (`link_quality`): where known already.
+
+    `at` is of an episode of the `scene`.
+    """
+    if positions is None:
+        positions = _TAG_POSITIONS(at.rotation, at.translation, scene.tags)
+    normals = at.normals
+    if scene.obstacles:
+        quality = link_quality(scene, at, anchors) if quality is None else quality
+        normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
+    distances = _DISTANCES(anchors, positions)
+    measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
+    clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
+    # However the worlds lie in memory, what is observed is in C order.
+    ranges = np.ascontiguousarray(clipped)
+    links, nlos = np.ascontiguousarray(measured.links), np.ascontiguousarray(measured.nlos)
+    # A range of zero has no variance under a proportional law: such a reading is no reading.
+    links &= ranges > 0
+    if quality is not None and not scene.blocked_information:
+        links &= quality[..., None] > 0
+        ranges[~links] = 0.0
+    return ranging.Measurement(ranges, links, nlos)
+
+
+def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
+    """Share (..., M) of its information that the sight from each anchor leaves a link."""
+    return scene.obstruction.share(anchors, at.translation[..., None, :])[..., 0, :]
+
+
+def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> Any:
+    """Share (..., M, N) of its information that each link has: none where it gave no range."""
+    return links * link_quality(scene, at, anchors)[..., None] if scene.obstacles else links
+
+
+def perceived_noise(
+    scene: Scene, ranges: FloatArray, links: BoolArray, quality: FloatArray
+) -> ranging.LinkNoise:
+    """The noise of an epoch to a receiver that learns how good a link is with its range.
+
+    `quality` (..., M) is that of `link_quality`, `ranges` and `links` are (..., M, N).
+    """
+    variance = scene.noise.variance(np.where(links, ranges, 1.0), links)
+    return ranging.LinkNoise(np.sqrt(variance / np.where(quality > 0, quality, 1.0)[..., None]))
+
+
+def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:
+    """Anchors after one step of the commanded velocities.
+
+    `action` (..., 3 M) holds a velocity per anchor in units of the scene's limit; a longer
+    one than 1 is cut to 1, and the place is projected onto the anchors' region.
+    """
+    velocity = action.reshape(*action.shape[:-1], scene.n_anchors, 3)
+    length = np.sqrt(np.add.reduce(velocity * velocity, axis=-1))
+    reach = (scene.anchor_speed_m_s * scene.dt) / np.maximum(length, 1.0)
+    moved = velocity * reach[..., None]
+    moved += anchors
+    return scene.anchor_region.project(moved)
