@@ -30,7 +30,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     "BaseStation": {"scene": {"steps": 3}, "angle_std_rad": 0.01, "reward": "bound"},
     "PlanarNetwork": {
         "n_nodes": 5, "side_m": 10.0, "radius_m": 8.0, "blind_m": 0.5, "bearing_std_rad": 0.05,
-        "step_m": 0.5, "reward": "bound", "steps": 3,
+        "lengths": "all", "length_std_m": 0.1, "step_m": 0.5, "reward": "bound", "steps": 3,
     },
 }  # fmt: skip
 BATCH = {"num_envs": 2, "max_episode_steps": 2, "autoreset_mode": "NextStep"}
@@ -137,7 +137,10 @@ WRAPPERS: dict[str, tuple[str, dict[str, Any]]] = {
         "Tracking",
         {"filter": "iekf", "options": {"robust": True}, "reward": "belief", "observation": "dict"},
     ),
-    "EstimateNetwork": ("PlanarNetwork", {"reward": "belief"}),
+    "EstimateNetwork": (
+        "PlanarNetwork",
+        {"reward": "belief", "cycles": "bfs", "kappa": "best", "order": "asynchronous", "steps": 9},
+    ),
 }
 
 

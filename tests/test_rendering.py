@@ -213,11 +213,25 @@ def test_a_frame_after_an_autoreset_shows_the_new_episode(mode, wrapped):
 
 
 def test_beliefs_of_a_vector_look_like_scalar_ones():
-    envs: Any = VectorEstimateNetwork(make_vec("PlanarNetwork", num_envs=2))
-    env: Any = EstimateNetwork(make("PlanarNetwork"))
-    envs.reset(seed=2)
-    env.reset(seed=3)
-    assert_alike(envs.render()[1], env.render())
+    for lengths in ("none", "all"):
+        envs: Any = VectorEstimateNetwork(make_vec("PlanarNetwork", num_envs=2, lengths=lengths))
+        env: Any = EstimateNetwork(make("PlanarNetwork", lengths=lengths))
+        envs.reset(seed=2)
+        env.reset(seed=3)
+        assert_alike(envs.render()[1], env.render())
+
+
+def test_believed_places_of_a_network_are_drawn():
+    frames = []
+    for lengths in ("none", "one", "all"):
+        env: Any = EstimateNetwork(make("PlanarNetwork", lengths=lengths))
+        env.reset(seed=3)
+        # The plan alone: the legend differs, too.
+        frames.append(env.render()[60:, :510])
+    bare, one, every = frames
+    assert (one != bare).any()
+    # Sharper places have smaller rings.
+    assert green(one) != green(every)
 
 
 # --- what is shown ------------------------------------------------------------------------------

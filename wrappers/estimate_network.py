@@ -1,83 +1,123 @@
-"""EstimateNetwork: the cycle consensus on the bearings of a network environment."""
+"""EstimateNetwork: observations of a network become beliefs over its poses, by cycle consensus."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import RecordConstructorArgs
+from gymnasium.utils import RecordConstructorArgs, seeding
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
-from rbl_gym.envs.network import PRIOR_STD_RAD, PlanarNetworkEnv, PlanarNetworkVectorEnv
-from rbl_gym.estimators.networks.consensus import cycle_iteration
-from rbl_gym.estimators.networks.orientations import along_tree
-from rbl_gym.networks.bounds import linked_covariance
-from rbl_gym.networks.graphs import components
-from rbl_gym.networks.sensing import edge_angles, proj
+from rbl_gym.envs.batch import seeds_of
+from rbl_gym.envs.network import PlanarNetworkEnv, PlanarNetworkVectorEnv
+from rbl_gym.estimators.networks.beliefs import (
+    Consensus,
+    NetworkBelief,
+    check_consensus,
+    consensus,
+    network_belief,
+)
+from rbl_gym.networks.bounds import Sensing
+from rbl_gym.networks.sensing import proj
 from rbl_gym.rendering import tell
 from rbl_gym.rendering.network import Headings
 
 REWARDS = ("belief", "error")
-_TOL = 1e-9
-_MAX_STEPS = 5000
+# Sets the wrapper's own randomness apart from that of the environment with the same seed.
+_STREAM = 1
 
 
 class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Turns bearings into orientations by the cycle consensus, and their accuracy into reward.
+    """Turns bearings into orientations, with lengths into poses, and scores the estimate.
 
     Wraps `RBL/PlanarNetwork-v0`; its own reward is replaced. For vector environments:
-    `VectorEstimateNetwork`. Each epoch is estimated from its own bearings; the last estimate
-    says which multiple of 2 pi a cycle sums to, so that long cycles do not slip.
+    `VectorEstimateNetwork`. Each epoch is estimated from its own measurements: orientations by
+    the cycle consensus, (14), summed up along a tree; where lengths are observed, both by
+    maximum likelihood from there. The last estimate says which multiple of 2 pi a cycle sums
+    to, so that long cycles do not slip.
 
     Parameters
     ----------
     env
         The environment.
     reward
-        ``"belief"``: ``-log`` of the root mean square standard deviation of the orientations, as
-        the bearings' noise promises, radians. ``"error"``: minus the real root mean square error.
+        ``"error"``: minus the real root mean square error. ``"belief"``: ``-log`` of the one
+        that the belief expects. Of the orientations, in radians; where lengths are observed,
+        of the poses, in metres: of a point 1 m away from its node.
+    cycles, kappa, order
+        Of `estimators.cycle_iteration`: the cycles by name, the step or its rule, and
+        ``"synchronous"`` or ``"asynchronous"``. A step too large for the cycles of an epoch is
+        an error of that epoch.
+    steps
+        The most steps of the iteration in an epoch. Where they are too few, the residuals are
+        larger than the noise, and the belief is wider.
 
     Observation
     -----------
     The environment's, with `orientations` (n,) relative to node 0, radians in [-pi, pi], and
-    `orientation_std` (n,). A node that has no path to node 0 keeps its last estimate (0 before
-    the first) and the standard deviation of its prior.
+    `orientation_std` (n,). Where lengths are observed, also `positions` (n, 2) in the frame of
+    node 0, metres, and `pose_covariance` (n, 3, 3) of each node's orientation, x and y: with
+    them a node's pose is the belief.
+
+    All variances are scaled by max(1, chi-square per degree of freedom of the residuals), and
+    end at those of the prior. A node that has no path to node 0 keeps its last estimate (0
+    before the first) and has the standard deviations of its prior.
 
     Info
     ----
-    `orientation_error_rad` (root mean square over all nodes but node 0), `belief_rad` and
-    `consensus_steps`, beside what the environment says.
+    `orientation_error_rad` (root mean square over all nodes but node 0) and `belief_rad`, what
+    the belief expects it to be; `chi_square` (per degree of freedom; 0 without one);
+    `consensus_steps` and `consensus_converged`; with lengths `position_error_m`, `pose_error_m`
+    and `belief_m`, what is expected of the latter; beside what the environment says.
 
     Examples
     --------
     >>> import gymnasium as gym
     >>> from rbl_gym.wrappers import EstimateNetwork
-    >>> env = EstimateNetwork(gym.make("rbl_gym:RBL/PlanarNetwork-v0"))
+    >>> env = EstimateNetwork(gym.make("rbl_gym:RBL/PlanarNetwork-v0", lengths="all"))
     >>> observation, info = env.reset(seed=1)
     >>> info["orientation_error_rad"] < 0.2
     True
+    >>> observation["positions"].shape, observation["pose_covariance"].shape
+    ((12, 2), (12, 3, 3))
     """
 
-    def __init__(self, env: gym.Env[Any, Any], reward: str = "belief") -> None:
-        RecordConstructorArgs.__init__(self, reward=reward)
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        reward: str = "error",
+        cycles: str = "bfs",
+        kappa: float | str | None = None,
+        order: str = "synchronous",
+        steps: int = 5000,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, reward=reward, cycles=cycles, kappa=kappa, order=order, steps=steps
+        )
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.unwrapped, PlanarNetworkEnv):
             raise ValueError(f"env must be RBL/PlanarNetwork-v0, got {env.unwrapped}")
         self._reward = check_one_of("reward", reward, REWARDS)
-        self._sigma = env.unwrapped.bearing_std_rad
+        self._options = check_consensus(cycles, kappa, order, steps)
+        self._sensing = env.unwrapped.sensing
+        self._rng = seeding.np_random()[0]
         self._theta: FloatArray | None = None
-        self.observation_space = _space(env.observation_space)
+        self._places = np.zeros((env.unwrapped.n_nodes, 2))
+        self.observation_space = _space(env.observation_space, self._sensing)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start without an estimate and give it the first epoch."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._theta = None
+        if seed is not None:
+            self._rng = _generator(seed)
+        self._theta, self._places = None, np.zeros_like(self._places)
         return self._estimate(observation, info), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -87,13 +127,14 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, float(_rewarded(self._reward, info)), terminated, truncated, info
 
     def _estimate(self, observation: dict[str, np.ndarray], info: dict[str, Any]) -> Any:
-        links = observation["links"].astype(np.bool_)
-        self._theta, steps = consensus(links, observation["bearings"], self._theta)
-        figures, std = _judge(links, self._sigma, self._theta, info["orientations"])
-        info.update({name: float(value) for name, value in figures.items()})
-        info["consensus_steps"] = steps
-        tell(self.env, Headings(self._theta, std), single=True)
-        return {**observation, "orientations": self._theta.copy(), "orientation_std": std}
+        run = _run(observation, self._theta, self._options, self._rng)
+        found = _believe(observation, run[0], self._places, self._sensing)
+        self._theta = found.orientations
+        self._places = self._places if found.positions is None else found.positions
+        for name, value in {**_judge(found, info), **_progress(run)}.items():
+            info[name] = np.asarray(value).item()
+        tell(self.env, _shown(found), single=True)
+        return {**observation, **_observed(found)}
 
 
 class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
@@ -111,16 +152,29 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
     (4, 12)
     """
 
-    def __init__(self, env: VectorEnv[Any, Any, Any], reward: str = "belief") -> None:
-        RecordConstructorArgs.__init__(self, reward=reward)
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        reward: str = "error",
+        cycles: str = "bfs",
+        kappa: float | str | None = None,
+        order: str = "synchronous",
+        steps: int = 5000,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, reward=reward, cycles=cycles, kappa=kappa, order=order, steps=steps
+        )
         VectorWrapper.__init__(self, env)
         if not isinstance(env.unwrapped, PlanarNetworkVectorEnv):
             raise ValueError(f"env must be RBL/PlanarNetwork-v0, got {env.unwrapped}")
         self._reward = check_one_of("reward", reward, REWARDS)
-        self._sigma = env.unwrapped.bearing_std_rad
-        self._theta: list[FloatArray | None] = [None] * env.num_envs
+        self._options = check_consensus(cycles, kappa, order, steps)
+        self._sensing = env.unwrapped.sensing
+        self._rngs = [seeding.np_random()[0] for _ in range(env.num_envs)]
+        shape = (env.num_envs, env.unwrapped.n_nodes)
+        self._theta, self._places = np.zeros(shape), np.zeros((*shape, 2))
         self._over = np.zeros(env.num_envs, dtype=np.bool_)
-        self.single_observation_space = _space(env.single_observation_space)
+        self.single_observation_space = _space(env.single_observation_space, self._sensing)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
@@ -129,6 +183,9 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
         fresh = np.ones(self.num_envs, dtype=np.bool_)
         if options is not None and "reset_mask" in options:
             fresh = np.asarray(options["reset_mask"])
+        for world, one in enumerate(seeds_of(seed, self.num_envs)):
+            if fresh[world] and one is not None:
+                self._rngs[world] = _generator(one)
         self._over = self._over & ~fresh
         return self._estimate(observation, info, fresh), info
 
@@ -150,11 +207,11 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
         """Estimate the last epoch of the worlds that ended; their rewards."""
         final, last = info["final_obs"], info["final_info"]
         for world in np.flatnonzero(ended):
-            links = final[world]["links"].astype(np.bool_)
-            theta, steps = consensus(links, final[world]["bearings"], self._theta[world])
-            figures, std = _judge(links, self._sigma, theta, last["orientations"][world])
-            final[world] = {**final[world], "orientations": theta, "orientation_std": std}
-            for name, value in {**figures, "consensus_steps": steps}.items():
+            run = _run(final[world], self._theta[world], self._options, self._rngs[world])
+            found = _believe(final[world], run[0], self._places[world], self._sensing)
+            truth = {name: last[name][world] for name in ("orientations", "positions")}
+            final[world] = {**final[world], **_observed(found)}
+            for name, value in {**_judge(found, truth), **_progress(run)}.items():
                 column = last.setdefault(name, np.zeros(self.num_envs, np.asarray(value).dtype))
                 column[world] = value
                 last[f"_{name}"] = ended.copy()
@@ -163,84 +220,109 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
     def _estimate(
         self, observation: dict[str, np.ndarray], info: dict[str, Any], fresh: BoolArray
     ) -> dict[str, np.ndarray]:
-        links = observation["links"].astype(np.bool_)
-        steps = np.zeros(self.num_envs, dtype=np.int64)
+        runs = []
         for world in range(self.num_envs):
+            one = {name: value[world] for name, value in observation.items()}
             before = None if fresh[world] else self._theta[world]
-            found = consensus(links[world], observation["bearings"][world], before)
-            self._theta[world], steps[world] = found
-        theta = np.array(self._theta)
-        figures, std = _judge(links, self._sigma, theta, info["orientations"])
-        tell(self.env, Headings(theta, std))
-        for name, value in {**figures, "consensus_steps": steps}.items():
+            runs.append(_run(one, before, self._options, self._rngs[world]))
+        theta, steps, converged = (np.array(part) for part in zip(*runs, strict=True))
+        self._places = np.where(fresh[:, None, None], 0.0, self._places)
+        found = _believe(observation, theta, self._places, self._sensing)
+        self._theta = found.orientations
+        self._places = self._places if found.positions is None else found.positions
+        tell(self.env, _shown(found))
+        for name, value in {**_judge(found, info), **_progress((theta, steps, converged))}.items():
             info[name], info[f"_{name}"] = value, np.ones(self.num_envs, dtype=np.bool_)
-        return {**observation, "orientations": theta, "orientation_std": std}
+        return {**observation, **_observed(found)}
 
 
-def consensus(
-    links: BoolArray, bearings: FloatArray, before: FloatArray | None = None
-) -> tuple[FloatArray, int]:
-    """Orientations (n,) of one network by the cycle iteration, and how many steps it took.
-
-    Parameters
-    ----------
-    links, bearings
-        (n, n) symmetric; (n, n) of j in the frame of i, radians.
-    before
-        Orientations (n,) that are near: edge angles are then taken within pi of theirs, and
-        cycles sum to what they should.
-    """
-    n_nodes = len(links)
-    theta = np.zeros(n_nodes) if before is None else before.copy()
-    edges = np.argwhere(np.triu(links))
-    label = components(edges, n_nodes)
-    near = label == label[0]
-    if near.sum() < 2:
-        return theta, 0
-    edges = edges[near[edges[:, 0]]]
-    i, j = edges.T
-    y = edge_angles(np.column_stack([bearings[i, j], bearings[j, i]]))
-    if before is not None:
-        # Around any cycle the expected angles sum to 0, and so must those that are near them.
-        expected = before[j] - before[i]
-        y = expected + proj(y - expected)
-    named = (np.cumsum(near) - 1)[edges]
-    size = int(near.sum())
-    branch = None if before is None else np.zeros(len(edges) - size + 1)
-    run = cycle_iteration(named, y, size, tol=_TOL, max_steps=_MAX_STEPS, branch=branch)
-    theta[near] = proj(along_tree(named, run.psi, size))
-    return theta, run.steps
+def _generator(seed: int) -> np.random.Generator:
+    return np.random.default_rng([seed, _STREAM])
 
 
-def _judge(
-    links: BoolArray, sigma: float, theta: FloatArray, truth: FloatArray
-) -> tuple[dict[str, FloatArray], FloatArray]:
-    """Figures (...) of estimates (..., n), and the standard deviations (..., n)."""
-    covariance = linked_covariance(links, sigma, PRIOR_STD_RAD)
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    error = proj(theta - truth)[..., 1:]
-    figures = {
-        "orientation_error_rad": np.sqrt(np.mean(error**2, axis=-1)),
-        "belief_rad": np.sqrt(variance.mean(axis=-1)),
+def _run(
+    observation: dict[str, np.ndarray],
+    before: FloatArray | None,
+    options: Consensus,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, int, bool]:
+    links = observation["links"].astype(np.bool_)
+    return consensus(links, observation["bearings"], before, options, rng)
+
+
+def _progress(run: tuple[Any, Any, Any]) -> dict[str, Any]:
+    return {"consensus_steps": run[1], "consensus_converged": run[2]}
+
+
+def _believe(
+    observation: dict[str, np.ndarray], theta: FloatArray, places: FloatArray, sensing: Sensing
+) -> NetworkBelief:
+    links, lengths = observation["links"].astype(np.bool_), observation.get("lengths")
+    found = network_belief(links, observation["bearings"], lengths, theta, places, sensing)
+    if found.positions is None:
+        return found
+    limit = _farthest(sensing)
+    return found._replace(positions=np.clip(found.positions, -limit, limit))
+
+
+def _observed(found: NetworkBelief) -> dict[str, FloatArray]:
+    observed = {
+        "orientations": found.orientations.copy(),
+        "orientation_std": np.sqrt(found.covariance[..., 0, 0]),
     }
-    known = np.zeros((*variance.shape[:-1], 1))
-    return figures, np.sqrt(np.concatenate([known, variance], axis=-1))
+    if found.positions is not None:
+        observed["positions"] = found.positions.copy()
+        observed["pose_covariance"] = found.covariance.copy()
+    return observed
+
+
+def _shown(found: NetworkBelief) -> Headings:
+    std = np.sqrt(found.covariance[..., 0, 0])
+    spread = None if found.positions is None else found.covariance[..., 1:, 1:]
+    return Headings(found.orientations, std, found.positions, spread)
+
+
+def _judge(found: NetworkBelief, truth: dict[str, Any]) -> dict[str, FloatArray]:
+    """Figures (...) of estimates and beliefs over all nodes but node 0."""
+    error = proj(found.orientations - truth["orientations"])[..., 1:] ** 2
+    variance = np.diagonal(found.covariance[..., 1:, :, :], axis1=-2, axis2=-1)
+    figures = {
+        "orientation_error_rad": np.sqrt(error.mean(axis=-1)),
+        "belief_rad": np.sqrt(variance[..., 0].mean(axis=-1)),
+        "chi_square": found.chi_square,
+    }
+    if found.positions is not None:
+        places = truth["positions"] - truth["positions"][..., :1, :]
+        away = ((found.positions - places)[..., 1:, :] ** 2).sum(axis=-1)
+        figures["position_error_m"] = np.sqrt(away.mean(axis=-1))
+        # Of a point 1 m away from its node: a turn moves it as many metres as it has radians.
+        figures["pose_error_m"] = np.sqrt((away + error).mean(axis=-1))
+        figures["belief_m"] = np.sqrt(variance.sum(axis=-1).mean(axis=-1))
+    return figures
 
 
 def _rewarded(reward: str, info: dict[str, Any]) -> Any:
+    of_poses = "pose_error_m" in info
     if reward == "belief":
         # Zeros stand where a world has no last epoch.
-        return -np.log(np.maximum(info["belief_rad"], 1e-300))
-    return -np.asarray(info["orientation_error_rad"])
+        return -np.log(np.maximum(info["belief_m" if of_poses else "belief_rad"], 1e-300))
+    return -np.asarray(info["pose_error_m" if of_poses else "orientation_error_rad"])
 
 
-def _space(inner: spaces.Space[Any]) -> spaces.Dict:
+def _farthest(sensing: Sensing) -> float:
+    """A coordinate that no estimate passes, twice the square's side."""
+    return 2 * math.sqrt(6) * sensing.prior_std_m
+
+
+def _space(inner: spaces.Space[Any], sensing: Sensing) -> spaces.Dict:
     assert isinstance(inner, spaces.Dict)
     size = inner["bearings"].shape[:1]  # pyright: ignore[reportOptionalSubscript]
-    return spaces.Dict(
-        {
-            **inner.spaces,
-            "orientations": spaces.Box(-np.pi, np.pi, size, np.float64),
-            "orientation_std": spaces.Box(0.0, 2 * PRIOR_STD_RAD, size, np.float64),
-        }
-    )
+    added: dict[str, spaces.Space[Any]] = {
+        "orientations": spaces.Box(-np.pi, np.pi, size, np.float64),
+        "orientation_std": spaces.Box(0.0, 2 * sensing.prior_std_rad, size, np.float64),
+    }
+    if "lengths" in inner.spaces:
+        limit, most = _farthest(sensing), max(sensing.prior_std_rad, sensing.prior_std_m) ** 2
+        added["positions"] = spaces.Box(-limit, limit, (*size, 2), np.float64)
+        added["pose_covariance"] = spaces.Box(-most, most, (*size, 3, 3), np.float64)
+    return spaces.Dict({**inner.spaces, **added})

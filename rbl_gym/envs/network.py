@@ -12,18 +12,33 @@ from gymnasium.vector import AutoresetMode
 
 from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
-from rbl_gym.networks.bounds import linked_covariance
+from rbl_gym.networks.bounds import Sensing, linked_covariance, linked_pose_covariance
 from rbl_gym.networks.graphs import components
 from rbl_gym.networks.sensing import proj
 from rbl_gym.rendering import network as rendering
 
 REWARDS = ("bound", "none")
+LENGTHS = ("none", "one", "all")
 # Of an orientation that nothing is known of: uniform on the circle.
 PRIOR_STD_RAD = math.pi / math.sqrt(3)
+# Of the length that is known, as a share of the square's side: exact as far as anyone can see,
+# and no wall for an iteration.
+_KNOWN = 1e-4
+# A millionth of a radian and of the side are as sharp as bounds in double precision can be.
+_SHARPEST = 1e-6
+# Lengths beyond the longest link, in standard deviations: the end of the observation space.
+_TAIL = 8.0
 # Layouts that are tried for one whose nodes are connected at the start.
 _TRIES = 64
 # The bound inverts n x n matrices.
 MOST_NODES = 10_000
+
+
+def _ring(low: float, high: float) -> tuple[float, float]:
+    """Mean and standard deviation of the distance of points spread evenly over a ring."""
+    high = max(high, 1.001 * low)
+    mean = 2 / 3 * (high**3 - low**3) / (high**2 - low**2)
+    return mean, math.sqrt((high**2 + low**2) / 2 - mean**2)
 
 
 class PlanarNetworkVectorEnv(BatchEnv):
@@ -43,6 +58,8 @@ class PlanarNetworkVectorEnv(BatchEnv):
         radius_m: float = 4.0,
         blind_m: float = 0.5,
         bearing_std_rad: float = 0.05,
+        lengths: str = "none",
+        length_std_m: float = 0.1,
         step_m: float = 0.5,
         reward: str = "bound",
         steps: int = 50,
@@ -56,15 +73,29 @@ class PlanarNetworkVectorEnv(BatchEnv):
         self.radius_m = check_number("radius_m", radius_m, low=0.0)
         self.blind_m = check_number("blind_m", blind_m, low=1e-9)
         self.bearing_std_rad = check_number("bearing_std_rad", bearing_std_rad, low=1e-9)
+        self.lengths = check_one_of("lengths", lengths, LENGTHS)
+        self.length_std_m = check_number("length_std_m", length_std_m, low=1e-9)
+        if lengths == "one":
+            self.length_std_m = _KNOWN * self.side_m
+        reach = min(self.radius_m, self.side_m * math.sqrt(2))
+        self.sensing = Sensing(
+            bearing_std_rad=max(self.bearing_std_rad, _SHARPEST),
+            length_std_m=max(self.length_std_m, _SHARPEST * self.side_m),
+            typical_length_m=_ring(self.blind_m, reach),
+            prior_std_rad=PRIOR_STD_RAD,
+            prior_std_m=self.side_m / math.sqrt(6),
+        )
         self.step_m = check_number("step_m", step_m, low=0.0)
         self._rewarded = check_one_of("reward", reward, REWARDS) == "bound"
         square = (n_nodes, n_nodes)
-        self.single_observation_space = spaces.Dict(
-            {
-                "bearings": spaces.Box(-math.pi, math.pi, square, np.float64),
-                "links": spaces.Box(0, 1, square, np.int8),
-            }
-        )
+        observed: dict[str, spaces.Space[Any]] = {
+            "bearings": spaces.Box(-math.pi, math.pi, square, np.float64),
+            "links": spaces.Box(0, 1, square, np.int8),
+        }
+        self._longest = reach + _TAIL * self.length_std_m
+        if lengths != "none":
+            observed["lengths"] = spaces.Box(0.0, self._longest, square, np.float64)
+        self.single_observation_space = spaces.Dict(observed)
         self.single_action_space = spaces.Box(-1.0, 1.0, (2 * n_nodes,), np.float32)
         self.film = rendering.film_of(render_mode, self.side_m, n_nodes, steps)
         self._configure(num_envs, render_mode, steps, max_episode_steps, autoreset_mode)
@@ -72,7 +103,10 @@ class PlanarNetworkVectorEnv(BatchEnv):
         self._orientations = np.zeros((num_envs, n_nodes))
         self._links = np.zeros((num_envs, *square), dtype=np.bool_)
         self._bearings = np.zeros((num_envs, *square))
+        self._lengths = np.zeros((num_envs, *square))
+        self._std = np.zeros((num_envs, n_nodes))
         self._score_rad = np.zeros(num_envs)
+        self._score_m = np.zeros(num_envs)
 
     def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
         for world, generator in zip(chosen, generators, strict=True):
@@ -106,7 +140,36 @@ class PlanarNetworkVectorEnv(BatchEnv):
         seen = toward - self._orientations[rows][..., None] + self.bearing_std_rad * normals
         self._links[rows] = links
         self._bearings[rows] = np.where(links, proj(seen), 0.0)
-        self._score_rad[rows] = score(links, self.bearing_std_rad)
+        if self.lengths == "none":
+            covariance = linked_covariance(links, self.bearing_std_rad, PRIOR_STD_RAD)
+        else:
+            distance = np.linalg.norm(apart, axis=-1)
+            self._lengths[rows] = lengths = self._measured(links, distance, generators)
+            covariance = linked_pose_covariance(
+                self._positions[rows], links, lengths > 0, self.sensing
+            )
+            trace = np.trace(covariance, axis1=-2, axis2=-1)
+            self._score_m[rows] = np.sqrt(trace / (self.n_nodes - 1))
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)[..., : self.n_nodes - 1]
+        self._std[rows, 1:] = np.sqrt(variance)
+        self._score_rad[rows] = np.sqrt(variance.mean(axis=-1))
+
+    def _measured(
+        self, links: BoolArray, distance: FloatArray, generators: Sequence[np.random.Generator]
+    ) -> FloatArray:
+        """Lengths (..., n, n) as they are observed, 0 where none is."""
+        if self.lengths == "one":
+            # The longest link of node 0 bears the shape's errors best.
+            other = np.where(links[:, 0], distance[:, 0], 0.0).argmax(axis=-1)
+            known = np.zeros(links.shape, dtype=np.bool_)
+            worlds = np.arange(len(links))
+            known[worlds, 0, other] = known[worlds, other, 0] = True
+            return np.where(known & links, distance, 0.0)
+        size = (self.n_nodes, self.n_nodes)
+        normals = np.array([np.triu(g.standard_normal(size), 1) for g in generators])
+        noisy = distance + self.length_std_m * (normals + normals.swapaxes(-1, -2))
+        # A length is above 0: 0 says that there is none.
+        return np.where(links, np.clip(noisy, 1e-9, self._longest), 0.0)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         rows = np.flatnonzero(moving)
@@ -117,24 +180,24 @@ class PlanarNetworkVectorEnv(BatchEnv):
             moved = self._positions[rows] + np.stack([turn.real, turn.imag], axis=-1)
             self._positions[rows] = np.clip(moved, 0.0, self.side_m)
             self._measure(rows, [self._generators[i] for i in rows])
-        reward = -np.log(self._score_rad) if self._rewarded else np.zeros(self.num_envs)
+        score = self._score_rad if self.lengths == "none" else self._score_m
+        reward = -np.log(score) if self._rewarded else np.zeros(self.num_envs)
         return reward, np.zeros(self.num_envs, dtype=np.bool_)
 
     def _observe(self) -> dict[str, np.ndarray]:
-        return {"bearings": self._bearings.copy(), "links": self._links.astype(np.int8)}
+        seen = {"bearings": self._bearings.copy(), "links": self._links.astype(np.int8)}
+        return seen if self.lengths == "none" else {**seen, "lengths": self._lengths.copy()}
 
     def _inform(self) -> dict[str, np.ndarray]:
-        return {
+        told = {
             "positions": self._positions.copy(),
             "orientations": self._orientations.copy(),
             "score_rad": self._score_rad.copy(),
         }
+        return told if self.lengths == "none" else {**told, "score_m": self._score_m.copy()}
 
     def _shot(self) -> tuple[Any, None]:
-        covariance = linked_covariance(self._links, self.bearing_std_rad, PRIOR_STD_RAD)
-        std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-        std = np.concatenate([np.zeros((self.num_envs, 1)), std], axis=-1)
-        return rendering.Network(self._positions, self._orientations, self._links, std), None
+        return rendering.Network(self._positions, self._orientations, self._links, self._std), None
 
 
 class PlanarNetworkEnv(ScalarEnv):
@@ -153,12 +216,19 @@ class PlanarNetworkEnv(ScalarEnv):
 
     ## Observation space
     ``Dict``: `bearings` (n, n) float64 in [-pi, pi], entry (i, j) of node j in the frame of node
-    i, 0 where there is no link; `links` (n, n) int8, 1 where i and j see each other.
+    i, 0 where there is no link; `links` (n, n) int8, 1 where i and j see each other. With
+    `lengths` also `lengths` (n, n) float64, symmetric, metres, 0 where there is none:
+    ``lengths="one"``, the exact length of one link, the longest of node 0; ``lengths="all"``,
+    those of all links, with noise of their own. Bearings and a length give the scale, and so
+    the places.
 
     ## Reward
     ``-log b``, b the Cramer-Rao bound of the root mean square orientation error in radians of
     all nodes but node 0, from the bearings of this epoch alone and a prior of pi / sqrt(3) (that
-    of a uniform angle). ``reward="none"``: 0.
+    of a uniform angle). With `lengths`, b is the bound of the pose in metres: of a point 1 m
+    away from its node, in the frame of node 0, from the bearings and lengths of this epoch and
+    what is known of any link, that it is between `blind_m` and `radius_m` long.
+    ``reward="none"``: 0.
 
     ## Starting state
     Uniform in the square, redrawn until the network is connected (64 times at most); uniform
@@ -168,11 +238,12 @@ class PlanarNetworkEnv(ScalarEnv):
     Truncates after `steps`.
 
     ## Info
-    `positions` (n, 2) and `orientations` (n,), the truth; `score_rad`, b.
+    `positions` (n, 2) and `orientations` (n,), the truth, in a frame that is turned like node 0;
+    `score_rad`, the bound of the orientations, and with `lengths` `score_m`, that of the poses.
 
     ## Rendering
     ``render_mode="rgb_array"``: nodes, links and headings, with the orientations of
-    `EstimateNetwork`; without it the bound.
+    `EstimateNetwork` (with `lengths` the places, too); without it the bound.
 
     ## Arguments
     ```python
@@ -181,6 +252,7 @@ class PlanarNetworkEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/PlanarNetwork-v0", n_nodes=20, radius_m=3.0)
     ```
     `n_nodes`; `side_m` of the square; `radius_m` and `blind_m` of sensing; `bearing_std_rad`;
+    `lengths`, ``"none"``, ``"one"`` or ``"all"``, and with ``"all"`` their `length_std_m`;
     `step_m`, the longest displacement on an axis; `reward`; `steps`.
 
     ## Version history
@@ -196,6 +268,8 @@ class PlanarNetworkEnv(ScalarEnv):
         radius_m: float = 4.0,
         blind_m: float = 0.5,
         bearing_std_rad: float = 0.05,
+        lengths: str = "none",
+        length_std_m: float = 0.1,
         step_m: float = 0.5,
         reward: str = "bound",
         steps: int = 50,
@@ -203,16 +277,21 @@ class PlanarNetworkEnv(ScalarEnv):
     ) -> None:
         self._configure(
             render_mode, n_nodes=n_nodes, side_m=side_m, radius_m=radius_m, blind_m=blind_m,
-            bearing_std_rad=bearing_std_rad, step_m=step_m, reward=reward, steps=steps,
+            bearing_std_rad=bearing_std_rad, lengths=lengths, length_std_m=length_std_m,
+            step_m=step_m, reward=reward, steps=steps,
         )  # fmt: skip
+
+    @property
+    def n_nodes(self) -> int:
+        """How many nodes."""
+        return self._batch.n_nodes
 
     @property
     def bearing_std_rad(self) -> float:
         """Standard deviation of a bearing."""
         return self._batch.bearing_std_rad
 
-
-def score(links: BoolArray, bearing_std_rad: float) -> FloatArray:
-    """b (...): bound of the root mean square orientation error, radians, of links (..., n, n)."""
-    covariance = linked_covariance(links, bearing_std_rad, PRIOR_STD_RAD)
-    return np.sqrt(np.trace(covariance, axis1=-2, axis2=-1) / covariance.shape[-1])
+    @property
+    def sensing(self) -> Sensing:
+        """What an estimator may know beside the observation."""
+        return self._batch.sensing

@@ -6,7 +6,7 @@ stands at the origin.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -44,6 +44,8 @@ def edge_variance(n_edges: int, n_nodes: int, bearing_std_rad: float) -> float:
 def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: float) -> FloatArray:
     """Orientation bound (..., n - 1, n - 1) of many small networks, disconnected ones too.
 
+    Nodes without a path to node 0 keep their prior: links among them say nothing about node 0.
+
     Parameters
     ----------
     links
@@ -53,9 +55,110 @@ def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: f
     prior_std_rad
         Of an orientation that nothing is measured of; it keeps the bound finite.
     """
-    weight = links / (2 * bearing_std_rad**2)
+    weight = linked_to_0(links) / (2 * bearing_std_rad**2)
     information = np.eye(links.shape[-1]) * (weight.sum(axis=-1) + prior_std_rad**-2)[..., None]
     return np.linalg.inv((information - weight)[..., 1:, 1:])
+
+
+def linked_to_0(links: BoolArray) -> BoolArray:
+    """Links (..., n, n) without those of nodes that have no path to node 0."""
+    near = np.zeros(links.shape[:-1], dtype=np.bool_)
+    near[..., 0] = True
+    while ((more := near | (links & near[..., None, :]).any(axis=-1)) != near).any():
+        near = more
+    return links & near[..., None]
+
+
+class Sensing(NamedTuple):
+    """What is known of a network beside what is measured: of its sensors, and beforehand."""
+
+    bearing_std_rad: float
+    length_std_m: float  # of a measured length
+    # Mean and standard deviation of the length of a link before it is measured.
+    typical_length_m: tuple[float, float]
+    # Of an orientation and a coordinate, relative to node 0, that nothing is measured of.
+    prior_std_rad: float
+    prior_std_m: float
+
+
+def linked_pose_covariance(
+    positions: FloatArray, links: BoolArray, ranged: BoolArray, sensing: Sensing
+) -> FloatArray:
+    """Pose bound (..., 3 n - 3, 3 n - 3) of many small networks, disconnected ones too.
+
+    Rows: n - 1 orientations, then x and y of nodes 1 to n - 1, in the frame of node 0, as
+    `frame_covariance`. Nodes without a path to node 0 keep their prior.
+
+    Parameters
+    ----------
+    positions
+        (..., n, 2) metres, in any frame turned like node 0.
+    links, ranged
+        (..., n, n) symmetric: who sees whom, and whose distance is measured. Any link has the
+        typical length, without which networks that are not rigid have no bound.
+    sensing
+        The deviations.
+    """
+    links = linked_to_0(links)
+    weight = length_information(links, ranged & links, sensing)
+    H = pose_information(positions, links, sensing.bearing_std_rad, weight)
+    diagonal = np.arange(H.shape[-1])
+    H[..., diagonal, diagonal] += prior_information(links.shape[-1], sensing)
+    free = free_columns(links.shape[-1])
+    return np.linalg.inv(H[..., free[:, None], free])
+
+
+def length_information(links: BoolArray, ranged: BoolArray, sensing: Sensing) -> FloatArray:
+    """Information (..., n, n) of the lengths of links: typical, and measured where they are."""
+    return links / sensing.typical_length_m[1] ** 2 + ranged / sensing.length_std_m**2
+
+
+def prior_information(n_nodes: int, sensing: Sensing) -> FloatArray:
+    """Information (3 n,) of what no sensor says, in the order of `bearing_jacobian`."""
+    each = [sensing.prior_std_rad**-2, sensing.prior_std_m**-2]
+    return np.repeat(each, [n_nodes, 2 * n_nodes])
+
+
+def pose_information(
+    positions: FloatArray, links: BoolArray, bearing_std_rad: float, of_lengths: FloatArray
+) -> FloatArray:
+    """Fisher information (..., 3 n, 3 n) of frames, columns as `bearing_jacobian`.
+
+    Of both bearings of each link, and of lengths with the information (..., n, n).
+    """
+    along, distance = lines_of_sight(positions)
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) / distance[..., None]
+    weight = links / bearing_std_rad**2
+    n_nodes = links.shape[-1]
+    # Both bearings of a link and its length tie two places together ...
+    tie = _outer(across) * (2 * weight)[..., None, None]
+    tie += _outer(along) * of_lengths[..., None, None]
+    # ... and a bearing its observer's turn to both places.
+    turn = -weight[..., None] * across
+    diagonal = np.arange(n_nodes)
+    places = -tie
+    places[..., diagonal, diagonal, :, :] += tie.sum(axis=-3)
+    turn[..., diagonal, diagonal, :] -= turn.sum(axis=-2)
+    H = np.zeros((*links.shape[:-2], 3 * n_nodes, 3 * n_nodes))
+    H[..., diagonal, diagonal] = weight.sum(axis=-1)
+    flat = (*links.shape[:-2], n_nodes, 2 * n_nodes)
+    H[..., :n_nodes, n_nodes:] = turn.reshape(flat)
+    H[..., n_nodes:, :n_nodes] = turn.reshape(flat).swapaxes(-1, -2)
+    H[..., n_nodes:, n_nodes:] = places.swapaxes(-3, -2).reshape(
+        *links.shape[:-2], 2 * n_nodes, 2 * n_nodes
+    )
+    return H
+
+
+def lines_of_sight(positions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors (..., n, n, 2) from i to j and distances (..., n, n); no distance is 0."""
+    apart = positions[..., None, :, :] - positions[..., :, None, :]
+    distance = np.maximum(np.linalg.norm(apart, axis=-1), 1e-9)
+    return apart / distance[..., None], distance
+
+
+def _outer(vectors: FloatArray) -> FloatArray:
+    return vectors[..., :, None] * vectors[..., None, :]
 
 
 def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:

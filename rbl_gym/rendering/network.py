@@ -18,6 +18,8 @@ from rbl_gym.rendering.film import Film, check_mode, mapped
 
 _LENGTH = 0.055  # of a heading, of the square's side
 _ARC = np.linspace(-1, 1, 13)
+_TURN = np.linspace(0, 2 * np.pi, 33)
+_RING = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
 
 
 class Network(NamedTuple):
@@ -33,10 +35,16 @@ class Network(NamedTuple):
 
 
 class Headings(NamedTuple):
-    """Believed orientations (B, n) and their standard deviations, radians."""
+    """Believed orientations (B, n) and their standard deviations, radians, and places.
+
+    `positions` (B, n, 2) relative to node 0 and `spread` (B, n, 2, 2), their covariances, None
+    where places are not estimated.
+    """
 
     orientations: FloatArray
     std: FloatArray
+    positions: FloatArray | None = None
+    spread: FloatArray | None = None
 
 
 def film_of(render_mode: str | None, side_m: float, n_nodes: int, steps: int) -> Film | None:
@@ -72,7 +80,8 @@ def _frame(
         headline += f", error {errors[0, -1]:.2f}°"
     picture, left, upper, lower = panels.empty()
     _plan(side_m, n_nodes).paint(last, belief, headline, left)
-    _legend(source).paint([], upper)
+    placed = belief is not None and belief.positions is not None
+    _legend(source, placed).paint([], upper)
     strips = panels.strips(
         steps, (limits_of(bands[0], errors[0]),), ("orientation [deg]",),
         ("" if belief is None else "error, RMS over the nodes", rf"3$\sigma$ of the {source}"),
@@ -105,6 +114,8 @@ class _Plan:
         self._length = _LENGTH * side_m
         self._links = panel.line(axes, color="#adb5bd", lw=1.0)
         self._wedges = [panel.patch(axes, fc=BELIEF, ec="none", alpha=0.3) for _ in range(n_nodes)]
+        self._ellipses = panel.line(axes, color=BELIEF, lw=1.0)
+        self._places = panel.line(axes, color=BELIEF, marker="x", ms=6, mew=1.5, ls="")
         self._believed = panel.line(axes, color=BELIEF, lw=2.0)
         self._true = panel.line(axes, color=INK, lw=1.4)
         self._nodes = panel.line(axes, color=INK, marker="o", ms=7, ls="", mec="white", mew=0.8)
@@ -115,7 +126,7 @@ class _Plan:
         places, true = last.positions, last.orientations
         i, j = np.nonzero(np.triu(last.links))
         self._links.set_data(*gapped(np.stack([places[i], places[j]], axis=1)).T)
-        middle, std = (true, last.bound_std) if belief is None else belief
+        middle, std = (true, last.bound_std) if belief is None else belief[:2]
         opening = np.minimum(3 * std, math.pi)
         for patch, place, angle, half in zip(self._wedges, places, middle, opening, strict=True):
             arc = _along(angle + half * _ARC, 1.7 * self._length)
@@ -131,6 +142,15 @@ class _Plan:
         artists = [self._links, *self._wedges]
         if belief is not None:
             artists.append(self._believed)
+        if belief is not None and belief.positions is not None and belief.spread is not None:
+            # Drawn from where node 0 really is.
+            found = belief.positions + places[0]
+            values, vectors = np.linalg.eigh(belief.spread)
+            axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+            rings = found[:, None] + 3 * np.einsum("nij,kj->nki", axes, _RING)
+            self._ellipses.set_data(*gapped(rings[1:]).T)
+            self._places.set_data(*found[1:].T)
+            artists += [self._ellipses, self._places]
         self.panel.paint([*artists, self._true, self._nodes, self._first], picture)
         write(picture, 34, 14, headline)
 
@@ -139,8 +159,8 @@ def _along(angles: FloatArray, length: float) -> FloatArray:
     return length * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
 
 
-@functools.lru_cache(maxsize=2)
-def _legend(source: str) -> Panel:
+@functools.lru_cache(maxsize=3)
+def _legend(source: str, placed: bool) -> Panel:
     """What the signs mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -155,6 +175,9 @@ def _legend(source: str) -> Panel:
     ]  # fmt: skip
     if source == "belief":
         handles.append(Line2D([], [], color=BELIEF, lw=2.0, label="believed heading"))
+    if placed:
+        handles.append(Line2D([], [], color=BELIEF, lw=1.0, marker="x", ms=6,
+                              label=r"believed place, 3$\sigma$"))  # fmt: skip
     handles.append(Patch(fc=BELIEF, alpha=0.3, label=rf"$\pm$3$\sigma$ of the {source}"))
     panel.figure.legend(handles=handles, loc="center left", bbox_to_anchor=(0.14, 0.5),
                         fontsize=9, frameon=False, labelspacing=0.9)  # fmt: skip

@@ -1,0 +1,158 @@
+"""Beliefs over the poses of a planar network, from one epoch: the cycle consensus and its noise."""
+
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray, check_count
+from rbl_gym.estimators.networks.consensus import cycle_iteration
+from rbl_gym.estimators.networks.orientations import along_tree
+from rbl_gym.estimators.networks.poses import network_poses
+from rbl_gym.networks.bounds import Sensing, linked_covariance, linked_to_0
+from rbl_gym.networks.graphs import BASES, cycle_matrix
+from rbl_gym.networks.sensing import edge_angles, proj
+
+_TOL = 1e-9
+
+
+class Consensus(NamedTuple):
+    """How the cycle iteration runs, as the arguments of `cycle_iteration`."""
+
+    cycles: str = "bfs"
+    kappa: float | str | None = None
+    order: str = "synchronous"
+    steps: int = 5000  # at most
+
+
+class NetworkBelief(NamedTuple):
+    """Beliefs (...) over n nodes in the frame of node 0."""
+
+    orientations: FloatArray  # (..., n) radians in [-pi, pi)
+    positions: FloatArray | None  # (..., n, 2) metres, None without lengths
+    # (..., n, 3, 3) of each node's orientation, x and y; (..., n, 1, 1) without lengths.
+    covariance: FloatArray
+    chi_square: FloatArray  # (...) per degree of freedom of the residuals, 0 without one
+
+
+def check_consensus(cycles: Any, kappa: Any, order: Any, steps: Any) -> Consensus:
+    """The options, tried on a triangle, or a ValueError that names one."""
+    steps = check_count("steps", steps, least=0)
+    if not isinstance(cycles, str):
+        raise ValueError(f"cycles must be a name, got {cycles!r:.80}")
+    cycle_iteration([[0, 1], [1, 2], [0, 2]], np.zeros(3), 3, cycles, kappa, order=order,
+                    rng=np.random.default_rng(0))  # fmt: skip
+    return Consensus(cycles, kappa, order, steps)
+
+
+def consensus(
+    links: BoolArray,
+    bearings: FloatArray,
+    before: FloatArray | None = None,
+    options: Consensus | None = None,
+    rng: np.random.Generator | None = None,
+) -> tuple[FloatArray, int, bool]:
+    """Orientations (n,) of one network by the cycle iteration, its steps, whether it converged.
+
+    Parameters
+    ----------
+    links, bearings
+        (n, n) symmetric; (n, n) of j in the frame of i, radians.
+    before
+        Orientations (n,) that are near: edge angles are then taken within pi of theirs, and
+        cycles sum to what they should.
+    options, rng
+        Of the iteration; the source of its order where that is random.
+    """
+    options = options or Consensus()
+    n_nodes = len(links)
+    theta = np.zeros(n_nodes) if before is None else before.copy()
+    edges = np.argwhere(np.triu(linked_to_0(links)))
+    if not len(edges):
+        return theta, 0, True
+    near = np.isin(np.arange(n_nodes), edges)
+    i, j = edges.T
+    y = edge_angles(np.column_stack([bearings[i, j], bearings[j, i]]))
+    named = (np.cumsum(near) - 1)[edges]
+    size = int(near.sum())
+    branch: FloatArray | None = None
+    if before is not None:
+        # Around any cycle the expected angles sum to 0, and so must those that are near them.
+        expected = before[j] - before[i]
+        y = expected + proj(y - expected)
+        count = len(edges) - size + 1
+        if options.cycles not in BASES:
+            count = cycle_matrix(named, size, options.cycles).shape[0]
+        branch = np.zeros(count)
+    run = cycle_iteration(named, y, size, options.cycles, options.kappa, tol=_TOL,
+                          max_steps=options.steps, order=options.order, rng=rng,
+                          branch=branch)  # fmt: skip
+    theta[near] = proj(along_tree(named, run.psi, size))
+    return theta, run.steps, run.converged
+
+
+def network_belief(
+    links: BoolArray,
+    bearings: FloatArray,
+    lengths: FloatArray | None,
+    orientations: FloatArray,
+    positions: FloatArray,
+    sensing: Sensing,
+) -> NetworkBelief:
+    """The belief around orientations found; with lengths, poses by maximum likelihood from there.
+
+    Variances are scaled by max(1, chi-square per degree of freedom of the residuals), and end
+    at those of the prior.
+
+    Parameters
+    ----------
+    links, bearings, lengths
+        (..., n, n) as `network_poses`; lengths are None where none are measured.
+    orientations, positions
+        (..., n) of `consensus`, and (..., n, 2), where nodes stay that have no path to node 0.
+    sensing
+        Deviations of the sensors and of the prior.
+    """
+    if lengths is None:
+        P = linked_covariance(links, sensing.bearing_std_rad, sensing.prior_std_rad)
+        blocks = np.diagonal(P, axis1=-2, axis2=-1)[..., None, None]
+        chi_square, degrees = _of_angles(links, bearings, orientations, sensing)
+        places = None
+    else:
+        poses = network_poses(links, bearings, lengths, sensing, orientations, positions)
+        orientations, places, chi_square, degrees = (
+            poses.orientations, poses.positions, poses.chi_square, poses.degrees
+        )  # fmt: skip
+        before = orientations.shape[-1] - 1
+        node = np.arange(before)
+        rows = np.stack([node, before + 2 * node, before + 2 * node + 1], axis=-1)
+        blocks = poses.covariance[..., rows[:, :, None], rows[:, None, :]]
+    # Less than one degree of freedom says nothing about the noise.
+    chi_square = np.where(degrees > 0.9, chi_square / np.maximum(degrees, 0.9), 0.0)
+    return NetworkBelief(orientations, places, _scaled(blocks, chi_square, sensing), chi_square)
+
+
+def _of_angles(
+    links: BoolArray, bearings: FloatArray, theta: FloatArray, sensing: Sensing
+) -> tuple[FloatArray, FloatArray]:
+    """Chi-square (...) of the edge angles' residuals, and its degrees of freedom: the cycles."""
+    near = linked_to_0(links)
+    y = bearings - bearings.swapaxes(-1, -2) + np.pi
+    off = np.where(near, proj(y - theta[..., None, :] + theta[..., :, None]), 0.0)
+    # Each edge stands twice in the matrix; its variance is 2 sigma^2.
+    chi_square = (off**2).sum(axis=(-2, -1)) / (4 * sensing.bearing_std_rad**2)
+    unknown = np.maximum(near.any(axis=-1).sum(axis=-1) - 1, 0)
+    return chi_square, near.sum(axis=(-2, -1)) / 2 - unknown
+
+
+def _scaled(blocks: FloatArray, chi_square: FloatArray, sensing: Sensing) -> FloatArray:
+    """Covariances (..., n, k, k), node 0's first, scaled up to the prior's at most."""
+    most = np.array([sensing.prior_std_rad, sensing.prior_std_m, sensing.prior_std_m]) ** 2
+    variance = np.diagonal(blocks, axis1=-2, axis2=-1)
+    room = (most[: blocks.shape[-1]] / variance).min(axis=-1)
+    scale = np.minimum(np.maximum(chi_square[..., None], 1.0), np.maximum(room, 1.0))
+    reference = np.zeros((*blocks.shape[:-3], 1, *blocks.shape[-2:]))
+    return np.concatenate([reference, blocks * scale[..., None, None]], axis=-3)
