@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -93,7 +94,8 @@ def test_wrappers_below_see_the_environment_as_it_is(mode):
     plain = gym.make_vec(ID, num_envs=3, scene=short("hall", 4), autoreset_mode=mode)
     envs = VectorEstimatePose(below, "iekf")
     zeros = np.zeros(3, int)
-    above, want = [envs.reset(seed=1)], [plain.reset(seed=1)]
+    above: list[Any] = [envs.reset(seed=1)]
+    want: list[Any] = [plain.reset(seed=1)]
     for _ in range(9):
         above.append(envs.step(zeros))
         want.append(plain.step(zeros))

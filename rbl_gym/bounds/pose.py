@@ -169,9 +169,12 @@ def information_at(
     rotation: FloatArray,
     translation: FloatArray,
     noise: ranging.NoiseLaw,
-    links: BoolArray | None = None,
+    links: BoolArray | FloatArray | None = None,
 ) -> FloatArray:
-    """`range_information` on arrays that are known to be good (the environment's inner loop)."""
+    """`range_information` on arrays that are known to be good (the environment's inner loop).
+
+    `links` may also be the share of its information that each link has.
+    """
     distance, J = range_jacobian(anchors, tags, rotation, translation)
     weight = _inverse(noise.variance(distance), distance)
     if links is not None:
