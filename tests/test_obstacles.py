@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rbl_gym.geometry.obstacles import check_obstacles, in_sight
+from rbl_gym.geometry.obstacles import Obstacles, check_obstacles, in_sight
 
 BOX = np.array([0.0, 0, 0, 1, 2, 3])
 
@@ -160,3 +160,24 @@ def test_good_obstacles_come_back_as_arrays():
 def test_bad_obstacles_are_refused(obstacles, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         check_obstacles(obstacles)
+
+
+def test_obstacles_tell_the_share_of_each_link():
+    """In sight all of it; behind a box, or with an end in it, what the box leaves."""
+    rng = np.random.default_rng(8)
+    obstacles = Obstacles(np.array([BOX, [4.0, 0, 0, 0.5, 2, 3]]), 0.03)
+    anchors, points = rng.uniform(-6, 6, (2, 30, 3))
+    wanted = np.where(in_sight(anchors, points, obstacles.boxes), 1.0, 0.03)
+    np.testing.assert_array_equal(obstacles.share(anchors, points), wanted)
+    assert 0.1 < (wanted == 1).mean() < 0.9
+    start = [anchors[:, i, None] for i in range(3)]
+    along = [(points[:, None, i] - anchors[:, i])[..., None] for i in range(3)]
+    many = Obstacles(obstacles.boxes[None], 0.03)
+    np.testing.assert_array_equal(many.share_along(start, along)[..., 0], wanted)
+    held = [any((np.abs(p - box[:3]) <= box[3:]).all() for box in obstacles.boxes) for p in points]
+    np.testing.assert_array_equal(obstacles.contain(points), held)
+    assert obstacles
+    nothing = Obstacles(np.empty((0, 6)), 0.0)
+    assert not nothing
+    assert (nothing.share(anchors, points) == 1).all()
+    assert not nothing.contain(points).any()
