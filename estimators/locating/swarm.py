@@ -4,8 +4,8 @@ With the directions known, K distances from the base station say where K tags ar
 searched for is the K distances whose places are as far from each other as the tags are on the
 body. The paper names the two searches and gives neither objective nor parameters. Ours minimise
 ``sum_ij (|d_i u_i - d_j u_j| - |c_i - c_j|)^2``; the y of all tags has one sign. What else was
-assumed stands in the two classes. Population, steps and reach were tuned once for success at 0.1
-degrees.
+assumed stands in the two classes. Population, steps, reach and the share of new individuals were
+tuned once for the share of poses near the truth.
 """
 
 from __future__ import annotations
@@ -69,19 +69,19 @@ class ParticipatorySearch:
     difference. At every step, of each individual s and a random other one s': p_s is the one more
     compatible with the best; ``p_r = s + alpha rho^(1-a) (s' - s)`` recombines them by the
     participatory learning rule, rho their compatibility; ``p_m = best + rho^(1-a) (p_s - p_r)``
-    mutates, rho that of p_s and p_r; p_m stays where it is better than s. The worse half then
+    mutates, rho that of p_s and p_r; p_m stays where it is better than s. The worst tenth then
     gives way to new random individuals.
 
-    Assumed: 200 individuals, 200 steps, alpha = 0.5 (learning rate), a = 0 (no arousal),
-    distances up to the largest that the directions allow, and the new half.
+    Assumed: 400 individuals, 200 steps, alpha = 0.5 (learning rate), a = 0 (no arousal),
+    distances up to the largest that the directions allow, and the new tenth.
     """
 
-    size: int = 200
+    size: int = 400
     steps: int = 200
     reach: float = 1.0
     learning_rate: float = 0.5
     arousal: float = 0.0
-    fresh: int = 100
+    fresh: int = 40
 
     def search(
         self, objective: Objective, shape: tuple[int, int], rng: np.random.Generator
