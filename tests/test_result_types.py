@@ -52,6 +52,13 @@ CASES = {
     "tree": (lambda _: graphs.spanning_tree(EDGES, 4), graphs.SpanningTree),
     "freedom": (lambda _: rigidity.freedom(np.eye(4)[:, :3], EDGES), rigidity.Freedom),
     "localizability": (lambda _: rigidity.localizability(SQUARE, EDGES), rigidity.Localizability),
+    "triangle": (
+        lambda _: estimators.triangle_frames(sensing.measure_in_space(
+            np.eye(3), np.tile(np.eye(3), (3, 1, 1)), [[0, 1], [1, 2], [2, 0]], 0.0,
+            np.random.default_rng(0),
+        )),
+        estimators.TriangleFrames,
+    ),
     "locate": (
         lambda _: estimators.locate(
             np.full((4, 5), 3.0), np.diag([3.0, 4, 5, 6])[:, :3], bodies.pyramid(),
