@@ -9,6 +9,7 @@ import pytest
 
 from rbl_gym import metrics, motion
 from rbl_gym.app import reports
+from rbl_gym.app.cli import main
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
@@ -154,6 +155,31 @@ def test_the_note_is_printed(capsys):
     shown = capsys.readouterr().out
     assert "25 of 25 epochs have truth" in shown
     assert "a mirror pose behind the anchors' plane" in shown
+
+
+def test_the_command_takes_a_volume(tmp_path, capsys):
+    recording = record(CEILING, FLAT, epochs=6)
+    columns = [f"a{m}t{n}" for m in range(6) for n in range(4)]
+    rows = np.column_stack([recording.times, recording.ranges.reshape(6, -1)])
+    texts = {"ranges": (["t", *columns], rows)}
+    for name, points in (("anchor", CEILING), ("tag", FLAT)):
+        texts[f"{name}s"] = [name, "x", "y", "z"], [[i, *p] for i, p in enumerate(points)]
+    command = ["replay"]
+    for name, (header, table) in texts.items():
+        lines = [",".join(header), *(",".join(map(str, row)) for row in table)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
+        command += [f"--{name}", str(tmp_path / f"{name}.csv")]
+    page = tmp_path / "page.html"
+    assert main([*command, "--html", str(page)]) == 0
+    assert "a mirror pose behind" in capsys.readouterr().out
+    assert "a mirror pose behind" in page.read_text(encoding="utf-8")
+    for option in ("--below-anchors", "--volume=-1,5,-1,4,0,2", "--volume=,,,,,2"):
+        assert main([*command, option]) == 0
+        assert "mirror" not in capsys.readouterr().out
+    for wrong in ("--volume=1,2", "--volume=a,b,c,d,e,f"):
+        with pytest.raises(SystemExit):
+            main([*command, wrong])
+        assert "must be xmin,xmax" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from rbl_gym.app.reports import CAMSAP_COLUMNS
 from rbl_gym.app.track_html import Beliefs, Story
 from rbl_gym.recordings.reading import Recording
 from rbl_gym.studies.papers.camsap2013 import Example
-from rbl_gym.studies.replay import Settings, Track, truth_of
+from rbl_gym.studies.replay import Settings, Track, origin_of, truth_of
 
 _LEGEND = (
     "Drag to turn, wheel to zoom; play, or move the slider. Shaded: three sigma of the belief "
@@ -111,12 +111,21 @@ def replay(recording: Recording, track: Track, result: dict[str, Any], settings:
     """A recording: the track, its errors where truth exists, the figures of the run."""
     truth = truth_of(recording, track, settings)
     times = track.times - track.times[0]
-    beliefs = Beliefs(*track[1:4], COLOURS["iterated EKF"])
+    # Pictures in 3-D have seven digits, those of a map need more.
+    origin = origin_of(recording)
+    places = track.translation - origin
+    beliefs = Beliefs(track.rotation, places, track.covariance, COLOURS["iterated EKF"])
+    if truth is not None:
+        truth = truth[0], truth[1] - origin, truth[2]
     story = Story(
-        times, recording.anchors, recording.anchor_ids, recording.tags, truth,
+        times, recording.anchors - origin, recording.anchor_ids, recording.tags, truth,
         {settings.filter: beliefs}, "xy" if settings.planar else "xyz",
     )  # fmt: skip
-    parts = [page.note(_LEGEND), page.plot(track_html.figure(story), "track")]
+    parts = [*map(page.note, result["notes"]), page.note(_LEGEND)]
+    if origin.any():
+        shift = ", ".join(f"{x:.0f}" for x in origin)
+        parts.append(page.note(f"Coordinates are relative to ({shift}) m."))
+    parts.append(page.plot(track_html.figure(story), "track"))
     if truth is not None:
         rows = [
             [f"{name} {result['position_axes']} (m)" if unit == "m" else f"{name} (deg)",
@@ -124,7 +133,8 @@ def replay(recording: Recording, track: Track, result: dict[str, Any], settings:
             for name, unit in (("position", "m"), ("yaw", "deg"), ("rotation", "deg"))
         ]  # fmt: skip
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
-        parts.append(page.note(f"NEES per degree of freedom {result['anees']:.2f} (1: honest)."))
+        parts.append(page.note(f"NEES per degree of freedom {result['anees']:.2f} (1: honest); "
+                               f"{result['epochs_with_truth']} epochs have truth."))  # fmt: skip
     parts.append(track_html.anchors_table(story))
     used = [[name.replace("_", " "), value] for name, value in result["settings"].items()]
     parts.append(page.table("settings", ["setting", "value"], used))

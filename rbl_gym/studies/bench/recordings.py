@@ -58,7 +58,9 @@ def load(spec: Mapping[str, Any]) -> Log:
             raise ValueError(f"a recording needs {key!r}, got {', '.join(spec)}")
     files = [Path(spec[key]).stat() for key in FILES if key in spec]
     stamps = tuple((file.st_mtime_ns, file.st_size) for file in files)
-    return _load(tuple(sorted(spec.items())), stamps)
+    # What JSON gives as a list cannot be the key of a cache.
+    items = ((key, tuple(x) if isinstance(x, list) else x) for key, x in spec.items())
+    return _load(tuple(sorted(items)), stamps)
 
 
 @functools.lru_cache(maxsize=2)
