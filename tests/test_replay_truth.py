@@ -90,7 +90,7 @@ def test_no_common_time_names_what_lies_between():
     times, rotation, place = moving(0.1)
     with pytest.raises(ValueError, match=r"shares no time with the ranges: .* 5 s apart$"):
         check_overlap(Truth(times[:20] + 14.9, rotation[:20], place[:20]), times, 0.5)
-    with pytest.raises(ValueError, match="their clocks may differ by about -1700000000 s"):
+    with pytest.raises(ValueError, match="the truth's clock may be ahead by about 1700000000 s"):
         check_overlap(Truth(times + 1.7e9, rotation, place), times, 0.5)
     with pytest.raises(ValueError, match="the stamps of the truth look like milliseconds"):
         check_overlap(Truth(1e3 * times + 50, rotation, place), times, 0.5)

@@ -14,13 +14,16 @@ from rbl_gym.recordings.reading import Truth
 
 # Epochs further apart than this are seldom a log in seconds.
 _LONG_STEP_S = 10.0
-# A fault is named where the errors are so many times what the beliefs expect, and where mending
-# it leaves less than this share of the mean square.
-_LARGE, _EXPLAINED = 4.0, 0.25
+# A fault is named where the mean square of the errors is at least this much of what the beliefs
+# expect, and where mending it leaves less than this share of it.
+_LARGE, _EXPLAINED = 0.5, 0.25
+# A constant transform explains any error of a body that stands still: it has to explain more of
+# one that moves further than the error, or the errors are so many times what is expected.
+_MOST_EXPLAINED, _HUGE = 0.1, 4.0
 # Of faults that explain about as much, the one named first is taken.
 _AS_GOOD = 1.5
 # Fewest poses that tell a fault, and the shifts of time that are tried (s).
-_FEWEST = 5
+_FEWEST = 4
 _SHIFTS = np.linspace(-3.0, 3.0, 121)
 _SI = ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds"))
 
@@ -68,12 +71,13 @@ def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
     apart = max(truth.times[0] - times[-1], times[0] - truth.times[-1])
     hints = "".join(f"; {hint}" for hint in stamp_hints(times, truth))
     if apart > 0:
-        shift = times[0] - truth.times[0]
+        shift = truth.times[0] - times[0]
         longest = max(np.ptp(times), np.ptp(truth.times))
         if not hints and abs(np.ptp(times) - np.ptp(truth.times)) < 0.2 * longest < 0.2 * abs(
             shift
         ):
-            hints = f"; their clocks may differ by about {shift:.10g} s"
+            side = "ahead" if shift > 0 else "behind"
+            hints = f"; the truth's clock may be {side} by about {abs(shift):.10g} s"
         raise ValueError(
             f"no epoch has truth: the truth shares no time with the ranges: {where}, "
             f"{apart:.4g} s apart{hints}"
@@ -125,6 +129,7 @@ class Judged(NamedTuple):
         return 0.5 * float((turn / self.turn_variance + place / self.place_variance).mean())
 
     def rmse(self) -> str:
+        """The errors in words: root mean squares of the place and of the rotation."""
         turn = rotations.error(self.rotation, self.true_rotation)
         place = self.translation - self.true_translation
         turn_deg, place_m = (np.sqrt((a**2).sum(-1).mean()) for a in (np.rad2deg(turn), place))
@@ -162,18 +167,31 @@ def fault_hints(
     while judged.excess() >= _LARGE and len(hints) < 2:
         best: tuple[float, str, Judged] | None = None
         # A frame comes alone, or on top of another fault: neither explains much without the other.
-        tried = [*faults, *_frames(judged, planar)]
-        for text, other in faults:
-            tried += [(f"{text}, with {frame}", both) for frame, both in _frames(other, planar)]
-        for text, other in tried:
+        most = _EXPLAINED * judged.excess()
+        tried = [(text, other, most) for text, other in faults]
+        for text, other in (("", judged), *faults):
+            limit = min(most, _share_of_frames(other) * other.excess())
+            tried += [(f"{text}, with {frame}" if text else frame, both, limit)
+                      for frame, both in _frames(other, planar)]  # fmt: skip
+        for text, other, limit in tried:
             left = other.excess()
-            if left < _EXPLAINED * judged.excess() and (best is None or left * _AS_GOOD < best[0]):
+            if left < limit and (best is None or left * _AS_GOOD < best[0]):
                 best = left, text, other
         if best is None:
             break
         hints.append(f"{best[1]}: the errors would be {best[2].rmse()} in place of {judged.rmse()}")
         judged, faults = best[2], []
     return hints
+
+
+def _share_of_frames(judged: Judged) -> float:
+    """The share of the mean square that a constant transform may leave to be named."""
+    if judged.excess() >= _HUGE:
+        return _EXPLAINED
+    place = judged.true_translation
+    moved = ((place - place.mean(axis=0)) ** 2).sum(axis=-1).mean()
+    off = ((judged.translation - place) ** 2).sum(axis=-1).mean()
+    return _MOST_EXPLAINED if moved > off else 0.0
 
 
 def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
