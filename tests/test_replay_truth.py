@@ -11,7 +11,7 @@ from rbl_gym import motion, recordings
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
-from rbl_gym.studies.replay_truth import check_overlap, matched, stamp_hints
+from rbl_gym.studies.replay.truth import check_overlap, matched, stamp_hints
 
 STD_RAD, STD_M = 0.03, 0.03
 ANCHORS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])

@@ -133,7 +133,7 @@ def add_replay(commands: Any) -> None:
 
 def _replay(options: argparse.Namespace) -> int:
     from rbl_gym import recordings
-    from rbl_gym.studies import replay, replay_truth
+    from rbl_gym.studies import replay
 
     check_html(options)
     settings = replay.Settings(
@@ -159,7 +159,7 @@ def _replay(options: argparse.Namespace) -> int:
     settings = dataclasses.replace(settings, height_offset_m=offset)
     replay.make_filter(recording, settings)
     if recording.truth is not None:
-        replay_truth.check_overlap(recording.truth, recording.times, settings.truth_gap_s)
+        replay.check_overlap(recording.truth, recording.times, settings.truth_gap_s)
     with progress("replay", len(recording.times)) as advance:
         track = replay.run(recording, settings, advance)
     found = replay.errors(recording, track, settings)

@@ -1,0 +1,215 @@
+"""A recording through a filter: the same estimators on real radios."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import estimators, motion
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.filter import check_takes_noise
+from rbl_gym.geometry.mirror import mirror_pose
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings.reading import Recording
+from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
+from rbl_gym.studies.replay.settings import (
+    DEFAULT_RANGE_STD_M,
+    Settings,
+    has_own_std,
+    height_offset,
+    origin_of,
+    volume_of,
+)
+
+# What the planar constraint leaves to height (m), roll and pitch (rad).
+_PLANAR_STD = 1e-3
+# How much wider than the belief its mirror image starts.
+_IMAGE_RAD, _IMAGE_M = 0.1, 0.2
+# How many extents of the anchors away from them the bank looks where the volume has no limit.
+_REACH = 10.0
+
+
+class Track(NamedTuple):
+    """Beliefs after every epoch: times (K,), rotation, translation, covariance (K, 6, 6).
+
+    `other`: the mirror pose where one explains the ranges too; the covariance covers it then.
+    """
+
+    times: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    other: Mirror | None = None
+
+
+def run(
+    recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
+) -> Track:
+    """Filter a recording causally, epoch by epoch; `advance` is called after each.
+
+    Where a mirror pose explains the ranges as well, the belief covers both (`replay.mirror`).
+    """
+    beliefs = []
+    for _, belief in steps(recording, settings, make_filter(recording, settings)):
+        beliefs.append(belief)
+        advance()
+    track = track_of(recording, beliefs)
+    if settings.planar:
+        # Height, roll and pitch are held: they tell the sides apart.
+        return track
+    std = None
+    if not has_own_std(recording, settings):
+        std = settings.range_std_m or DEFAULT_RANGE_STD_M
+    judge = named_filter(recording, settings, "iekf", {"robust": settings.robust})
+    poses = track[1:4]
+    other = other_pose(recording, judge, std, poses, volume_of(recording, settings))
+    if other is None:
+        return track
+    return track._replace(covariance=covering(other, poses), other=other)
+
+
+def steps(
+    recording: Recording, settings: Settings, filter: estimators.Filter
+) -> Iterator[tuple[Any, estimators.PoseBelief]]:
+    """State and belief of a filter after every epoch of a recording, started from nothing.
+
+    Standard deviations that the recording reports itself are the law of their epoch. A belief
+    outside the settings' volume starts again from its mirror image, where that is inside.
+    Coordinates of a map are taken relative to the anchors; beliefs are of the world.
+    """
+    origin = origin_of(recording)
+    local = recording._replace(anchors=recording.anchors - origin)
+    volume = volume_of(recording, settings)
+    volume = None if volume is None else volume - origin
+    state = filter.initial(*_prior(local, settings, volume))
+    before = local.times[0]
+    for k, now in enumerate(local.times):
+        if now > before:
+            state = filter.predict(state, np.zeros(6), now - before)
+        epoch = local.ranges[k], local.anchors, local.links[k]
+        law = {}
+        if has_own_std(local, settings):
+            law["noise"] = ranging.LinkNoise(local.range_std[k])
+        state = filter.update(state, *epoch, **law)
+        belief = filter.belief(state)
+        if volume is not None and (image := _image_inside(local, belief, volume)) is not None:
+            state = filter.update(filter.initial(*image), *epoch, **law)
+            belief = filter.belief(state)
+        yield state, belief._replace(translation=belief.translation + origin)
+        before = now
+
+
+def _image_inside(
+    recording: Recording, belief: estimators.PoseBelief, volume: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """The mirror image of a belief that is outside the volume, if that is inside; widened."""
+    if not is_outside(volume, belief.translation, belief.covariance):
+        return None
+    image = mirror_pose(*belief[:3], recording.anchors, recording.tags)
+    if is_outside(volume, *image[1:]):
+        return None
+    # Of anchors nearly in a plane the image is near the best pose, not at it.
+    widened = image[2] + np.diag([_IMAGE_RAD**2] * 3 + [_IMAGE_M**2] * 3)
+    return image[0], image[1], widened
+
+
+def range_std_of(recording: Recording, settings: Settings) -> float | str:
+    """The standard deviation of a range [m], or ``"recorded"`` where each has its own."""
+    if settings.range_std_m is not None:
+        return settings.range_std_m
+    return "recorded" if has_own_std(recording, settings) else DEFAULT_RANGE_STD_M
+
+
+def track_of(recording: Recording, beliefs: list[estimators.PoseBelief]) -> Track:
+    """Beliefs after every epoch as arrays."""
+    return Track(
+        recording.times,
+        np.array([belief.rotation for belief in beliefs]),
+        np.array([belief.translation for belief in beliefs]),
+        np.array([belief.covariance for belief in beliefs]),
+    )
+
+
+def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
+    """The named filter with the recording's tags, a random walk and the range noise."""
+    return named_filter(recording, settings, settings.filter, _options(settings))
+
+
+def named_filter(
+    recording: Recording, settings: Settings, name: str, options: dict[str, Any]
+) -> estimators.Filter:
+    """`make_filter` for any filter and options of its own.
+
+    Raises
+    ------
+    ValueError
+        As `estimators.make`; and for a filter that does not take the law of an epoch, where the
+        recording has one.
+    """
+    walk, turn = settings.walk_m, math.radians(settings.walk_deg)
+    if settings.planar:
+        process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
+    else:
+        process = motion.ProcessNoise(turn, walk)
+    noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
+    volume = volume_of(recording, settings)
+    if name == "iekf-bank" and volume is not None:
+        # The bank looks for a lost body in its volume, which is finite.
+        anchors = recording.anchors
+        reach = _REACH * max(float(np.ptp(anchors, axis=0).max()), 1.0)
+        box = np.clip(volume, anchors.min(axis=0) - reach, anchors.max(axis=0) + reach)
+        options = {"volume": box - origin_of(recording), **options}
+    laws = {"tags": recording.tags, "noise": noise, "process": process}
+    filter = estimators.make(name, **laws, **options)
+    if has_own_std(recording, settings):
+        why = "the recording has a standard deviation for every range"
+        check_takes_noise(name, filter, why)
+    return filter
+
+
+# Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
+_ANY_TURN, _ANY_SPEED = 1.0, 3.0
+
+
+def _options(settings: Settings) -> dict[str, Any]:
+    """What the settings say to the named filter."""
+    if settings.filter in ("iekf", "iekf-bank"):
+        return {"robust": settings.robust}
+    if settings.filter == "iekf-bias":
+        return {
+            "robust": settings.robust,
+            "bias_std_m": settings.bias_std_m,
+            "bias_time_s": settings.bias_time_s,
+            "common_std_m": settings.bias_common_m,
+        }
+    if settings.filter == "iekf-cv":
+        turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.planar else ((1, 1, 1), (1, 1, 1))
+        return {
+            "robust": settings.robust,
+            "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),
+            "speed_m_s": tuple(_ANY_SPEED * axis for axis in shift),
+            "turn_acceleration": tuple(math.radians(settings.accel_deg) * axis for axis in turn),
+            "acceleration": tuple(settings.accel_m * axis for axis in shift),
+        }
+    return {}
+
+
+def _prior(
+    recording: Recording, settings: Settings, volume: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Anywhere among the anchors, turned anyhow; the plane, where there is one, is known."""
+    centre = recording.anchors.mean(axis=0)
+    extent = max(float(np.ptp(recording.anchors, axis=0).max()), 1.0)
+    std = np.array([math.pi] * 3 + [extent] * 3)
+    if volume is not None:
+        bounded = np.isfinite(volume).all(axis=0)
+        centre = np.where(bounded, np.where(bounded, volume, 0.0).mean(axis=0), centre)
+        half = 0.5 * np.diff(np.where(bounded, volume, 0.0), axis=0)[0]
+        std[3:] = np.where(bounded, half, std[3:])
+    if settings.planar:
+        centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
+        std[[0, 1, 5]] = _PLANAR_STD
+    return np.eye(3), centre, np.diag(std**2)
