@@ -34,12 +34,24 @@ def train(
         raise ValueError(f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the "
                          "worlds of larger ones are held out for evaluations")  # fmt: skip
     import torch  # pyright: ignore[reportMissingImports]
+
+    # Small networks: threads cost more than they give, and vary the sums.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _train(name, task, steps, seed, advance)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _train(
+    name: str, task: RlTask, steps: int, seed: int, advance: Callable[[int], None]
+) -> tuple[Policy, dict[str, Any]]:
+    import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
-    # Small networks: threads cost more than they give, and vary the sums.
-    torch.set_num_threads(1)
     envs = _Timed(Sb3VecEnv(task.make(task.num_envs)))
     continuous = kind_and_outputs(envs.venv.action_space)[0] == "box"
     log_std = {"log_std_init": task.log_std_init} if continuous else {}
