@@ -51,6 +51,8 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(name, tmp
     assert picture.stat().st_size > 20_000
     result = json.loads((tmp_path / "x.json").read_text())
     assert_table_holds(table, result, least=100)
+    if name == "slides2013":
+        assert set(result["dynamic"]["filters"]) == {"KF", "KF-ortho", "UC-KF", "iterated EKF"}
 
 
 @pytest.fixture(scope="module", params=[300, pytest.param(1000, marks=pytest.mark.long)])

@@ -478,7 +478,7 @@ def test_the_noise_of_the_static_paper_from_what_makes_it():
     """Its (1): variance 3 c^2 r^2 / (N_s kappa SNR); its reference range in dB."""
     c, n_samples, kappa, snr = 299_792_458.0, 1000, 2.0, 1e13
     parts = {"speed_m_s": c, "n_samples": n_samples, "kappa": kappa, "snr": snr}
-    noise = ranging.RangeNoise.from_time_of_arrival(**parts)
+    noise = ranging.RangeNoise.from_time_of_arrival(c, n_samples, kappa, snr)
     got = noise.variance(np.array([[80.0, 90.0]]))
     np.testing.assert_allclose(got, 3 * c**2 / (n_samples * kappa) * 80.0**2 / snr)
     db = 10 * np.log10(n_samples * kappa * snr / (3 * c**2))
@@ -486,9 +486,10 @@ def test_the_noise_of_the_static_paper_from_what_makes_it():
     np.testing.assert_allclose(noise.proportional, same.proportional)
     for form in ({"kind": "time-of-arrival", **parts}, {"kind": "reference-range", "db": db}):
         scene = scenes.get({"name": "icassp2013", "noise": form})
+        assert isinstance(scene.noise, ranging.RangeNoise)
         np.testing.assert_allclose(scene.noise.proportional, noise.proportional)
     with pytest.raises(ValueError, match="snr must be a finite number"):
-        ranging.RangeNoise.from_time_of_arrival(**parts | {"snr": 0.0})
+        ranging.RangeNoise.from_time_of_arrival(c, n_samples, kappa, snr=0.0)
     with pytest.raises(ValueError, match=r"scene.noise: .*missing 3 required"):
         scenes.get({"name": "icassp2013", "noise": {"kind": "time-of-arrival", "snr": 1.0}})
 
