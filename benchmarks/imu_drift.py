@@ -14,8 +14,10 @@ import argparse
 
 import numpy as np
 
-from rbl_gym import metrics, motion, scenes
-from rbl_gym.app import camsap2013, monte_carlo
+from rbl_gym import metrics, motion
+from rbl_gym.studies import monte_carlo
+from rbl_gym.studies.papers import camsap2013
+from rbl_gym.worlds import scenes
 
 SCENE = {"name": "camsap2013", "steps": 99, "process": {"translation_m": 0.1}}
 DRIFT = np.array([np.deg2rad(0.2)] * 3 + [0.2] * 3)

@@ -17,7 +17,7 @@ from rbl_gym.estimators.linear import squared_range
 from rbl_gym.estimators.locating import localization as door
 from rbl_gym.estimators.locating import maximum_likelihood
 from rbl_gym.geometry import bodies, rotations
-from rbl_gym.measurements import ranging
+from rbl_gym.measurements import noise_laws, ranging
 from rbl_gym.worlds import scenes
 from tests.helpers import load, random_world, simulate
 
@@ -485,6 +485,7 @@ def test_the_noise_of_the_static_paper_from_what_makes_it():
     same = ranging.RangeNoise.from_reference_range_db(db)
     np.testing.assert_allclose(noise.proportional, same.proportional)
     for form in ({"kind": "time-of-arrival", **parts}, {"kind": "reference-range", "db": db}):
+        assert form["kind"] in noise_laws.NOISE_FORMS
         scene = scenes.get({"name": "icassp2013", "noise": form})
         assert isinstance(scene.noise, ranging.RangeNoise)
         np.testing.assert_allclose(scene.noise.proportional, noise.proportional)

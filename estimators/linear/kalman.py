@@ -1,6 +1,8 @@
 """The Kalman filters of the tracking paper on the 12 states ``x = [vec Q; t]``.
 
-KF, UC-KF, ET-KF and KF-ortho are one filter with a different `constrain` step after the
+Source: S. P. Chepuri, A. Simonetto, G. Leus, A.-J. van der Veen, "Tracking position and
+orientation of a mobile rigid body", CAMSAP 2013: KF (17)-(22), UC-KF (23)-(27), ET-KF (28),
+KF-ortho Section V. KF, UC-KF, ET-KF and KF-ortho are one filter with a different `constrain` step after the
 linear update. The linear algebra below is filterpy's (one body) or the batched engine (any
 leading axes); both read the statistic of `squared_range`.
 """
@@ -59,7 +61,7 @@ class KalmanState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class KalmanFamily:
-    """A Kalman filter on squared ranges, with a constraint step (tracking paper, (16)-(27)).
+    """A Kalman filter on squared ranges, with a constraint step (tracking paper, (16)-(28)).
 
     Parameters
     ----------
@@ -70,9 +72,10 @@ class KalmanFamily:
     process
         Noise of the motion.
     constraint
-        ``"none"`` KF; ``"newton"`` UC-KF: the rotation of the weighted problem (26), then the
-        translation (27); ``"threshold"`` ET-KF: projection where ``|Q^T Q - I|_F > threshold``;
-        ``"always"`` KF-ortho: projection after every update. The projection is fed back.
+        ``"none"`` KF, (17)-(22); ``"newton"`` UC-KF, (23)-(27): the rotation of the weighted
+        problem (26), then the translation (27); ``"threshold"`` ET-KF: projection (28) where
+        ``|Q^T Q - I|_F > threshold``; ``"always"`` KF-ortho, Section V: projection after every
+        update. The projection is fed back.
     sigma_q_scale
         Process noise of an entry of Q over that of the rotation; 1 as printed, sqrt(2/3) is
         consistent.

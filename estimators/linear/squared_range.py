@@ -1,5 +1,7 @@
 """The papers' linear model of squared ranges, and the small statistic that is all of it.
 
+Sources: static paper (ICASSP 2013), (3)-(13); tracking paper (CAMSAP 2013), (1)-(9).
+
 With ``d_mn = r_mn^2 - |a_m|^2`` the tag places obey ``d_mn = |s_n|^2 - 2 a_m^T s_n + noise``.
 Projecting ``|s_n|^2`` out with ``Pi = W - W 1 1^T W / (1^T W 1)`` (W the inverse variances of
 the squared ranges) leaves a linear model in ``x = [vec Q; t]``, ``s_n = Q c_n + t``, whose

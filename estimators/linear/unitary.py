@@ -1,4 +1,4 @@
-"""The rotation of UC-KF: the weighted problems (23) and (26) of the tracking paper, on SO(3)."""
+"""UC-KF on SO(3): the weighted problems (23), (26) and (27) of the tracking paper."""
 
 from __future__ import annotations
 

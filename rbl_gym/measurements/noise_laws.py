@@ -16,7 +16,8 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
 __all__ = [
-    "NOISE_LAWS", "LinkNoise", "NoiseLaw", "RangeNoise", "SquaredRangeNoise", "reference_range",
+    "NOISE_FORMS", "NOISE_LAWS", "LinkNoise", "NoiseLaw", "RangeNoise", "SquaredRangeNoise",
+    "reference_range",
 ]  # fmt: skip
 
 

@@ -193,7 +193,7 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         change. Nested fields take mappings of their own: ``{"name": "uwb_room", "steps": 50,
         "links": {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``. A region or noise of
         another kind is named by ``"kind"`` (``"box"``, ``"walls"``, ``"shell"``; a name of
-        `ranging.NOISE_FORMS`: ``"range"``, ``"squared-range"``, ``"reference-range"`` with its
+        `noise_laws.NOISE_FORMS`: ``"range"``, ``"squared-range"``, ``"reference-range"`` with its
         `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`, `kappa` and `snr`). Another
         number of anchors than the scene has, without their places, draws them anew in the region
         at every reset.
