@@ -2,9 +2,9 @@
 
 Source: S. P. Chepuri, A. Simonetto, G. Leus, A.-J. van der Veen, "Tracking position and
 orientation of a mobile rigid body", CAMSAP 2013: KF (17)-(22), UC-KF (23)-(27), ET-KF (28),
-KF-ortho Section V. KF, UC-KF, ET-KF and KF-ortho are one filter with a different `constrain` step after the
-linear update. The linear algebra below is filterpy's (one body) or the batched engine (any
-leading axes); both read the statistic of `squared_range`.
+KF-ortho Section V. The four are one filter with a different `constrain` step after the linear
+update. The linear algebra below is filterpy's (one body) or the batched engine (any leading
+axes); both read the statistic of `squared_range`.
 """
 
 from __future__ import annotations
