@@ -62,7 +62,7 @@ def brute_force(state, ranges, anchors, tags, links, sums):
 @pytest.mark.parametrize(("twist", "laws"), [(True, 0), (False, 1), (False, 2), (True, 1)], ids=str)
 @pytest.mark.parametrize("missing", [False, True])
 def test_update_is_the_maximum_a_posteriori_of_all_states_by_brute_force(twist, laws, missing):
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(4)
     anchors, tags, rotation, translation = random_world(rng, 5, 3)
     pose = IteratedEkf(tags, NOISE, PROCESS, iterations=20)
     law = ut.WanderingTwist() if twist else None

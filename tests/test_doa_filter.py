@@ -153,9 +153,6 @@ def test_huber_shrugs_off_a_wrong_direction():
         (lambda f, s: f.update(s, np.ones((2, 4)), np.zeros(3), np.ones(3)), "links must be"),
         (lambda f, s: f.update(s, np.ones((2, 4)), np.zeros(3), ranges=np.ones((1, 4))),
          "range_noise must be given"),
-        (lambda f, s: make(TAGS[:2]).update(
-            s._replace(covariance=100 * np.eye(6)), np.ones((2, 2)), np.zeros(3)),
-         "tags must be at least 3"),
         (lambda f, s: make(noise=RANGES), "noise must be a bearing"),
         (lambda f, s: estimators.make("iekf", tags=TAGS, noise=RANGES, process=PROCESS,
                                       range_noise=RANGES), "range_noise must be None"),

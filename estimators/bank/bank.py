@@ -31,11 +31,11 @@ from rbl_gym.estimators.bank.hypotheses import (
     with_rivals,
 )
 from rbl_gym.estimators.costs.range_cost import cut_huber
+from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import TRAILING, IteratedEkf, PoseState, as_state, block_size
 from rbl_gym.estimators.iekf.manifold import update_in_blocks as in_blocks
 from rbl_gym.estimators.iekf.robust_update import GATE, HUBER
-from rbl_gym.estimators.iekf.vague_start import is_vague
 from rbl_gym.estimators.inputs import check_batches
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
@@ -166,7 +166,7 @@ class IteratedEkfBank:
         strained = state.nis > self._bearable(state.links)
         if self.volume is not None:
             strained |= self._is_outside(led.translation, led.covariance)
-        vague = is_vague(prior.covariance)
+        vague = self._filter.is_sought(leader_of(prior), *epoch)
         lost = np.flatnonzero((strained | vague) & (count >= _FEWEST_LINKS))
         if len(lost):
             state = self._look_around(prior, state, led, epoch, lost, vague)
@@ -217,7 +217,8 @@ class IteratedEkfBank:
                 data = dataclasses.replace(problem.data, loss=cut_huber(HUBER, GATE))
                 whole = dataclasses.replace(problem, data=data)
                 cost = whole(found.rotation, found.translation).cost
-            return _Scored(*as_state(found), cost)
+            heard = (arrays[1] > 0).any(axis=-2)
+            return _Scored(*kept_wide(state, as_state(found), heard, self.tags), cost)
 
         arrays, trailing = [*prior, *epoch, *(start or ())], (*TRAILING, 2, 1)
         return in_blocks(update, arrays, trailing[: len(arrays)], block_size(epoch.ranges))

@@ -19,6 +19,7 @@ from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, minimize_pose
 from rbl_gym.estimators.costs.range_cost import huber
+from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations
 
@@ -189,8 +190,11 @@ def solve(
     covariance: FloatArray | None,
     iterations: int,
     threshold: float | None,
+    heard: BoolArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """The fields of the state at the most likely pose near a start.
+
+    `heard` (..., N): which tags had any link.
 
     Huber's weights (`threshold`; None: least squares) are taken at the start, whose pose has a
     `covariance` (..., 6, 6; None: not to be counted), and once more at the pose found from them.
@@ -209,7 +213,14 @@ def solve(
     # Of the extra states: what the ranges tell given the pose, then what the pose tells.
     gain = problem.spread @ problem.sums.T @ problem.weight
     slope = problem.gain @ D - gain @ H
-    pose = inverse(found.at.hessian)
+    pose = kept_wide(
+        AugmentedState(
+            problem.rotation, problem.translation, problem.extra, inverse(problem.information)
+        ),
+        AugmentedState(rotation, translation, problem.extra, inverse(found.at.hessian)),
+        heard,
+        problem.tags,
+    ).covariance
     K = problem.extra.shape[-1]
     P = np.empty((*nu.shape[:-1], 6 + K, 6 + K))
     P[..., :6, :6] = pose

@@ -21,7 +21,7 @@ from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log,
 from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
 from rbl_gym.estimators.filter import PoseBelief, register
-from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState, is_vague
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState
 from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, law_of, plain
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
@@ -161,7 +161,8 @@ class AugmentedEkf:
         sums = bias_cost.sums_of(self._n_twist, len(self.biases), math.prod(ranges.shape[-2:]))
         problem = bias_cost.problem(state, sums, ranges, variance, anchors, self.pose.tags, mask)
         start, covariance = (state.rotation, state.translation), state.covariance[..., :6, :6]
-        vague = is_vague(covariance)
+        weights = 1 / variance if mask is None else mask / variance
+        vague = self.pose.is_sought(pose, ranges, weights, anchors)
         if vague.any():
             found = self._found_from_nothing(state, sums, ranges, variance, anchors, mask)
             start = (
@@ -170,8 +171,10 @@ class AugmentedEkf:
             )
             covariance = np.where(vague[..., None, None], found.covariance, covariance)
         threshold = HUBER if self.pose.robust else None
+        heard = np.ones(ranges.shape[-1], np.bool_) if mask is None else mask.any(axis=-2)
+        iterations = self.pose.iterations
         return AugmentedState(
-            *bias_cost.solve(problem, start, covariance, self.pose.iterations, threshold)
+            *bias_cost.solve(problem, start, covariance, iterations, threshold, heard)
         )
 
     def _with_biases(self, state: AugmentedState, shape: tuple[int, ...]) -> AugmentedState:

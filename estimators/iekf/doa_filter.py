@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 from rbl_gym.estimators.costs.doa_cost import DoaCost, SumCost
-from rbl_gym.estimators.costs.range_cost import Index, RangeCost, huber
+from rbl_gym.estimators.costs.range_cost import Index, Loss, RangeCost, huber
+from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import register
 from rbl_gym.estimators.iekf.manifold import (
     IteratedEkf,
@@ -23,7 +24,7 @@ from rbl_gym.estimators.iekf.manifold import (
     update_in_blocks,
 )
 from rbl_gym.estimators.iekf.robust_update import HUBER
-from rbl_gym.estimators.iekf.vague_start import best_start, global_start, is_vague
+from rbl_gym.estimators.iekf.vague_start import best_start, global_start, is_vague, settles, spread
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.locating.doa_global import global_search
 from rbl_gym.measurements import bearing
@@ -72,8 +73,10 @@ class DoaEkf(IteratedEkf):
     ) -> PoseState:
         """State after one epoch of directions of arrival, and of ranges where there are any.
 
-        A prior whose rotation is vague (`vague_start`) starts from the global solution of the
-        angles and its alternatives besides; of mirror images the prior decides.
+        Where the prior rotation is vague in a direction that the epoch determines, the update
+        starts from the global solution of the angles and its alternatives besides (with fewer
+        than three tags, or tags in a line, from rotations all over the prior); of mirror images
+        the prior decides. What the epoch does not see stays as wide as it was.
 
         Parameters
         ----------
@@ -92,8 +95,7 @@ class DoaEkf(IteratedEkf):
         Raises
         ------
         ValueError
-            On wrong shapes, NaN, angles outside [0, pi], ranges without their law; and where the
-            prior is vague and the tags are fewer than three or collinear.
+            On wrong shapes, NaN, angles outside [0, pi], ranges without their law.
         """
         n_tags = self.tags.shape[-2]
         station = _check_station(station)
@@ -137,25 +139,29 @@ class DoaEkf(IteratedEkf):
         *of_ranges: FloatArray,
     ) -> PoseState:
         """The update of one block of trials; `of_ranges`: ranges, their weights, the anchors."""
-        loss = huber(HUBER) if self.robust else None
-        data: DoaCost | SumCost = DoaCost(angles, weights, self.tags, station, loss)
-        if of_ranges:
-            ranges, range_weights, anchors = of_ranges
-            cost = RangeCost(ranges, range_weights, anchors, self.tags, loss, lift=self._lift)
-            data = SumCost((data, cost))
-        problem = map_problem(state, data)
+
+        def problem_by(loss: Loss | None) -> MapProblem:
+            data: DoaCost | SumCost = DoaCost(angles, weights, self.tags, station, loss)
+            if of_ranges:
+                ranges, range_weights, anchors = of_ranges
+                cost = RangeCost(ranges, range_weights, anchors, self.tags, loss, lift=self._lift)
+                data = SumCost((data, cost))
+            return map_problem(state, data)
+
+        problem = problem_by(huber(HUBER) if self.robust else None)
         start = problem.prior.rotation, problem.prior.translation
         vague = is_vague(state.covariance)
         if vague.any():
-            if not self._has_rotation:
-                raise ValueError(
-                    "tags must be at least 3 and not collinear where the prior rotation is vague, "
-                    f"got {self.tags.shape[-2]}; give a tighter prior"
-                )
-            others = (array.shape[:-2] for array in (angles, *of_ranges, self.tags))
+            others = (array.shape[:-2] for array in (angles, weights, *of_ranges, self.tags))
             batch = np.broadcast_shapes(vague.shape, station.shape[:-1], *others)
-            start = global_start(problem, vague, batch, _best_of_angles)
-        return posterior(problem, *start, self.iterations)
+            sought = settles(problem_by(None), vague, batch)
+            if sought.any():
+                search = _best_of_angles if self._has_rotation else _best_of_spread
+                start = global_start(problem, sought, batch, search)
+        heard = (weights > 0).any(axis=-2)
+        if of_ranges:
+            heard = heard | (of_ranges[1] > 0).any(axis=-2)
+        return kept_wide(state, posterior(problem, *start, self.iterations), heard, self.tags)
 
 
 def _best_of_angles(
@@ -176,6 +182,16 @@ def _best_of_angles(
         np.stack([*np.moveaxis(rotation, 1, 0), best.rotation, part.prior.rotation], axis=1),
         np.stack([*np.moveaxis(translation, 1, 0), shift, part.prior.translation], axis=1),
     )
+
+
+def _best_of_spread(
+    problem: MapProblem, batch: tuple[int, ...], where: Index
+) -> tuple[FloatArray, FloatArray]:
+    """The best solve from the prior's place, turned as far as the prior is wide."""
+    prior = problem.take(batch, where).prior
+    rotation = spread(prior)
+    translation = np.broadcast_to(prior.translation[:, None], rotation.shape[:-1])
+    return best_start(problem, batch, where, rotation, translation)
 
 
 def _check_station(station: ArrayLike) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds
-from rbl_gym.checks import FloatArray, check_array, check_count, check_number
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count, check_number
 from rbl_gym.components import (
     exp_and_left_jacobian,
     first,
@@ -31,9 +31,10 @@ from rbl_gym.components import (
 )
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.costs.range_cost import Index, RangeCost, huber, lift_map, pick
+from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.robust_update import HUBER, robust_solution
-from rbl_gym.estimators.iekf.vague_start import best_of_net, global_start, is_vague
+from rbl_gym.estimators.iekf.vague_start import best_of_net, global_start, is_vague, settles
 from rbl_gym.estimators.inputs import (
     check_batches,
     check_covariance,
@@ -41,7 +42,6 @@ from rbl_gym.estimators.inputs import (
     check_variance,
     law_of,
     plain,
-    spanned_dimensions,
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements.ranging import NoiseLaw
@@ -139,16 +139,16 @@ class IteratedEkf:
     ) -> PoseState:
         """State after one epoch of ranges (..., M, N); `noise` is its law, None: the filter's.
 
-        Where the prior rotation is vague (`vague_start`), the update starts from many poses and
-        keeps the best. Among coplanar anchors the mirror pose may explain the ranges as well:
-        then only a prior that knows the side tells them apart (`locate` lists both, ``"iekf-bank"``
-        follows both).
+        Where the prior rotation is vague in a direction that the epoch determines (a first epoch,
+        a lost track), the update starts from many poses and keeps the best. What the epoch does
+        not see stays as wide as it was. Among coplanar anchors the mirror pose may explain the
+        ranges as well: then only a prior that knows the side tells them apart (`locate` lists both,
+        ``"iekf-bank"`` follows both).
 
         Raises
         ------
         ValueError
-            On wrong shapes, NaN, ranges that are not positive; and where the prior is vague
-            and the anchors or tags cannot determine a pose (the message names the rank).
+            On wrong shapes, NaN, ranges that are not positive.
         """
         ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
@@ -175,7 +175,8 @@ class IteratedEkf:
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
     ) -> PoseState:
         """The update of one block of trials, links as weights (..., M, N)."""
-        return as_state(self.solve(state, ranges, weights, anchors)[1])
+        found = as_state(self.solve(state, ranges, weights, anchors)[1])
+        return kept_wide(state, found, (weights > 0).any(axis=-2), self.tags)
 
     def solve(
         self,
@@ -191,16 +192,25 @@ class IteratedEkf:
         problem = map_problem(state, data)
         if start is None:
             start = problem.prior.rotation, problem.prior.translation
-            vague = is_vague(state.covariance)
-            if vague.any():
-                _check_determined(anchors, self.tags)
-                others = (array.shape[:-2] for array in (ranges, anchors, self.tags))
-                batch = np.broadcast_shapes(vague.shape, *others)
-                start = global_start(problem, vague, batch, best_of_net)
+            sought = self.is_sought(state, ranges, weights, anchors)
+            if sought.any():
+                start = global_start(problem, sought, sought.shape, best_of_net)
         found = (robust_solution if self.robust else minimize_pose)(
             problem, *start, self.iterations
         )
         return problem, found
+
+    def is_sought(
+        self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
+    ) -> BoolArray:
+        """Where (...) an update by a checked epoch starts from many poses (`vague_start`)."""
+        vague = is_vague(state.covariance)
+        if not vague.any():
+            return vague
+        others = (array.shape[:-2] for array in (ranges, weights, anchors, self.tags))
+        batch = np.broadcast_shapes(vague.shape, state.translation.shape[:-1], *others)
+        data = RangeCost(ranges, weights, anchors, self.tags, lift=self._lift)
+        return settles(map_problem(state, data), vague, batch)
 
     def belief(self, state: PoseState) -> PoseBelief:
         """The state as a belief (copies)."""
@@ -342,14 +352,3 @@ def _flatten(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatA
     if array.ndim == trailing:
         return array[None]
     return np.broadcast_to(array, (*batch, *shape)).reshape((-1, *shape))
-
-
-def _check_determined(anchors: FloatArray, tags: FloatArray) -> None:
-    """A ValueError where no number of full epochs can tell a pose: collinear anchors or tags."""
-    for name, points in (("anchors", anchors), ("tags", tags)):
-        rank = spanned_dimensions(points)
-        if (rank < 2).any():
-            raise ValueError(
-                f"{name} must be at least 3 and not collinear where the prior rotation is vague, "
-                f"got {points.shape[-2]} of rank {int(rank.min())}; give a tighter prior"
-            )

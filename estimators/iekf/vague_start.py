@@ -1,6 +1,8 @@
 """Where an update starts from when its prior says little about the rotation.
 
-Arguments named `problem` are `manifold.MapProblem`.
+An update starts globally where the prior is vague in a direction that its epoch determines: at a
+first epoch, and after a track was lost. A direction that the epoch does not see stays wide, and
+needs no search. Arguments named `problem` are `manifold.MapProblem`.
 """
 
 from __future__ import annotations
@@ -31,6 +33,46 @@ def is_vague(covariance: FloatArray) -> BoolArray:
     if vague.any():
         vague[vague] = np.linalg.eigvalsh(covariance[vague, :3, :3])[..., -1] > limit
     return vague
+
+
+def settles(problem: Any, vague: BoolArray, batch: tuple[int, ...]) -> BoolArray:
+    """Where (...) an epoch determines a direction in which its prior rotation is vague.
+
+    That is where the linear update leaves fewer vague directions than there were. It is tried at
+    the prior's place and one standard deviation from it to all sides: what anchors in a plane tell
+    vanishes in that plane.
+
+    Parameters
+    ----------
+    problem
+        The problem of the update, of least squares: by a loss, what misfits there tells little.
+    vague
+        Trials (...) to be looked at, by `is_vague`; the others are False.
+    batch
+        Leading axes of the problem.
+    """
+    # A trial alone has no axis to index: it gets one.
+    axes = batch or (1,)
+    where = np.broadcast_to(vague, axes).nonzero()
+    prior = problem.take(axes, where).prior
+    values, vectors = np.linalg.eigh(prior.covariance[..., 3:, 3:])
+    steps = np.swapaxes(vectors * np.sqrt(values)[..., None, :], -1, -2)
+    offsets = np.concatenate([np.zeros_like(steps[:, :1]), steps, -steps], axis=1)
+    count = offsets.shape[1]
+    tried = problem.take(axes, tuple(np.repeat(axis, count) for axis in where))
+    places = prior.translation[:, None] + offsets
+    told = tried.data(tried.prior.rotation, places.reshape(-1, 3)).hessian
+    left = _vague_directions(np.linalg.inv(tried.prior_information + told))
+    result = np.zeros(axes, np.bool_)
+    fewer = left < _vague_directions(tried.prior.covariance)
+    result[where] = fewer.reshape(-1, count).any(axis=-1)
+    return result.reshape(batch)
+
+
+def _vague_directions(covariance: FloatArray) -> np.ndarray:
+    """How many (...) principal axes of the rotation are vague."""
+    values = np.linalg.eigvalsh(covariance[..., :3, :3])
+    return (values > VAGUE_ROTATION_RAD**2).sum(axis=-1)
 
 
 _NET = rotations.log(ROTATION_NET)
@@ -68,7 +110,7 @@ def best_of_net(
     Gauss-Newton steps on the full cost.
     """
     part = problem.take(batch, where)
-    rotation = _spread(part.prior)
+    rotation = spread(part.prior)
     translation = _translation_given(rotation, part)
     return best_start(problem, batch, where, rotation, translation)
 
@@ -92,7 +134,7 @@ def best_start(
     return solution.rotation[best], solution.translation[best]
 
 
-def _spread(prior: Any) -> FloatArray:
+def spread(prior: Any) -> FloatArray:
     """Rotations (K, 24, 3, 3) around priors (K, ...), on each axis as far as it is uncertain."""
     values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
     reach = np.minimum(np.sqrt(values) / VAGUE_ROTATION_RAD, 1.0)

@@ -1,0 +1,79 @@
+"""What an update leaves of a prior about directions that its epoch cannot see.
+
+Ranges to tags in a line say nothing of the body's roll about that line, and the line turns with the
+body. The update carries the prior's information to the new pose by ``Jl^-1(log(Q Q_-^T))``, the
+derivative of its residual, halfway between the old line and the new one: each update then takes a
+little of what the prior knows of other directions for knowledge of the roll, and after many of them
+the roll is believed to be known. Carried along with the body, the wide direction stays on the line.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray, kernel
+from rbl_gym.estimators.filter import inverse
+from rbl_gym.geometry import rotations
+
+Pose = TypeVar("Pose", bound=tuple)
+
+# Tags this thin beside their length (squared) are as good as in a line: to them the two ways of
+# carrying the prior differ by more than the ranges tell, to others by nothing that matters.
+_THIN = 0.01
+_HAT, _LOG = kernel(rotations.hat), kernel(rotations.log)
+_LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
+
+
+def kept_wide(prior: Pose, posterior: Pose, heard: BoolArray, tags: FloatArray) -> Pose:
+    """The posterior pose with the covariance that leaves unseen directions as wide as they were.
+
+    Parameters
+    ----------
+    prior, posterior
+        Poses before and after the update, NamedTuples with `rotation`, `translation` and
+        `covariance`.
+    heard
+        (..., N), which tags had any link.
+    tags
+        (..., N, 3), metres.
+    """
+    thin, centre = _line(heard, tags)
+    if not thin.any():
+        return posterior
+    batch = np.broadcast_shapes(thin.shape, posterior.translation.shape[:-1])
+    axes = batch or (1,)
+    where = np.broadcast_to(thin, axes).nonzero()
+
+    def chosen(array: FloatArray, core: int) -> FloatArray:
+        return np.broadcast_to(array, (*axes, *array.shape[array.ndim - core :]))[where]
+
+    Q0, P0 = chosen(prior.rotation, 2), chosen(prior.covariance, 2)
+    Q1, P1 = chosen(posterior.rotation, 2), chosen(posterior.covariance, 2)
+    information = inverse(P0)
+    back = Q0 @ np.swapaxes(Q1, -1, -2)
+    arms = [_HAT((Q @ chosen(centre, 1)[..., None])[..., 0]) for Q in (Q0, Q1)]
+    D = np.zeros_like(P1)
+    D[:, :3, :3] = _LEFT_JACOBIAN_INVERSE(_LOG(np.swapaxes(back, -1, -2)))
+    D[:, 3:, 3:] = np.eye(3)
+    # With the body: an error about the tags' centre is the same in the body's frame.
+    T = np.zeros_like(P1)
+    T[:, :3, :3], T[:, 3:, 3:] = back, np.eye(3)
+    T[:, 3:, :3] = arms[0] @ back - arms[1]
+    carried = [np.swapaxes(A, -1, -2) @ information @ A for A in (D, T)]
+    covariance = np.broadcast_to(posterior.covariance, (*axes, 6, 6)).copy()
+    covariance[where] = inverse(inverse(P1) - carried[0] + carried[1])
+    return posterior._replace(covariance=covariance.reshape((*batch, 6, 6)))
+
+
+def _line(heard: BoolArray, tags: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Where (...) the tags that were heard are about in a line, and their centre (..., 3)."""
+    share = heard / np.maximum(heard.sum(axis=-1, keepdims=True), 1)
+    centre = (share[..., None, :] @ tags)[..., 0, :]
+    about = (tags - centre[..., None, :]) * heard[..., None]
+    gram = np.swapaxes(about, -1, -2) @ about
+    trace = np.einsum("...ii->...", gram)
+    # The sum of products of two eigenvalues, over the square of their sum.
+    pairs = 0.5 * (trace**2 - np.einsum("...ij,...ij->...", gram, gram))
+    return np.asarray(heard.any(axis=-1) & (pairs <= _THIN * trace**2)), centre
