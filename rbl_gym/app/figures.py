@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.rotations import error as rotation_error
-from rbl_gym.recordings.reading import Recording, truth_at
+from rbl_gym.recordings.reading import Recording
 from rbl_gym.studies.papers.camsap2013 import Example
 from rbl_gym.studies.replay import Errors, Track
 
@@ -242,7 +242,9 @@ def replay(recording: Recording, track: Track, found: Errors | None) -> Figure:
     for place, name in zip(recording.anchors, recording.anchor_ids, strict=True):
         axes.annotate(name, place[:2], xytext=(4, 4), textcoords="offset points", fontsize=8)
     if recording.truth is not None and found is not None:
-        true = truth_at(recording.truth, track.times)[1][found.known]
+        when = recording.truth.times
+        during = (when >= track.times[0]) & (when <= track.times[-1])
+        true = recording.truth.translation[during]
         axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label="truth")
     axes.plot(*track.translation[:, :2].T, color=COLOURS["iterated EKF"], lw=0.8, label="estimate")
     axes.set_aspect("equal", adjustable="box")  # datalim cuts off the label
