@@ -55,9 +55,12 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(name, tmp
         assert set(result["dynamic"]["filters"]) == {"KF", "KF-ortho", "UC-KF", "iterated EKF"}
 
 
-@pytest.fixture(scope="module", params=[300, pytest.param(1000, marks=pytest.mark.long)])
+LONG = [pytest.param((1000, seed), marks=pytest.mark.long) for seed in (0, 1, 2)]
+
+
+@pytest.fixture(scope="module", params=[(300, 0), *LONG], ids=str)
 def experiment(request):
-    return camsap2013.run(request.param, 0)
+    return camsap2013.run(*request.param)
 
 
 def test_the_tracking_papers_claims_hold(experiment):
