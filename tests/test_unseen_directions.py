@@ -206,6 +206,23 @@ def test_a_lost_track_is_searched_once(searches):
     assert (metrics.nees(error, state.covariance) < 22).mean() > 0.95
 
 
+def test_a_bank_of_two_tags_that_was_carried_off_finds_them_again():
+    """The bodies are put elsewhere between two epochs, metres away from where the bank thinks."""
+    rng = np.random.default_rng(10)
+    bank: Any = make(PAIR, "iekf-bank")
+    start = rotations.random(rng, (20,)), rng.uniform([1, 1, 0.5], [3, 2, 2], (20, 3))
+    state = bank.initial(*start, np.diag([0.01] * 3 + [0.01] * 3))
+    pose = rotations.random(rng, (20,)), rng.uniform([5, 4, 0.5], [7, 5, 2], (20, 3))
+    for k in range(12):
+        here = start if k < 2 else pose
+        state = bank.predict(state, np.zeros(6), DT) if k else state
+        state = bank.update(state, simulate(rng, ANCHORS, PAIR, *here, NOISE), ANCHORS)
+    belief = bank.belief(state)
+    gap = ranging.tag_positions(belief.rotation, belief.translation, PAIR)
+    gap = np.linalg.norm(gap - ranging.tag_positions(*pose, PAIR), axis=-1)
+    assert (gap < 0.2).mean() > 0.9
+
+
 @pytest.mark.parametrize(
     ("anchors", "tags"),
     [(ANCHORS[:2], bodies.pyramid()), (ANCHORS[[0, 0, 0]] + [[0, 0, 0], [5, 0, 0], [9, 0, 0]],

@@ -36,7 +36,7 @@ from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import TRAILING, IteratedEkf, PoseState, as_state, block_size
 from rbl_gym.estimators.iekf.manifold import update_in_blocks as in_blocks
 from rbl_gym.estimators.iekf.robust_update import GATE, HUBER
-from rbl_gym.estimators.inputs import check_batches
+from rbl_gym.estimators.inputs import check_batches, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
 from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
@@ -167,6 +167,9 @@ class IteratedEkfBank:
         if self.volume is not None:
             strained |= self._is_outside(led.translation, led.covariance)
         vague = self._filter.is_sought(leader_of(prior), *epoch)
+        if self._is_line:
+            # The update of the leader has searched; there is nothing else that `locate` knows.
+            vague = np.zeros_like(vague)
         lost = np.flatnonzero((strained | vague) & (count >= _FEWEST_LINKS))
         if len(lost):
             state = self._look_around(prior, state, led, epoch, lost, vague)
@@ -252,7 +255,10 @@ class IteratedEkfBank:
     ) -> BankState:
         """New rivals of some trials (R,), from their ranges alone."""
         part = epoch.take(rows)
-        rotation, translation, known = self._candidates(part)
+        if self._is_line:
+            rotation, translation, known = self._searched(state.rotation[rows], part)
+        else:
+            rotation, translation, known = self._candidates(part)
         trial, _ = known.nonzero()
         rotation, translation = rotation[known], translation[known]
         wide = self._anywhere(rotation, part.anchors[trial])
@@ -301,6 +307,19 @@ class IteratedEkfBank:
         known = np.isfinite(np.concatenate([found.cost[:, None], others.cost], axis=1))
         known &= np.isfinite(translation).all(axis=-1) & (found.rank == 6)[:, None]
         return rotation, translation, known
+
+    @functools.cached_property
+    def _is_line(self) -> bool:
+        """Whether the tags are in a line: no ranges determine a pose of theirs."""
+        return bool(spanned_dimensions(self.tags) < 2)
+
+    def _searched(
+        self, rotation: FloatArray, epoch: _Epoch
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """As `_candidates`, one each: what the filter finds that knows nothing beforehand."""
+        found = self._scored(self._anywhere(rotation, epoch.anchors), epoch)
+        known = np.isfinite(found.cost)
+        return found.rotation[:, None], found.translation[:, None], known[:, None]
 
     def _anywhere(self, rotation: FloatArray, anchors: FloatArray) -> PoseState:
         """A prior (K,) that says nothing of the rotation, and of the place what is known."""
