@@ -337,7 +337,12 @@ def _asynchronous(samples: list[Sample], loss: float, rng: np.random.Generator) 
     return {"loss": loss, "rounds": float(np.mean(steps)), "largest_error_rad": max(off)}
 
 
-def _history(one: Sample, basis: str) -> list[float]:
+def _history(one: Sample, basis: str) -> dict[str, Any]:
+    """Distances from the limit over the steps of a run, and the factor that Theorem 19 prints."""
     C = network_graphs.cycle_matrix(one.edges, N_NODES, basis)
     run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, history=True)
-    return errors(C, one.y, run).tolist()
+    assert run.kappa is not None
+    return {
+        "distance": errors(C, one.y, run).tolist(),
+        "printed_factor_squared": consensus.printed_factor(run.kappa),
+    }
