@@ -18,8 +18,9 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_one_of
 from rbl_gym.estimators.networks.consensus import cycle_consensus
+from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.graphs import check_connected, spanning_tree, sum_to_root
-from rbl_gym.networks.sensing import IntArray, check_edge_angles, check_edge_values, proj
+from rbl_gym.networks.sensing import check_edge_angles, check_edge_values, proj
 
 # A step is exact to rounding once no residual wraps: the next one is far below this.
 _SETTLED_RAD = 1e-10

@@ -153,14 +153,12 @@ def range_information(
         raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
     mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
     if model == "raw" and tag_std_m == 0:
-        information = information_at(anchors, tags, rotation, translation, noise, mask)
-    else:
-        positions = _TAG_POSITIONS(rotation, translation, tags)
-        of_tag = _raw_tag_information if model == "raw" else _squared_tag_information
-        per_tag = of_tag(anchors, positions, noise, mask)
-        damping = np.eye(3) + tag_std_m**2 * per_tag
-        information = lift(tag_jacobian(rotation, tags), np.linalg.solve(damping, per_tag))
-    return information
+        return information_at(anchors, tags, rotation, translation, noise, mask)
+    positions = _TAG_POSITIONS(rotation, translation, tags)
+    of_tag = _raw_tag_information if model == "raw" else _squared_tag_information
+    per_tag = of_tag(anchors, positions, noise, mask)
+    damping = np.eye(3) + tag_std_m**2 * per_tag
+    return lift(tag_jacobian(rotation, tags), np.linalg.solve(damping, per_tag))
 
 
 def information_at(

@@ -14,14 +14,9 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.geometry import rotations
+from rbl_gym.networks.edges import IntArray, check_edges
 from rbl_gym.networks.graphs import check_connected, incidence
-from rbl_gym.networks.sensing import (
-    IntArray,
-    check_edges,
-    check_pair,
-    check_positions,
-    directions_of,
-)
+from rbl_gym.networks.sensing import check_pair, check_positions, directions_of
 
 __all__ = [
     "bearing_jacobian", "frame_covariance", "orientation_covariance", "range_jacobian",

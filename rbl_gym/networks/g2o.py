@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.networks.sensing import IntArray, edge_angles, proj
+from rbl_gym.networks.edges import IntArray
+from rbl_gym.networks.sensing import edge_angles, proj
 
 __all__ = ["PoseGraph", "read_graph"]
 

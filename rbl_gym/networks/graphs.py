@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csgraph
 
 from rbl_gym.checks import check_one_of
-from rbl_gym.networks.sensing import IntArray, check_edges
+from rbl_gym.networks.edges import IntArray, check_edges
 
 __all__ = ["BASES", "SpanningTree", "cycle_matrix", "incidence", "spanning_tree"]
 

@@ -24,8 +24,9 @@ from rbl_gym.networks.bounds import (
     space_jacobian,
     sparse_rows,
 )
+from rbl_gym.networks.edges import check_edges
 from rbl_gym.networks.graphs import check_connected, components
-from rbl_gym.networks.sensing import check_edges, check_positions, directions_of
+from rbl_gym.networks.sensing import check_positions, directions_of
 
 __all__ = [
     "Freedom", "Localizability", "feasible_rotations", "freedom", "localizability",

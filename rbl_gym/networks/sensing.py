@@ -16,7 +16,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from rbl_gym.checks import (
@@ -28,14 +28,14 @@ from rbl_gym.checks import (
     check_number,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.networks.edges import MOST_NODES, IntArray, check_edges
+from rbl_gym.networks.graphs import components
 
 __all__ = [
     "SensingNetwork", "directions", "edge_angles", "measure", "measure_in_space", "proj",
     "random_network", "true_bearings", "unit_disk_edges",
 ]  # fmt: skip
 
-IntArray = NDArray[np.intp]
-_MOST_NODES = 10**9
 _LARGEST_ANGLE = 1e6
 _TURN = 2 * np.pi
 
@@ -62,40 +62,6 @@ def proj(angle: ArrayLike) -> FloatArray:
     wrapped = np.where(wrapped >= np.pi, wrapped - _TURN, wrapped)
     wrapped = np.maximum(wrapped, -np.pi)
     return np.where((angle >= -np.pi) & (angle < np.pi), angle, wrapped)
-
-
-def check_edges(edges: ArrayLike, n_nodes: int, name: str = "edges") -> IntArray:
-    """`edges` as (m, 2) indices of two different nodes each, under this or another `name`.
-
-    An edge may come twice, in either direction: then it was measured twice. No edges at all
-    are an empty sequence.
-
-    Raises
-    ------
-    ValueError
-        If they are not pairs of whole numbers in [0, n_nodes), or an edge joins a node to itself.
-    """
-    n_nodes = check_count("n_nodes", n_nodes, most=_MOST_NODES)
-    try:
-        array = np.asarray(edges)
-    except ValueError as error:
-        raise ValueError(f"{name} must be integers of shape (m, 2), got {edges!r:.80}") from error
-    if array.size == 0:
-        return np.zeros((0, 2), dtype=np.intp)
-    if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
-        raise ValueError(f"{name} must be integers of shape (m, 2), got {array.shape} "
-                         f"of {array.dtype}")  # fmt: skip
-    array = array.astype(np.intp, copy=False)
-    if array.min() < 0 or array.max() >= n_nodes:
-        row = int(np.argmax(((array < 0) | (array >= n_nodes)).any(axis=1)))
-        raise ValueError(f"{name} must join nodes 0 to {n_nodes - 1}, got {array[row].tolist()} "
-                         f"at row {row}")  # fmt: skip
-    loops = array[:, 0] == array[:, 1]
-    if loops.any():
-        row = int(np.argmax(loops))
-        raise ValueError(f"{name} must join two different nodes, got {array[row].tolist()} "
-                         f"at row {row}")  # fmt: skip
-    return array
 
 
 def check_pair(name: str, pair: ArrayLike, n_nodes: int) -> tuple[int, int]:
@@ -267,9 +233,7 @@ def random_network(
     bearing_std_rad, rng
         Noise of the measured bearings, and where all that is drawn comes from.
     """
-    from rbl_gym.networks.graphs import components
-
-    n_nodes = check_count("n_nodes", n_nodes, most=_MOST_NODES)
+    n_nodes = check_count("n_nodes", n_nodes, most=MOST_NODES)
     mean_degree = check_number("mean_degree", mean_degree, low=0.0)
     positions = rng.uniform(0.0, math.sqrt(n_nodes), (n_nodes, 2))
     edges = unit_disk_edges(positions, math.sqrt(mean_degree / np.pi))

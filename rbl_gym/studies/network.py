@@ -15,8 +15,8 @@ from rbl_gym import estimators
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.networks.orientations import cost, residuals
 from rbl_gym.networks import g2o, graphs
+from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.g2o import PoseGraph
-from rbl_gym.networks.sensing import IntArray
 
 WEIGHTS = ("information", "unit")
 _WORST = 5  # edges that are listed

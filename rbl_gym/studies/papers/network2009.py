@@ -22,7 +22,8 @@ from rbl_gym.estimators.networks.orientations import along_tree
 from rbl_gym.networks import graphs as network_graphs
 from rbl_gym.networks import sensing
 from rbl_gym.networks.bounds import edge_variance
-from rbl_gym.networks.sensing import IntArray, check_positions, proj, unit_disk_edges
+from rbl_gym.networks.edges import IntArray
+from rbl_gym.networks.sensing import check_positions, proj, unit_disk_edges
 from rbl_gym.studies.papers import network_growth
 
 # Node 0, the reference, is the one at the bottom left, as in Fig. 6.
