@@ -24,6 +24,9 @@ from rbl_gym.studies.replay.truth import (
     stamp_hints,
 )
 
+# The mirror pose is the one meant where its mean square error is below this share of the track's.
+_NEARER = 0.25
+
 
 class Errors(NamedTuple):
     """Errors where truth exists: mask (K,), distance (m), yaw (rad), rotation angle (rad), NEES.
@@ -144,8 +147,23 @@ def _notes(
         if outside:
             notes.append(f"Note: the track is outside the volume in {outside} of {count} epochs.")
     if found is not None:
-        notes += [f"Note: {hint}." for hint in _fault_hints(recording, track, settings)]
+        nearer = _nearer(recording, track, found, settings)
+        if nearer is not track:
+            notes.append("Note: the truth is at the mirror pose.")
+        notes += [f"Note: {hint}." for hint in _fault_hints(recording, nearer, settings)]
     return {**result, "notes": notes}
+
+
+def _nearer(recording: Recording, track: Track, found: Errors, settings: Settings) -> Track:
+    """The track, or that of the mirror pose where both are alive and the truth is at that one."""
+    if track.other is None:
+        return track
+    image = Track(track.times, *track.other[:3])
+    off = errors(recording, image, settings)
+    assert off is not None
+    where = found.known & track.other.alive
+    far, near = (np.square(e.position[where]).sum() for e in (found, off))
+    return image if near < _NEARER * far else track
 
 
 def _mirror_note(found: dict[str, Any], count: int) -> str:
