@@ -324,5 +324,5 @@ def _space(inner: spaces.Space[Any], sensing: Sensing) -> spaces.Dict:
     if "lengths" in inner.spaces:
         limit, most = _farthest(sensing), max(sensing.prior_std_rad, sensing.prior_std_m) ** 2
         added["positions"] = spaces.Box(-limit, limit, (*size, 2), np.float64)
-        added["pose_covariance"] = spaces.Box(-most, most, (*size, 3, 3), np.float64)
+        added["pose_covariance"] = spaces.Box(-2 * most, 2 * most, (*size, 3, 3), np.float64)
     return spaces.Dict({**inner.spaces, **added})

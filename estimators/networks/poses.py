@@ -16,6 +16,7 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.networks.bounds import (
     Sensing,
+    across_of,
     free_columns,
     length_information,
     lines_of_sight,
@@ -29,6 +30,7 @@ _MAX_STEPS = 60
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-9, 1e9
 _SETTLED = 1e-8  # radians, and share of a link's typical length
 _REWEIGHTINGS = 3
+_NEAREST = 0.03  # of the typical length
 _HINT = 1e-6
 
 
@@ -49,6 +51,7 @@ class _Measured(NamedTuple):
     lengths: FloatArray  # typical and measured
     information: FloatArray  # of the lengths
     prior: FloatArray  # (3 n,) information
+    nearest: float  # nodes that come nearer count as this far: no bearing becomes infinitely sharp
 
 
 def network_poses(
@@ -85,6 +88,7 @@ def network_poses(
     measured = _Measured(
         links, bearings, sensing.bearing_std_rad, typical + share * (lengths - typical),
         information, prior_information(n_nodes, sensing),
+        _NEAREST * typical,
     )  # fmt: skip
     theta, places = orientations, _linear_start(measured, orientations, positions)
     damping = np.full(links.shape[:-2], _DAMPING)
@@ -124,16 +128,22 @@ def _found(
     chi_square = chi_square + (off**2 * of_lengths).sum(axis=(-2, -1)) / 2
     count = measured.links.sum(axis=(-2, -1)) + (of_lengths > 0).sum(axis=(-2, -1)) / 2
     # Measurements determine tr(P H) of the unknowns, H their information.
-    H = pose_information(places, measured.links, measured.bearing_std, of_lengths)
+    H = _of(measured, places, of_lengths)
     used = (covariance * H[..., free[:, None], free]).sum(axis=(-2, -1))
     return NetworkPoses(proj(theta), places, covariance, chi_square, count - used)
 
 
 def _information(measured: _Measured, places: FloatArray) -> FloatArray:
-    H = pose_information(places, measured.links, measured.bearing_std, measured.information)
+    H = _of(measured, places, measured.information)
     diagonal = np.arange(H.shape[-1])
     H[..., diagonal, diagonal] += measured.prior
     return H
+
+
+def _of(measured: _Measured, places: FloatArray, of_lengths: FloatArray) -> FloatArray:
+    return pose_information(
+        places, measured.links, measured.bearing_std, of_lengths, measured.nearest
+    )
 
 
 def _solved(H: FloatArray, slope: FloatArray, damping: FloatArray) -> FloatArray:
@@ -168,7 +178,7 @@ def _slope(
 ) -> tuple[FloatArray, FloatArray]:
     """Cost (...) and minus half its gradient (..., 3 n)."""
     along, distance = lines_of_sight(places)
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) / distance[..., None]
+    across = across_of(along, distance, measured.nearest)
     bearings, lengths = _residuals(measured, theta, places)
     turned = measured.links * bearings / measured.bearing_std**2
     stretched = measured.information * lengths

@@ -115,14 +115,19 @@ def prior_information(n_nodes: int, sensing: Sensing) -> FloatArray:
 
 
 def pose_information(
-    positions: FloatArray, links: BoolArray, bearing_std_rad: float, of_lengths: FloatArray
+    positions: FloatArray,
+    links: BoolArray,
+    bearing_std_rad: float,
+    of_lengths: FloatArray,
+    nearest_m: float = 1e-9,
 ) -> FloatArray:
     """Fisher information (..., 3 n, 3 n) of frames, columns as `bearing_jacobian`.
 
-    Of both bearings of each link, and of lengths with the information (..., n, n).
+    Of both bearings of each link, and of lengths with the information (..., n, n). Bearings
+    count as if no node were nearer than `nearest_m`.
     """
     along, distance = lines_of_sight(positions)
-    across = np.stack([-along[..., 1], along[..., 0]], axis=-1) / distance[..., None]
+    across = across_of(along, distance, nearest_m)
     weight = links / bearing_std_rad**2
     n_nodes = links.shape[-1]
     # Both bearings of a link and its length tie two places together ...
@@ -150,6 +155,12 @@ def lines_of_sight(positions: FloatArray) -> tuple[FloatArray, FloatArray]:
     apart = positions[..., None, :, :] - positions[..., :, None, :]
     distance = np.maximum(np.linalg.norm(apart, axis=-1), 1e-9)
     return apart / distance[..., None], distance
+
+
+def across_of(along: FloatArray, distance: FloatArray, nearest_m: float) -> FloatArray:
+    """Derivative (..., n, n, 2) of the direction from i to j by the place of j."""
+    across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    return across / np.maximum(distance, nearest_m)[..., None]
 
 
 def _outer(vectors: FloatArray) -> FloatArray:
