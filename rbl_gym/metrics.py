@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy import special
 
+from rbl_gym import bounds
 from rbl_gym.checks import FloatArray, checked, kernel
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 
 __all__ = [
-    "expected_mean_angular_error", "length", "mean_angular_error", "nees", "pose_error",
-    "tag_error",
+    "Figures", "expected_mean_angular_error", "judge", "length", "mean_angular_error", "nees",
+    "pose_error", "tag_error",
 ]  # fmt: skip
 
 # Behind the doors: what comes to these was checked.
@@ -111,3 +115,85 @@ def expected_mean_angular_error(covariance: FloatArray, rotation: FloatArray) ->
         ratio = l2 / np.where(l1 > 0, l1, 1.0)
         lengths.append(np.sqrt(2 * l1 / np.pi) * special.ellipe(1 - ratio))
     return np.mean(lengths, axis=0)
+
+
+class Figures(NamedTuple):
+    """How good beliefs are, arrays (...).
+
+    Attributes
+    ----------
+    rotation_error_rad, position_error_m
+        Angle and distance to the true pose.
+    tag_error_m
+        Root mean square displacement of the tags (`tag_error`).
+    nees
+        `nees` of the pose error, 6 degrees of freedom.
+    score_m
+        `bounds.score` of the belief's covariance.
+    """
+
+    rotation_error_rad: FloatArray
+    position_error_m: FloatArray
+    tag_error_m: FloatArray
+    nees: FloatArray
+    score_m: FloatArray
+
+
+def judge(
+    rotation_hat: FloatArray,
+    translation_hat: FloatArray,
+    covariance: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    tags: FloatArray,
+) -> Figures:
+    """Errors of beliefs against true poses, their NEES and their score, all at once.
+
+    Parameters
+    ----------
+    rotation_hat, translation_hat, covariance
+        The beliefs: (..., 3, 3), (..., 3), (..., 6, 6).
+    rotation, translation, tags
+        The truth: (..., 3, 3), (..., 3); (..., N, 3) in the body frame, metres.
+
+    Raises
+    ------
+    ValueError
+        If a covariance is not positive definite, or anything is not finite.
+    """
+    figures = Figures(
+        *_judge(rotation_hat, translation_hat, covariance, rotation, translation, tags)
+    )
+    # A NaN or inf of any of them is one here.
+    if not np.isfinite(figures.nees + figures.score_m + figures.tag_error_m).all():
+        wrong = covariance if np.isfinite(figures.tag_error_m).all() else translation_hat
+        raise ValueError(
+            "beliefs must be finite, and their covariance positive definite, got "
+            f"{np.asarray(wrong)!r:.200}"
+        )
+    return figures
+
+
+@compiled("belief_errors:judge")
+def _judge(
+    rotation_hat: FloatArray,
+    translation_hat: FloatArray,
+    covariance: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    tags: FloatArray,
+) -> tuple[FloatArray, ...]:
+    """`judge`; NaN for the NEES of a covariance that is not positive definite."""
+    truth = rotation, translation
+    error = kernel(pose_error)(rotation_hat, translation_hat, *truth)
+    good = np.isfinite(covariance).all(axis=(-2, -1))
+    safe = np.where(good[..., None, None], covariance, np.eye(6))
+    good &= np.linalg.eigvalsh(safe)[..., 0] > 0
+    safe = np.where(good[..., None, None], covariance, np.eye(6))
+    return (
+        np.asarray(kernel(length)(error[..., :3])),
+        np.asarray(kernel(length)(error[..., 3:])),
+        kernel(tag_error)(rotation_hat, translation_hat, *truth, tags),
+        np.where(good, kernel(nees)(error, safe), np.nan),
+        np.where(good, bounds.score(safe, rotation_hat, tags), np.nan),
+    )

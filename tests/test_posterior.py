@@ -1,4 +1,4 @@
-"""The fast forms of the posterior bound against `bounds`, step by step."""
+"""The posterior bound of scenes against the recursion of `bounds`, step by step."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import pytest
 
 from rbl_gym import bounds
 from rbl_gym.bounds import posterior
+from rbl_gym.bounds.doa import doa_information
 from rbl_gym.geometry import rotations
+from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.worlds import scene_bounds, scenes, simulation
 
@@ -23,61 +25,78 @@ def assert_close(got, want, rtol):
 
 @pytest.mark.parametrize("links", [{}, LOSSY, {"reach_m": 500.0}], ids=["all", "lossy", "near"])
 @pytest.mark.parametrize("name", NAMES)
-def test_steps_of_many_worlds_and_of_one_equal_the_plain_recursion(name, links):
+def test_steps_and_whole_episodes_equal_the_plain_recursion(name, links):
     scene = scenes.get({"name": name, "links": links, "steps": 6})
     episode = simulation.draw_episode(scene, np.random.default_rng(1), (7,))
-    alone = simulation.Episode(*(None if field is None else field[2] for field in episode))  # pyright: ignore[reportArgumentType]
-    course = scene_bounds.posterior_course(scene, alone)
-    want, got, P = None, None, alone.prior_covariance
+    whole = simulation.whole(episode)
+    seen = simulation.measure(scene, whole, episode.anchors[:, None]).links
+    all_informations, all_scores = scene_bounds.posterior_of_episode(scene, episode, seen)
+    want, got = np.linalg.inv(episode.prior_covariance), None
     for k in range(scene.steps + 1):
         at = simulation.epoch_of(episode, k)
-        seen = simulation.measure(scene, at, episode.anchors).links
-        rest = at, episode.anchors, seen
-        want = scene_bounds.posterior_information(scene, *rest, want, episode.prior_covariance)
-        got, score = scene_bounds.posterior_step(scene, *rest, got, episode.prior_covariance)
-        assert_close(got, want, 1e-9)
+        if k:
+            want = bounds.predict_information(want, at.twist, scene.dt, scene.process)
+        share = simulation.shares(scene, at, episode.anchors, seen[:, k])
+        want = want + bounds.information_at(
+            episode.anchors, scene.body, at.rotation, at.translation, scene.noise, share
+        )
         plain = bounds.score(np.linalg.inv(want), at.rotation, scene.tags)
-        np.testing.assert_allclose(score, plain, rtol=1e-9)
-        P = course.predict(k, P) if k else P
-        shares = simulation.shares(scene, at, episode.anchors, seen)
-        P = posterior.update(P, course.information(k, alone.anchors, scene.noise, shares[2]))
-        np.testing.assert_allclose(course.score(k, P), plain[2], rtol=1e-9)
+        got, score = scene_bounds.posterior_step(
+            scene, at, episode.anchors, seen[:, k], got, episode.prior_covariance
+        )
+        for one in (got, all_informations[:, k]):
+            assert_close(one, want, 1e-9)
+        for one in (score, all_scores[:, k]):
+            np.testing.assert_allclose(one, plain, rtol=1e-9)
 
 
-def test_uneven_noise_that_spoils_the_pivots_is_predicted_all_the_same():
-    scene = scenes.get("uwb_room")
-    rng = np.random.default_rng(0)
+def test_uneven_noise_is_predicted_all_the_same():
     root = np.array([1.0, -300.0, 0, 0, 0, 0])
-    J = np.tile(np.outer(root, root) + 1e-2 * np.eye(6), (5, 1, 1))
-    twist = np.tile([0.8, 0.8, 0.3, 0, 0, 0], (5, 1))
-    process = ProcessNoise((0.1, 3.0, 0.1), 0.3)
-    anchors, rotation = rng.normal(0, 9, (5, 4, 3)), rotations.random(rng, (5,))
-    links = np.zeros((5, 4, len(scene.tags)), bool)
-    got, _ = posterior.step_many(
-        J, posterior.Interval(twist, 1.0, process), anchors, scene.tags, rotation,
-        np.zeros((5, 3)), scene.noise, links,
+    J = np.outer(root, root) + 1e-2 * np.eye(6)
+    twist, process = np.array([0.8, 0.8, 0.3, 0, 0, 0]), ProcessNoise((0.1, 3.0, 0.1), 0.3)
+    scene = scenes.get("uwb_room")
+    got, _ = posterior.of_ranges(
+        J, twist[None], np.ones(1), process.std(), np.ones((1, 4, 3)), scene.body, np.eye(3)[None],
+        np.zeros((1, 3)), scene.noise.numbers, np.zeros((1, 4, len(scene.body))),
     )  # fmt: skip
-    assert_close(got, bounds.predict_information(J, twist, 1.0, process), 1e-9)
+    assert_close(got[0], bounds.predict_information(J, twist, 1.0, process), 1e-9)
 
 
 def test_an_anchor_on_a_tag_tells_nothing_of_that_tag():
     scene = scenes.get("uwb_room")
-    anchors = np.array([[scene.tags[0], (5.0, 0, 1), (0, 6, 2)]])
-    links, eye = np.ones((1, 3, len(scene.tags)), bool), np.eye(3)[None]
-    got, _ = posterior.step_many(
-        np.eye(6)[None], None, anchors, scene.tags, eye, np.zeros((1, 3)), scene.noise, links
-    )
-    want = np.eye(6) + bounds.range_information(
-        anchors[0], scene.tags, np.eye(3), np.zeros(3), scene.noise
-    )
-    assert_close(got[0], want, 1e-12)
+    anchors = np.array([scene.tags[0], (5.0, 0, 1), (0, 6, 2)])
+    got, _ = posterior.of_ranges(
+        np.eye(6), np.zeros((1, 6)), np.zeros(1), np.ones(6), anchors[None], scene.body,
+        np.eye(3)[None], np.zeros((1, 3)), scene.noise.numbers, np.ones((1, 3, len(scene.body))),
+    )  # fmt: skip
+    seen = bounds.range_information(anchors, scene.tags, np.eye(3), np.zeros(3), scene.noise)
+    assert_close(got[0], np.eye(6) + seen, 1e-12)
 
 
 @pytest.mark.parametrize("J", [np.zeros((2, 6, 6)), np.full((2, 6, 6), np.nan)])
 def test_singular_information_is_refused(J):
     scene = scenes.get("uwb_room")
-    links, eye = np.zeros((2, 3, len(scene.tags)), bool), np.tile(np.eye(3), (2, 1, 1))
+    episode = simulation.draw_episode(scene, np.random.default_rng(0), (2,))
+    links = np.zeros((2, scene.n_anchors, len(scene.tags)), bool)
     with pytest.raises(ValueError, match="information about the pose is singular"):
-        posterior.step_many(
-            J, None, np.ones((2, 3, 3)), scene.tags, eye, np.zeros((2, 3)), scene.noise, links
+        scene_bounds.posterior_step(
+            scene, simulation.epoch_of(episode, 0), episode.anchors, links, J, np.eye(6)
         )
+
+
+def test_angles_have_the_same_recursion():
+    rng = np.random.default_rng(3)
+    scene, process, noise = scenes.get("uwb_room"), ProcessNoise(0.1, 0.3), AngleNoise(0.01)
+    rotation, translation = rotations.random(rng, (5, 2)), rng.normal(0, 9, (5, 2, 3))
+    twists, stations = rng.standard_normal((5, 2, 6)), rng.normal(0, 9, (5, 2, 3))
+    got, score = posterior.of_angles(
+        np.eye(6), twists, np.array([0.0, 0.2]), process.std(), stations, scene.body, rotation,
+        translation, noise.std_rad,
+    )  # fmt: skip
+    told = doa_information(scene.tags, rotation, translation, noise, stations)
+    first = np.eye(6) + told[:, 0]
+    second = bounds.predict_information(first, twists[:, 1], 0.2, process) + told[:, 1]
+    want = np.stack([first, second], axis=1)
+    assert_close(got, want, 1e-9)
+    b = bounds.score(np.linalg.inv(want), rotation, scene.tags)
+    np.testing.assert_allclose(score, b, rtol=1e-9)

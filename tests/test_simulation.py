@@ -587,7 +587,7 @@ def test_posterior_information_equals_a_naive_recursion_and_that_of_bounds(name)
             P = predicted_covariance(scene, P, twist)
         P = np.linalg.inv(np.linalg.inv(P) + information_by_hand(scene, episode, k, anchors, links))
         pose = episode.rotation[k], episode.translation[k]
-        J = scene_bounds.posterior_information(
+        J, _ = scene_bounds.posterior_step(
             scene, simulation.epoch_of(episode, k), anchors, links, J, episode.prior_covariance
         )
         law = law_by_hand(scene, anchors, *pose)
@@ -611,7 +611,7 @@ def test_links_that_gave_nothing_tell_nothing(name):
     scene = change(name, steps=2)
     episode = draw(scene, 20)
     none = np.zeros((scene.n_anchors, len(scene.tags)), bool)
-    J = scene_bounds.posterior_information(
+    J, _ = scene_bounds.posterior_step(
         scene,
         simulation.epoch_of(episode, 0),
         episode.anchors,
@@ -626,17 +626,17 @@ def test_information_of_a_batch_equals_its_episodes_one_by_one():
     scene = change("auv_buoys", steps=2)
     batch = draw(scene, 21, (3,))
     links = np.ones((3, scene.n_anchors, len(scene.tags)), bool)
-    first = scene_bounds.posterior_information(
+    first, _ = scene_bounds.posterior_step(
         scene, simulation.epoch_of(batch, 0), batch.anchors, links, None, batch.prior_covariance
     )
-    second = scene_bounds.posterior_information(
+    second, _ = scene_bounds.posterior_step(
         scene, simulation.epoch_of(batch, 1), batch.anchors, links, first, batch.prior_covariance
     )
     for b in range(3):
         alone = Episode(*(None if array is None else array[b] for array in batch))  # type: ignore[arg-type]
         J = None
         for k in (0, 1):
-            J = scene_bounds.posterior_information(
+            J, _ = scene_bounds.posterior_step(
                 scene,
                 simulation.epoch_of(alone, k),
                 alone.anchors,

@@ -7,15 +7,17 @@ from rbl_gym.bounds.pose import (
     inverted,
     lift,
     pose_crb,
-    posterior_crb_step,
-    predict_covariance,
-    predict_information,
     range_information,
     range_jacobian,
     root_of_trace,
     score,
     symmetric,
     tag_jacobian,
+)
+from rbl_gym.bounds.posterior import (
+    posterior_crb_step,
+    predict_covariance,
+    predict_information,
 )
 
 __all__ = [

@@ -20,19 +20,19 @@ from rbl_gym.checks import (
     kernel,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
-from rbl_gym.motion.kinematics import ProcessNoise, check_process
 
 __all__ = [
-    "directions", "information_rank", "lift", "pose_crb", "posterior_crb_step",
-    "predict_covariance", "predict_information", "range_information",
-    "range_jacobian", "score", "symmetric", "tag_jacobian",
+    "directions", "information_rank", "lift", "pose_crb",
+    "range_information", "range_jacobian", "score", "symmetric", "tag_jacobian",
 ]  # fmt: skip
 
 # Behind the doors: what comes to these was checked, or made here.
 _HAT, _EXP = kernel(rotations.hat), kernel(rotations.exp)
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
+_NOTHING, _ONE = np.zeros((6, 6)), np.ones((1, 1))
 # J_n as a linear function of (c_n, 1), c_n turned: J_n[i, a] = sum_k (c_n, 1)[k] _BY_POSE[k, i, a].
 _BY_POSE = np.zeros((4, 3, 6))
 _BY_POSE[:3, :, :3] = -rotations.hat(np.eye(3))
@@ -77,8 +77,6 @@ def range_jacobian(
 
     Arguments as `range_information`.
     """
-    if anchors.ndim == tags.ndim == rotation.ndim == 2 and translation.ndim == 1:
-        return _one_range_jacobian(anchors, tags, rotation, translation)
     turned = tags @ np.swapaxes(rotation, -1, -2)
     positions = turned + translation[..., None, :]
     c = [turned[..., None, :, i] for i in range(3)]
@@ -91,19 +89,6 @@ def range_jacobian(
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
         J[..., i, :, :] = c[j] * J[..., 3 + k, :, :] - c[k] * J[..., 3 + j, :, :]
     return distance, J.reshape((*distance.shape[:-2], 6, -1))
-
-
-def _one_range_jacobian(
-    anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """`range_jacobian` of one pose, in few calls: its rows are linear in ``(c, 1) kron u``."""
-    turned = tags @ rotation.T
-    extended = np.ones((len(tags), 4, 1))
-    extended[:, :3, 0] = turned
-    difference = turned + (translation - anchors)[:, None]
-    distance = np.sqrt(np.einsum("mni,mni->mn", difference, difference))
-    products = extended * (difference / np.maximum(distance, 1e-300)[..., None])[:, :, None]
-    return distance, (products.reshape(-1, 12) @ _BY_POSE.reshape(12, 6)).T
 
 
 def range_information(
@@ -167,18 +152,57 @@ def information_at(
     rotation: FloatArray,
     translation: FloatArray,
     noise: ranging.NoiseLaw,
-    links: BoolArray | FloatArray | None = None,
+    share: FloatArray | BoolArray | None = None,
 ) -> FloatArray:
-    """`range_information` on arrays that are known to be good (the environment's inner loop).
+    """`range_information` on arrays that are known to be good.
 
-    `links` may also be the share of its information that each link has.
+    `share` (..., M, N): of its information that each link has, None: all of it.
     """
+    share = _ONE if share is None else share
+    numbers = ranging.numbers_of(noise, tags.shape[-2])
+    if numbers is None:
+        return _range_information(anchors, tags, rotation, translation, noise, share)
+    links = anchors.shape[-2], tags.shape[-2]
+    if share.shape[-2:] != links:
+        share = np.broadcast_to(share, (*share.shape[:-2], *links))
+    told = _information(_NOTHING, anchors, tags, rotation, translation, numbers, share)
+    if not np.isfinite(told).all():
+        check_variance(noise, _DISTANCES(anchors, _TAG_POSITIONS(rotation, translation, tags)))
+    return told
+
+
+@compiled("pose_bound:range_information")
+def _information(
+    prior: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    law: FloatArray,
+    share: FloatArray,
+) -> FloatArray:
+    """A prior's information (..., 6, 6) and that of ranges, whose law is told by its numbers."""
+    noise = ranging.law_of(law)
+    return prior + _range_information(anchors, tags, rotation, translation, noise, share)
+
+
+def _range_information(
+    anchors: FloatArray,
+    tags: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    noise: ranging.NoiseLaw,
+    share: FloatArray,
+) -> FloatArray:
     distance, J = range_jacobian(anchors, tags, rotation, translation)
-    weight = _inverse(noise.variance(distance), distance)
-    if links is not None:
-        weight = weight * links
+    weight = _inverse(noise.variance(distance), distance) * share
     flat = weight.reshape((*weight.shape[:-2], 1, -1))
     return (J * flat) @ np.swapaxes(J, -1, -2)
+
+
+def check_variance(noise: ranging.NoiseLaw, distance: FloatArray) -> None:
+    """A ValueError where a law has no variance at a distance (..., M, N) that is not zero."""
+    _inverse(noise.variance(distance), distance)
 
 
 def _inverse(variance: FloatArray, distance: FloatArray) -> FloatArray:
@@ -287,87 +311,6 @@ def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.nd
     if open_.any():
         rank[open_] = (np.linalg.eigvalsh(scaled[open_]) > tolerance).sum(axis=-1)
     return rank
-
-
-def posterior_crb_step(
-    J: ArrayLike,
-    anchors: ArrayLike,
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: ranging.NoiseLaw,
-    twist: ArrayLike,
-    dt: float,
-    process: ProcessNoise,
-    links: ArrayLike | None = None,
-) -> FloatArray:
-    """One step of the posterior Cramer-Rao recursion (Tichavsky et al. 1998) at the true pose.
-
-    Parameters
-    ----------
-    J
-        Posterior information (..., 6, 6) of the epoch before.
-    anchors, tags, rotation, translation, links
-        At the new epoch; the pose is the true one.
-    noise
-        Law of the ranges.
-    twist, dt, process
-        Motion of the interval that ends at the new epoch, and its noise.
-
-    Returns
-    -------
-    Information (..., 6, 6) after the new epoch; its inverse is the bound.
-    """
-    J = check_array("J", J, (6, 6))
-    twist = check_array("twist", twist, (6,))
-    if (check_array("dt", dt, ()) < 0).any():
-        raise ValueError(f"dt must not be negative, got {dt}")
-    check_process(process)
-    predicted = predict_information(J, twist, dt, process)
-    return predicted + range_information(anchors, tags, rotation, translation, noise, links)
-
-
-def predict_information(
-    J: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
-) -> FloatArray:
-    """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J.
-
-    Arguments as `predict_covariance`, with information J (..., 6, 6) for P.
-    """
-    turned = _turn(J, twist, dt)
-    Q = process.covariance(twist, dt)
-    return symmetric(np.linalg.solve(np.eye(6) + turned @ Q, turned))
-
-
-def predict_covariance(
-    P: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
-) -> FloatArray:
-    """Pose covariance after a step of motion, ``F P F^T + Q``, ``F = blkdiag(exp(w dt), I)``.
-
-    Parameters
-    ----------
-    P, twist
-        (..., 6, 6) and (..., 6).
-    dt, process
-        Seconds, and the noise of the motion.
-    """
-    return _turn(P, twist, dt) + process.covariance(twist, dt)
-
-
-def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
-    """``F matrix F^T`` of a symmetric matrix: the error is global, so its rotation part turns."""
-    step = _EXP(twist[..., :3] * np.asarray(dt, float)[..., None])
-    if matrix.ndim == step.ndim == 2:
-        F = np.eye(6).copy()
-        F[:3, :3] = step
-        return F @ matrix @ F.T
-    top = step @ matrix[..., :3, :]
-    turned = np.empty((*top.shape[:-2], 6, 6))
-    turned[..., :3, :3] = top[..., :3] @ np.swapaxes(step, -1, -2)
-    turned[..., :3, 3:] = top[..., 3:]
-    turned[..., 3:, :3] = np.swapaxes(top[..., 3:], -1, -2)
-    turned[..., 3:, 3:] = matrix[..., 3:, 3:]
-    return turned
 
 
 def symmetric(matrix: FloatArray) -> FloatArray:

@@ -12,10 +12,8 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike
 
 from rbl_gym import rendering
-from rbl_gym.bounds import posterior
-from rbl_gym.checks import BoolArray, FloatArray, as_array, check_array, check_one_of
+from rbl_gym.checks import FloatArray, as_array, check_array, check_one_of
 from rbl_gym.envs.batch import StatedLength, check_options
-from rbl_gym.measurements import ranging
 from rbl_gym.worlds import scene_bounds, scenes, simulation
 from rbl_gym.worlds.scene import Scene
 
@@ -128,15 +126,15 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self._episode = episode
         self._epoch = 0
         self._anchors = episode.anchors.copy()
-        self._whole = at = simulation.whole(episode)
-        self._positions = ranging.tag_positions(at.rotation, at.translation, self.scene.tags)
         self._measured: dict[str, np.ndarray] | None = None
+        self._bound: tuple[FloatArray, FloatArray] | None = None
         if self.scene.anchor_speed_m_s == 0:
-            # No action can change what anchors that stand still will measure.
-            self._measured = measure(self.scene, at, episode.anchors, self._positions)
-        self._covariance = episode.prior_covariance
-        if self.reward_mode == "bound":
-            self._start_bound(episode)
+            # No action can change what anchors that stand still will measure, nor its bound.
+            self._measured = measure(self.scene, simulation.whole(episode), episode.anchors[None])
+            if self.reward_mode == "bound":
+                links = self._measured["links"].view(np.bool_)
+                self._bound = scene_bounds.posterior_of_episode(self.scene, episode, links)
+        self._information: FloatArray | None = None
         observation, info, _ = self._observe()
         info["prior_rotation"] = episode.prior_rotation.copy()
         info["prior_translation"] = episode.prior_translation.copy()
@@ -159,10 +157,10 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         return observation, reward, False, self._epoch >= self.scene.steps, info
 
     def _observe(self) -> tuple[dict[str, np.ndarray], dict[str, Any], float]:
-        k = self._epoch
-        at = simulation.Epoch(*(f if f is None else f[k] for f in self._whole))  # pyright: ignore[reportArgumentType]
+        assert self._episode is not None
+        k, at = self._epoch, simulation.epoch_of(self._episode, self._epoch)
         if self._measured is None:
-            observation = measure(self.scene, at, self._anchors, self._positions[k])
+            observation = measure(self.scene, at, self._anchors)
         else:
             observation = {key: field[k].copy() for key, field in self._measured.items()}
         info: dict[str, Any] = {
@@ -173,56 +171,43 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         }
         reward = 0.0
         if self.reward_mode == "bound":
-            info["score_m"] = self._carry_bound(at, observation["links"].view(np.bool_))
+            info["score_m"] = self._carry_bound(at, observation["links"])
             reward = -math.log(info["score_m"])
         if self.film is not None:
-            bound = self._covariance[None] if self.reward_mode == "bound" else None
-            links, pose = (
-                observation["links"].view(np.bool_),
-                (at.rotation[None], at.translation[None]),
-            )
-            self.film.take([k], rendering.shot(links[None], self._anchors[None], *pose, bound))
+            self._shoot(at, observation["links"])
         observation["anchors"] = self._anchors.copy()
         observation["twist"] = at.twist.copy()
         return observation, info, reward
+
+    def _shoot(self, at: simulation.Epoch, links: np.ndarray) -> None:
+        bound = None if self._information is None else np.linalg.inv(self._information)[None]
+        one = (field[None] for field in (links.view(np.bool_), self._anchors, *at[:2]))
+        self.film.take([self._epoch], rendering.shot(*one, bound))  # pyright: ignore[reportOptionalMemberAccess]
 
     def render(self) -> Any:
         """The world, the body close up, and its errors (or the bound): an RGB frame, uint8."""
         return rendering.picture(self.film)
 
-    def _start_bound(self, episode: simulation.Episode) -> None:
-        """All of the bound that no action of the episode changes."""
-        self._course = scene_bounds.posterior_course(self.scene, episode)
-        self._informations: FloatArray | None = None
-        if self._measured is not None:
-            links = self._measured["links"].view(np.bool_)
-            shares = simulation.shares(self.scene, self._whole, episode.anchors, links)
-            self._informations = self._course.information(
-                slice(None), episode.anchors, self.scene.noise, shares
-            )
-
-    def _carry_bound(self, at: simulation.Epoch, links: BoolArray) -> float:
-        """The posterior Cramer-Rao bound of this epoch, from that of the one before."""
-        k = self._epoch
-        if self._informations is None:
-            shares = simulation.shares(self.scene, at, self._anchors, links)
-            information = self._course.information(k, self._anchors, self.scene.noise, shares)
+    def _carry_bound(self, at: simulation.Epoch, links: np.ndarray) -> float:
+        """Score of the posterior Cramer-Rao bound of this epoch."""
+        if self._bound is not None:
+            self._information, score = (field[self._epoch] for field in self._bound)
         else:
-            information = self._informations[k]
-        predicted = self._course.predict(k, self._covariance) if k else self._covariance
-        self._covariance = posterior.update(predicted, information)
-        return self._course.score(k, self._covariance)
+            self._information, score = scene_bounds.posterior_step(
+                self.scene,
+                at,
+                self._anchors,
+                links.view(np.bool_),
+                self._information,
+                self._episode.prior_covariance,  # pyright: ignore[reportOptionalMemberAccess]
+            )
+        return float(score)
 
 
-def measure(
-    scene: Scene,
-    at: simulation.Epoch,
-    anchors: FloatArray,
-    positions: FloatArray | None = None,
-) -> dict[str, np.ndarray]:
+def measure(scene: Scene, at: simulation.Epoch, anchors: FloatArray) -> dict[str, np.ndarray]:
     """What an epoch tells: ranges and links with `nlos`, behind obstacles `quality`."""
     quality = simulation.link_quality(scene, at, anchors) if scene.obstacles else None
-    measured = simulation.measure(scene, at, anchors, positions, quality)
+    measured = simulation.measure(scene, at, anchors, quality)
     told: dict[str, np.ndarray] = {
         "ranges": measured.ranges,
         "links": measured.links.view(np.int8),

@@ -5,13 +5,12 @@ An obstacle is a row of six numbers, centre and half size of an axis-aligned box
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray, as_float, check_array
+from rbl_gym.kernels import compiled
 
 __all__ = ["Obstacles", "in_sight", "inside"]
 
@@ -44,22 +43,11 @@ class Obstacles:
         Anchors (..., M, 3) and points (..., P, 3), metres: the link is that of a body with its
         origin there.
         """
-        return self._share(in_sight(anchors, points, self.boxes))
-
-    def share_along(self, start: Sequence[FloatArray], along: Sequence[FloatArray]) -> FloatArray:
-        """`share` (P, M, B) by the components of `clear`, boxes (B, K, 6)."""
-        return self._share(self.clear_along(start, along))
-
-    def clear_along(self, start: Sequence[FloatArray], along: Sequence[FloatArray]) -> BoolArray:
-        """Which segments (P, M, B) pass by all boxes (B, K, 6), K at least 1; see `clear`."""
-        return clear(start, along, self.boxes.transpose(1, 2, 0).copy())
+        return np.where(in_sight(anchors, points, self.boxes), 1.0, self.blocked_information)
 
     def contain(self, points: FloatArray) -> BoolArray:
         """Which points (..., 3) lie in or on one of the boxes (K, 6)."""
         return inside(points, self.boxes)
-
-    def _share(self, sight: BoolArray) -> FloatArray:
-        return np.where(sight, 1.0, self.blocked_information)
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
@@ -75,6 +63,7 @@ def check_obstacles(obstacles: object) -> FloatArray:
     return array
 
 
+@compiled("sight:in_sight")
 def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> BoolArray:
     """Which points each anchor sees, (..., P, M) booleans.
 
@@ -87,44 +76,18 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
     obstacles
         (..., K, 6), centres and half sizes; K may be 0.
     """
-    batch = np.broadcast_shapes(anchors.shape[:-2], points.shape[:-2], obstacles.shape[:-2])
-    free = np.ones((*batch, points.shape[-2], anchors.shape[-2]), dtype=np.bool_)
-    if not obstacles.shape[-2]:
-        return free
-    start = [anchors[..., None, :, i] for i in range(3)]
-    along = [points[..., :, None, i] - start[i] for i in range(3)]
-    boxes = np.moveaxis(obstacles, (-2, -1), (0, 1))[..., None, None]
-    return free & clear(start, along, boxes)
+    start, end = anchors[..., None, :, None, :], points[..., :, None, None, :]
+    boxes = obstacles[..., None, None, :, :]
+    along, away = end - start, boxes[..., :3] - start
+    low, high = (away - boxes[..., 3:]) / along, (away + boxes[..., 3:]) / along
+    # Places along the segment where it enters and leaves; along a face the quotients are 0/0,
+    # and NaN never blocks.
+    enter = np.minimum(low, high).max(axis=-1, initial=0.0)
+    leave = np.maximum(low, high).min(axis=-1, initial=1.0)
+    return ~(enter < leave).any(axis=-1)
 
 
 def inside(points: FloatArray, obstacles: FloatArray) -> BoolArray:
     """Which points (..., 3) lie in or on a box of (K, 6)."""
     away = np.abs(points[..., None, :] - obstacles[:, :3]) - obstacles[:, 3:]
     return np.asarray((away.max(axis=-1) <= 1e-9).any(axis=-1))
-
-
-def clear(
-    start: Sequence[FloatArray], along: Sequence[FloatArray], boxes: FloatArray
-) -> np.ndarray:
-    """Whether segments pass by all boxes.
-
-    Parameters
-    ----------
-    start, along
-        Three components (...) each: one end, and the other end less it.
-    boxes
-        (K, 6, ...), K at least 1.
-    """
-    free: Any = True
-    # Along a face the quotients are 0/0, and NaN never blocks.
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for box in boxes:
-            # Places along the segment where it enters and leaves.
-            enter, leave = np.float64(0), np.float64(1)
-            for i in range(3):
-                away, half = box[i] - start[i], box[3 + i]
-                low, high = (away - half) / along[i], (away + half) / along[i]
-                enter = np.maximum(enter, np.minimum(low, high))
-                leave = np.minimum(leave, np.maximum(low, high))
-            free = free & ~(enter < leave)
-    return free

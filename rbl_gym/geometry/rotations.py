@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, checked, kernel
+from rbl_gym.kernels import compiled
 
 __all__ = [
     "angle_between", "cayley", "error", "exp", "from_euler_zyx", "from_quaternion", "hat",
@@ -27,10 +28,6 @@ _SMALL_SQUARED_ANGLE = 1e-4
 _SERIES_SQUARED_ANGLE = 0.25
 # Of sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2, the highest power first.
 _SERIES = [[(-1) ** n / math.factorial(2 * n + k) for n in range(6, -1, -1)] for k in (1, 2, 3)]
-# Fewer matrices than this are decomposed: an iteration in array calls takes longer.
-_SMALL_BATCH = 32
-# Determinant at unit norm (at most 0.19) above which the polar iteration is exact to 1e-13.
-_WELL_CONDITIONED = 1e-3
 
 
 @checked(w=(3,))
@@ -304,64 +301,15 @@ def nearest(M: ArrayLike) -> FloatArray:
     The polar factor with the smallest singular direction flipped where it would be a
     reflection, ``U diag(1, 1, det(U V^T)) V^T``.
     """
-    M = np.asarray(M, dtype=np.float64)
-    if M.size < 9 * _SMALL_BATCH:
-        return _nearest_by_svd(M)
-    X = np.ascontiguousarray(M.reshape(-1, 9).T).reshape(3, 3, -1)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        X /= np.abs(X).max(axis=(0, 1))
-        X /= np.sqrt(np.einsum("ijb,ijb->b", X, X))
-    # Of unit norm; false also for zero and NaN, which are left to the decomposition.
-    good = np.einsum("ib,ib->b", X[0], _cofactors(X)[0]) > _WELL_CONDITIONED
-    R = np.empty((X.shape[-1], 3, 3))
-    if good.all():
-        R[...] = _polar(X).transpose(2, 0, 1)
-    else:
-        R[good] = _polar(X[..., good]).transpose(2, 0, 1)
-        R[~good] = _nearest_by_svd(M.reshape(-1, 3, 3)[~good])
-    return R.reshape(M.shape)
+    return _nearest(M)
 
 
-def _nearest_by_svd(M: FloatArray) -> FloatArray:
-    """`nearest` of any matrices (..., 3, 3)."""
+@compiled("rotation_fits:nearest")
+def _nearest(M: FloatArray) -> FloatArray:
+    """`nearest` by its singular values."""
     U, _, Vt = np.linalg.svd(M)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return U @ Vt
-
-
-def _polar(X: FloatArray) -> FloatArray:
-    """Orthogonal polar factors (3, 3, B), trials last, of well-conditioned matrices.
-
-    Higham's Newton iteration ``X <- (g X + X^-T / g) / 2``; the scale g makes the first steps
-    long, the last ones converge quadratically without it.
-    """
-    change = 1.0
-    while change > 1e-8 and X.size:
-        C = _cofactors(X)
-        inverse = 1 / np.einsum("ib,ib->b", X[0], C[0])
-        if change > 0.1:
-            norms = np.einsum("ijb,ijb->b", C, C) / np.einsum("ijb,ijb->b", X, X)
-            g = np.sqrt(np.sqrt(norms) * inverse)
-            new = (0.5 * g) * X
-            inverse /= g
-        else:
-            new = 0.5 * X
-        C *= 0.5 * inverse
-        new += C
-        X -= new
-        change = max(X.max(), -X.min())
-        X = new
-    return X
-
-
-def _cofactors(X: FloatArray) -> FloatArray:
-    """Cofactor matrices ``det(X) X^-T`` (3, 3, B) of matrices (3, 3, B)."""
-    C = np.empty_like(X)
-    for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
-        for m, (n, o) in enumerate(((1, 2), (2, 0), (0, 1))):
-            np.multiply(X[j, n], X[k, o], out=C[i, m])
-            C[i, m] -= X[j, o] * X[k, n]
-    return C
 
 
 @checked(Q_hat=(3, 3), Q=(3, 3))

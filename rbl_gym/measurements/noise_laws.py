@@ -5,6 +5,7 @@ Where the variance is common to all tags of an anchor it comes back as (..., M, 
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -138,6 +139,14 @@ class RangeNoise:
         ranges += distances
         return np.maximum(ranges, 0.0, out=ranges)
 
+    @functools.cached_property
+    def numbers(self) -> FloatArray | None:
+        """The law as kernels take it (4,), `rbl_gym.kernels.noise_laws`; None: they cannot."""
+        tag = -1 if self.reference_tag is None else self.reference_tag
+        if self.reference_tag is not None and tag < 0:
+            return None
+        return np.array([0.0, self.floor_m, self.proportional, tag])
+
     def _scale(self, ranges: FloatArray, links: BoolArray | None) -> FloatArray:
         if self.reference_tag is None:
             return ranges
@@ -158,6 +167,11 @@ class SquaredRangeNoise:
 
     def __post_init__(self) -> None:
         check_number("sigma_m", self.sigma_m, low=1e-300)
+
+    @functools.cached_property
+    def numbers(self) -> FloatArray:
+        """As those of `RangeNoise`."""
+        return np.array([1.0, self.sigma_m, 0.0, 0.0])
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
         """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order; inf at zero."""
@@ -212,6 +226,28 @@ class LinkNoise:
         return np.maximum(distances + self.std_m * normals, 0.0)
 
 
+def numbers_of(noise: NoiseLaw, n_tags: int) -> FloatArray | None:
+    """The law of N tags as kernels take it, None where they know no such law.
+
+    Raises
+    ------
+    ValueError
+        If there is no such reference tag.
+    """
+    numbers = getattr(noise, "numbers", None)
+    if numbers is not None and numbers[3] >= n_tags:
+        _check_reference(int(numbers[3]), n_tags)
+    return numbers
+
+
+def law_of(numbers: FloatArray) -> NoiseLaw:
+    """The law that has these `numbers`."""
+    kind, first, second, reference = numbers.tolist()
+    if kind == 1:
+        return SquaredRangeNoise(first)
+    return RangeNoise(first, second, None if reference < 0 else int(reference))
+
+
 def check_law(name: str, noise: Any) -> None:
     """A ValueError where something does not offer what a `NoiseLaw` does."""
     methods = ("variance", "squared_range_variance", "sample")
@@ -243,9 +279,7 @@ def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None
     ValueError
         If there is no such tag.
     """
-    n_tags = ranges.shape[-1]
-    if not -n_tags <= tag < n_tags:
-        raise ValueError(f"reference_tag must be below the number of tags {n_tags}, got {tag}")
+    _check_reference(tag, ranges.shape[-1])
     reference = ranges[..., tag : tag + 1 or None]
     if links is None or links.all():
         return reference
@@ -255,3 +289,8 @@ def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None
     mean = np.where(links, ranges, 0.0).sum(axis=-1, keepdims=True) / np.maximum(count, 1)
     stand_in = np.where(count > 0, mean, 1.0)
     return np.where(links[..., tag : tag + 1 or None], reference, stand_in)
+
+
+def _check_reference(tag: int, n_tags: int) -> None:
+    if not -n_tags <= tag < n_tags:
+        raise ValueError(f"reference_tag must be below the number of tags {n_tags}, got {tag}")

@@ -20,6 +20,7 @@ from rbl_gym.checks import (
     checked,
     kernel,
 )
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements.noise_laws import (
     NOISE_LAWS,
     LinkNoise,
@@ -27,6 +28,8 @@ from rbl_gym.measurements.noise_laws import (
     RangeNoise,
     SquaredRangeNoise,
     check_law,
+    law_of,
+    numbers_of,
     reference_range,
 )
 
@@ -142,7 +145,16 @@ def measure(
         Uniforms on [0, 1) of shape (..., 2, M, N), for drops and NLOS; needed where
         ``link_model.is_random``.
     """
-    ranges = noise.sample(true_distances, normals)
+    return lose_links(noise.sample(true_distances, normals), true_distances, link_model, uniforms)
+
+
+def lose_links(
+    ranges: FloatArray,
+    true_distances: FloatArray,
+    link_model: LinkModel | None = None,
+    uniforms: FloatArray | None = None,
+) -> Measurement:
+    """What a link model leaves of noisy ranges of all links; arguments as `measure`."""
     links = np.ones(ranges.shape, dtype=np.bool_)
     nlos = np.zeros(ranges.shape, dtype=np.bool_)
     if link_model is None or not (link_model.is_random or link_model.reach_m is not None):
@@ -156,6 +168,36 @@ def measure(
     if link_model.reach_m is not None:
         links &= true_distances <= link_model.reach_m
     return Measurement(np.where(links, ranges, 0.0), links, nlos & links)
+
+
+def sample(
+    rotation: FloatArray,
+    translation: FloatArray,
+    tags: FloatArray,
+    anchors: FloatArray,
+    normals: FloatArray,
+    noise: NoiseLaw,
+) -> tuple[FloatArray, FloatArray]:
+    """Noisy ranges of all links (..., M, N) of bodies at given poses, and the true distances."""
+    numbers = numbers_of(noise, tags.shape[-2])
+    if numbers is not None:
+        return _sample(rotation, translation, tags, anchors, normals, numbers)
+    true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
+    return noise.sample(true, normals), true
+
+
+@compiled("epoch:measure")
+def _sample(
+    rotation: FloatArray,
+    translation: FloatArray,
+    tags: FloatArray,
+    anchors: FloatArray,
+    normals: FloatArray,
+    law: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """`sample` of a law by its numbers."""
+    true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
+    return law_of(law).sample(true, normals), true
 
 
 @checked(anchors=("M", 3), tags=("N", 3), rotation=(3, 3), translation=(3,))

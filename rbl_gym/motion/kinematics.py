@@ -8,7 +8,6 @@ Kinematics (tracking paper, (10)-(15), Omega carrying the time step tau):
 from __future__ import annotations
 
 import functools
-import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +25,7 @@ from rbl_gym.checks import (
     kernel,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 
 __all__ = [
     "Path", "ProcessNoise", "Trajectory", "constant_twist", "interpolate", "lawn_mower_points",
@@ -66,7 +66,7 @@ class ProcessNoise:
 
     def std(self) -> FloatArray:
         """The six standard deviations after 1 s: rotation (rad), then translation (m)."""
-        return six(self.rotation_rad, self.translation_m)
+        return self._std.copy()
 
     def covariance(self, twist: FloatArray, dt: ArrayLike) -> FloatArray:
         """Covariance (..., 6, 6) that one step adds to the pose error (w, v).
@@ -86,9 +86,13 @@ class ProcessNoise:
         return covariance
 
     @functools.cached_property
+    def _std(self) -> FloatArray:
+        return six(self.rotation_rad, self.translation_m)
+
+    @functools.cached_property
     def _variance(self) -> FloatArray:
         """The six variances after 1 s."""
-        return self.std() ** 2
+        return self._std**2
 
 
 def check_process(process: ProcessNoise) -> None:
@@ -138,55 +142,39 @@ def simulate(
         Standard normals (..., T, 6); None: no process noise.
     """
     dt = check_number("dt", dt, low=1e-12)
-    nominal = trajectory.twists
-    batch = np.broadcast_shapes(
-        trajectory.rotation.shape[:-2],
-        trajectory.translation.shape[:-1],
-        nominal.shape[:-2],
-        () if normals is None else normals.shape[:-2],
-    )
-    n_steps = nominal.shape[-2]
-    twists = _trials_last(batch, n_steps, 6)
+    start, twists = trajectory.rotation, trajectory.twists
     if normals is None:
-        twists[...] = nominal
-    else:
-        twists[...] = normals
-        twists *= process.std() / np.sqrt(dt)
-        twists += nominal
-    twists *= dt
-    rotation = _trials_last(batch, n_steps + 1, 3, 3)
-    rotation[..., 0, :, :] = trajectory.rotation
-    _EXP(twists[..., :3], out=rotation[..., 1:, :, :])
-    _chain(rotation)
-    translation = _trials_last(batch, n_steps + 1, 3)
-    translation[..., 0, :] = 0.0
-    for k in range(n_steps):
-        np.add(translation[..., k, :], twists[..., k, 3:], out=translation[..., k + 1, :])
-    translation += trajectory.translation[..., None, :]
+        normals = np.zeros_like(twists)
+    turned, moved = _walk(start, trajectory.translation, twists, normals, process.std(), dt)
+    rotation = np.empty((*moved.shape[:-2], moved.shape[-2] + 1, 3, 3))
+    rotation[..., 0, :, :], rotation[..., 1:, :, :] = start, turned
+    translation = np.empty((*moved.shape[:-2], moved.shape[-2] + 1, 3))
+    translation[..., 0, :], translation[..., 1:, :] = trajectory.translation, moved
     return Path(rotation, translation)
 
 
-def _trials_last(batch: tuple[int, ...], *trailing: int) -> FloatArray:
-    """An empty array (*batch, *trailing) whose memory runs along the trials.
-
-    Loops over inner axes of 3 or 6 are slow; these run over all trials instead.
-    """
-    return np.empty((*batch, *trailing), order="F" if batch else "C")
-
-
-def _chain(rotation: FloatArray) -> None:
-    """Turn a start and T steps (..., T + 1, 3, 3) into the rotations they lead to, in place."""
-    if rotation.ndim == 3:
-        for before, step in itertools.pairwise(rotation):
-            step[...] = step @ before
-        return
-    # Row i, column j of every trial side by side; a matrix product of each alone is slow.
-    planes = np.moveaxis(rotation, (-3, -2, -1), (0, 1, 2))
-    for before, step in itertools.pairwise(planes):
-        product = step[:, 0, None] * before[0]
-        for i in (1, 2):
-            product += step[:, i, None] * before[i]
-        step[...] = product
+@compiled("epoch:walk")
+def _walk(
+    rotation: FloatArray,
+    translation: FloatArray,
+    twists: FloatArray,
+    normals: FloatArray,
+    std: FloatArray,
+    dt: ArrayLike,
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (..., T, 3, 3) and (..., T, 3) after each of T steps; `std` (..., 6) after 1 s."""
+    dt = np.asarray(dt, dtype=np.float64)[..., None, None]
+    steps = dt * (twists + normals * (std[..., None, :] / np.sqrt(dt)))
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1], steps.shape[:-2])
+    rotations_after = np.empty((*batch, steps.shape[-2], 3, 3))
+    turns = _EXP(steps[..., :3])
+    for k in range(steps.shape[-2]):
+        rotation = turns[..., k, :, :] @ rotation
+        rotations_after[..., k, :, :] = rotation
+    moves = np.cumsum(steps[..., 3:], axis=-2)
+    return rotations_after, np.broadcast_to(
+        translation[..., None, :] + moves, (*batch, *moves.shape[-2:])
+    )
 
 
 def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike) -> FloatArray:
@@ -277,7 +265,7 @@ def waypoints(
     travelled = speed_m_s * dt * np.arange(check_count("steps", steps, most=_MOST_STEPS) + 1)
     velocity = np.diff(_along(points, travelled), axis=-2) / dt
     batch = np.broadcast_shapes(spin.shape[:-1], velocity.shape[:-2])
-    twists = _trials_last(batch, len(travelled) - 1, 6)
+    twists = np.empty((*batch, len(travelled) - 1, 6))
     twists[..., :3], twists[..., 3:] = spin[..., None, :], velocity
     return Trajectory(rotation, points[..., 0, :], twists)
 

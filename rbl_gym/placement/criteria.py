@@ -53,7 +53,9 @@ def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Crit
     tags, rotation = np.asarray(task.scene.tags), task.poses[0]
     b = bounds.score(covariance, rotation, tags)
     # The pose error (w, v) in metres at the tags: C^T (w, v).
-    C = np.moveaxis(task.shared.spread, -1, 0)
+    J = bounds.tag_jacobian(rotation, tags)
+    square, vectors = np.linalg.eigh(np.einsum("pnia,pnib->pab", J, J) / len(tags))
+    C = vectors * np.sqrt(np.maximum(square, 0.0))[:, None]
     values = np.maximum(np.linalg.eigvalsh(np.swapaxes(C, -1, -2) @ covariance @ C), 1e-300)
     of_position, of_rotation = (
         np.sqrt(np.einsum("...ii->...", covariance[..., part, part]).mean(axis=-1))

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.bounds.shared_poses import SharedPoses
+from rbl_gym import bounds
 from rbl_gym.checks import (
     BoolArray,
     FloatArray,
@@ -28,9 +27,11 @@ from rbl_gym.checks import (
     check_count,
     check_finite,
 )
-from rbl_gym.geometry import rotations
+from rbl_gym.geometry import obstacles, rotations
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Walls
+from rbl_gym.kernels import compiled
+from rbl_gym.measurements import ranging
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
@@ -52,8 +53,6 @@ _POSE_SEED = 20130821
 _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
 # Uniforms that a context takes: region 6, each rack 6.
 _REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
-# Problems times poses times links, and so on, that are computed at a time: temporaries in cache.
-_LINKS_AT_ONCE, _POSES_AT_ONCE, _SIGHTS_AT_ONCE = 16_000, 512, 16_000
 
 
 class Context(NamedTuple):
@@ -140,11 +139,6 @@ class PlacementTask:
         diagonal = [_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3
         return _read_only(np.diag(diagonal))
 
-    @functools.cached_property
-    def shared(self) -> SharedPoses:
-        """What the poses and the tags alone decide."""
-        return SharedPoses(self.poses[0], np.asarray(self.scene.tags))
-
 
 def _read_only(array: FloatArray) -> FloatArray:
     array.flags.writeable = False
@@ -230,32 +224,20 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
 
     It is a sum over the anchors: the information of a layout is that of its parts together.
     """
-    return _in_blocks(
-        lambda *some: _information(task, *some).transpose(3, 2, 0, 1),
-        context, anchors, _problems_at_once(task, anchors), (task.n_poses, 6, 6),
-    )  # fmt: skip
+    places = positions(task, context)
+    share = _share(task, context, anchors, places)[..., None]
+    return bounds.information_at(
+        anchors[..., None, :, :], task.scene.body, task.poses[0], places, task.scene.noise, share
+    )
 
 
-def _information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """`information` as (6, 6, P, B), of one batch axis."""
-    start, away = _segments(task, context, anchors)
-    share = None
-    if context.racks.shape[-2]:
-        share = task.obstacles(context).share_along(start, away)
-    return task.shared.information(away, task.scene.noise, share)
-
-
-def _segments(
-    task: PlacementTask, context: Context, anchors: FloatArray
-) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Components of the anchors (M, B), and of the body's places less them (P, M, B)."""
-    end = positions(task, context).transpose(1, 2, 0).copy()
-    start = anchors.transpose(1, 2, 0).copy()
-    return [start[:, i] for i in range(3)], [end[:, None, i] - start[:, i] for i in range(3)]
-
-
-def _problems_at_once(task: PlacementTask, anchors: FloatArray) -> int:
-    return _LINKS_AT_ONCE // (task.n_poses * anchors.shape[-2] * len(task.scene.tags))
+def _share(
+    task: PlacementTask, context: Context, anchors: FloatArray, places: FloatArray
+) -> FloatArray:
+    """Share (..., P, M) of its information that each anchor's sight of each place leaves."""
+    if not context.racks.shape[-2]:
+        return np.ones((task.n_poses, anchors.shape[-2]))
+    return task.obstacles(context).share(anchors, places)
 
 
 def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
@@ -265,32 +247,42 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
     coincident anchors from winning.
     """
+    return root_of(_mean_square(*arguments(task, context, anchors)))
+
+
+def arguments(task: PlacementTask, context: Context, anchors: FloatArray) -> tuple[FloatArray, ...]:
+    """What the score is computed from: arguments of `_mean_square`, checked."""
     anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
-    prior = task.prior_information[..., None, None]
-    square = _in_blocks(
-        lambda *some: task.shared.mean_square(_information(task, *some) + prior),
-        context, anchors, _problems_at_once(task, anchors), (),
-    )  # fmt: skip
-    return _root(square)
+    places = positions(task, context)
+    share = _share(task, context, anchors, places)
+    law = ranging.numbers_of(task.scene.noise, len(task.scene.tags))
+    assert law is not None  # the laws of scenes have numbers
+    return anchors, task.poses[0], places, task.scene.body, task.prior_information, law, share
 
 
-def _in_blocks(
-    function: Callable[[Context, FloatArray], FloatArray],
-    context: Context,
+@compiled("layout_score:mean_square")
+def _mean_square(
     anchors: FloatArray,
-    size: int,
-    shape: tuple[int, ...],
+    rotation: FloatArray,
+    places: FloatArray,
+    tags: FloatArray,
+    prior: FloatArray,
+    law: FloatArray,
+    share: FloatArray,
 ) -> FloatArray:
-    """Results (..., *shape) of a function of one batch axis, `size` problems at a time."""
-    batch = np.broadcast_shapes(anchors.shape[:-2], context.centre.shape[:-1])
-    arrays = zip((*context, anchors), (1, 1, 2, 2), strict=True)
-    flat = [_flat(array, trailing, batch) for array, trailing in arrays]
-    result = np.empty((math.prod(batch), *shape))
-    for begin in range(0, len(result), max(1, size)):
-        some = slice(begin, begin + max(1, size))
-        *fields, part = (array[some] for array in flat)
-        result[some] = function(Context(*fields), part)
-    return result.reshape((*batch, *shape))
+    """Mean (...) of b^2 over poses (..., P, 3, 3), (..., P, 3) with a share (..., P, M)."""
+    told = bounds.information_at(
+        anchors[..., None, :, :], tags[..., None, :, :], rotation, places, ranging.law_of(law),
+        share[..., None],
+    )  # fmt: skip
+    return _mean_square_of(told + prior[..., None, :, :], rotation, tags)
+
+
+@compiled("layout_score:mean_square_of_information")
+def _mean_square_of(information: FloatArray, rotation: FloatArray, tags: FloatArray) -> FloatArray:
+    """Mean (...) of b^2 over poses of information (..., P, 6, 6)."""
+    b = bounds.score(np.linalg.inv(information), rotation, tags[..., None, :, :])
+    return (b**2).mean(axis=-1)
 
 
 def checked_context(context: Context) -> Context:
@@ -302,24 +294,13 @@ def checked_context(context: Context) -> Context:
     return Context(centre, half, racks)
 
 
-def _flat(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
-    """The array (..., n) with the batch as its one leading axis."""
-    shape = array.shape[array.ndim - trailing :]
-    return np.broadcast_to(array, (*batch, *shape)).reshape((math.prod(batch), *shape))
-
-
 def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
     """Score (...) of an information (..., P, 6, 6) at the task's poses."""
-    flat = information.reshape((-1, *information.shape[-3:]))
-    square = np.empty(len(flat))
-    size = max(1, _POSES_AT_ONCE // task.n_poses)
-    for begin in range(0, len(flat), size):
-        part = flat[begin : begin + size] + task.prior_information
-        square[begin : begin + size] = task.shared.mean_square(part.transpose(2, 3, 1, 0))
-    return _root(square).reshape(information.shape[:-3])
+    told = information + task.prior_information
+    return root_of(_mean_square_of(told, task.poses[0], task.scene.body))
 
 
-def _root(square: FloatArray) -> FloatArray:
+def root_of(square: FloatArray) -> FloatArray:
     if not np.isfinite(square).all():
         raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
     return np.sqrt(square)
@@ -353,13 +334,9 @@ def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) 
     """Share (..., M) of the task's poses that each anchor sees."""
     if not context.racks.shape[-2]:
         return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
-    return _in_blocks(
-        lambda some, part: (
-            task.obstacles(some).clear_along(*_segments(task, some, part)).mean(axis=0).T
-        ),
-        context, anchors, _SIGHTS_AT_ONCE // (task.n_poses * anchors.shape[-2]),
-        anchors.shape[-2:-1],
-    )  # fmt: skip
+    places = positions(task, context)
+    sight = obstacles.in_sight(anchors, places, context.racks)
+    return sight.mean(axis=-2)
 
 
 def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:

@@ -133,7 +133,7 @@ def _bound(world: World, links: list[Any]) -> FloatArray:
     episode, rows, information = world.episode, [], None
     for epoch, mask in enumerate(links):
         at = simulation.epoch_of(episode, epoch)
-        information = scene_bounds.posterior_information(
+        information, _ = scene_bounds.posterior_step(
             world.scene, at, episode.anchors, mask, information, episode.prior_covariance
         )
         rows.append(np.linalg.inv(information))

@@ -70,7 +70,7 @@ def simulate_world(scene: Scene, trials: int, rng: np.random.Generator) -> World
     for epoch in range(scene.steps + 1):
         at = simulation.epoch_of(episode, epoch)
         measured = simulation.measure(scene, at, episode.anchors)
-        information = scene_bounds.posterior_information(
+        information, _ = scene_bounds.posterior_step(
             scene, at, episode.anchors, measured.links, information, episode.prior_covariance
         )
         measurements.append(measured)

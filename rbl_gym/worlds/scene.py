@@ -169,6 +169,13 @@ class Scene:
         """The obstacles, and what they leave of a link."""
         return Obstacles(np.array(self.obstacles).reshape(-1, 6), self.blocked_information)
 
+    @functools.cached_property
+    def body(self) -> FloatArray:
+        """The tags as an array (N, 3), not to be written to."""
+        body = np.array(self.tags)
+        body.flags.writeable = False
+        return body
+
     @property
     def prior_covariance(self) -> FloatArray:
         """Pose covariance (6, 6) of the prior."""

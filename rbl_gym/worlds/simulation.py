@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym import bounds, motion
-from rbl_gym.checks import BoolArray, FloatArray, kernel
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.worlds.scene import Scene
@@ -20,9 +20,6 @@ from rbl_gym.worlds.scene import Scene
 __all__ = [
     "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure", "move_anchors",
 ]  # fmt: skip
-
-# Behind the doors: what comes to these was checked, or made here.
-_TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
 
 class Draws(NamedTuple):
@@ -249,30 +246,19 @@ def whole(episode: Episode) -> Epoch:
 
 
 def measure(
-    scene: Scene,
-    at: Epoch,
-    anchors: FloatArray,
-    positions: FloatArray | None = None,
-    quality: FloatArray | None = None,
+    scene: Scene, at: Epoch, anchors: FloatArray, quality: FloatArray | None = None
 ) -> ranging.Measurement:
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
 
-    `positions` of the tags (..., N, 3) and `quality` (`link_quality`): where known already.
-
-    `at` is of an episode of the `scene`.
+    `at` is of an episode of the `scene`; `quality` (`link_quality`): where known already.
     """
-    if positions is None:
-        positions = _TAG_POSITIONS(at.rotation, at.translation, scene.tags)
     normals = at.normals
     if scene.obstacles:
         quality = link_quality(scene, at, anchors) if quality is None else quality
         normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
-    distances = _DISTANCES(anchors, positions)
-    measured = ranging.measure(distances, scene.noise, normals, scene.links, at.uniforms)
-    clipped = np.minimum(measured.ranges, scene.range_limit_m, out=measured.ranges)
-    # However the worlds lie in memory, what is observed is in C order.
-    ranges = np.ascontiguousarray(clipped)
-    links, nlos = np.ascontiguousarray(measured.links), np.ascontiguousarray(measured.nlos)
+    taken = ranging.sample(at.rotation, at.translation, scene.body, anchors, normals, scene.noise)
+    ranges, links, nlos = ranging.lose_links(*taken, scene.links, at.uniforms)
+    np.minimum(ranges, scene.range_limit_m, out=ranges)
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     links &= ranges > 0
     if quality is not None and not scene.blocked_information:

@@ -1,0 +1,98 @@
+"""The world's side of an epoch: the body moves, ranges and angles are taken.
+
+Random numbers come in as standard normals. The textbook forms are `rbl_gym.motion.simulate`,
+`rbl_gym.worlds.simulation` and `rbl_gym.measurements.bearing`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.kernels import rotations
+from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.noise_laws import reference_of, sample
+
+
+@gufunc("(d,d),(d),(t,s),(t,s),(s),()->(t,d,d),(t,d)")
+def walk(
+    rotation: Any, translation: Any, twists: Any, normals: Any, std: Any, dt: float,
+    rotations_after: Any, translations_after: Any,
+) -> None:  # fmt: skip
+    """Poses after each of T steps of nominal twists with noise, std (6,) after 1 s."""
+    turn = np.empty((3, 3))
+    root = math.sqrt(dt)
+    x = y = z = 0.0
+    for k in range(twists.shape[0]):
+        rotations.exp(
+            (normals[k, 0] * (std[0] / root) + twists[k, 0]) * dt,
+            (normals[k, 1] * (std[1] / root) + twists[k, 1]) * dt,
+            (normals[k, 2] * (std[2] / root) + twists[k, 2]) * dt,
+            turn,
+        )
+        before = rotation if k == 0 else rotations_after[k - 1]
+        for i in range(3):
+            for j in range(3):
+                rotations_after[k, i, j] = (
+                    turn[i, 0] * before[0, j]
+                    + turn[i, 1] * before[1, j]
+                    + turn[i, 2] * before[2, j]
+                )
+        x += (normals[k, 3] * (std[3] / root) + twists[k, 3]) * dt
+        y += (normals[k, 4] * (std[4] / root) + twists[k, 4]) * dt
+        z += (normals[k, 5] * (std[5] / root) + twists[k, 5]) * dt
+        translations_after[k, 0] = translation[0] + x
+        translations_after[k, 1] = translation[1] + y
+        translations_after[k, 2] = translation[2] + z
+
+
+@helper
+def tag_position(rotation: Any, translation: Any, tags: Any, n: int) -> tuple[float, float, float]:
+    """``s_n = Q c_n + t``."""
+    a, b, c = tags[n, 0], tags[n, 1], tags[n, 2]
+    return (
+        rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c + translation[0],
+        rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c + translation[1],
+        rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c + translation[2],
+    )
+
+
+@helper
+def _square(x: float, y: float, z: float, anchors: Any, m: int) -> float:
+    dx, dy, dz = x - anchors[m, 0], y - anchors[m, 1], z - anchors[m, 2]
+    return dx * dx + dy * dy + dz * dz
+
+
+@gufunc("(d,d),(d),(n,d),(m,d),(m,n),(l)->(m,n),(m,n)")
+def measure(
+    rotation: Any, translation: Any, tags: Any, anchors: Any, normals: Any, law: Any,
+    ranges: Any, distances: Any,
+) -> None:  # fmt: skip
+    """Noisy ranges of all links and the distances behind them."""
+    for n in range(tags.shape[0]):
+        x, y, z = tag_position(rotation, translation, tags, n)
+        reference = reference_of(law, n)
+        a, b, c = x, y, z
+        if reference != n:
+            a, b, c = tag_position(rotation, translation, tags, reference)
+        for m in range(anchors.shape[0]):
+            square = _square(x, y, z, anchors, m)
+            of_reference = square if reference == n else _square(a, b, c, anchors, m)
+            distances[m, n] = math.sqrt(square)
+            ranges[m, n] = sample(law, square, of_reference, normals[m, n])
+
+
+@gufunc("(d,d),(d),(n,d),(d),(k,n),()->(k,n)")
+def measure_angles(
+    rotation: Any, translation: Any, tags: Any, station: Any, normals: Any, std: float, angles: Any
+) -> None:
+    """Noisy angles to the x and z axis of all tags, folded back into [0, pi]; k is 2."""
+    for n in range(tags.shape[0]):
+        x, y, z = tag_position(rotation, translation, tags, n)
+        x, y, z = x - station[0], y - station[1], z - station[2]
+        alpha = math.atan2(math.hypot(y, z), x) + std * normals[0, n]
+        beta = math.atan2(math.hypot(x, y), z) + std * normals[1, n]
+        angles[0, n] = abs(alpha - 2 * math.pi * np.rint(alpha / (2 * math.pi)))
+        angles[1, n] = abs(beta - 2 * math.pi * np.rint(beta / (2 * math.pi)))

@@ -1,0 +1,221 @@
+"""The Kalman filters of 12 states on squared ranges: prediction, update, constraint, belief.
+
+The state is ``[vec Q; t]``, columns of Q first; s_n = Q c_n + t are the tags. Weights are inverse
+variances of the squared ranges, (M, 1) where all tags share them, else (M, N); zero where a link is
+lost. The textbook forms stand in `rbl_gym.estimators`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.kernels import rotations
+from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.linear_algebra import of_size
+
+_STATES = 12
+_cholesky, _, _invert_factored = of_size(_STATES)
+
+
+@gufunc("(p),(p,p),(d),(d),(p)->(p),(p,p)")
+def predict(
+    mean: Any, P: Any, turn: Any, shift: Any, noise: Any, new_mean: Any, new_P: Any
+) -> None:
+    """``x <- F x + [0; shift]``, ``P <- F P F^T + diag(noise)``, F = blkdiag(R, R, R, I)."""
+    work = np.empty((2, 3, 3))
+    R, half = work[0], work[1]
+    rotations.exp(turn[0], turn[1], turn[2], R)
+    for k in range(4):
+        for i in range(3):
+            if k == 3:
+                new_mean[9 + i] = mean[9 + i] + shift[i]
+            else:
+                a, b, c = mean[3 * k], mean[3 * k + 1], mean[3 * k + 2]
+                new_mean[3 * k + i] = R[i, 0] * a + R[i, 1] * b + R[i, 2] * c
+    for k in range(4):
+        for m in range(k + 1):
+            row, column = 3 * k, 3 * m
+            for i in range(3):
+                for j in range(3):
+                    if k == 3:
+                        half[i, j] = P[row + i, column + j]
+                    else:
+                        half[i, j] = (
+                            R[i, 0] * P[row, column + j]
+                            + R[i, 1] * P[row + 1, column + j]
+                            + R[i, 2] * P[row + 2, column + j]
+                        )
+            for i in range(3):
+                for j in range(3):
+                    if m == 3:
+                        value = half[i, j]
+                    else:
+                        value = half[i, 0] * R[j, 0] + half[i, 1] * R[j, 1] + half[i, 2] * R[j, 2]
+                    if k != m or j <= i:
+                        new_P[row + i, column + j] = value
+                        new_P[column + j, row + i] = value
+    for i in range(_STATES):
+        new_P[i, i] += noise[i]
+
+
+@helper
+def _weighted_mean(anchors: Any, weights: Any, column: int) -> tuple[float, float, float]:
+    """Weighted mean of the anchors."""
+    total = x = y = z = 0.0
+    for m in range(anchors.shape[0]):
+        w = weights[m, column]
+        total += w
+        x += w * anchors[m, 0]
+        y += w * anchors[m, 1]
+        z += w * anchors[m, 2]
+    if total > 0:
+        return x / total, y / total, z / total
+    return 0.0, 0.0, 0.0
+
+
+@helper
+def spread(anchors: Any, weights: Any, column: int, G: Any) -> None:
+    """Upper triangle of ``G = 4 A Pi A^T``, what the anchors tell about the place of a tag."""
+    x, y, z = _weighted_mean(anchors, weights, column)
+    xx = xy = xz = yy = yz = zz = 0.0
+    for m in range(anchors.shape[0]):
+        w = 4 * weights[m, column]
+        a, b, c = anchors[m, 0] - x, anchors[m, 1] - y, anchors[m, 2] - z
+        xx += w * a * a
+        xy += w * a * b
+        xz += w * a * c
+        yy += w * b * b
+        yz += w * b * c
+        zz += w * c * c
+    G[0], G[1], G[2], G[3], G[4], G[5] = xx, xy, xz, yy, yz, zz
+
+
+@helper
+def _add_information(H: Any, anchors: Any, tags: Any, weights: Any) -> None:
+    """Add ``sum_n (c_e c_e^T) kron G_n`` to the lower blocks of H."""
+    n_tags, n_weights = tags.shape[0], weights.shape[1]
+    G = np.empty((n_weights, 6))
+    for n in range(n_weights):
+        spread(anchors, weights, n, G[n])
+    for k in range(4):
+        for m in range(k + 1):
+            gram = xx = xy = xz = yy = yz = zz = 0.0
+            for n in range(n_tags):
+                s = 1.0
+                if k < 3:
+                    s = tags[n, k]
+                if m < 3:
+                    s *= tags[n, m]
+                gram += s
+                if n_weights > 1:
+                    xx += s * G[n, 0]
+                    xy += s * G[n, 1]
+                    xz += s * G[n, 2]
+                    yy += s * G[n, 3]
+                    yz += s * G[n, 4]
+                    zz += s * G[n, 5]
+            if n_weights == 1:
+                xx, xy, xz = gram * G[0, 0], gram * G[0, 1], gram * G[0, 2]
+                yy, yz, zz = gram * G[0, 3], gram * G[0, 4], gram * G[0, 5]
+            i, j = 3 * k, 3 * m
+            H[i, j] += xx
+            H[i + 1, j] += xy
+            H[i + 2, j] += xz
+            H[i + 1, j + 1] += yy
+            H[i + 2, j + 1] += yz
+            H[i + 2, j + 2] += zz
+            if m < k:
+                H[i, j + 1] += xy
+                H[i, j + 2] += xz
+                H[i + 1, j + 2] += yz
+
+
+@helper
+def _posterior(P: Any, anchors: Any, tags: Any, weights: Any, work: Any, new_P: Any) -> None:
+    """``(P^-1 + information)^-1``; work is (2, 12, 12)."""
+    L, information = work[0], work[1]
+    _cholesky(P, L)
+    _invert_factored(L, information)
+    _add_information(information, anchors, tags, weights)
+    _cholesky(information, L)
+    _invert_factored(L, new_P)
+
+
+@helper
+def innovation(
+    mean: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, arms: Any, y: Any
+) -> None:
+    """``y = sum_n c_e kron (b_n - G_n s_n)`` (4, 3), from squared ranges less those expected.
+
+    ``b_n - G_n s_n = -2 sum_m w (a_m - a) (r_mn^2 - |a_m - s_n|^2)``, a the weighted mean of the
+    anchors: what |s_n|^2 adds to each square drops out. `arms` are the c_n of c_e = [c_n; 1],
+    the tags or those about their centroid.
+    """
+    for k in range(4):
+        for i in range(3):
+            y[k, i] = 0.0
+    column = 0
+    x0, x1, x2 = _weighted_mean(anchors, weights, 0)
+    for n in range(tags.shape[0]):
+        c0, c1, c2 = tags[n, 0], tags[n, 1], tags[n, 2]
+        s0 = mean[0] * c0 + mean[3] * c1 + mean[6] * c2 + mean[9]
+        s1 = mean[1] * c0 + mean[4] * c1 + mean[7] * c2 + mean[10]
+        s2 = mean[2] * c0 + mean[5] * c1 + mean[8] * c2 + mean[11]
+        if weights.shape[1] > 1:
+            column = n
+            x0, x1, x2 = _weighted_mean(anchors, weights, n)
+        b0 = b1 = b2 = 0.0
+        for m in range(anchors.shape[0]):
+            a0, a1, a2 = anchors[m, 0], anchors[m, 1], anchors[m, 2]
+            d0, d1, d2 = a0 - s0, a1 - s1, a2 - s2
+            r = ranges[m, n]
+            e = -2 * weights[m, column] * (r * r - (d0 * d0 + d1 * d1 + d2 * d2))
+            b0 += e * (a0 - x0)
+            b1 += e * (a1 - x1)
+            b2 += e * (a2 - x2)
+        for k in range(4):
+            c = arms[n, k] if k < 3 else 1.0
+            y[k, 0] += c * b0
+            y[k, 1] += c * b1
+            y[k, 2] += c * b2
+
+
+@helper
+def _correct(mean: Any, P: Any, y: Any, new_mean: Any) -> None:
+    """``x + P y`` with the posterior P."""
+    for i in range(_STATES):
+        total = mean[i]
+        for k in range(4):
+            for j in range(3):
+                total += P[i, 3 * k + j] * y[k, j]
+        new_mean[i] = total
+
+
+@gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p),(p,p)")
+def update(
+    mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any, new_P: Any
+) -> None:
+    """Mean and covariance after an epoch, in the information form."""
+    work = np.empty((2, _STATES, _STATES))
+    y = work[0, :4, :3]
+    _posterior(P, anchors, tags, weights, work, new_P)
+    innovation(mean, ranges, anchors, tags, weights, tags, y)
+    _correct(mean, new_P, y, new_mean)
+
+
+@gufunc("(p,p),(m,d),(n,d),(m,w)->(p,p)")
+def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) -> None:
+    """The covariance of `update`, which needs no ranges."""
+    _posterior(P, anchors, tags, weights, np.empty((2, _STATES, _STATES)), new_P)
+
+
+@gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p)")
+def update_mean(
+    mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any
+) -> None:
+    """The mean of `update`, with the covariance P after the epoch."""
+    y = np.empty((4, 3))
+    innovation(mean, ranges, anchors, tags, weights, tags, y)
+    _correct(mean, P, y, new_mean)
