@@ -15,6 +15,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.placement import criteria as layout_criteria
 from rbl_gym.placement import problem as placement
+from rbl_gym.placement.gradient import score_and_gradient
 from rbl_gym.worlds import scenes
 from tests.test_obstacles import depth_by_sampling
 
@@ -287,19 +288,31 @@ def test_batches_are_loops(kind):
         placement.score(task, context, anchors[:0])
 
 
-@pytest.mark.parametrize("kind", ["auv_buoys", "room with racks"])
-def test_blocks_are_one_call(kind, monkeypatch):
+@pytest.mark.parametrize(
+    "noise",
+    [
+        {},
+        {"proportional": 0.02, "reference_tag": 1},
+        {"kind": "squared-range", "sigma_m": 0.1},
+    ],
+    ids=["own", "reference", "squared"],
+)
+@pytest.mark.parametrize("kind", ["drone_yard", "room with racks"])
+def test_gradient_is_that_of_finite_differences(kind, noise):
     task = make(kind)
-    context, anchors = problem(task, 13, (5, 7))
-    blocked = []
-    for links, poses in ((1, 1), (700, 30), (10**9, 10**9)):
-        monkeypatch.setattr(placement, "_LINKS_AT_ONCE", links)
-        monkeypatch.setattr(placement, "_POSES_AT_ONCE", poses)
-        blocked.append(placement.score(task, context, anchors))
-        shared = placement.score(task, context, anchors[0, 0])
-        np.testing.assert_allclose(shared[0, 0], blocked[-1][0, 0], rtol=1e-9)
-    np.testing.assert_allclose(blocked[0], blocked[2], rtol=1e-12)
-    np.testing.assert_allclose(blocked[1], blocked[2], rtol=1e-12)
+    task = dataclasses.replace(task, scene=scenes.get({"name": task.scene.name, "noise": noise}))
+    context, anchors = problem(task, 17, (3,))
+    score, gradient = score_and_gradient(task, context, anchors)
+    np.testing.assert_allclose(score, placement.score(task, context, anchors), rtol=1e-12)
+    step = 1e-4
+    for index in np.ndindex(*anchors.shape[1:]):
+        moved = np.zeros(anchors.shape)
+        moved[(slice(None), *index)] = step
+        above, below = (placement.score(task, context, anchors + s * moved) for s in (1, -1))
+        # Truncation, and the rounding of scores over the step.
+        np.testing.assert_allclose(
+            gradient[(slice(None), *index)], (above - below) / (2 * step), rtol=1e-4, atol=1e-9
+        )
 
 
 def test_moving_region_racks_and_anchors_together_changes_no_score():

@@ -12,9 +12,7 @@ from rbl_gym.kernels import compiled
 from rbl_gym.measurements import bearing, ranging
 from rbl_gym.motion.kinematics import ProcessNoise, check_process
 
-__all__ = [
-    "of_angles", "of_ranges", "posterior_crb_step", "predict_covariance", "predict_information",
-]  # fmt: skip
+__all__ = ["posterior_crb_step", "predict_covariance", "predict_information"]
 
 # Behind the door: what comes to it was checked, or made here.
 _EXP = kernel(rotations.exp)
@@ -179,6 +177,9 @@ def _recursion(
 def _score(information: FloatArray, rotation: FloatArray, tags: FloatArray) -> FloatArray:
     """Score (...) of information (..., 6, 6), NaN where that is not positive definite."""
     good = np.isfinite(information).all(axis=(-2, -1))
-    good &= pose.information_rank(information, 1e-14) == 6
+    safe = np.where(good[..., None, None], information, 0.0)
+    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", safe), 1e-300))
+    scaled = safe / (scale[..., :, None] * scale[..., None, :])
+    good &= np.linalg.eigvalsh(scaled)[..., 0] > 1e-14
     covariance = np.linalg.inv(np.where(good[..., None, None], information, np.eye(6)))
     return np.where(good, pose.score(covariance, rotation, tags), np.nan)

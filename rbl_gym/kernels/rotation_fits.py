@@ -31,19 +31,24 @@ def nearest(matrix: Any, rotation: Any) -> None:
 @helper
 def nearest_rotation(matrix: Any, Q: Any) -> None:
     """`nearest`; Q is not the matrix."""
-    norm = 0.0
+    largest = total = norm = 0.0
     for i in range(3):
         for j in range(3):
-            norm += matrix[i, j] * matrix[i, j]
+            total += abs(matrix[i, j])
+            largest = max(largest, abs(matrix[i, j]))
+    for i in range(3):
+        for j in range(3):
+            Q[i, j] = matrix[i, j] / largest
+            norm += Q[i, j] * Q[i, j]
     scale = 1 / math.sqrt(norm)
     for i in range(3):
         for j in range(3):
-            Q[i, j] = matrix[i, j] * scale
+            Q[i, j] *= scale
     if _cofactor_row(Q, 0, 1, 2)[3] > _WELL_CONDITIONED:
         _polar(Q)
     elif 0 < norm < math.inf:
         _nearest_by_quaternion(Q)
-    elif norm == 0:
+    elif total == 0:
         for i in range(3):
             for j in range(3):
                 Q[i, j] = 1.0 if i == j else 0.0

@@ -301,6 +301,7 @@ def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
 
 
 def root_of(square: FloatArray) -> FloatArray:
+    """Scores (...) of their squares, or a ValueError where those are not finite."""
     if not np.isfinite(square).all():
         raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
     return np.sqrt(square)

@@ -1,0 +1,263 @@
+"""Every kernel of the world against its textbook form: shapes, lost links, degenerate cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym import kernels, metrics
+from rbl_gym.bounds import pose, posterior
+from rbl_gym.geometry import obstacles, rotations
+from rbl_gym.measurements import noise_laws, ranging
+from rbl_gym.metrics import Figures
+from rbl_gym.motion import kinematics
+from rbl_gym.placement import gradient
+from rbl_gym.placement import problem as placement
+
+pytestmark = pytest.mark.skipif(not kernels.enabled(), reason="kernels are off")
+
+LAWS = {
+    "own": noise_laws.RangeNoise(0.05, 0.01),
+    "reference": noise_laws.RangeNoise(0.05, 0.01, reference_tag=1),
+    "squared": noise_laws.SquaredRangeNoise(0.1),
+}
+every_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
+every_batch = pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
+
+
+def assert_equal_forms(form, *args, atol=1e-9):
+    """Both forms of a function: relative to the largest entry, and for shapes that broadcast."""
+    with np.errstate(all="ignore"):
+        got, want = form.kernel(*args), form.textbook(*args)
+    got, want = (x if isinstance(x, tuple) else (x,) for x in (got, want))
+    assert len(got) == len(want)
+    for mine, plain in zip(got, want, strict=True):
+        assert mine.shape == plain.shape
+        scale = np.nanmax(np.abs(plain), initial=1e-300)
+        np.testing.assert_allclose(mine / scale, plain / scale, rtol=0, atol=atol)
+    return got
+
+
+class World:
+    """Random bodies among anchors; anchors and tags are common to all where `common`."""
+
+    def __init__(self, batch, m=4, n=5, common=False, seed=0):
+        rng = self.rng = np.random.default_rng(seed)
+        self.anchors = rng.normal(0, 20, (*(() if common else batch), m, 3))
+        self.tags = rng.normal(0, 1, (n, 3))
+        self.rotation, self.translation = (
+            rotations.random(rng, batch),
+            rng.normal(0, 5, (*batch, 3)),
+        )
+        self.share = np.where(rng.random((*batch, m, n)) < 0.3, 0.0, rng.random((*batch, m, n)))
+        root = rng.standard_normal((*batch, 6, 6))
+        self.matrix = root @ np.swapaxes(root, -1, -2) + 0.1 * np.eye(6)
+
+    @property
+    def places(self):
+        return self.anchors, self.tags, self.rotation, self.translation
+
+
+# --- rotations ---------------------------------------------------------------------------------
+
+
+@every_batch
+@pytest.mark.parametrize("spread", [1e-9, 0.1, 1.0, 30.0])
+def test_nearest(batch, spread):
+    rng = np.random.default_rng(1)
+    near = rotations.random(rng, batch) + spread * rng.standard_normal((*batch, 3, 3))
+    assert_equal_forms(rotations._nearest, near)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        -np.eye(3), np.diag([1.0, 2, -3]), np.diag([1.0, 2, 0]), 1e-200 * np.diag([3.0, 2, -1]),
+        np.diag([1e-9, 1, 1e9]),
+    ],
+)  # fmt: skip
+def test_nearest_of_reflections_and_singular_matrices(matrix):
+    turn = rotations.random(np.random.default_rng(2))
+    got = rotations._nearest(turn @ matrix)
+    assert np.linalg.det(got) == pytest.approx(1.0, abs=1e-12)
+    np.testing.assert_allclose(got @ got.T, np.eye(3), atol=1e-12)
+    # The projection may not be unique (-I): what it is worth is.
+    want = rotations._nearest.textbook(turn @ matrix)
+    scale = np.abs(matrix).max()
+    trace = [np.sum(Q * (turn @ matrix)) / scale for Q in (got, want)]
+    assert trace[0] == pytest.approx(trace[1], abs=1e-9)
+
+
+def test_nearest_of_nothing():
+    np.testing.assert_array_equal(rotations._nearest(np.zeros((3, 3))), np.eye(3))
+    assert np.isnan(rotations._nearest(np.full((3, 3), np.nan))).any()
+
+
+# --- epochs ------------------------------------------------------------------------------------
+
+
+@every_batch
+@every_law
+@pytest.mark.parametrize("common", [False, True])
+def test_ranges_of_an_epoch(law, batch, common):
+    world = World(batch, common=common)
+    normals = 3 * world.rng.standard_normal((*batch, 4, 5))
+    assert_equal_forms(
+        ranging._sample, world.rotation, world.translation, world.tags, world.anchors, normals,
+        law.numbers,
+    )  # fmt: skip
+
+
+@every_law
+def test_ranges_of_an_anchor_on_a_tag(law):
+    tags, anchors = np.eye(3), np.array([[1.0, 0, 0], [0, 1, 0], [9, 9, 9]])
+    normals = -np.ones((3, 3))
+    assert_equal_forms(ranging._sample, np.eye(3), np.zeros(3), tags, anchors, normals, law.numbers)
+
+
+@every_batch
+def test_walk(batch):
+    rng = np.random.default_rng(3)
+    start = rotations.random(rng, batch), rng.normal(size=(*batch, 3))
+    twists, normals = rng.standard_normal((2, *batch, 7, 6))
+    std = np.array([0.1, 0.0, 0.2, 1, 2, 3])
+    assert_equal_forms(kinematics._walk, *start, twists, normals, std, 0.1)
+    assert_equal_forms(kinematics._walk, *start, np.zeros((7, 6)), normals, std, 0.1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+@every_batch
+def test_sight(batch, count):
+    rng = np.random.default_rng(4)
+    anchors, points = rng.uniform(-5, 5, (*batch, 6, 3)), rng.uniform(-5, 5, (9, 3))
+    boxes = np.concatenate([rng.uniform(-4, 4, (count, 3)), rng.uniform(0.2, 2, (count, 3))], -1)
+    got = obstacles.in_sight(anchors, points, boxes)
+    assert got.dtype == np.bool_
+    with np.errstate(all="ignore"):
+        np.testing.assert_array_equal(got, obstacles.in_sight.textbook(anchors, points, boxes))
+
+
+def test_sight_along_a_face_and_from_inside():
+    box = np.array([[0.0, 0, 0, 1, 1, 1]])
+    anchors = np.array([[-3.0, 1, 0], [-3, 0, 0], [0, 0, 0], [3, 1, 1]])
+    points = np.array([[3.0, 1, 0], [0, 0.5, 0], [3, 3, 3], [-3, 1, 1]])
+    with np.errstate(all="ignore"):
+        want = obstacles.in_sight.textbook(anchors, points, box)
+    np.testing.assert_array_equal(obstacles.in_sight(anchors, points, box), want)
+    assert want[0, 0]
+    assert not want[2, 2]
+
+
+# --- bounds ------------------------------------------------------------------------------------
+
+
+@every_batch
+@every_law
+@pytest.mark.parametrize("common", [False, True])
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (4, 5), (7, 2)])
+def test_information(law, batch, common, m, n):
+    if n == 1 and law.numbers[3] == 1:
+        pytest.skip("no such tag")
+    world = World(batch, m, n, common)
+    for share in (world.share, np.ones((m, n)), np.zeros((m, n), bool)):
+        assert_equal_forms(pose._information, np.eye(6), *world.places, law.numbers, share)
+
+
+def test_a_law_that_no_kernel_knows_takes_the_textbook_form():
+    world = World((2,))
+    law = noise_laws.LinkNoise(np.full((4, 5), 0.1))
+    got = pose.information_at(*world.places, law, world.share)
+    want = pose.information_at(*world.places, noise_laws.RangeNoise(0.1), world.share)
+    np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
+
+
+@every_batch
+@every_law
+def test_posterior_of_ranges(law, batch):
+    steps = 3
+    world = World((*batch, steps))
+    prior = world.matrix[..., 0, :, :]
+    twists, dt = world.rng.standard_normal((*batch, steps, 6)), np.array([0.0, 0.2, 0.1])
+    args = world.anchors, world.tags, world.rotation, world.translation, law.numbers, world.share
+    for std in (np.zeros(6), np.array([0.1, 0.2, 0.3, 1, 2, 3])):
+        for J in (prior, np.zeros((6, 6)), 1e12 * prior):
+            with np.errstate(all="ignore"):
+                got, _ = posterior.of_ranges.kernel(J, twists, dt, std, *args)
+                want, _ = posterior.of_ranges.textbook(J, twists, dt, std, *args)
+            scale = np.sqrt(np.einsum("...ii->...i", want))
+            scale = scale[..., :, None] * scale[..., None, :]
+            np.testing.assert_allclose(got / scale, want / scale, rtol=0, atol=1e-9)
+        assert_equal_forms(posterior.of_ranges, prior, twists, dt, std, *args)
+
+
+@every_batch
+def test_posterior_of_angles(batch):
+    world = World((*batch, 2), m=1)
+    twists = world.rng.standard_normal((*batch, 2, 6))
+    assert_equal_forms(
+        posterior.of_angles, world.matrix[..., 0, :, :], twists, np.array([0.0, 0.3]), np.ones(6),
+        world.anchors[..., 0, :], world.tags, world.rotation, world.translation, 0.01,
+    )  # fmt: skip
+
+
+def test_scores_of_what_is_no_information_are_nan():
+    world = World((1,))
+    for J in (np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6)):
+        args = (
+            J, np.zeros((1, 6)), np.zeros(1), np.zeros(6), *world.places, LAWS["own"].numbers,
+            np.zeros((1, 4, 5)),
+        )  # fmt: skip
+        for form in (posterior.of_ranges.kernel, posterior.of_ranges.textbook):
+            with np.errstate(all="ignore"):
+                assert np.isnan(form(*args)[1]).all()
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+@every_batch
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.1, 3.1])
+@pytest.mark.parametrize("n", [1, 5])
+def test_figures_of_beliefs(batch, angle, n):
+    world = World(batch, n=n)
+    axis = world.rng.standard_normal((*batch, 3))
+    axis *= angle / np.linalg.norm(axis, axis=-1, keepdims=True)
+    belief = rotations.exp(axis) @ world.rotation, world.translation + 0.1, world.matrix
+    truth = world.rotation, world.translation, world.tags
+    # The angle comes of a matrix near the identity, whose entries are rounded to 1e-16.
+    assert_equal_forms(metrics._judge, *belief, *truth, atol=max(1e-9, 1e-15 / max(angle, 1e-9)))
+    figures = metrics.judge(*belief, *truth)
+    assert isinstance(figures, Figures)
+    np.testing.assert_allclose(figures.rotation_error_rad, angle, atol=1e-7)
+    error = metrics.pose_error(*belief[:2], *truth[:2])
+    np.testing.assert_allclose(figures.nees, metrics.nees(error, belief[2]), rtol=1e-8)
+    np.testing.assert_allclose(figures.score_m, pose.score(belief[2], belief[0], world.tags))
+
+
+@pytest.mark.parametrize("factor", [-1.0, np.nan])
+def test_figures_of_no_covariance_are_refused(factor):
+    world = World((3,))
+    world.matrix[1] *= factor
+    pair = world.rotation, world.translation
+    assert_equal_forms(metrics._judge, *pair, world.matrix, *pair, world.tags)
+    with pytest.raises(ValueError, match="covariance positive definite"):
+        metrics.judge(*pair, world.matrix, *pair, world.tags)
+
+
+# --- layouts -----------------------------------------------------------------------------------
+
+
+@every_batch
+@every_law
+@pytest.mark.parametrize("m", [1, 4])
+def test_scores_of_layouts(law, batch, m):
+    world, poses = World((), m=m), World((*batch, 6), seed=1)
+    anchors = world.rng.normal(0, 20, (*batch, m, 3))
+    share = world.rng.random((*batch, 6, m))
+    args = (
+        anchors, poses.rotation, poses.translation, world.tags, 0.1 * np.eye(6), law.numbers, share
+    )  # fmt: skip
+    assert_equal_forms(placement._mean_square, *args)
+    square, _ = assert_equal_forms(gradient._mean_square_and_gradient, *args)
+    np.testing.assert_allclose(square, placement._mean_square(*args), rtol=1e-12)
+    assert_equal_forms(placement._mean_square_of, poses.matrix, poses.rotation, world.tags)
