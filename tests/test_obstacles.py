@@ -170,10 +170,6 @@ def test_obstacles_tell_the_share_of_each_link():
     wanted = np.where(in_sight(anchors, points, obstacles.boxes), 1.0, 0.03)
     np.testing.assert_array_equal(obstacles.share(anchors, points), wanted)
     assert 0.1 < (wanted == 1).mean() < 0.9
-    start = [anchors[:, i, None] for i in range(3)]
-    along = [(points[:, None, i] - anchors[:, i])[..., None] for i in range(3)]
-    many = Obstacles(obstacles.boxes[None], 0.03)
-    np.testing.assert_array_equal(many.share_along(start, along)[..., 0], wanted)
     held = [any((np.abs(p - box[:3]) <= box[3:]).all() for box in obstacles.boxes) for p in points]
     np.testing.assert_array_equal(obstacles.contain(points), held)
     assert obstacles

@@ -281,8 +281,9 @@ def _mean_square(
 @compiled("layout_score:mean_square_of_information")
 def _mean_square_of(information: FloatArray, rotation: FloatArray, tags: FloatArray) -> FloatArray:
     """Mean (...) of b^2 over poses of information (..., P, 6, 6)."""
-    b = bounds.score(np.linalg.inv(information), rotation, tags[..., None, :, :])
-    return (b**2).mean(axis=-1)
+    J = bounds.tag_jacobian(rotation, tags[..., None, :, :])
+    S = np.einsum("...nia,...nib->...ab", J, J) / tags.shape[-2]
+    return np.einsum("...ab,...ba->...", S, np.linalg.inv(information)).mean(axis=-1)
 
 
 def checked_context(context: Context) -> Context:
@@ -302,7 +303,7 @@ def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
 
 def root_of(square: FloatArray) -> FloatArray:
     """Scores (...) of their squares, or a ValueError where those are not finite."""
-    if not np.isfinite(square).all():
+    if not (np.isfinite(square) & (square > 0)).all():
         raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
     return np.sqrt(square)
 
