@@ -199,6 +199,15 @@ def test_wrong_volumes_are_named(volume, message):
         replay.Settings(volume=volume)
 
 
+def test_a_volume_out_of_reach_is_named():
+    settings = replay.Settings(volume=(None, None, None, None, 50, None))
+    with pytest.raises(ValueError, match=r"volume must be in reach of the anchors, .* got \(None"):
+        replay.make_filter(record(CEILING, FLAT, epochs=2), settings)
+    settings = replay.Settings(volume=(None, None, None, None, 2.5, None), below_anchors=True)
+    with pytest.raises(ValueError, match="volume must reach below the anchors' mean height of 2 m"):
+        replay.make_filter(record(CEILING, FLAT, epochs=2), settings)
+
+
 def test_the_bank_covers_its_rivals():
     """Its covariance is the second moment about the leader of a mixture."""
     recording = record(CEILING, FLAT)

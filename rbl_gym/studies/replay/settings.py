@@ -109,8 +109,21 @@ def origin_of(recording: Recording) -> FloatArray:
     return np.round(recording.anchors.mean(axis=0))
 
 
+def reach_of(recording: Recording) -> tuple[FloatArray, FloatArray]:
+    """Corners (3,) each of the box that the longest range leaves around the anchors."""
+    longest = recording.ranges.max()
+    return recording.anchors.min(axis=0) - longest, recording.anchors.max(axis=0) + longest
+
+
 def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
-    """Corners (2, 3) of where the body may be, infinite where there is no limit; None: anywhere."""
+    """Corners (2, 3) of where the body may be, infinite where there is no limit; None: anywhere.
+
+    Raises
+    ------
+    ValueError
+        If the volume is further from the anchors than any range, or nothing of it is below them
+        where that is asked for.
+    """
     if settings.volume is None and not settings.below_anchors:
         return None
     limits = settings.volume or (None,) * 6
@@ -118,7 +131,19 @@ def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
     high = [np.inf if x is None else x for x in limits[1::2]]
     if settings.below_anchors:
         seen = recording.links.any(axis=(0, 2))
-        high[2] = min(high[2], float(recording.anchors[seen, 2].mean()))
+        mean = float(recording.anchors[seen, 2].mean())
+        if low[2] >= mean:
+            raise ValueError(
+                f"volume must reach below the anchors' mean height of {mean:.4g} m with "
+                f"below_anchors, got zmin {low[2]:g}"
+            )
+        high[2] = min(high[2], mean)
+    reach = reach_of(recording)
+    if (np.array(low) > reach[1]).any() or (np.array(high) < reach[0]).any():
+        raise ValueError(
+            f"volume must be in reach of the anchors, between {np.round(reach[0], 1).tolist()} and "
+            f"{np.round(reach[1], 1).tolist()} m, got {settings.volume}"
+        )
     return np.array([low, high])
 
 

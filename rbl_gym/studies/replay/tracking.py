@@ -21,6 +21,7 @@ from rbl_gym.studies.replay.settings import (
     has_own_std,
     height_offset,
     origin_of,
+    reach_of,
     volume_of,
 )
 
@@ -28,8 +29,6 @@ from rbl_gym.studies.replay.settings import (
 _PLANAR_STD = 1e-3
 # How much wider than the belief its mirror image starts.
 _IMAGE_RAD, _IMAGE_M = 0.1, 0.2
-# How many extents of the anchors away from them the bank looks where the volume has no limit.
-_REACH = 10.0
 
 
 class Track(NamedTuple):
@@ -158,9 +157,7 @@ def named_filter(
     volume = volume_of(recording, settings)
     if name == "iekf-bank" and volume is not None:
         # The bank looks for a lost body in its volume, which is finite.
-        anchors = recording.anchors
-        reach = _REACH * max(float(np.ptp(anchors, axis=0).max()), 1.0)
-        box = np.clip(volume, anchors.min(axis=0) - reach, anchors.max(axis=0) + reach)
+        box = np.clip(volume, *reach_of(recording))
         options = {"volume": box - origin_of(recording), **options}
     laws = {"tags": recording.tags, "noise": noise, "process": process}
     filter = estimators.make(name, **laws, **options)
