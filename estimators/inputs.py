@@ -105,6 +105,31 @@ def are_positive(values: FloatArray) -> bool:
     return all(are_positive(flat[k : k + _PART]) for k in range(0, flat.size, _PART))
 
 
+def epoch_variance(
+    noise: NoiseLaw | None,
+    own: NoiseLaw,
+    ranges: FloatArray,
+    links: BoolArray | None,
+    squared: bool = False,
+) -> FloatArray:
+    """Variances of an epoch's ranges by its law, None: by the filter's `own`; checked.
+
+    `squared`: of the squared ranges. 1 where no link uses them.
+
+    Raises
+    ------
+    ValueError
+        If what is given is no law of ranges, or does not fit these.
+    """
+    law = law_of(noise, own)
+    try:
+        variance = (law.squared_range_variance if squared else law.variance)(ranges, links)
+        np.broadcast_shapes(variance.shape, ranges.shape)
+    except ValueError as error:
+        raise ValueError(f"noise does not fit ranges of shape {ranges.shape}: {error}") from error
+    return check_variance(variance, links)
+
+
 def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
     """The variances, 1 where no link uses them, or a ValueError if one is not positive."""
     if links is not None:

@@ -135,6 +135,22 @@ def test_a_noise_that_is_no_law_is_refused(name):
     ranges = ranging.distances(anchors, TAGS)
     with pytest.raises(ValueError, match=r"noise must have variance and .* got 0.1"):
         filter.update(state, ranges, anchors, noise=0.1)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"noise does not fit ranges of shape \(4, 6\)"):
+        filter.update(state, ranges, anchors, noise=ranging.LinkNoise(np.ones((3, 6))))
+
+
+@pytest.mark.parametrize("name", ["kf", "iekf", "iekf-bank", "iekf-cv", "iekf-bias"])
+def test_a_law_with_leading_axes_is_a_law_for_each(name):
+    filter = estimators.make(name, tags=TAGS, noise=ranging.RangeNoise(0.1), process=PROCESS)
+    state = filter.initial(np.eye(3), np.zeros(3), 0.01 * np.eye(6))
+    anchors = 9.0 * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]])
+    ranges = ranging.distances(anchors, TAGS) + 0.05
+    each = np.random.default_rng(0).uniform(0.05, 0.5, (3, 4, 6))
+    belief = filter.belief(filter.update(state, ranges, anchors, noise=ranging.LinkNoise(each)))
+    for k in range(3):
+        alone = filter.update(state, ranges, anchors, noise=ranging.LinkNoise(each[k]))
+        for a, b in zip(belief, filter.belief(alone), strict=True):
+            np.testing.assert_allclose(a[k], b, rtol=1e-8, atol=1e-9)
 
 
 def test_angles_take_the_laws_of_their_epoch():

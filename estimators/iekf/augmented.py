@@ -22,7 +22,7 @@ from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState
-from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, law_of, plain
+from rbl_gym.estimators.inputs import check_batches, check_epoch, epoch_variance, plain
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
@@ -145,8 +145,8 @@ class AugmentedEkf:
         if not self.biases:
             return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.pose.tags)
-        variance = check_variance(law_of(noise, self.pose.noise).variance(ranges, mask), mask)
-        variance = np.broadcast_to(variance, np.broadcast_shapes(variance.shape, ranges.shape))
+        variance = epoch_variance(noise, self.pose.noise, ranges, mask)
+        ranges, variance = np.broadcast_arrays(ranges, variance)
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         state = self._with_biases(state, ranges.shape[-2:])
         batch = np.broadcast_shapes(

@@ -39,8 +39,7 @@ from rbl_gym.estimators.inputs import (
     check_batches,
     check_covariance,
     check_epoch,
-    check_variance,
-    law_of,
+    epoch_variance,
     plain,
 )
 from rbl_gym.geometry import rotations
@@ -165,8 +164,7 @@ class IteratedEkf:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """A checked epoch as (ranges, weights, anchors): inverse variances, 0 of lost links."""
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
-        law = law_of(noise, self.noise)
-        weights = 1 / check_variance(law.variance(ranges, mask), mask)
+        weights = 1 / epoch_variance(noise, self.noise, ranges, mask)
         weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
         return ranges, weights if mask is None else weights * mask, anchors
 

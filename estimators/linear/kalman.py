@@ -25,8 +25,7 @@ from rbl_gym.estimators.inputs import (
     check_batches,
     check_covariance,
     check_epoch,
-    check_variance,
-    law_of,
+    epoch_variance,
 )
 from rbl_gym.estimators.linear.engines import ENGINES, Prediction, engine_for
 from rbl_gym.estimators.linear.least_squares import unvec, vec
@@ -170,10 +169,9 @@ class KalmanFamily:
             message names the rank).
         """
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
-        law = law_of(noise, self.noise)
         self._check_determined(state, anchors)
         if self.weights is None:
-            weights = 1 / check_variance(law.squared_range_variance(ranges, mask), mask)
+            weights = 1 / epoch_variance(noise, self.noise, ranges, mask, squared=True)
         else:
             weights = np.asarray(self.weights, dtype=np.float64)
             weights = weights[..., None] if weights.ndim == 1 else weights
