@@ -73,6 +73,7 @@ def network(rng: Rng) -> tuple[dict[str, Any], tuple[int, int]]:
         "n_nodes": int(rng.integers(2, 20)),
         "radius_m": float(rng.uniform(1, 8)),
         "bearing_std_rad": float(rng.choice([0.001, 0.05, 1.0])),
+        "lengths": str(rng.choice(["none", "one", "all"])),
         "steps": int(rng.integers(1, 60)),
     }
     return options, LEAST

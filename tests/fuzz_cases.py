@@ -122,6 +122,8 @@ case(sensing.random_network, n_nodes=12, mean_degree=8.0, bearing_std_rad=0.05, 
 for _method in ("ml", "chordal", "cycle", "spectral", "tree"):
     case(estimators.orientations, _method, **GRAPH, y=EDGE_ANGLES, method=_method)
 case(estimators.chordal_optimum, **GRAPH, y=EDGE_ANGLES)
+case(estimators.orientations, "weighted", **GRAPH, y=EDGE_ANGLES, method="ml",
+     weights=np.ones(len(EDGE_ANGLES)))  # fmt: skip
 case(estimators.cycle_consensus, **GRAPH, y=EDGE_ANGLES)
 case(estimators.ring_least_squares, y=np.array([1.0, 2, 3]))
 _cycles = graphs.cycle_matrix(**GRAPH)

@@ -301,6 +301,23 @@ def test_poses_reach_their_bound(lengths, arguments):
     assert 1.7 < np.median(np.concatenate(nees)) < 2.5
 
 
+@pytest.mark.parametrize("sigma", [1e-6, 0.5, 3.0])
+@pytest.mark.parametrize("lengths", ["one", "all"])
+def test_beliefs_stay_finite_and_definite_in_any_noise(lengths, sigma):
+    envs = VectorEstimateNetwork(
+        make_vec(12, lengths=lengths, bearing_std_rad=sigma, step_m=10.0), reward="belief"
+    )
+    rng = np.random.default_rng(0)
+    observation, _ = envs.reset(seed=7)
+    for _ in range(3):
+        assert envs.observation_space.contains(observation)
+        values = np.linalg.eigvalsh(observation["pose_covariance"][:, 1:])
+        assert values.min() > -1e-9
+        assert np.diagonal(observation["pose_covariance"][:, 1:], axis1=-2, axis2=-1).min() > 0
+        observation, reward, *_ = envs.step(actions_of(envs, rng))
+        assert np.isfinite(reward).all()
+
+
 def test_too_few_steps_show_in_the_belief():
     found = {}
     for steps in (0, 5000):

@@ -120,10 +120,24 @@ def test_an_edge_of_weight_2_is_two_edges(method):
     assert (found.cost, found.certified) == (pytest.approx(both.cost, rel=1e-9), both.certified)
 
 
+def test_weak_edges_between_strong_parts_still_decide():
+    """Two triangles, exact and heavy, turn by the weighted mean of what joins them."""
+    edges = [[0, 1], [1, 2], [0, 2], [3, 4], [4, 5], [3, 5], [0, 3], [2, 5]]
+    y = np.array([0.3, 0.4, 0.7, -0.2, 0.5, 0.3, 1.0, 1.2])
+    weights = np.array([9.0, 5, 7, 8, 6, 5, 1e-11, 3e-11])
+    # Edge (2, 5) says 1.2 + 0.7 - 0.3 of the turn from 0 to 3.
+    want = (1 * 1.0 + 3 * 1.6) / 4
+    assert orientations(edges, y, 6, weights=weights)[3] == pytest.approx(want, abs=1e-4)
+    weights[6:] *= 1e3
+    assert chordal_optimum(edges, y, 6, weights=weights).certified
+
+
 def test_wrong_weights_are_named():
     edges, y = [[0, 1], [1, 2]], [0.1, 0.2]
     with pytest.raises(ValueError, match="weights must be above 0, got 0 at index 1"):
         orientations(edges, y, 3, weights=[1, 0])
+    with pytest.raises(ValueError, match="at least 1e-12 of the largest, 2, got 1e-13 at index 1"):
+        orientations(edges, y, 3, weights=[2, 1e-13])
     with pytest.raises(ValueError, match=r"weights must have shape \(2,\) like the edges"):
         chordal_optimum(edges, y, 3, weights=[1.0])
     with pytest.raises(ValueError, match="weights must be None with the method 'cycle'"):

@@ -25,6 +25,9 @@ from rbl_gym.networks.sensing import check_edge_angles, check_edge_values, proj
 # A step is exact to rounding once no residual wraps: the next one is far below this.
 _SETTLED_RAD = 1e-10
 _MAX_STEPS = 100
+# A weight beside the largest. Two parts that lighter edges alone join would be turned by rounding.
+LEAST_WEIGHT = 1e-12
+_SMALLEST = 5e-324
 _DENSE = 50  # nodes up to which all eigenvectors are computed
 # Pivots of the dual matrix below this share of the sum of a node's weights count as zero.
 _PIVOT_FLOOR = 1e-10
@@ -61,8 +64,9 @@ def orientations(
         (14), then along a tree. ``"tree"``: y along the breadth-first tree. ``"spectral"``:
         phases of the eigenvector of the connection Laplacian's smallest eigenvalue.
     weights
-        (m,) above 0: the information of each y, one over its variance, in any unit. None: all
-        alike. Not for ``"cycle"`` and ``"tree"``, which have none.
+        (m,) above 0: the information of each y, one over its variance, in any unit; none below
+        `LEAST_WEIGHT` of the largest, which rounding would drown. None: all alike. Not for
+        ``"cycle"`` and ``"tree"``, which have none.
     options
         Of `cycle_consensus`, with ``"cycle"``.
 
@@ -81,7 +85,8 @@ def orientations(
         if method not in _WEIGHTED:
             raise ValueError(f"weights must be None with the method {method!r}, "
                              f"got {weights!r:.80}")  # fmt: skip
-        options = {"weights": check_weights(weights, edges)}
+        weights = check_weights(weights, edges)
+        options = {"weights": weights / weights.max(initial=_SMALLEST)}
     return proj(METHODS[method](edges, y, n_nodes, **options))
 
 
@@ -104,6 +109,10 @@ def check_weights(weights: ArrayLike | None, edges: IntArray) -> FloatArray:
     if (array <= 0).any():
         row = int(np.argmax(array <= 0))
         raise ValueError(f"weights must be above 0, got {array[row]:g} at index {row}")
+    if len(array) and array.min() < LEAST_WEIGHT * array.max():
+        row = int(np.argmin(array))
+        raise ValueError(f"weights must be at least {LEAST_WEIGHT:g} of the largest, "
+                         f"{array.max():g}, got {array[row]:g} at index {row}")  # fmt: skip
     return array
 
 
@@ -230,6 +239,8 @@ def chordal_optimum(
     edges = check_connected(edges, n_nodes)
     y = check_edge_angles(y, edges)
     weights = check_weights(weights, edges)
+    unit = float(weights.max(initial=_SMALLEST))
+    weights = weights / unit
     if n_nodes == 1:
         return ChordalOptimum(np.zeros(1), 0.0, True)
     if start is None:
@@ -250,7 +261,7 @@ def chordal_optimum(
         if np.abs(step).max() <= _SETTLED_RAD:
             break
     residual = residuals(edges, y, theta)
-    value = float(4 * weights @ np.sin(residual / 2) ** 2)
+    value = float(unit * 4 * weights @ np.sin(residual / 2) ** 2)
     certified = _is_positive(_dual(edges, residual, n_nodes, weights)[1:, 1:])
     return ChordalOptimum(proj(theta), value, certified)
 

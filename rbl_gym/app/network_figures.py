@@ -47,8 +47,8 @@ def print_network(result: dict[str, Any]) -> None:
         lines = ", ".join(f"{count} {kind}" for kind, count in result["skipped_lines"].items())
         out.print(f"skipped, no planar poses: {lines}")
     without = result["edges_without_weight"]
-    out.print(f"weights: {result['weights']}"
-              + (f"; {without} edges with I33 = 0 are left out" if without else ""))  # fmt: skip
+    left_out = f"; {without} edges left out, without information of theta" if without else ""
+    out.print(f"weights: {result['weights']}{left_out}")
     out.print(f"cost {result['cost']:.10g}, sum of weight x residual^2 (along a tree: "
               f"{result['tree_cost']:.4g})")  # fmt: skip
     out.print(f"residuals {result['residual_rms_deg']:.3f} deg RMS "

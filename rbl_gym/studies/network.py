@@ -13,7 +13,7 @@ import scipy.sparse.linalg
 
 from rbl_gym import estimators
 from rbl_gym.checks import FloatArray
-from rbl_gym.estimators.networks.orientations import cost, residuals
+from rbl_gym.estimators.networks.orientations import LEAST_WEIGHT, cost, residuals
 from rbl_gym.networks import g2o, graphs
 from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.g2o import PoseGraph
@@ -60,13 +60,13 @@ def _solved(path: str, graph: PoseGraph, weights: str) -> Solved:
     n_nodes = len(graph.ids)
     graphs.check_connected(graph.edges, n_nodes, graph.ids)
     weight = edge_weights(graph) if weights == "information" else np.ones(len(graph.edges))
-    used = weight > 0
+    used = weight > max(LEAST_WEIGHT * weight.max(), 0.0)
     edges, y, w = graph.edges[used], graph.y[used], weight[used]
     if not used.all():
         try:
             graphs.check_connected(edges, n_nodes, graph.ids)
         except ValueError as error:
-            raise ValueError(f"of those with information of theta (I33 above 0): {error}; "
+            raise ValueError(f"of those with information of theta (I33): {error}; "
                              "--weights unit takes all edges alike") from error  # fmt: skip
     begin = time.perf_counter()
     theta = estimators.orientations(edges, y, n_nodes, weights=w)
