@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rbl_gym.estimators import triangle_frames
 from rbl_gym.estimators.networks.triangle import TRIANGLE_EDGES
+from rbl_gym.geometry import rotations
 from rbl_gym.networks import bounds, rigidity, sensing
 
 PLACES = np.array([[0.0, 0.0, 0.0], [4.0, 1.0, 0.5], [1.0, 3.0, -2.0]])
@@ -16,7 +17,7 @@ PLACES = np.array([[0.0, 0.0, 0.0], [4.0, 1.0, 0.5], [1.0, 3.0, -2.0]])
 
 def measured(sigma, rng, trials=1):
     """Truth and bearings; every node's frame is anyhow."""
-    turned = Rotation.random(3 * trials, random_state=rng).as_matrix().reshape(trials, 3, 3, 3)
+    turned = rotations.random(rng, (trials, 3))
     seen = sensing.measure_in_space(PLACES, turned, TRIANGLE_EDGES, sigma, rng)
     return turned, seen
 

@@ -67,8 +67,8 @@ def _frames(ax: Axes, result: dict[str, Any]) -> None:
         angle = np.array(run[key])[:, None] + [0, np.pi / 2]
         tips = places[:, None] + length * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         lines = np.stack([np.broadcast_to(places[:, None], tips.shape), tips], axis=2)
-        ax.add_collection(LineCollection(lines.reshape(-1, 2, 2), colors=colour, ls=style, lw=1.4,
-                                         label=label))  # fmt: skip
+        pairs = list(lines.reshape(-1, 2, 2))
+        ax.add_collection(LineCollection(pairs, colors=colour, ls=style, lw=1.4, label=label))
     ax.plot(*places[0], "ks", ms=5)
     ax.plot(*places.T, "k.", ms=4)
     ax.margins(0.15)

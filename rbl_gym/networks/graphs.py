@@ -3,6 +3,8 @@
 Graphs are multigraphs: rows of `edges` (m, 2), each an edge of its own.
 """
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
 from collections.abc import Sequence

@@ -7,6 +7,8 @@ points are drawn, not printed: `PLACES` are ours. Beside the paper's figures: th
 networks of ten nodes uniform in a square.
 """
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
 import itertools
@@ -116,8 +118,9 @@ def run(
         "footprints": [float(radius) for radius in radii],
         "edges": [edges.tolist() for edges in graphs],
     }
-    sigma = [np.sqrt(check_number("variance", VARIANCE if variance is None else variance, low=0.0)),
-             np.sqrt(RUN_VARIANCE if variance is None else variance)]  # fmt: skip
+    if variance is not None:
+        variance = check_number("variance", variance, low=1e-12)
+    sigma = np.sqrt([VARIANCE, RUN_VARIANCE] if variance is None else [variance] * 2)
     result["variance"] = [float(one**2) for one in sigma]
     result["accuracy"] = [
         {"footprint": float(radius), **_accuracy(places, edges, float(sigma[0]), trials,

@@ -1,5 +1,7 @@
 """The network paper's outlook, measured: kappa against n (Section IV-E), three nodes in space."""
 
+# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
 import itertools
