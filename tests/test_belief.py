@@ -81,7 +81,11 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
         ("iekf", {"tags": np.zeros((5, 2))}, r"tags must have shape \(..., N, 3\), got \(5, 2\)"),
         ("iekf", {"iterations": 0}, "iterations must be a positive int, got 0"),
         ("et-kf", {"threshold": -1}, "threshold must be a finite number"),
-        ("kf", {"engine": "numpy"}, "engine must be one of 'auto', 'batched', 'filterpy', got 'numpy'"),
+        (
+            "kf",
+            {"engine": "numpy"},
+            "engine must be one of 'auto', 'batched', 'filterpy', got",
+        ),
         ("kf", {"weights": [1.0, -1.0]}, "weights must not be negative, got -1.0"),
     ],
 )
