@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ CEILING = np.array([[0, 0, 2], [0, 3, 2], [4, 3, 2], [4, 0, 2], [1.3, 1, 2], [2.
 WALL = CEILING[:, [2, 0, 1]] - [2, 0, 0]  # in the plane x = 0
 FLAT = np.array([[0.2, 0.15, 0], [-0.2, 0.15, 0], [-0.2, -0.15, 0], [0.2, -0.15, 0]])
 SOLID = FLAT + [[0, 0, 0.3], [0, 0, 0], [0, 0, 0.2], [0, 0, -0.1]]
-OPTIONS = {"walk_m": 0.3, "walk_deg": 20.0, "range_std_m": 0.03}
+OPTIONS: dict[str, Any] = {"walk_m": 0.3, "walk_deg": 20.0, "range_std_m": 0.03}
 
 
 def record(anchors, tags, seed=0, epochs=25, noise_m=0.03, start=(1.5, 1.2, 0.8)):
@@ -57,6 +58,8 @@ def test_a_mirror_pose_is_named_and_the_belief_covers_it(name, anchors):
     assert result["anees"] < 1.5
     height = np.sqrt(track.covariance[10, 3:, 3:].trace())
     assert height > 0.5
+    assert recording.truth is not None
+    assert track.other is not None
     truth = recording.truth.translation
     nearer = np.minimum(*(
         np.linalg.norm(pose - truth, axis=-1)
@@ -120,8 +123,10 @@ def test_one_range_at_a_time():
     settings = replay.Settings(walk_m=0.3, walk_deg=20)
     judge = replay.make_filter(recording, settings)
     P = np.broadcast_to(1e-3 * np.eye(6), (count, 6, 6))
+    assert whole.truth is not None
     poses = whole.truth.rotation, whole.truth.translation, P
     other = replay.other_pose(recording, judge, None, poses)
+    assert other is not None
     assert other.alive[-10:].all()
     np.testing.assert_allclose(other.translation[-10:, 2] - 2, 2 - poses[1][-10:, 2], atol=0.3)
     room = record(ROOM, FLAT, epochs=60)
@@ -138,13 +143,16 @@ def test_a_mirrored_planar_track_is_held_by_its_height():
 def test_map_coordinates_give_the_track_of_local_ones():
     shift = np.array([448_262.0, 5_411_932.0, 310.0])
     near = record(CEILING, SOLID)
+    assert near.truth is not None
     far = near._replace(
         anchors=near.anchors + shift,
         truth=near.truth._replace(translation=near.truth.translation + shift),
     )
     for name in ("iekf", "iekf-bank"):
         tracks = [
-            replay.run(recording, replay.Settings(**OPTIONS, filter=name, below_anchors=True))
+            replay.run(
+                recording, replay.Settings(**{**OPTIONS, "filter": name, "below_anchors": True})
+            )
             for recording in (near, far)
         ]
         np.testing.assert_allclose(tracks[0].rotation, tracks[1].rotation, atol=1e-4)
@@ -168,7 +176,7 @@ def test_the_command_takes_a_volume(tmp_path, capsys):
     recording = record(CEILING, FLAT, epochs=6)
     columns = [f"a{m}t{n}" for m in range(6) for n in range(4)]
     rows = np.column_stack([recording.times, recording.ranges.reshape(6, -1)])
-    texts = {"ranges": (["t", *columns], rows)}
+    texts: dict[str, Any] = {"ranges": (["t", *columns], rows)}
     for name, points in (("anchor", CEILING), ("tag", FLAT)):
         texts[f"{name}s"] = [name, "x", "y", "z"], [[i, *p] for i, p in enumerate(points)]
     command = ["replay"]
@@ -212,7 +220,7 @@ def test_the_bank_covers_its_rivals():
     """Its covariance is the second moment about the leader of a mixture."""
     recording = record(CEILING, FLAT)
     settings = replay.Settings(**OPTIONS, filter="iekf-bank")
-    bank = replay.make_filter(recording, settings)
+    bank: Any = replay.make_filter(recording, settings)
     states = [state for state, _ in replay.steps(recording, settings, bank)]
     state, belief = states[3], bank.belief(states[3])
     share = bank.probabilities(state)

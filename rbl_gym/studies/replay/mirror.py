@@ -79,8 +79,8 @@ def other_pose(
         Corners (2, 3) of where the body may be: a pose outside is not counted.
     """
     seen = recording.links.any(axis=0)
-    anchors = recording.anchors[seen.any(axis=1)]
-    tags = recording.tags[seen.any(axis=0)]
+    anchors = recording.anchors[np.flatnonzero(seen.sum(axis=1))]
+    tags = recording.tags[np.flatnonzero(seen.sum(axis=0))]
     plane = mirror.plane_of(anchors)
     if plane.width < 1e-6 or plane.thickness > _THICK * plane.width:
         return None
@@ -117,9 +117,9 @@ def _followed(
 ) -> Mirror | None:
     """Both poses through all epochs from `start` on, until the image is out of the question."""
     count = len(recording.times)
-    result = Mirror(
-        *(np.array(a) for a in track), np.full(count, -np.inf), np.zeros(count, dtype=np.bool_)
-    )
+    rotation, translation, covariance = (np.array(a) for a in track)
+    odds_of, alive = np.full(count, -np.inf), np.zeros(count, dtype=np.bool_)
+    result = Mirror(rotation, translation, covariance, odds_of, alive)
     gain, cost, links, same = np.zeros(2), np.zeros(2), _PRIOR_LINKS, 0
     state = filter.initial(*poses)
     spread = np.diag(filter.process.std() ** 2)

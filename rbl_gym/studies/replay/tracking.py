@@ -90,7 +90,7 @@ def steps(
             state = filter.predict(state, np.zeros(6), now - before)
         epoch = local.ranges[k], local.anchors, local.links[k]
         law = {}
-        if has_own_std(local, settings):
+        if local.range_std is not None and has_own_std(local, settings):
             law["noise"] = ranging.LinkNoise(local.range_std[k])
         state = filter.update(state, *epoch, **law)
         belief = filter.belief(state)

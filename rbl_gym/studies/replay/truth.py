@@ -37,8 +37,8 @@ def matched(
     truth without such a neighbour is compared with the track at its own time: it counts for the
     epoch that is nearest, moved there as the track moves.
     """
-    there = recordings.truth_at(truth, times, gap_s)
-    turned, moved, known = (np.array(a) for a in there)
+    turned, moved, known = recordings.truth_at(truth, times, gap_s)
+    turned, moved, known = turned.copy(), moved.copy(), known.copy()
     alone = np.diff(truth.times, prepend=-np.inf, append=np.inf) > gap_s
     at = np.flatnonzero(alone[:-1] & alone[1:])
     after = np.clip(np.searchsorted(times, truth.times[at]), 0, len(times) - 1)
