@@ -92,6 +92,7 @@ def test_weights_bend_the_picture_neither(tmp_path):
     path.write_text("EDGE_SE2 0 1 1 0 0 90 0 0 90 0 400\nEDGE_SE2 1 2 1 0 0 90 0 0 90 0 400\n"
                     "EDGE_SE2 0 2 9 7 0 1e-6 0 0 1e-6 0 400\n")  # fmt: skip
     places = network.run(str(path)).positions
+    assert places is not None
     np.testing.assert_allclose(places, [[0, 0], [1, 0], [2, 0]], atol=1e-6)
 
 

@@ -217,6 +217,7 @@ print(min(spent))
 @pytest.mark.skipif(not G2O.is_dir(), reason="pose graphs are not beside the checkout")
 def test_pose_graphs_are_solved_and_certified(name, least):
     graph = g2o.read_graph(G2O / f"{name}_edges.csv")
+    assert graph.information is not None
     weights = graph.information[:, 2, 2]
     weighted = chordal_optimum(graph.edges, graph.y, len(graph.ids), weights=weights)
     assert weighted.certified
