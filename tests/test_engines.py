@@ -64,7 +64,7 @@ class Run:
 
     def states(self, name, engine, pick=()):
         filter = estimators.make(name, engine=engine, **self.laws)
-        state = filter.initial(*(a[pick] for a in self.start), self.prior)
+        state = filter.initial(self.start[0][pick], self.start[1][pick], self.prior)
         states = []
         for twist, ranges, links in self.epochs:
             twist = twist if twist.ndim == 1 else twist[pick]

@@ -99,7 +99,9 @@ def test_a_recording_with_its_own_noise_is_weighed_by_it(name):
     found = []
     for std in (0.02, 10.0):
         track = replay.run(log(std), settings)
-        found.append(replay.errors(log(std), track, settings).tags[-1])
+        errors = replay.errors(log(std), track, settings)
+        assert errors is not None
+        found.append(errors.tags[-1])
     told_wrong, told_right = found
     assert told_right < 0.02
     assert told_wrong > 5 * told_right

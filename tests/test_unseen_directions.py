@@ -96,7 +96,7 @@ def test_a_roll_that_nobody_sees_grows_as_the_process_says(name, tags, dead, sea
     assert expected > 0.5**2
     assert searches == []
     heard = np.delete(tags, list(dead), axis=0)
-    nees = tag_nees(belief, *pose, heard)
+    nees = tag_nees(belief, pose[0], pose[1], heard)
     # 12 bodies, 3 degrees of freedom: the mean is within five standard deviations of 3.
     assert abs(nees.mean() - 3) < 5 * np.sqrt(6 / 12)
 
@@ -159,7 +159,7 @@ def test_a_first_epoch_is_searched_once_and_the_roll_of_two_tags_never_again(nam
     assert searches == [8]
     belief = filter.belief(state)
     found = ranging.tag_positions(belief.rotation, belief.translation, PAIR)
-    gap = np.linalg.norm(found - ranging.tag_positions(*pose, PAIR), axis=-1)
+    gap = np.linalg.norm(found - ranging.tag_positions(pose[0], pose[1], PAIR), axis=-1)
     # One of the 16 tags may be in doubt between the two ends of so short a body.
     assert np.median(gap) < 0.1
     assert (np.linalg.eigvalsh(belief.covariance[:, :3, :3])[:, -1] > 0.5**2).all()

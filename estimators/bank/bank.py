@@ -221,7 +221,8 @@ class IteratedEkfBank:
                 whole = dataclasses.replace(problem, data=data)
                 cost = whole(found.rotation, found.translation).cost
             heard = (arrays[1] > 0).any(axis=-2)
-            return _Scored(*kept_wide(state, as_state(found), heard, self.tags), cost)
+            after: PoseState = kept_wide(state, as_state(found), heard, self.tags)
+            return _Scored._make([*after, cost])
 
         arrays, trailing = [*prior, *epoch, *(start or ())], (*TRAILING, 2, 1)
         return in_blocks(update, arrays, trailing[: len(arrays)], block_size(epoch.ranges))

@@ -190,7 +190,7 @@ def solve(
     covariance: FloatArray | None,
     iterations: int,
     threshold: float | None,
-    heard: BoolArray,
+    heard: BoolArray | np.bool_,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """The fields of the state at the most likely pose near a start.
 

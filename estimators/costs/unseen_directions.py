@@ -9,15 +9,13 @@ the roll is believed to be known. Carried along with the body, the wide directio
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations
-
-Pose = TypeVar("Pose", bound=tuple)
 
 # Tags this thin beside their length (squared) are as good as in a line: to them the two ways of
 # carrying the prior differ by more than the ranges tell, to others by nothing that matters.
@@ -26,7 +24,7 @@ _HAT, _LOG = kernel(rotations.hat), kernel(rotations.log)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 
 
-def kept_wide(prior: Pose, posterior: Pose, heard: BoolArray, tags: FloatArray) -> Pose:
+def kept_wide(prior: Any, posterior: Any, heard: BoolArray | np.bool_, tags: FloatArray) -> Any:
     """The posterior pose with the covariance that leaves unseen directions as wide as they were.
 
     Parameters
@@ -67,8 +65,9 @@ def kept_wide(prior: Pose, posterior: Pose, heard: BoolArray, tags: FloatArray) 
     return posterior._replace(covariance=covariance.reshape((*batch, 6, 6)))
 
 
-def _line(heard: BoolArray, tags: FloatArray) -> tuple[BoolArray, FloatArray]:
+def _line(heard: BoolArray | np.bool_, tags: FloatArray) -> tuple[BoolArray, FloatArray]:
     """Where (...) the tags that were heard are about in a line, and their centre (..., 3)."""
+    heard = np.asarray(heard)
     share = heard / np.maximum(heard.sum(axis=-1, keepdims=True), 1)
     centre = (share[..., None, :] @ tags)[..., 0, :]
     about = (tags - centre[..., None, :]) * heard[..., None]
