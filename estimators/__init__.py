@@ -10,6 +10,7 @@ from pkgutil import walk_packages
 from rbl_gym.estimators.asynchronous import Asynchronous, Stream
 from rbl_gym.estimators.bank.bank import IteratedEkfBank
 from rbl_gym.estimators.bank.hypotheses import BankState
+from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import (
     ENTRY_POINT_GROUP,
     Filter,
@@ -20,7 +21,7 @@ from rbl_gym.estimators.filter import (
 )
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
 from rbl_gym.estimators.iekf.doa_filter import DoaEkf
-from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.linear.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.locating.doa import locate_doa
 from rbl_gym.estimators.locating.localization import PoseEstimate, locate, methods

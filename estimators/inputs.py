@@ -18,9 +18,6 @@ from rbl_gym.checks import (
 )
 from rbl_gym.measurements.ranging import NoiseLaw
 
-# Ranges that stay in the cache from one look at them to the next.
-_PART = 1 << 15
-
 State = TypeVar("State", bound=tuple[Any, ...])
 
 # Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
@@ -99,10 +96,7 @@ def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
 
 def are_positive(values: FloatArray) -> bool:
     """Whether all are positive and finite, without a mask of them: NaN fails both comparisons."""
-    if values.size <= _PART or not values.flags.c_contiguous:
-        return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < HUGE)
-    flat = values.reshape(-1)
-    return all(are_positive(flat[k : k + _PART]) for k in range(0, flat.size, _PART))
+    return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < HUGE)
 
 
 def epoch_variance(
@@ -135,7 +129,8 @@ def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
     if links is not None:
         used = links if variance.shape[-1] == links.shape[-1] else links.any(-1, keepdims=True)
         variance = np.where(used, variance, 1.0)
-    if not (variance > 0).all():
+    # False of NaN too.
+    if not variance.min(initial=1.0) > 0:
         raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
     return variance
 

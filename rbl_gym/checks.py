@@ -23,6 +23,7 @@ BoolArray = NDArray[np.bool_]
 Axes = float | tuple[float, float, float]
 # No length, time or rate is as large; its powers still are finite numbers.
 HUGE = 1e50
+_FLOAT64 = np.dtype(np.float64)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -90,7 +91,9 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
 
 def check_shape(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> FloatArray:
     """`check_array` without the look at the values."""
-    array = as_float(name, value)
+    array = value if type(value) is np.ndarray else as_float(name, value)
+    if array.dtype is not _FLOAT64:
+        array = as_float(name, array)
     sizes = array.shape[array.ndim - len(shape) :]
     if array.ndim < len(shape) or any(
         (got != want if isinstance(want, int) else got < 1)
@@ -124,7 +127,9 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
 
 def check_finite(name: str, array: FloatArray) -> FloatArray:
     """`array` unchanged, or a ValueError with the first entry that is NaN, inf or `HUGE`."""
-    # False of NaN too.
+    # The sum of squares of most arrays says it all, in one look; false of NaN too.
+    if np.vdot(array, array) < HUGE:
+        return array
     if not (array.min(initial=0.0) > -HUGE and array.max(initial=0.0) < HUGE):
         if np.isfinite(array).all():
             index = tuple(int(i) for i in np.argwhere(np.abs(array) >= HUGE)[0])

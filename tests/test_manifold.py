@@ -7,9 +7,10 @@ import pytest
 
 from rbl_gym import bounds, estimators, metrics, motion
 from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
-from rbl_gym.estimators.costs.range_cost import RangeCost, huber
+from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
+from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, huber
 from rbl_gym.estimators.filter import inverse
-from rbl_gym.estimators.iekf.manifold import IteratedEkf, MapProblem, PoseState
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from tests.helpers import load, random_world, simulate
@@ -70,7 +71,7 @@ def test_gradient_and_hessian_by_finite_differences(threshold, tag_variance):
     P = np.diag([0.3, 0.2, 0.4, 1.0, 2.0, 3.0])
     off = rotations.exp(0.3 * rng.standard_normal(3)) @ rotation
     weights = 1 / NOISE.variance(ranges) * (rng.random((5, 4)) > 0.2)
-    loss = None if threshold is None else huber(threshold)
+    loss = SQUARES if threshold is None else huber(threshold)
     prior = PoseState(off, translation + 0.2, P)
     positions = ranging.tag_positions(off, translation, tags)
     unit = bounds.directions(anchors, positions)[1] if tag_variance else None
@@ -93,7 +94,7 @@ def test_gradient_and_hessian_by_finite_differences(threshold, tag_variance):
         exact = MapProblem(
             PoseState(rotation, translation, P),
             inverse(P),
-            RangeCost(true, weights, anchors, tags, None, tag_variance, unit),
+            RangeCost(true, weights, anchors, tags, SQUARES, tag_variance, unit),
         )
         hessian = exact(rotation, translation).hessian
         for axis in range(6):

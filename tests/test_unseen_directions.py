@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, estimators, metrics, motion, ranging
+from rbl_gym import bounds, estimators, metrics, motion
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.iekf import doa_filter, manifold
 from rbl_gym.estimators.iekf.manifold import PoseState
 from rbl_gym.geometry import bodies, rotations
-from rbl_gym.measurements import bearing
+from rbl_gym.measurements import bearing, ranging
 from tests.helpers import simulate
 
 ANCHORS = np.array(

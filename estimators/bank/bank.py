@@ -7,7 +7,6 @@ the ranges of late contradict the leader. Trials without rivals cost what the it
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -30,12 +29,9 @@ from rbl_gym.estimators.bank.hypotheses import (
     with_best,
     with_rivals,
 )
-from rbl_gym.estimators.costs.range_cost import cut_huber
-from rbl_gym.estimators.costs.unseen_directions import kept_wide
+from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief, register
-from rbl_gym.estimators.iekf.manifold import TRAILING, IteratedEkf, PoseState, as_state, block_size
-from rbl_gym.estimators.iekf.manifold import update_in_blocks as in_blocks
-from rbl_gym.estimators.iekf.robust_update import GATE, HUBER
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state, update_pose
 from rbl_gym.estimators.inputs import check_batches, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
@@ -154,6 +150,7 @@ class IteratedEkfBank:
         prior = flat(state, batch)
         epoch = _Epoch(*(rows_of(a, batch) for a in (ranges, weights, anchors)))
         led = self._scored(leader_of(prior), epoch)
+        as_state(*led[:3])
         count = (epoch.weights > 0).sum(axis=(-2, -1))
         state = prior._replace(
             rotation=led.rotation,
@@ -210,22 +207,11 @@ class IteratedEkfBank:
         epoch: _Epoch,
         start: tuple[FloatArray, FloatArray] | None = None,
     ) -> _Scored:
-        """The update of trials (B,), with its cost."""
-
-        def update(state: PoseState, *arrays: FloatArray) -> _Scored:
-            problem, found = self._filter.solve(state, *arrays[:3], start=arrays[3:] or None)  # pyright: ignore[reportArgumentType]
-            cost = found.at.cost
-            if self.robust:
-                # A link that contradicts the pose costs so much and no more, whoever leaves it out.
-                data = dataclasses.replace(problem.data, loss=cut_huber(HUBER, GATE))
-                whole = dataclasses.replace(problem, data=data)
-                cost = whole(found.rotation, found.translation).cost
-            heard = (arrays[1] > 0).any(axis=-2)
-            after: PoseState = kept_wide(state, as_state(found), heard, self.tags)
-            return _Scored._make([*after, cost])
-
-        arrays, trailing = [*prior, *epoch, *(start or ())], (*TRAILING, 2, 1)
-        return in_blocks(update, arrays, trailing[: len(arrays)], block_size(epoch.ranges))
+        """The update of trials (B,), with its cost; NaN where it has none."""
+        start = start or self._filter.start(prior, *epoch)
+        return _Scored(
+            *update_pose(*prior, *epoch, self.tags, *start, self.iterations, self.robust)
+        )
 
     def _weigh_rivals(
         self, prior: BankState, state: BankState, led: _Scored, epoch: _Epoch
@@ -267,19 +253,21 @@ class IteratedEkfBank:
         before = PoseState(
             *(
                 np.where(own.reshape(-1, *[1] * n), old[rows][trial], new)
-                for old, new, n in zip(leader_of(prior), wide, TRAILING[:3], strict=True)
+                for old, new, n in zip(leader_of(prior), wide, (2, 1, 2), strict=True)
             )
         )
         nis = state.nis.copy()
         nis[rows] = state.links[rows]
         state = state._replace(nis=nis)
-        if not len(trial):
+        scored = self._scored(before, part.take(trial), (rotation, translation))
+        # Of anchors so far apart that rounding hides what they tell there may be none.
+        found = np.isfinite(scored.cost)
+        if not found.any():
             return state
-        try:
-            scored = self._scored(before, part.take(trial), (rotation, translation))
-        except np.linalg.LinAlgError:
-            # Anchors so far apart that rounding hides what they tell: nothing is found here.
-            return state
+        known[known] = found
+        trial, own = trial[found], own[found]
+        scored = _Scored(*(a[found] for a in scored))
+        before = PoseState(*(a[found] for a in before))
         leader = _Scored(*(a[rows] for a in led))
         odds = _log_likelihood(before.covariance, scored)
         odds -= _log_likelihood(prior.covariance[rows], leader)[trial]

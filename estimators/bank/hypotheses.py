@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.estimators.iekf.manifold import PoseState
+from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.geometry.rotations import error as rotation_error
 
 RIVALS = 3

@@ -18,7 +18,7 @@ import numpy as np
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, minimize_pose
-from rbl_gym.estimators.costs.range_cost import huber
+from rbl_gym.estimators.costs.range_cost import huber, loss_of
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations
@@ -147,7 +147,7 @@ class BiasProblem:
         variance = np.diagonal(self._own, axis1=-2, axis2=-1) + self.variance
         if P is not None:
             variance = variance + np.einsum("...la,...ab,...lb->...l", H, P, H)
-        return huber(threshold)(nu**2 / variance)[1]
+        return loss_of((nu**2 / variance)[..., None], huber(threshold))[1][..., 0]
 
 
 def sums_of(n_twist: int, n_laws: int, links: int) -> FloatArray:

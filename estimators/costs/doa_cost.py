@@ -8,27 +8,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
+from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
-from rbl_gym.components import cross, first, last, trials_last
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization
-from rbl_gym.estimators.costs.range_cost import Loss, weighed
+from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, loss_of
 from rbl_gym.measurements import bearing
-
-
-class Cost(Protocol):
-    """What a pose problem is made of: callable on poses, and its arrays can be picked from."""
-
-    def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """Cost, gradient and Gauss-Newton Hessian at poses."""
-        ...
-
-    def each(self, function: Callable[[FloatArray, int], FloatArray]) -> Cost:
-        """The cost with a function of (array, number of trailing axes) applied to its arrays."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,42 +31,44 @@ class DoaCost:
     station
         (..., 3), the base station, metres.
     loss
-        Of the squared whitened residuals; None: half of them (least squares).
+        Of the squared whitened residuals, (..., 3), as of `range_cost.loss_of`.
     """
 
     angles: FloatArray
     weights: FloatArray
     tags: FloatArray
     station: FloatArray
-    loss: Loss | None = None
+    loss: FloatArray = dataclasses.field(default_factory=lambda: SQUARES)
 
-    def __post_init__(self) -> None:
-        for name, trailing in (("angles", 2), ("weights", 2), ("tags", 2), ("station", 1)):
-            object.__setattr__(self, name, trials_last(getattr(self, name), trailing))
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The shape of the leading axes."""
+        arrays = (self.angles.shape[:-2], self.weights.shape[:-2], self.tags.shape[:-2])
+        return np.broadcast_shapes(*arrays, self.station.shape[:-1], self.loss.shape[:-1])
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
-        ndim = max(
-            rotation.ndim - 2, translation.ndim - 1, self.angles.ndim - 2,
-            self.weights.ndim - 2, self.tags.ndim - 2, self.station.ndim - 1,
-        )  # fmt: skip
-        tags = first(self.tags, 2, ndim).swapaxes(0, 1)
-        turned = np.einsum("ij...,jn...->in...", first(rotation, 2, ndim), tags)
-        away = first(translation, 1, ndim) - first(self.station, 1, ndim)
-        found, gradient = bearing.linearize(turned + away[:, None])
-        root = np.sqrt(first(self.weights, 2, ndim))
-        whitened = root * (found - first(self.angles, 2, ndim))
-        cost, root, whitened = weighed(self.loss, root, whitened)
-        # A place moves by w x Q c + v: the derivative of an angle is (Q c x g, g).
-        rows = np.empty((6, *whitened.shape))
-        np.multiply(gradient.swapaxes(0, 1), root, out=rows[3:])
-        for angle in (0, 1):
-            rows[:3, angle] = cross(turned, rows[3:, angle][:, None])[:, 0]
-        return Linearization(
-            cost,
-            last(np.einsum("ian...,an...->i...", rows, whitened), 1),
-            last(np.einsum("ian...,jan...->ij...", rows, rows), 2),
+        turned = self.tags @ np.swapaxes(rotation, -1, -2)
+        places = turned + (translation - self.station)[..., None, :]
+        residual = np.where(self.weights > 0, bearing.angles(places) - self.angles, 0.0)
+        cost, share = loss_of(self.weights * residual**2, self.loss)
+        # The angles' derivative by the places, times that of the places by the pose.
+        J = (
+            bearing.jacobian(places)[..., None, :]
+            @ bounds.tag_jacobian(rotation, self.tags)[..., None, :, :, :]
         )
+        rows = J[..., 0, :].reshape((*residual.shape[:-2], -1, 6))
+        weighted = rows * (self.weights * share).reshape((*residual.shape[:-2], -1, 1))
+        flat = residual.reshape((*residual.shape[:-2], -1, 1))
+        return Linearization(
+            cost.sum(axis=(-2, -1)),
+            (np.swapaxes(weighted, -1, -2) @ flat)[..., 0],
+            np.swapaxes(weighted, -1, -2) @ rows,
+        )
+
+    def with_loss(self, loss: FloatArray) -> DoaCost:
+        """The cost by another loss."""
+        return dataclasses.replace(self, loss=loss)
 
     def each(self, function: Callable[[FloatArray, int], FloatArray]) -> DoaCost:
         """The cost with a function of (array, number of trailing axes) applied to its arrays."""
@@ -89,6 +78,7 @@ class DoaCost:
             weights=function(self.weights, 2),
             tags=function(self.tags, 2),
             station=function(self.station, 1),
+            loss=function(self.loss, 1),
         )
 
 
@@ -96,12 +86,21 @@ class DoaCost:
 class SumCost:
     """Several costs of one pose together, such as angles and ranges of one epoch."""
 
-    parts: tuple[Cost, ...]
+    parts: tuple[DoaCost | RangeCost, ...]
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The shape of the leading axes."""
+        return np.broadcast_shapes(*(part.batch for part in self.parts))
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """The sum of the parts."""
         at = [part(rotation, translation) for part in self.parts]
         return Linearization._make(sum(fields[1:], fields[0]) for fields in zip(*at, strict=True))
+
+    def with_loss(self, loss: FloatArray) -> SumCost:
+        """The sum of the parts by another loss."""
+        return SumCost(tuple(dataclasses.replace(part, loss=loss) for part in self.parts))
 
     def each(self, function: Callable[[FloatArray, int], FloatArray]) -> SumCost:
         """The sum of the parts with a function applied to their arrays."""

@@ -7,8 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.components import exp, first, last, product, solve
+from rbl_gym.checks import BoolArray, FloatArray, kernel
+from rbl_gym.geometry import rotations
+
+# Behind the door: what comes to it was made here.
+_EXP = kernel(rotations.exp)
 
 # No step is longer (rad, m) on any axis.
 _LONGEST = 1e12
@@ -50,7 +53,7 @@ def minimize_pose(
     rotation, translation
         The starts, (..., 3, 3) and (..., 3).
     iterations
-        At the most; stops when every trial has converged.
+        At the most; a trial stands still once it has converged.
     tolerance
         On the length of the step in standard deviations, the Hessian taken as information.
         The step is still taken, and near the minimum leaves its square behind.
@@ -62,31 +65,36 @@ def minimize_pose(
     damping = np.zeros(batch)
     converged = np.zeros(batch, bool)
     for _ in range(iterations):
-        gradient = first(at.gradient, 1)
+        step = -damped_solution(at.hessian, at.gradient, damping)
         # Where next to nothing is determined a step may be too long for its own square.
-        step = np.clip(-solve(first(at.hessian, 2), gradient, damping), -_LONGEST, _LONGEST)
-        turned = product(exp(step[:3]), first(rotation, 2))
-        candidate = last(turned, 2), translation + last(step[3:], 1)
-        new = linearize(*candidate)
+        step = np.clip(step, -_LONGEST, _LONGEST)
+        turned, moved = _EXP(step[..., :3]) @ rotation, translation + step[..., 3:]
+        new = linearize(turned, moved)
         # Damping shortens the step by about 1 + damping: a short step alone proves nothing.
-        decrease = -np.einsum("i...,i...->...", gradient, step) * (1 + damping)
-        converged = decrease < tolerance**2
+        decrease = -np.einsum("...i,...i->...", at.gradient, step) * (1 + damping)
         # A step of 1e-4 standard deviations changes the cost by less than rounding may.
         better = (new.cost <= at.cost * (1 + 1e-12)) | (decrease < 1e-8)
-        if better.all():
-            (rotation, translation), at = candidate, new
-            if damping.any():
-                damping = np.where(damping > 1e-5, 0.1 * damping, 0.0)
-        else:
-            rotation = np.where(better[..., None, None], candidate[0], rotation)
-            translation = np.where(better[..., None], candidate[1], translation)
-            at = Linearization(
-                np.where(better, new.cost, at.cost),
-                np.where(better[..., None], new.gradient, at.gradient),
-                np.where(better[..., None, None], new.hessian, at.hessian),
-            )
-            eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
-            damping = np.where(better, eased, np.maximum(10 * damping, 1e-3))
+        taken = better & ~converged
+        rotation = np.where(taken[..., None, None], turned, rotation)
+        translation = np.where(taken[..., None], moved, translation)
+        at = Linearization(
+            np.where(taken, new.cost, at.cost),
+            np.where(taken[..., None], new.gradient, at.gradient),
+            np.where(taken[..., None, None], new.hessian, at.hessian),
+        )
+        eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
+        damping = np.where(better, eased, np.maximum(10 * damping, 1e-3))
+        converged = converged | (decrease < tolerance**2)
         if converged.all():
             break
     return Solution(rotation, translation, at, converged)
+
+
+def damped_solution(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:
+    """Solution (..., n) of ``(A + damping diag(A)) x = b``, A (..., n, n) positive semidefinite.
+
+    A diagonal that is not zero is raised by 1e-14 of itself: singular matrices solve too.
+    """
+    diagonal = np.einsum("...ii->...i", A)
+    raised = (damping[..., None] + 1e-14) * diagonal + 1e-300
+    return np.linalg.solve(A + raised[..., None] * np.eye(A.shape[-1]), b[..., None])[..., 0]

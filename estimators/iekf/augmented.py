@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rbl_gym import bounds
 from rbl_gym.bounds.twist import predict_covariance
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
-from rbl_gym.components import first, inverse, last, left_jacobian_inverse, log, product
 from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
+from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
 from rbl_gym.estimators.filter import PoseBelief, register
-from rbl_gym.estimators.iekf.manifold import IteratedEkf, PoseState
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.inputs import check_batches, check_epoch, epoch_variance, plain
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
@@ -243,26 +244,20 @@ def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> 
 
 def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
     """The state once its pose is known better: the others follow by their correlation with it."""
-    ndim = pose.translation.ndim - 1
-    P, new = first(state.covariance, 2, ndim), first(pose.covariance, 2, ndim)
-    before, after = (first(a.rotation, 2, ndim) for a in (state, pose))
-    turn = log(product(after, before.swapaxes(0, 1)))
-    shift = first(pose.translation, 1, ndim) - first(state.translation, 1, ndim)
-    across = P[6:, :6]
-    gain = product(across, inverse(P[:6, :6]))
-    moved = np.einsum("ij...,j...->i...", gain, np.concatenate([turn, shift]))
+    P, new = state.covariance, pose.covariance
+    turn = rotations.error(pose.rotation, state.rotation)
+    error, D = pose_error(turn, pose.translation - state.translation)
+    gain = P[..., 6:, :6] @ positive_inverse(P[..., :6, :6])
     # An error of the new pose is one of the old times blkdiag(Jl^-1, I).
-    slope = np.broadcast_to(gain, (*gain.shape[:2], *new.shape[2:])).copy()
-    slope[:, :3] = product(gain[:, :3], left_jacobian_inverse(turn))
-    covariance = np.empty((*P.shape[:2], *new.shape[2:]))
-    covariance[:6, :6] = new
-    covariance[6:, :6] = product(slope, new)
-    covariance[:6, 6:] = covariance[6:, :6].swapaxes(0, 1)
-    kept = P[6:, 6:] - product(gain, across.swapaxes(0, 1))
-    kept = kept + product(covariance[6:, :6], slope.swapaxes(0, 1))
-    covariance[6:, 6:] = 0.5 * (kept + kept.swapaxes(0, 1))
-    extra = state.extra + last(moved, 1)
-    return AugmentedState(pose.rotation, pose.translation, extra, last(covariance, 2))
+    slope = gain @ D
+    across = slope @ new
+    kept = P[..., 6:, 6:] - gain @ P[..., :6, 6:] + across @ np.swapaxes(slope, -1, -2)
+    covariance = np.empty((*new.shape[:-2], *P.shape[-2:]))
+    covariance[..., :6, :6] = new
+    covariance[..., 6:, :6], covariance[..., :6, 6:] = across, np.swapaxes(across, -1, -2)
+    covariance[..., 6:, 6:] = bounds.symmetric(kept)
+    extra = state.extra + (gain @ error[..., None])[..., 0]
+    return AugmentedState(pose.rotation, pose.translation, extra, covariance)
 
 
 def iekf_cv(

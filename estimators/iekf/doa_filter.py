@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,19 +12,19 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 from rbl_gym.estimators.costs.doa_cost import DoaCost, SumCost
-from rbl_gym.estimators.costs.range_cost import Index, Loss, RangeCost, huber
-from rbl_gym.estimators.costs.unseen_directions import kept_wide
-from rbl_gym.estimators.filter import register
-from rbl_gym.estimators.iekf.manifold import (
-    IteratedEkf,
+from rbl_gym.estimators.costs.map_problem import (
     MapProblem,
     PoseState,
     map_problem,
-    posterior,
-    update_in_blocks,
+    minimize,
+    positive_inverse,
 )
+from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, huber
+from rbl_gym.estimators.costs.unseen_directions import kept_wide
+from rbl_gym.estimators.filter import register
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state
 from rbl_gym.estimators.iekf.robust_update import HUBER
-from rbl_gym.estimators.iekf.vague_start import best_start, global_start, is_vague, settles, spread
+from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, settles, spread
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.locating.doa_global import global_search
 from rbl_gym.measurements import bearing
@@ -32,8 +32,6 @@ from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
 MEASUREMENTS = ("ranges", "doa")
-# Trials that are updated at once.
-_BLOCK = 512
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +109,9 @@ class DoaEkf(IteratedEkf):
         weights = 1 / law.variance(angles)
         if heard is not None:
             weights = weights * heard[..., None, :]
-        epoch, trailing = [*state, angles, weights, station], [2, 1, 2, 2, 2, 1]
+        loss = huber(HUBER) if self.robust else SQUARES
+        measured = (weights > 0).any(axis=-2)
+        data: DoaCost | SumCost = DoaCost(angles, weights, self.tags, station, loss)
         if ranges is not None:
             range_law = self.range_noise if range_noise is None else range_noise
             if range_law is None:
@@ -121,77 +121,56 @@ class DoaEkf(IteratedEkf):
             of_ranges = 1 / check_variance(range_law.variance(ranges, mask), mask)
             shape = np.broadcast_shapes(of_ranges.shape, ranges.shape)
             of_ranges = np.broadcast_to(of_ranges, shape)
-            epoch += [ranges, of_ranges if mask is None else of_ranges * mask, anchors]
-            trailing += [2, 2, 2]
-        size = _BLOCK if self.tags.ndim == 2 else math.inf
-        return update_in_blocks(self._update_angles, epoch, trailing, size)
+            of_ranges = of_ranges if mask is None else of_ranges * mask
+            measured = measured | (of_ranges > 0).any(axis=-2)
+            data = SumCost((data, RangeCost(ranges, of_ranges, anchors, self.tags, loss)))
+        problem = map_problem(state, data)
+        found = minimize(problem, *self._start(problem, data), self.iterations)
+        covariance = positive_inverse(found.at.hessian)
+        pose = as_state(found.rotation, found.translation, covariance)
+        return kept_wide(state, pose, measured, self.tags)
 
     @functools.cached_property
     def _has_rotation(self) -> bool:
         return self.tags.shape[-2] > 2 and bool((spanned_dimensions(self.tags) > 1).all())
 
-    def _update_angles(
-        self,
-        state: PoseState,
-        angles: FloatArray,
-        weights: FloatArray,
-        station: FloatArray,
-        *of_ranges: FloatArray,
-    ) -> PoseState:
-        """The update of one block of trials; `of_ranges`: ranges, their weights, the anchors."""
-
-        def problem_by(loss: Loss | None) -> MapProblem:
-            data: DoaCost | SumCost = DoaCost(angles, weights, self.tags, station, loss)
-            if of_ranges:
-                ranges, range_weights, anchors = of_ranges
-                cost = RangeCost(ranges, range_weights, anchors, self.tags, loss, lift=self._lift)
-                data = SumCost((data, cost))
-            return map_problem(state, data)
-
-        problem = problem_by(huber(HUBER) if self.robust else None)
-        start = problem.prior.rotation, problem.prior.translation
-        vague = is_vague(state.covariance)
-        if vague.any():
-            others = (array.shape[:-2] for array in (angles, weights, *of_ranges, self.tags))
-            batch = np.broadcast_shapes(vague.shape, station.shape[:-1], *others)
-            sought = settles(problem_by(None), vague, batch)
-            if sought.any():
-                search = _best_of_angles if self._has_rotation else _best_of_spread
-                start = global_start(problem, sought, batch, search)
-        heard = (weights > 0).any(axis=-2)
-        if of_ranges:
-            heard = heard | (of_ranges[1] > 0).any(axis=-2)
-        return kept_wide(state, posterior(problem, *start, self.iterations), heard, self.tags)
+    def _start(self, problem: MapProblem, data: DoaCost | SumCost) -> tuple[FloatArray, FloatArray]:
+        """The prior, or what a search finds where that is vague in what the epoch determines."""
+        vague = is_vague(problem.prior.covariance)
+        if not vague.any():
+            return problem.prior.rotation, problem.prior.translation
+        batch = np.broadcast_shapes(vague.shape, data.batch)
+        plain = dataclasses.replace(problem, data=data.with_loss(SQUARES))
+        sought = settles(plain, vague, batch)
+        if not sought.any():
+            return problem.prior.rotation, problem.prior.translation
+        starts = _starts_of_angles if self._has_rotation else _spread_of_prior
+        return global_start(problem, sought, batch, starts)
 
 
-def _best_of_angles(
-    problem: MapProblem, batch: tuple[int, ...], where: Index
-) -> tuple[FloatArray, FloatArray]:
-    """The best solve from the prior, the global solution of the angles, and its alternatives."""
-    part = problem.take(batch, where)
-    data: Any = part.data.parts[0] if isinstance(part.data, SumCost) else part.data
-    best, others = global_search(data.angles, data.weights, data.tags, None)
+def _starts_of_angles(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
+    """Poses (K, S, ...): the prior, the global solution of the angles, and its alternatives.
+
+    `problem`: trials (K, 1).
+    """
+    prior, data = problem.prior, problem.data
+    of_angles: Any = data.parts[0] if isinstance(data, SumCost) else data
+    angles = of_angles.angles[:, 0], of_angles.weights[:, 0], of_angles.tags[:, 0]
+    best, others = global_search(*angles, None)
     missing = np.isinf(others.cost)
     rotation = np.where(missing[..., None, None], best.rotation[:, None], others.rotation)
     translation = np.where(missing[..., None], best.translation[:, None], others.translation)
-    translation, shift = translation + data.station[:, None], best.translation + data.station
-    return best_start(
-        problem,
-        batch,
-        where,
-        np.stack([*np.moveaxis(rotation, 1, 0), best.rotation, part.prior.rotation], axis=1),
-        np.stack([*np.moveaxis(translation, 1, 0), shift, part.prior.translation], axis=1),
+    translation = np.concatenate([translation, best.translation[:, None]], axis=1)
+    return (
+        np.concatenate([rotation, best.rotation[:, None], prior.rotation], axis=1),
+        np.concatenate([translation + of_angles.station, prior.translation], axis=1),
     )
 
 
-def _best_of_spread(
-    problem: MapProblem, batch: tuple[int, ...], where: Index
-) -> tuple[FloatArray, FloatArray]:
-    """The best solve from the prior's place, turned as far as the prior is wide."""
-    prior = problem.take(batch, where).prior
-    rotation = spread(prior)
-    translation = np.broadcast_to(prior.translation[:, None], rotation.shape[:-1])
-    return best_start(problem, batch, where, rotation, translation)
+def _spread_of_prior(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
+    """Poses (K, S, ...) at the prior's place, turned as far as the prior is wide."""
+    rotation = spread(problem.prior)
+    return rotation, np.broadcast_to(problem.prior.translation, rotation.shape[:-1])
 
 
 def _check_station(station: ArrayLike) -> FloatArray:

@@ -7,58 +7,35 @@ filters of the tracking paper, which project ``|s|^2`` out, cannot.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym import bounds
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count, check_number
-from rbl_gym.components import (
-    exp_and_left_jacobian,
-    first,
-    inverse,
-    last,
-    left_jacobian_inverse,
-    log,
-    product,
-    trials_last,
-    whole_rows,
-)
-from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
-from rbl_gym.estimators.costs.range_cost import Index, RangeCost, huber, lift_map, pick
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count, check_number, kernel
+from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positive_inverse
+from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import PoseBelief
-from rbl_gym.estimators.iekf.robust_update import HUBER, robust_solution
-from rbl_gym.estimators.iekf.vague_start import best_of_net, global_start, is_vague, settles
+from rbl_gym.estimators.iekf.robust_update import GATE, HUBER, robust_solution
+from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, net_of_starts, settles
 from rbl_gym.estimators.inputs import (
     check_batches,
     check_covariance,
     check_epoch,
     epoch_variance,
-    plain,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements.ranging import NoiseLaw
-from rbl_gym.motion.kinematics import ProcessNoise, propagate
+from rbl_gym.motion.kinematics import ProcessNoise
 
-# At most so many trials, and so many links, are updated at once: the temporaries of a block
-# then stay in the cache.
-_BLOCK, _BLOCK_LINKS = 1024, 32_000
-# Trailing axes of rotation, translation, covariance, ranges, weights, anchors.
-TRAILING = (2, 1, 2, 2, 2, 2)
-
-
-class PoseState(NamedTuple):
-    """Pose and covariance, (..., 3, 3), (..., 3), (..., 6, 6) of the error (w, v)."""
-
-    rotation: FloatArray
-    translation: FloatArray
-    covariance: FloatArray
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +69,9 @@ class IteratedEkf:
             raise ValueError(f"robust must be True or False, got {self.robust!r}")
 
     @functools.cached_property
-    def _lift(self) -> FloatArray | None:
-        return lift_map(self.tags) if self.tags.ndim == 2 else None
+    def _variance(self) -> FloatArray:
+        """Variances (6,) of the motion's noise after 1 s."""
+        return self.process.std() ** 2
 
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
@@ -121,12 +99,8 @@ class IteratedEkf:
         """State after `dt` seconds of the twist (..., 6), ``P <- F P F^T + Q``."""
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
-        if state.translation.ndim > 1 or twist.ndim > 1:
-            return _predict_many(state, twist, dt, self.process)
-        state = plain(state)
-        rotation, translation = propagate(state.rotation, state.translation, twist, dt)
-        covariance = bounds.predict_covariance(state.covariance, twist, dt, self.process)
-        return PoseState(rotation, translation, covariance)
+        check_batches(state=state.translation.shape[:-1], twist=twist.shape[:-1])
+        return PoseState(*predict_pose(*state, twist, dt, self._variance))
 
     def update(
         self,
@@ -150,10 +124,15 @@ class IteratedEkf:
             On wrong shapes, NaN, ranges that are not positive.
         """
         ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
-        check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
-        epoch = (*plain(state), ranges, weights, anchors)
-        size = block_size(ranges) if self.tags.ndim == 2 else math.inf
-        return update_in_blocks(self._update, epoch, TRAILING, size)
+        batch = state.translation.shape[:-1]
+        check_batches(state=batch, ranges=ranges.shape[:-2])
+        check_batches(state=batch, anchors=anchors.shape[:-2])
+        start = self.start(state, ranges, weights, anchors)
+        return as_state(
+            *update_pose(
+                *state, ranges, weights, anchors, self.tags, *start, self.iterations, self.robust
+            )[:3]
+        )
 
     def weighed(
         self,
@@ -165,38 +144,19 @@ class IteratedEkf:
         """A checked epoch as (ranges, weights, anchors): inverse variances, 0 of lost links."""
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
         weights = 1 / epoch_variance(noise, self.noise, ranges, mask)
-        weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
+        if weights.shape[-2:] != ranges.shape[-2:]:
+            weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
         return ranges, weights if mask is None else weights * mask, anchors
 
-    @whole_rows()
-    def _update(
+    def start(
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
-    ) -> PoseState:
-        """The update of one block of trials, links as weights (..., M, N)."""
-        found = as_state(self.solve(state, ranges, weights, anchors)[1])
-        return kept_wide(state, found, (weights > 0).any(axis=-2), self.tags)
-
-    def solve(
-        self,
-        state: PoseState,
-        ranges: FloatArray,
-        weights: FloatArray,
-        anchors: FloatArray,
-        start: tuple[FloatArray, FloatArray] | None = None,
-    ) -> tuple[MapProblem, Solution]:
-        """The problem of an update and its solution near a start, None: near the prior."""
-        loss = huber(HUBER) if self.robust else None
-        data = RangeCost(ranges, weights, anchors, self.tags, loss, lift=self._lift)
-        problem = map_problem(state, data)
-        if start is None:
-            start = problem.prior.rotation, problem.prior.translation
-            sought = self.is_sought(state, ranges, weights, anchors)
-            if sought.any():
-                start = global_start(problem, sought, sought.shape, best_of_net)
-        found = (robust_solution if self.robust else minimize_pose)(
-            problem, *start, self.iterations
-        )
-        return problem, found
+    ) -> tuple[FloatArray, FloatArray]:
+        """Where an update of a checked epoch starts from: the prior, or what a search finds."""
+        sought = self.is_sought(state, ranges, weights, anchors)
+        if not sought.any():
+            return state.rotation, state.translation
+        problem = map_problem(state, RangeCost(ranges, weights, anchors, self.tags))
+        return global_start(problem, sought, sought.shape, net_of_starts)
 
     def is_sought(
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
@@ -205,9 +165,8 @@ class IteratedEkf:
         vague = is_vague(state.covariance)
         if not vague.any():
             return vague
-        others = (array.shape[:-2] for array in (ranges, weights, anchors, self.tags))
-        batch = np.broadcast_shapes(vague.shape, state.translation.shape[:-1], *others)
-        data = RangeCost(ranges, weights, anchors, self.tags, lift=self._lift)
+        data = RangeCost(ranges, weights, anchors, self.tags)
+        batch = np.broadcast_shapes(vague.shape, state.translation.shape[:-1], data.batch)
         return settles(map_problem(state, data), vague, batch)
 
     def belief(self, state: PoseState) -> PoseBelief:
@@ -216,137 +175,84 @@ class IteratedEkf:
         return PoseBelief(rotation, state.translation.copy(), state.covariance.copy(), rotation)
 
 
-@whole_rows()
-def _predict_many(
-    state: PoseState, twist: FloatArray, dt: float, process: ProcessNoise
-) -> PoseState:
-    """`IteratedEkf.predict` by components: exp(w) and its left Jacobian from one series."""
-    batch = np.broadcast_shapes(state.translation.shape[:-1], twist.shape[:-1])
-    ndim = len(batch)
-    twist = first(trials_last(twist, 1), 1, ndim)
-    turn, jacobian = exp_and_left_jacobian(twist[:3] * dt)
-    P = first(trials_last(state.covariance, 2), 2, ndim)
-    variance = dt * process.std() ** 2
-    top = product(turn, P[:3])
-    covariance = np.empty((6, 6, *batch))
-    covariance[:3, :3] = product(top[:, :3], turn.swapaxes(0, 1))
-    spread = jacobian * variance[:3].reshape((3, *[1] * ndim))
-    covariance[:3, :3] += product(spread, jacobian.swapaxes(0, 1))
-    covariance[:3, 3:] = top[:, 3:]
-    covariance[3:, :3] = top[:, 3:].swapaxes(0, 1)
-    covariance[3:, 3:] = P[3:, 3:]
-    for i in range(3, 6):
-        covariance[i, i] += variance[i]
-    rotation = product(turn, first(trials_last(state.rotation, 2), 2, ndim))
-    translation = first(state.translation, 1, ndim) + twist[3:] * dt
-    return PoseState(last(rotation, 2), last(translation, 1), last(covariance, 2))
+@compiled("pose_filter:predict")
+def predict_pose(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    twist: FloatArray,
+    dt: float,
+    variance: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pose and covariance after `dt` seconds of a twist, ``P <- F P F^T + dt G S G^T``.
 
-
-def update_in_blocks(
-    update: Callable[..., Any],
-    epoch: Sequence[FloatArray],
-    trailing: Sequence[int],
-    size: float,
-) -> Any:
-    """`update` (state, arrays ...) over at most `size` trials at once; returns what it returns.
-
-    `epoch`: the state's arrays and those of the measurements, each with so many `trailing` axes.
+    ``F = blkdiag(exp(w dt), I)`` and ``G = blkdiag(Jl(w dt), I)``: the error is global, and the
+    noise, of `variance` (6,) after 1 s, is on the angular velocity.
     """
-    batch = np.broadcast_shapes(
-        *(a.shape[: a.ndim - n] for a, n in zip(epoch, trailing, strict=True))
+    dt = np.asarray(dt)[..., None]
+    turn = twist[..., :3] * dt
+    F, G = (np.broadcast_to(np.eye(6), (*turn.shape[:-1], 6, 6)).copy() for _ in range(2))
+    F[..., :3, :3], G[..., :3, :3] = _EXP(turn), _LEFT_JACOBIAN(turn)
+    spread = (G * (dt * variance)[..., None, :]) @ np.swapaxes(G, -1, -2)
+    return (
+        F[..., :3, :3] @ rotation,
+        translation + twist[..., 3:] * dt,
+        F @ covariance @ np.swapaxes(F, -1, -2) + spread,
     )
-    if math.prod(batch) <= size:
-        return update(PoseState(*epoch[:3]), *epoch[3:])
-    flat = [_flatten(a, n, batch) for a, n in zip(epoch, trailing, strict=True)]
-    parts = []
-    for start in range(0, math.prod(batch), int(size)):
-        block = [a if len(a) == 1 else a[start : start + int(size)] for a in flat]
-        parts.append(update(PoseState(*block[:3]), *block[3:]))
-    joined = (np.concatenate(fields) for fields in zip(*parts, strict=True))
-    return type(parts[0])(*(a.reshape((*batch, *a.shape[1:])) for a in joined))
 
 
-def block_size(ranges: FloatArray) -> int:
-    """How many trials of ranges (..., M, N) to update at once."""
-    return min(_BLOCK, 1 + _BLOCK_LINKS // math.prod(ranges.shape[-2:]))
+@compiled("pose_filter:update")
+def update_pose(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    ranges: FloatArray,
+    weights: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    start_rotation: FloatArray,
+    start_translation: FloatArray,
+    iterations: int,
+    robust: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The most likely pose of an epoch near a start, its covariance, and the cost there.
 
+    Parameters
+    ----------
+    rotation, translation, covariance
+        The prior.
+    ranges, weights, anchors, tags
+        As of `RangeCost`.
+    start_rotation, start_translation
+        Where Gauss-Newton starts.
+    iterations
+        Of Gauss-Newton, at the most.
+    robust
+        Whether links may be wrong: see `robust_update`. The cost is then that of Huber's loss,
+        constant beyond `GATE`, of all links.
 
-def map_problem(state: PoseState, data: Any) -> MapProblem:
-    """The problem of an update: a prior and the cost of what was measured."""
-    prior = PoseState(*(trials_last(a, n) for a, n in zip(state, TRAILING[:3], strict=True)))
-    return MapProblem(prior, last(inverse(first(prior.covariance, 2)), 2), data)
-
-
-def posterior(
-    problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
-) -> PoseState:
-    """The most likely pose near a start, with the covariance there."""
-    return as_state(minimize_pose(problem, rotation, translation, iterations=iterations))
-
-
-def as_state(found: Solution) -> PoseState:
-    """A solution with the covariance there."""
-    covariance = last(inverse(first(found.at.hessian, 2)), 2)
-    fields = found.rotation, found.translation, covariance
-    return PoseState(*(np.array(field, order="C") for field in fields))
-
-
-@dataclass(frozen=True, eq=False)
-class MapProblem:
-    """Maximum a posteriori pose of one epoch; arrays with leading batch axes.
-
-    `data` is the cost of the measurements (`RangeCost`, `doa_cost.DoaCost`, or a sum of costs).
-    Cost: that of the measurements plus half the prior's Mahalanobis distance, residual
-    ``(log(Q Q_pred^T), t - t_pred)``.
+    Returns
+    -------
+    Rotation, translation, covariance (NaN where a matrix is not positive definite), cost (...).
     """
+    prior = PoseState(rotation, translation, covariance)
+    data = RangeCost(ranges, weights, anchors, tags, SQUARES)
+    problem = map_problem(prior, data)
+    if robust:
+        found = robust_solution(problem, start_rotation, start_translation, iterations)
+        data = dataclasses.replace(data, loss=cut_huber(HUBER, GATE))
+        cost = dataclasses.replace(problem, data=data)(found.rotation, found.translation).cost
+    else:
+        found = minimize_pose(problem, start_rotation, start_translation, iterations)
+        cost = found.at.cost
+    pose = PoseState(found.rotation, found.translation, positive_inverse(found.at.hessian))
+    return *kept_wide(prior, pose, (weights > 0).any(axis=-2), tags), cost
 
-    prior: PoseState
-    prior_information: FloatArray
-    data: Any
 
-    def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
-        data = self.data(rotation, translation)
-        if rotation is self.prior.rotation and translation is self.prior.translation:
-            # Of the prior itself there is no error, and its Jacobian is the identity.
-            return data._replace(hessian=data.hessian + self.prior_information)
-        ndim = data.cost.ndim
-        information = first(self.prior_information, 2, ndim)
-        turned_back = first(self.prior.rotation, 2, ndim)
-        turn = log(product(first(rotation, 2, ndim), turned_back.swapaxes(0, 1)))
-        shift = first(translation, 1, ndim) - first(self.prior.translation, 1, ndim)
-        error = np.empty((6, *data.cost.shape))
-        error[:3], error[3:] = turn, shift
-        pull = product(information, error[:, None])[:, 0]
-        cost = data.cost + 0.5 * np.einsum("i...,i...->...", error, pull)
-        # D^T P^-1 D with D = blkdiag(Jl^-1, I), and D^T P^-1 e, added where the data's stand.
-        D = left_jacobian_inverse(turn)
-        gradient, hessian = first(data.gradient, 1), first(data.hessian, 2)
-        gradient[:3] += product(D.swapaxes(0, 1), pull[:3, None])[:, 0]
-        gradient[3:] += pull[3:]
-        pulled = product(D.swapaxes(0, 1), information[:3])
-        hessian[:3, :3] += product(pulled[:, :3], D)
-        hessian[:3, 3:] += pulled[:, 3:]
-        hessian[3:, :3] += pulled[:, 3:].swapaxes(0, 1)
-        hessian[3:, 3:] += information[3:, 3:]
-        return data._replace(cost=cost)
-
-    def take(self, batch: tuple[int, ...], where: Index) -> MapProblem:
-        """The trials (K,) at an index into the batch."""
-        prior = PoseState(
-            pick(self.prior.rotation, batch, where, 2),
-            pick(self.prior.translation, batch, where, 1),
-            pick(self.prior.covariance, batch, where, 2),
+def as_state(rotation: FloatArray, translation: FloatArray, covariance: FloatArray) -> PoseState:
+    """A state of what an update found, or a LinAlgError where its covariance is none."""
+    if not math.isfinite(np.vdot(covariance, covariance)):
+        raise np.linalg.LinAlgError(
+            "the information about the pose must be positive definite before and after an update"
         )
-        prior = PoseState(*(trials_last(a, n) for a, n in zip(prior, TRAILING[:3], strict=True)))
-        information = trials_last(pick(self.prior_information, batch, where, 2), 2)
-        data = self.data.each(lambda array, trailing: pick(array, batch, where, trailing))
-        return MapProblem(prior, information, data)
-
-
-def _flatten(array: FloatArray, trailing: int, batch: tuple[int, ...]) -> FloatArray:
-    """An array (..., n) with one batch axis (B, n), of length 1 where it has none."""
-    shape = array.shape[array.ndim - trailing :]
-    if array.ndim == trailing:
-        return array[None]
-    return np.broadcast_to(array, (*batch, *shape)).reshape((-1, *shape))
+    return PoseState(rotation, translation, covariance)

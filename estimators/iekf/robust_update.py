@@ -7,13 +7,13 @@ standard deviations: with one range in ten over a reflected path that doubles th
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
-from rbl_gym.estimators.costs.range_cost import Loss, cut_huber, squared_residuals
+from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
+from rbl_gym.estimators.costs.range_cost import RangeCost, cut_huber, huber, squared_residuals
 
 # Whitened residual at which Huber's loss turns from squares to absolute values.
 HUBER = 1.5
@@ -26,9 +26,9 @@ _LARGEST_SHARE_OUT = 0.5
 
 
 def robust_solution(
-    problem: Any, rotation: FloatArray, translation: FloatArray, iterations: int
+    problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
 ) -> Solution:
-    """The pose of most links, `minimize_pose` of a problem whose loss is Huber's.
+    """The pose of most links, `minimize_pose` of a problem on ranges (`RangeCost`).
 
     Links whose innovation no honest prior explains are left out from the start. Where the pose
     that follows tells otherwise, of links in or out, they are chosen anew from a solution by
@@ -37,92 +37,61 @@ def robust_solution(
     Parameters
     ----------
     problem
-        A `manifold.MapProblem` on ranges.
+        Its loss is not looked at.
     rotation, translation
         The starts, (..., 3, 3) and (..., 3).
     iterations
         Gauss-Newton iterations of each stage.
     """
-    data = problem.data
-    out = _beyond_gate(problem)
-    gated = problem
-    if out.any():
-        weights = np.where(out, 0.0, data.weights)
-        gated = dataclasses.replace(problem, data=dataclasses.replace(data, weights=weights))
-    found = minimize_pose(gated, rotation, translation, iterations)
-    squared = squared_residuals(data, found.rotation, found.translation)
-    wrong = ((squared > GATE**2) != out).any(axis=(-2, -1))
+    data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
+    out = _beyond_gate(problem.prior, data)
+    kept = dataclasses.replace(data, weights=np.where(out, 0.0, data.weights), loss=huber(HUBER))
+    first = minimize_pose(_with(problem, kept), rotation, translation, iterations)
+    squared = squared_residuals(data, first.rotation, first.translation)
+    wrong = np.asarray(((squared > GATE**2) != out).any(axis=(-2, -1)))
     if not wrong.any():
-        return found
-    batch = found.at.cost.shape
-    axes = batch or (1,)
-    where = np.broadcast_to(wrong, axes).nonzero()
-    found = _of_shape(found, axes)
-    better = _narrowed(problem.take(axes, where), *found[:2], where, iterations)
-    for old, new in zip(_arrays(found), _arrays(better), strict=True):
-        old[where] = new
-    return _of_shape(found, batch)
-
-
-def _narrowed(
-    part: Any,
-    rotation: FloatArray,
-    translation: FloatArray,
-    where: tuple[np.ndarray, ...],
-    iterations: int,
-) -> Solution:
-    """Some of the trials (K,) by Huber's loss, then without the links beyond each cutoff."""
-    found = minimize_pose(part, rotation[where], translation[where], iterations, tolerance=1e-2)
+        return first
+    hubers = dataclasses.replace(data, loss=huber(HUBER))
+    found = minimize_pose(_with(problem, hubers), rotation, translation, iterations, 1e-2)
     for cutoff in _CUTOFFS:
-        squared = squared_residuals(part.data, found.rotation, found.translation)
-        doubted = _contradicted(squared > cutoff**2, part.data.weights)
-        loss = cut_loss(np.where(doubted, np.inf, cutoff))
-        narrowed = dataclasses.replace(part, data=dataclasses.replace(part.data, loss=loss))
+        squared = squared_residuals(data, found.rotation, found.translation)
+        doubted = _contradicted(squared > cutoff**2, data.weights)
+        loss = cut_huber(HUBER, np.where(doubted, np.inf, cutoff))
+        narrowed = _with(problem, dataclasses.replace(data, loss=loss))
         found = minimize_pose(narrowed, found.rotation, found.translation, iterations)
-    return found
+    return Solution(
+        np.where(wrong[..., None, None], found.rotation, first.rotation),
+        np.where(wrong[..., None], found.translation, first.translation),
+        Linearization(
+            np.where(wrong, found.at.cost, first.at.cost),
+            np.where(wrong[..., None], found.at.gradient, first.at.gradient),
+            np.where(wrong[..., None, None], found.at.hessian, first.at.hessian),
+        ),
+        np.where(wrong, found.converged, first.converged),
+    )
 
 
-def cut_loss(cutoff: FloatArray) -> Loss:
-    """Huber's loss that ends at cutoffs (...), one for each trial."""
-    return cut_huber(HUBER, cutoff[..., None, None])
+def _with(problem: MapProblem, data: RangeCost) -> MapProblem:
+    return dataclasses.replace(problem, data=data)
 
 
-def _beyond_gate(problem: Any) -> BoolArray:
+def _beyond_gate(prior: PoseState, data: RangeCost) -> BoolArray:
     """Links (..., M, N) that contradict the prior; none where too many do.
 
     The variance of an innovation is at most that of the range and the square of
     ``sqrt(tr P_v) + |c| sqrt(tr P_w)``: cheap, and never too narrow.
     """
-    data, P = problem.data, problem.prior.covariance
-    spread = [
-        np.sqrt(np.einsum("...ii->...", P[..., block, block]))
+    of_rotation, of_place = (
+        np.sqrt(np.einsum("...ii->...", prior.covariance[..., block, block]))[..., None]
         for block in (slice(0, 3), slice(3, 6))
-    ]
-    arm = np.sqrt(np.einsum("...ni,...ni->...n", data.tags, data.tags))
-    reach = spread[1][..., None] + arm * spread[0][..., None]
+    )
+    reach = of_place + np.linalg.norm(data.tags, axis=-1) * of_rotation
     allowed = GATE**2 * (1 + data.weights * np.square(reach)[..., None, :])
-    squared = squared_residuals(data, problem.prior.rotation, problem.prior.translation)
-    out = squared > allowed
-    if out.any():
-        out &= ~_contradicted(out, data.weights)[..., None, None]
-    return np.asarray(out)
+    out = squared_residuals(data, prior.rotation, prior.translation) > allowed
+    return out & ~_contradicted(out, data.weights)[..., None, None]
 
 
 def _contradicted(out: BoolArray, weights: FloatArray) -> BoolArray:
     """Whether (...) more than `_LARGEST_SHARE_OUT` of the links are out."""
     links = (weights > 0).sum(axis=(-2, -1))
     return np.asarray(out.sum(axis=(-2, -1)) > _LARGEST_SHARE_OUT * links)
-
-
-def _arrays(solution: Solution) -> tuple[Any, ...]:
-    return solution.rotation, solution.translation, *solution.at, solution.converged
-
-
-def _of_shape(solution: Solution, batch: tuple[int, ...]) -> Solution:
-    """A copy of the solution with this batch shape."""
-    trailing = (2, 1, 0, 1, 2, 0)
-    fields = [
-        np.array(a).reshape((*batch, *a.shape[a.ndim - n :]))
-        for a, n in zip(_arrays(solution), trailing, strict=True)
-    ]
-    return Solution(fields[0], fields[1], Linearization(*fields[2:5]), fields[5])

@@ -2,40 +2,44 @@
 
 An update starts globally where the prior is vague in a direction that its epoch determines: at a
 first epoch, and after a track was lost. A direction that the epoch does not see stays wide, and
-needs no search. Arguments named `problem` are `manifold.MapProblem`.
+needs no search.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
-from rbl_gym.estimators.costs.range_cost import Index
+from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState, minimize
+from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.linear.squared_range import statistic
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
 # Beyond this standard deviation (rad) of the prior rotation, no single linearisation is right.
 VAGUE_ROTATION_RAD = 0.5
-# Starts that are solved from at once.
-_BLOCK = 1024
+
+_NET = rotations.log(ROTATION_NET)
+
+# What takes a problem of trials (K, 1) to poses (K, S, 3, 3), (K, S, 3) to start from.
+Starts = Callable[[MapProblem], tuple[FloatArray, FloatArray]]
 
 
 def is_vague(covariance: FloatArray) -> BoolArray:
     """Where (...) the rotation's largest variance is above that of `VAGUE_ROTATION_RAD`."""
     limit = VAGUE_ROTATION_RAD**2
     # The trace bounds the largest eigenvalue: most priors need no more.
-    vague = np.asarray(np.einsum("...ii->...", covariance[..., :3, :3]) > limit)
+    vague = np.asarray(
+        covariance[..., 0, 0] + covariance[..., 1, 1] + covariance[..., 2, 2] > limit
+    )
     if vague.any():
         vague[vague] = np.linalg.eigvalsh(covariance[vague, :3, :3])[..., -1] > limit
     return vague
 
 
-def settles(problem: Any, vague: BoolArray, batch: tuple[int, ...]) -> BoolArray:
+def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> BoolArray:
     """Where (...) an epoch determines a direction in which its prior rotation is vague.
 
     That is where the linear update leaves fewer vague directions than there were. It is tried at
@@ -53,19 +57,15 @@ def settles(problem: Any, vague: BoolArray, batch: tuple[int, ...]) -> BoolArray
     """
     # A trial alone has no axis to index: it gets one.
     axes = batch or (1,)
-    where = np.broadcast_to(vague, axes).nonzero()
-    prior = problem.take(axes, where).prior
-    values, vectors = np.linalg.eigh(prior.covariance[..., 3:, 3:])
+    where = np.broadcast_to(vague, axes)
+    part = problem.take(axes, where)
+    values, vectors = np.linalg.eigh(part.prior.covariance[:, 0, 3:, 3:])
     steps = np.swapaxes(vectors * np.sqrt(values)[..., None, :], -1, -2)
     offsets = np.concatenate([np.zeros_like(steps[:, :1]), steps, -steps], axis=1)
-    count = offsets.shape[1]
-    tried = problem.take(axes, tuple(np.repeat(axis, count) for axis in where))
-    places = prior.translation[:, None] + offsets
-    told = tried.data(tried.prior.rotation, places.reshape(-1, 3)).hessian
-    left = _vague_directions(np.linalg.inv(tried.prior_information + told))
+    told = part.data(part.prior.rotation, part.prior.translation + offsets).hessian
+    left = _vague_directions(np.linalg.inv(part.prior_information + told))
     result = np.zeros(axes, np.bool_)
-    fewer = left < _vague_directions(tried.prior.covariance)
-    result[where] = fewer.reshape(-1, count).any(axis=-1)
+    result[where] = (left < _vague_directions(part.prior.covariance)).any(axis=-1)
     return result.reshape(batch)
 
 
@@ -75,84 +75,47 @@ def _vague_directions(covariance: FloatArray) -> np.ndarray:
     return (values > VAGUE_ROTATION_RAD**2).sum(axis=-1)
 
 
-_NET = rotations.log(ROTATION_NET)
-
-
 def global_start(
-    problem: Any,
-    vague: BoolArray,
-    batch: tuple[int, ...],
-    best_of: Callable[..., tuple[FloatArray, FloatArray]],
+    problem: MapProblem, vague: BoolArray, batch: tuple[int, ...], starts: Starts
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses to start from: for vague priors what `best_of` finds, else the prior.
-
-    `best_of` takes the problem, the batch, and where in it the trials stand.
-    """
+    """Poses to start from: for vague priors the best local solve from `starts`, else the prior."""
     # A trial alone has no axis to index: it gets one for the search.
     axes = batch or (1,)
     rotation = np.broadcast_to(problem.prior.rotation, (*axes, 3, 3)).copy()
     translation = np.broadcast_to(problem.prior.translation, (*axes, 3)).copy()
-    trials = np.broadcast_to(vague, axes).nonzero()
-    size = 1 + _BLOCK // len(_NET)
-    for start in range(0, len(trials[0]), size):
-        where = tuple(axis[start : start + size] for axis in trials)
-        rotation[where], translation[where] = best_of(problem, axes, where)
+    where = np.broadcast_to(vague, axes)
+    part = problem.take(axes, where)
+    found = minimize(part, *starts(part), 12, 1e-3)
+    best = np.arange(len(found.at.cost)), np.argmin(found.at.cost, axis=1)
+    rotation[where], translation[where] = found.rotation[best], found.translation[best]
     return rotation.reshape((*batch, 3, 3)), translation.reshape((*batch, 3))
 
 
-def best_of_net(
-    problem: Any, batch: tuple[int, ...], where: Index
-) -> tuple[FloatArray, FloatArray]:
-    """The best local solve (K, 3, 3), (K, 3) of the trials at an index into the batch.
+def net_of_starts(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
+    """24 rotations spread as far as the prior is wide on each axis; with each the translation.
 
-    The net is 24 rotations spread as far as the prior is wide on each axis; every one gets
-    the translation that the squared ranges and the prior imply (a linear problem), then a few
-    Gauss-Newton steps on the full cost.
+    That is what the squared ranges and the prior imply, a linear problem. `problem` is one of
+    ranges, of trials (K, 1).
     """
-    part = problem.take(batch, where)
-    rotation = spread(part.prior)
-    translation = _translation_given(rotation, part)
-    return best_start(problem, batch, where, rotation, translation)
+    rotation = spread(problem.prior)
+    return rotation, _translation_given(rotation, problem.prior, problem.data)  # pyright: ignore[reportArgumentType]
 
 
-def best_start(
-    problem: Any,
-    batch: tuple[int, ...],
-    where: Index,
-    rotation: FloatArray,
-    translation: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """The best local solve (K, 3, 3), (K, 3) from S starts (K, S, 3, 3), (K, S, 3) each."""
-    count = rotation.shape[1]
-    # Every start is a trial of its own, so that calls run over all of them.
-    starts = problem.take(batch, tuple(np.repeat(axis, count) for axis in where))
-    solution = minimize_pose(
-        starts, rotation.reshape(-1, 3, 3), translation.reshape(-1, 3), 12, tolerance=1e-3
-    )
-    cost = solution.at.cost.reshape(-1, count)
-    best = np.arange(len(cost)) * count + np.argmin(cost, axis=1)
-    return solution.rotation[best], solution.translation[best]
-
-
-def spread(prior: Any) -> FloatArray:
-    """Rotations (K, 24, 3, 3) around priors (K, ...), on each axis as far as it is uncertain."""
+def spread(prior: PoseState) -> FloatArray:
+    """Rotations (K, 24, 3, 3) around priors (K, 1), on each axis as far as it is uncertain."""
     values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
     reach = np.minimum(np.sqrt(values) / VAGUE_ROTATION_RAD, 1.0)
     shape = (vectors * reach[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return rotations.exp(_NET @ shape) @ prior.rotation[:, None]
+    return rotations.exp((_NET @ shape)[:, 0]) @ prior.rotation
 
 
-def _translation_given(rotation: FloatArray, problem: Any) -> FloatArray:
-    """Translations (K, 24, 3) of the linear squared-range model with its prior, given rotations."""
-    data = problem.data
+def _translation_given(rotation: FloatArray, prior: PoseState, data: RangeCost) -> FloatArray:
+    """Translations (K, S, 3) of the linear squared-range model and the prior, given rotations."""
     # To first order var(r^2) = 4 r^2 var(r).
     scale = 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
     stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale)
-    information = np.linalg.inv(problem.prior.covariance[..., 3:, 3:])
-    tags = data.tags if data.tags.ndim == 2 else data.tags[:, None]
-    turned = tags @ np.swapaxes(rotation, -1, -2)
-    per_tag = stat.b[:, None] - (stat.G[:, None] @ turned[..., None])[..., 0]
-    held = information @ problem.prior.translation[..., None]
-    right = held + np.swapaxes(per_tag.sum(axis=-2), -1, -2)
-    solved = np.linalg.solve(information + stat.G.sum(axis=-3), right)
-    return np.swapaxes(solved, -1, -2)
+    information = np.linalg.inv(prior.covariance[..., 3:, 3:])
+    turned = data.tags @ np.swapaxes(rotation, -1, -2)
+    of_tags = stat.b - (stat.G @ turned[..., None])[..., 0]
+    right = (information @ prior.translation[..., None])[..., 0] + of_tags.sum(axis=-2)
+    return np.linalg.solve(information + stat.G.sum(axis=-3), right[..., None])[..., 0]

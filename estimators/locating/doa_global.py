@@ -13,9 +13,9 @@ import itertools
 import numpy as np
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.components import cross, first, last
 from rbl_gym.estimators.costs.doa_cost import DoaCost
-from rbl_gym.estimators.costs.levenberg_marquardt import Solution, minimize_pose
+from rbl_gym.estimators.costs.levenberg_marquardt import Solution
+from rbl_gym.estimators.costs.map_problem import minimize
 from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, cheapest, merge, rivals
 from rbl_gym.measurements import bearing
 
@@ -45,15 +45,15 @@ def global_search(
     part = DoaCost(angles[:, None], weights[:, None], tags[:, None], np.zeros((1, 1, 3)))
     cost = _cost_of_angles(part, rotation, translation)
     chosen = _cheapest_of_sides(rotation, translation, cost, tags, sides, _REFINED)
-    coarse = minimize_pose(part, *chosen, iterations=6, tolerance=1e-2)
+    coarse = minimize(part, *chosen, iterations=6, tolerance=1e-2)
     finalists = _cheapest_of_sides(*coarse[:2], coarse.at.cost, tags, sides, _FINALISTS)
-    refined = minimize_pose(part, *finalists, iterations=8)
+    refined = minimize(part, *finalists, iterations=8)
     cost = refined.at.cost
     hopeful = cost < cost.min(axis=1, keepdims=True) + _HOPEFUL
     slow = (hopeful & ~refined.converged).any(axis=1)
     if slow.any():
         rest = part.each(lambda array, _: array[slow] if len(array) == len(slow) else array)
-        more = minimize_pose(rest, refined.rotation[slow], refined.translation[slow], 60)
+        more = minimize(rest, refined.rotation[slow], refined.translation[slow], 60)
         refined = merge(refined, more, slow)
     if side is not None:
         beyond = side * _height(refined.rotation, refined.translation, tags) <= 0
@@ -103,16 +103,14 @@ def starts(
     flat = [np.ascontiguousarray(a.reshape(-1, 3, 3).transpose(1, 2, 0)) for a in (rays, body)]
     depths = three_point_depths(*flat)
     places = depths[:, None] * flat[0][..., None]
-    Q, t = _align(places, flat[1][..., None])
-    rotation = last(Q, 2).reshape((batch[0], -1, 3, 3))
-    translation = last(t, 1).reshape((batch[0], -1, 3))
+    poses = [_align(places, flat[1][..., None])]
     if side is None:
         # Across the plane y = 0 the depths are the same and the triangle is turned over.
         places[:, 1] *= -1
-        Q, t = _align(places, flat[1][..., None])
-        rotation = np.concatenate([rotation, last(Q, 2).reshape(rotation.shape)], axis=1)
-        translation = np.concatenate([translation, last(t, 1).reshape(translation.shape)], axis=1)
-    return rotation, translation
+        poses.append(_align(places, flat[1][..., None]))
+    rotation = [np.moveaxis(Q, (0, 1), (-2, -1)).reshape((batch[0], -1, 3, 3)) for Q, _ in poses]
+    translation = [np.moveaxis(t, 0, -1).reshape((batch[0], -1, 3)) for _, t in poses]
+    return np.concatenate(rotation, axis=1), np.concatenate(translation, axis=1)
 
 
 def _triples(tags: FloatArray) -> np.ndarray:
@@ -177,8 +175,8 @@ def _align(places: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray
 def _frame(triangle: FloatArray) -> FloatArray:
     """Orthonormal axes (3, 3, ...), as columns, of triangles (3, 3, ...), tag first."""
     x = _unit(triangle[1] - triangle[0])
-    z = _unit(cross(x, (triangle[2] - triangle[0])[:, None])[:, 0])
-    return np.stack([x, cross(z, x[:, None])[:, 0], z], axis=1)
+    z = _unit(np.cross(x, triangle[2] - triangle[0], axis=0))
+    return np.stack([x, np.cross(z, x, axis=0), z], axis=1)
 
 
 def _unit(vector: FloatArray) -> FloatArray:
@@ -191,11 +189,9 @@ def _square(vector: FloatArray) -> FloatArray:
 
 def _cost_of_angles(part: DoaCost, rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """Half the squared whitened residuals (B, S), without derivatives."""
-    turned = np.einsum(
-        "ij...,jn...->in...", first(rotation, 2), first(part.tags, 2, 2).swapaxes(0, 1)
-    )
-    residual = bearing.seen(turned + first(translation, 1)[:, None]) - first(part.angles, 2, 2)
-    return 0.5 * np.einsum("an...,an...,an...->...", first(part.weights, 2, 2), residual, residual)
+    places = part.tags @ np.swapaxes(rotation, -1, -2) + translation[..., None, :]
+    residual = bearing.angles(places) - part.angles
+    return 0.5 * (part.weights * residual**2).sum(axis=(-2, -1))
 
 
 def _height(rotation: FloatArray, translation: FloatArray, tags: FloatArray) -> FloatArray:

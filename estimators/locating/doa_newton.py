@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray, kernel
-from rbl_gym.components import solve
+from rbl_gym.estimators.costs.levenberg_marquardt import damped_solution
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import bearing
 
@@ -140,9 +140,9 @@ def _newton_step(
     force = (E.T @ pull.reshape(len(pairs), -1)).reshape(n_tags, 3, trials)
     force -= np.einsum("aikb,akb->kib", J, residual)
     size = 3 * n_tags
-    A = A.swapaxes(1, 2).reshape(size, size, trials)
-    step = solve(A, force.reshape(size, trials), np.zeros(trials))
-    return step.reshape(n_tags, 3, trials).swapaxes(0, 1)
+    A = A.swapaxes(1, 2).reshape(size, size, trials).transpose(2, 0, 1)
+    step = damped_solution(A, force.reshape(size, trials).T, np.zeros(trials))
+    return step.T.reshape(n_tags, 3, trials).swapaxes(0, 1)
 
 
 def unit_quaternion(positions: FloatArray, tags: FloatArray) -> tuple[FloatArray, FloatArray]:

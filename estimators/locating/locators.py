@@ -9,7 +9,8 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray, are_finite
-from rbl_gym.estimators.costs.levenberg_marquardt import Solution, minimize_pose
+from rbl_gym.estimators.costs.levenberg_marquardt import Solution
+from rbl_gym.estimators.costs.map_problem import minimize
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.linear import least_squares
 from rbl_gym.estimators.linear.kalman import state_jacobian
@@ -18,8 +19,9 @@ from rbl_gym.estimators.locating.maximum_likelihood import (
     Alternatives,
     maximum_likelihood,
     no_alternatives,
-    robust,
+    points_start,
 )
+from rbl_gym.estimators.locating.robust_location import robust
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
@@ -106,14 +108,15 @@ def _procrustes(epoch: Epoch) -> Fit:
 
 
 def _ml(epoch: Epoch) -> Fit:
-    start = least_squares.points_fit(epoch.stat)
-    return _from_solution(*maximum_likelihood(_range_cost(epoch), *start, epoch.tag_std_m))
+    cost = _range_cost(epoch)
+    start = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
+    return _from_solution(*maximum_likelihood(cost, *start, epoch.tag_std_m))
 
 
 def _two_step(epoch: Epoch) -> Fit:
     rotation, translation = least_squares.points_fit(epoch.stat)
     usable = are_finite(translation, 1)
-    solution = minimize_pose(
+    solution = minimize(
         _range_cost(epoch),
         np.where(usable[:, None, None], rotation, np.eye(3)),
         np.where(usable[:, None], translation, 0.0),
@@ -131,8 +134,9 @@ def _two_step(epoch: Epoch) -> Fit:
 
 
 def _robust(epoch: Epoch) -> Fit:
-    start = least_squares.points_fit(epoch.stat)
-    return _from_solution(*robust(_range_cost(epoch), *start))
+    cost = _range_cost(epoch)
+    start = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
+    return _from_solution(*robust(cost, *start))
 
 
 def _range_cost(epoch: Epoch) -> RangeCost:

@@ -6,13 +6,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.bounds.pose import range_information, symmetric
-from rbl_gym.checks import FloatArray, check_array, check_number
-from rbl_gym.components import exp_and_left_jacobian, first, last, product
+from rbl_gym.checks import FloatArray, check_array, check_number, kernel
+from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist, check_laws
 
 __all__ = ["posterior_crb_step", "predict_covariance"]
+
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
 def predict_covariance(
@@ -28,44 +31,25 @@ def predict_covariance(
     beyond the twelve stand still. Without a law the twist is known: all beyond six stand still.
     `process` adds its noise to the pose.
     """
-    batch = np.broadcast_shapes(P.shape[:-2], twist.shape[:-1])
-    ndim = len(batch)
-    turn, jacobian = exp_and_left_jacobian(np.ascontiguousarray(first(twist, 1, ndim)[:3]) * dt)
-    P = first(P, 2, ndim)
-    half = np.empty((*P.shape[:2], *batch))
-    half[...] = P
-    drift = None if law is None else dt * jacobian
-    _advance(half, P, turn, drift, dt)
-    moved = half.copy()
-    _advance(moved.swapaxes(0, 1), half.swapaxes(0, 1), turn, drift, dt)
+    turn = twist[..., :3] * dt
+    step, jacobian = _EXP(turn), _LEFT_JACOBIAN(turn)
+    n = P.shape[-1]
+    F = np.broadcast_to(np.eye(n), (*turn.shape[:-1], n, n)).copy()
+    F[..., :3, :3] = step
+    if law is not None:
+        F[..., :3, 6:9] = dt * jacobian
+        F[..., 3:6, 9:12] = dt * np.eye(3)
+    # The noise in the frame of the turn: of an acceleration q the change of speed has variance
+    # q dt, the way q dt^3 / 3, and their covariance is q dt^2 / 2.
     wander = np.zeros(6) if law is None else law.std() ** 2
-    pose = dt * process.std() ** 2 + dt**3 / 3 * wander
-    both = dt**2 / 2 * wander
-    spread = jacobian * pose[:3].reshape((3, *[1] * ndim))
-    moved[:3, :3] += product(spread, jacobian.swapaxes(0, 1))
-    for i in range(3, 6):
-        moved[i, i] += pose[i]
-    if law is None:
-        return last(moved, 2)
-    crossed = jacobian * both[:3].reshape((3, *[1] * ndim))
-    moved[:3, 6:9] += crossed
-    moved[6:9, :3] += crossed.swapaxes(0, 1)
-    for i in range(3, 6):
-        moved[i, i + 6] += both[i]
-        moved[i + 6, i] += both[i]
-    for i in range(6):
-        moved[i + 6, i + 6] += dt * wander[i]
-    return last(moved, 2)
-
-
-def _advance(
-    out: FloatArray, P: FloatArray, turn: FloatArray, drift: FloatArray | None, dt: float
-) -> None:
-    """The pose's rows of ``F P`` (n, n, ...), where the turn rate moves it by `drift`."""
-    out[:3] = product(turn, P[:3])
-    if drift is not None:
-        out[:3] += product(drift, P[6:9])
-        out[3:6] = P[3:6] + dt * P[9:12]
+    Q = np.zeros((n, n))
+    Q[range(6), range(6)] = dt * process.std() ** 2 + dt**3 / 3 * wander
+    if law is not None:
+        Q[range(6), range(6, 12)] = Q[range(6, 12), range(6)] = dt**2 / 2 * wander
+        Q[range(6, 12), range(6, 12)] = dt * wander
+    G = np.broadcast_to(np.eye(n), F.shape).copy()
+    G[..., :3, :3] = jacobian
+    return F @ P @ np.swapaxes(F, -1, -2) + G @ Q @ np.swapaxes(G, -1, -2)
 
 
 def posterior_crb_step(

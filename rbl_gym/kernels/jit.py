@@ -75,7 +75,7 @@ _CACHE = _find_cache()
 
 def helper(function: F) -> F:
     """Compile a function that kernels call; division by zero gives inf, as in NumPy."""
-    return numba.njit(error_model="numpy", cache=_CACHE)(function)
+    return numba.njit(error_model="numpy", cache=_CACHE, no_cfunc_wrapper=True)(function)
 
 
 def gufunc(signature: str, types: str = "") -> Callable[[F], F]:

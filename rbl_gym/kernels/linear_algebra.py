@@ -112,3 +112,11 @@ def multiply_transposed(A: Any, B: Any, out: Any) -> None:
             for k in range(A.shape[1]):
                 total += A[i, k] * B[j, k]
             out[i, j] = total
+
+
+@helper
+def fill(value: float, out: Any) -> None:
+    """``out[:] = value`` of a matrix: numba takes a second to compile the slice."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = value

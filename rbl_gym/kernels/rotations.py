@@ -40,6 +40,14 @@ def series(x: float, y: float, z: float, a: float, b: float, diagonal: float, ou
 
 
 @helper
+def compose(A: Any, B: Any, out: Any) -> None:
+    """``out = A B`` of 3 x 3 matrices; `out` is neither of them."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@helper
 def exp(x: float, y: float, z: float, out: Any) -> None:
     """The rotation matrix of the rotation vector (x, y, z)."""
     s = x * x + y * y + z * z

@@ -1,0 +1,165 @@
+"""The most likely pose of an epoch: the cost of what was measured, and a prior.
+
+`minimize` is the one way to it: where all that was measured are ranges, a kernel runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray, kernel
+from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
+from rbl_gym.estimators.costs.range_cost import Index, RangeCost, pick
+from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
+
+# Behind the doors: what comes to these was checked, or made here.
+_ERROR = kernel(rotations.error)
+_LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
+
+
+class PoseState(NamedTuple):
+    """Pose and covariance, (..., 3, 3), (..., 3), (..., 6, 6) of the error (w, v)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+
+
+class Cost(Protocol):
+    """What was measured: callable on poses, and its arrays can be picked from."""
+
+    def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
+        """Cost, gradient and Gauss-Newton Hessian at poses."""
+        ...
+
+    def each(self, function: Callable[[FloatArray, int], FloatArray]) -> Cost:
+        """The cost with a function of (array, number of trailing axes) applied to its arrays."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MapProblem:
+    """Maximum a posteriori pose of one epoch; arrays with leading batch axes.
+
+    `data` is the cost of the measurements (`RangeCost`, `doa_cost.DoaCost`, or a sum of costs).
+    Cost: that of the measurements plus half the prior's Mahalanobis distance, residual
+    ``(log(Q Q_pred^T), t - t_pred)``.
+    """
+
+    prior: PoseState
+    prior_information: FloatArray
+    data: Cost
+
+    def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
+        """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
+        of_data = self.data(rotation, translation)
+        turn = _ERROR(rotation, self.prior.rotation)
+        shift = translation - self.prior.translation
+        error, D = pose_error(turn, shift)
+        pull = (self.prior_information @ error[..., None])[..., 0]
+        transposed = np.swapaxes(D, -1, -2)
+        return Linearization(
+            of_data.cost + 0.5 * np.einsum("...i,...i->...", error, pull),
+            of_data.gradient + (transposed @ pull[..., None])[..., 0],
+            of_data.hessian + transposed @ self.prior_information @ D,
+        )
+
+    def take(self, batch: tuple[int, ...], where: Index) -> MapProblem:
+        """The trials (K, 1) at an index into the batch, with an axis of 1 for starts."""
+
+        def some(array: FloatArray, trailing: int) -> FloatArray:
+            return pick(array, batch, where, trailing)[:, None]
+
+        prior = PoseState(
+            some(self.prior.rotation, 2), some(self.prior.translation, 1),
+            some(self.prior.covariance, 2),
+        )  # fmt: skip
+        return MapProblem(prior, some(self.prior_information, 2), self.data.each(some))
+
+
+def pose_error(turn: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The error (..., 6) of a pose, and its derivative ``blkdiag(Jl^-1, I)`` by (w, v)."""
+    shape = np.broadcast_shapes(turn.shape, shift.shape)
+    error = np.concatenate([np.broadcast_to(turn, shape), np.broadcast_to(shift, shape)], axis=-1)
+    D = np.zeros((*shape[:-1], 6, 6))
+    D[..., :3, :3] = _LEFT_JACOBIAN_INVERSE(turn)
+    D[..., 3:, 3:] = np.eye(3)
+    return error, D
+
+
+def map_problem(state: PoseState, data: Cost) -> MapProblem:
+    """The problem of an update: a prior and the cost of what was measured."""
+    return MapProblem(state, positive_inverse(state.covariance), data)
+
+
+def minimize(
+    problem: MapProblem | Cost,
+    rotation: FloatArray,
+    translation: FloatArray,
+    iterations: int,
+    tolerance: float = 1e-6,
+) -> Solution:
+    """`minimize_pose` of a problem, by its kernel where all that was measured are ranges."""
+    prior, information, data = _NO_PRIOR, _NOTHING, problem
+    if isinstance(problem, MapProblem):
+        prior, information, data = problem.prior, problem.prior_information, problem.data
+    if not isinstance(data, RangeCost) or data.tag_unit is not None:
+        return minimize_pose(problem, rotation, translation, iterations, tolerance)
+    found = minimize_ranges(
+        rotation, translation, prior.rotation, prior.translation, information,
+        data.ranges, data.weights, data.anchors, data.tags, data.loss, iterations, tolerance,
+    )  # fmt: skip
+    return Solution(found[0], found[1], Linearization(*found[2:5]), found[5])
+
+
+_NO_PRIOR = PoseState(np.eye(3), np.zeros(3), np.eye(6))
+_NOTHING = np.zeros((6, 6))
+
+
+@compiled("pose_solver:minimize")
+def minimize_ranges(
+    start_rotation: FloatArray,
+    start_translation: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    information: FloatArray,
+    ranges: FloatArray,
+    weights: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    loss: FloatArray,
+    iterations: int,
+    tolerance: float,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+    """The most likely pose near a start: ranges, and a prior of some information (..., 6, 6).
+
+    Returns
+    -------
+    Rotation, translation, cost, gradient, Hessian, and whether it converged: see `Solution`.
+    """
+    prior = PoseState(rotation, translation, information)
+    problem = MapProblem(prior, information, RangeCost(ranges, weights, anchors, tags, loss))
+    found = minimize_pose(problem, start_rotation, start_translation, iterations, tolerance)
+    return found.rotation, found.translation, *found.at, found.converged
+
+
+def positive_inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of symmetric positive definite matrices (..., n, n); NaN where one is not.
+
+    The units of its rows do not matter: of a matrix with a unit diagonal the smallest eigenvalue
+    decides.
+    """
+    n = matrix.shape[-1]
+    diagonal = np.einsum("...ii->...i", matrix)
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    outer = scale[..., :, None] * scale[..., None, :]
+    unit = matrix / outer
+    known = np.isfinite(unit).all(axis=(-2, -1), keepdims=True)
+    good = known & (np.linalg.eigvalsh(np.where(known, unit, np.eye(n)))[..., :1, None] > 1e-14)
+    inverse = np.linalg.inv(np.where(good, unit, np.eye(n))) / outer
+    return np.where(good, 0.5 * (inverse + np.swapaxes(inverse, -1, -2)), np.nan)

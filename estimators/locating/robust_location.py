@@ -1,0 +1,107 @@
+"""Location of a body from ranges of which some are wrong; flat problems, batch axis (B,)."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray, are_finite
+from rbl_gym.estimators.costs.levenberg_marquardt import Solution
+from rbl_gym.estimators.costs.map_problem import minimize
+from rbl_gym.estimators.costs.range_cost import RangeCost, geman_mcclure, huber, squared_residuals
+from rbl_gym.estimators.linear.least_squares import points_fit
+from rbl_gym.estimators.linear.squared_range import statistic
+from rbl_gym.estimators.locating.maximum_likelihood import (
+    Alternatives,
+    cheapest,
+    chunks,
+    local_minima,
+    maximum_likelihood,
+    merge,
+)
+from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
+
+_HUBER = 1.5
+# A robust fit that fewer of its ranges agree with is searched for again.
+_TRUSTED_INLIERS = 0.65
+
+
+def robust(
+    cost: RangeCost, rotation: FloatArray, translation: FloatArray
+) -> tuple[Solution, Alternatives]:
+    """Pose from ranges of which some are wrong: Huber, Geman-McClure, a refit on the inliers.
+
+    Geman and McClure's loss is narrowed step by step (graduated non-convexity), so that the
+    start need not be near. Where few ranges agree with the outcome, many starts are tried and
+    the one with the least bounded loss is kept. Ranges beyond 4 standard deviations of that fit
+    are left out of the maximum-likelihood refit.
+    """
+    rotation, translation = _stand_ins(rotation, translation, cost.anchors)
+    easy = dataclasses.replace(cost, loss=huber(_HUBER))
+    solution = minimize(easy, rotation, translation, iterations=20, tolerance=1e-2)
+    solution = _narrow(cost, solution.rotation, solution.translation, widest=1.0)
+    links = np.maximum((cost.weights > 0).sum(axis=(-2, -1)), 1)
+    doubtful = _inliers(cost, solution).sum(axis=(-2, -1)) < _TRUSTED_INLIERS * links
+    for rows in chunks(doubtful):
+        part = easy.rows(rows)
+        first = solution.rotation[rows], solution.translation[rows]
+        usable = np.ones(len(rows), bool)
+        minima = local_minima(part, first, usable, ROTATION_NET, starts=len(ROTATION_NET))[:2]
+        starts = zip(minima, _without_pairs_of_anchors(part), strict=True)
+        # From the median residual on: a wide loss would lead them all to the same wrong place.
+        narrowed = _narrow(part, *(np.concatenate(pair, axis=1) for pair in starts), widest=0.5)
+        solution = merge(solution, cheapest(narrowed), rows)
+    weights = np.where(_inliers(cost, solution), cost.weights, 0.0)
+    refit = dataclasses.replace(cost, weights=weights)
+    return maximum_likelihood(refit, solution.rotation, solution.translation)
+
+
+def _stand_ins(
+    rotation: FloatArray, translation: FloatArray, anchors: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Poses with the identity among the anchors where they are not finite."""
+    known = are_finite(translation, 1) & are_finite(rotation, 2)
+    return (
+        np.where(known[..., None, None], rotation, np.eye(3)),
+        np.where(known[..., None], translation, anchors.mean(axis=-2)),
+    )
+
+
+def _inliers(cost: RangeCost, solution: Solution) -> BoolArray:
+    """Links (..., M, N) within 4 standard deviations of a solution."""
+    squared = squared_residuals(cost, solution.rotation, solution.translation)
+    return (squared < 16.0) & (cost.weights > 0)
+
+
+def _narrow(
+    cost: RangeCost, rotation: FloatArray, translation: FloatArray, widest: float
+) -> Solution:
+    """Geman-McClure from the quantile `widest` of the residuals to 3 standard deviations."""
+    residuals = np.sqrt(squared_residuals(cost, rotation, translation))
+    scale = np.maximum(np.quantile(residuals, widest, axis=(-2, -1)), 3.0)
+    while True:
+        narrowed = dataclasses.replace(cost, loss=geman_mcclure(scale))
+        solution = minimize(narrowed, rotation, translation, iterations=4, tolerance=1e-3)
+        if (scale <= 3.0).all():
+            return solution
+        rotation, translation = solution.rotation, solution.translation
+        scale = np.maximum(scale / 1.6, 3.0)
+
+
+def _without_pairs_of_anchors(part: RangeCost) -> tuple[FloatArray, FloatArray]:
+    """Linear solutions (K, S, ...) with two anchors left out: one of them has no bad anchor.
+
+    All pairs among the first 10 anchors; with fewer than 6 anchors nothing can be left out.
+    """
+    n_anchors = part.anchors.shape[-2]
+    if n_anchors < 6:
+        return (np.empty((len(part.ranges), 0, 3, 3)), np.empty((len(part.ranges), 0, 3)))
+    pairs = np.array(list(itertools.combinations(range(min(n_anchors, 10)), 2)))
+    kept = np.ones((len(pairs), n_anchors, 1), bool)
+    kept[np.arange(len(pairs))[:, None], pairs, 0] = False
+    squared = part.weights / (4 * np.where(part.weights > 0, part.ranges, 1.0) ** 2)
+    found = points_fit(statistic(part.ranges, part.anchors, part.tags, squared * kept))
+    # The anchors that are left may lie in a plane: then there is no linear solution.
+    return _stand_ins(*found, part.anchors)

@@ -1,0 +1,271 @@
+"""Prediction and update of the iterated EKF, one body.
+
+The textbook forms are in `rbl_gym.estimators`: `manifold` and `robust_update`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.kernels import rotations
+from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
+from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
+from rbl_gym.kernels.range_cost import loss_of, squared_residuals
+
+# Whitened residual at which Huber's loss turns from squares to absolute values.
+HUBER = 1.5
+# Standard deviations beyond which a link contradicts a pose.
+GATE = 4.0
+# Where the gate at the prior was wrong: first with care, as Huber's pose is biased.
+CUTOFFS = (6.0, GATE)
+# A pose that more than this share of the links contradict is itself in doubt: all links count.
+LARGEST_SHARE_OUT = 0.5
+# Tags this thin beside their length (squared) are as good as in a line.
+THIN = 0.01
+
+
+@gufunc("(d,d),(d),(p,p),(p),(),(p)->(d,d),(d),(p,p)")
+def predict(Q0, t0, P0, twist, dt, variance, Q, t, P):
+    """Pose and covariance after a step: ``F P F^T + dt G S G^T``."""
+    turn, J, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    x, y, z = twist[0] * dt, twist[1] * dt, twist[2] * dt
+    rotations.exp(x, y, z, turn)
+    rotations.left_jacobian(x, y, z, J)
+    rotations.compose(turn, Q0, Q)
+    rotations.compose(turn, P0, half)
+    for i in range(3):
+        t[i] = t0[i] + twist[3 + i] * dt
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(3):
+                total += half[i, k] * turn[j, k] + dt * variance[k] * J[i, k] * J[j, k]
+            P[i, j] = total
+            P[j, i] = total
+        for j in range(3):
+            P[3 + i, 3 + j] = P0[3 + i, 3 + j]
+            total = 0.0
+            for k in range(3):
+                total += turn[i, k] * P0[k, 3 + j]
+            P[i, 3 + j] = total
+            P[3 + j, i] = total
+        P[3 + i, 3 + i] += dt * variance[3 + i]
+
+
+@helper
+def invert(A: Any, out: Any) -> bool:
+    """Inverse of a symmetric positive matrix; where it is none, NaN and False."""
+    L = np.empty((6, 6))
+    good = cholesky6(A, L)
+    if good:
+        invert_factored6(L, out)
+    else:
+        fill(math.nan, out)
+    return good
+
+
+@helper
+def count_beyond(squared: Any, cutoff: float) -> int:
+    """Links whose squared whitened residual is beyond a cutoff."""
+    count = 0
+    for m in range(squared.shape[0]):
+        for n in range(squared.shape[1]):
+            if squared[m, n] > cutoff * cutoff:
+                count += 1
+    return count
+
+
+@helper
+def leave_out(P0: Any, squared: Any, tags: Any, kept: Any) -> int:
+    """Set the weights of links that contradict the prior to zero; how many, none of too many.
+
+    `squared` and the weights `kept` are those of the prior. The variance of an innovation is at
+    most that of the range and the square of ``sqrt(tr P_v) + |c| sqrt(tr P_w)``.
+    """
+    of_rotation = math.sqrt(P0[0, 0] + P0[1, 1] + P0[2, 2])
+    of_place = math.sqrt(P0[3, 3] + P0[4, 4] + P0[5, 5])
+    out, links = 0, 0
+    for again in range(2):
+        for n in range(tags.shape[0]):
+            x, y, z = tags[n, 0], tags[n, 1], tags[n, 2]
+            reach = of_place + math.sqrt(x * x + y * y + z * z) * of_rotation
+            for m in range(squared.shape[0]):
+                weight = kept[m, n]
+                beyond = squared[m, n] > GATE * GATE * (1 + weight * reach * reach)
+                if again:
+                    if beyond:
+                        kept[m, n] = 0.0
+                else:
+                    out += beyond
+                    links += weight > 0
+        if out == 0 or out > LARGEST_SHARE_OUT * links:
+            return 0
+    return out
+
+
+@helper
+def is_wrong(squared: Any, weights: Any, kept: Any) -> bool:
+    """Whether a pose tells otherwise than `leave_out` did, of links in or out."""
+    for m in range(squared.shape[0]):
+        for n in range(squared.shape[1]):
+            if (squared[m, n] > GATE * GATE) != (kept[m, n] != weights[m, n]):
+                return True
+    return False
+
+
+@helper
+def data_cost(squared: Any, loss: Any) -> float:
+    """Cost of squared whitened residuals."""
+    total = 0.0
+    for m in range(squared.shape[0]):
+        for n in range(squared.shape[1]):
+            total += loss_of(squared[m, n], loss)[0]
+    return total
+
+
+@helper
+def carry(A: Any, information: Any, sign: float, H: Any) -> None:
+    """``H += sign A^T I A`` of matrices (6, 6)."""
+    for j in range(6):
+        for i in range(6):
+            for k in range(6):
+                moved = 0.0
+                for m in range(6):
+                    moved += information[k, m] * A[m, j]
+                H[i, j] += sign * A[k, i] * moved
+
+
+@helper
+def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any) -> None:
+    """Let the prior's information turn with the body where the tags heard are about in a line.
+
+    `rbl_gym.estimators.costs.unseen_directions` says why.
+    """
+    centre, gram = np.zeros(3), np.zeros((3, 3))
+    heard = 0
+    for again in range(2):
+        for n in range(tags.shape[0]):
+            is_heard = False
+            for m in range(weights.shape[0]):
+                is_heard = is_heard or weights[m, n] > 0
+            if not is_heard:
+                continue
+            if not again:
+                heard += 1
+            for i in range(3):
+                if not again:
+                    centre[i] += tags[n, i]
+                else:
+                    for j in range(3):
+                        gram[i, j] += (tags[n, i] - centre[i]) * (tags[n, j] - centre[j])
+        if heard == 0:
+            return
+        if not again:
+            for i in range(3):
+                centre[i] /= heard
+    trace = gram[0, 0] + gram[1, 1] + gram[2, 2]
+    squares = 0.0
+    for i in range(3):
+        for j in range(3):
+            squares += gram[i, j] * gram[i, j]
+    if not 0.5 * (trace * trace - squares) <= THIN * trace * trace:
+        return
+    back, there, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    D, T = np.zeros((6, 6)), np.zeros((6, 6))
+    a, b = np.zeros(3), np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            a[i] += Q0[i, j] * centre[j]
+            b[i] += Q[i, j] * centre[j]
+            back[i, j] = Q0[i, 0] * Q[j, 0] + Q0[i, 1] * Q[j, 1] + Q0[i, 2] * Q[j, 2]
+            there[j, i] = back[i, j]
+    x, y, z = rotations.log(there)
+    rotations.left_jacobian_inverse(x, y, z, turned)
+    for i in range(3):
+        D[3 + i, 3 + i] = T[3 + i, 3 + i] = 1.0
+        for j in range(3):
+            D[i, j], T[i, j] = turned[i, j], back[i, j]
+    # [Q0 c]x back - [Q c]x: an error about the tags' centre is the same in the body's frame.
+    for j in range(3):
+        T[3, j] = a[1] * back[2, j] - a[2] * back[1, j]
+        T[4, j] = a[2] * back[0, j] - a[0] * back[2, j]
+        T[5, j] = a[0] * back[1, j] - a[1] * back[0, j]
+    T[3, 1] += b[2]
+    T[3, 2] -= b[1]
+    T[4, 0] -= b[2]
+    T[4, 2] += b[0]
+    T[5, 0] += b[1]
+    T[5, 1] -= b[0]
+    carry(D, information, -1.0, H)
+    carry(T, information, 1.0, H)
+
+
+@gufunc(
+    "(d,d),(d),(p,p),(m,n),(m,n),(m,d),(n,d),(d,d),(d),(),()->(d,d),(d),(p,p),()",
+    "fffffffffibffff",
+)
+def update(
+    Q0, t0, P0, ranges, weights, anchors, tags, start_Q, start_t, iterations, robust, Q, t, P, cost
+):
+    """The most likely pose of an epoch near a start, its covariance, and the cost there.
+
+    The robust one leaves out links that the prior contradicts (stage 0). Where the pose that
+    follows tells otherwise, it starts again with Huber's loss on all of them (1), and leaves out
+    those beyond each cutoff (2 and 3).
+    """
+    information, H, g = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
+    room = room_to_solve()
+    loss = np.empty(3)
+    loss[0] = loss[1] = loss[2] = math.inf
+    kept, tolerance = weights, 1e-6
+    squared = np.empty((0, 0))
+    links = 0
+    if not invert(P0, information):
+        copy_pose(Q0, t0, Q, t)
+        fill(math.nan, P)
+        cost[0] = math.nan
+        return
+    if robust:
+        loss[0] = HUBER
+        squared, kept = np.empty(weights.shape), np.empty(weights.shape)
+        for m in range(weights.shape[0]):
+            for n in range(weights.shape[1]):
+                kept[m, n] = weights[m, n]
+                links += weights[m, n] > 0
+        squared_residuals(Q0, t0, ranges, weights, anchors, tags, squared)
+        leave_out(P0, squared, tags, kept)
+    for stage in range(4):
+        if stage == 1:
+            if not is_wrong(squared, weights, kept):
+                break
+            kept, tolerance = weights, 1e-2
+        elif stage > 1:
+            tolerance = 1e-6
+            cutoff = CUTOFFS[stage - 2]
+            doubted = count_beyond(squared, cutoff) > LARGEST_SHARE_OUT * links
+            loss[1] = math.inf if doubted else cutoff
+        if stage < 2:
+            copy_pose(start_Q, start_t, Q, t)
+        total, _ = solve(
+            Q, t, True, Q0, t0, information, ranges, kept, anchors, tags, loss,
+            iterations, tolerance, g, H, room,
+        )  # fmt: skip
+        if not robust:
+            break
+        squared_residuals(Q, t, ranges, weights, anchors, tags, squared)
+    mirror(H)
+    keep_wide(Q0, information, Q, weights, tags, H)
+    invert(H, P)
+    if robust:
+        # A link that contradicts the pose costs so much and no more, whoever left it out.
+        of_prior = total
+        for m in range(weights.shape[0]):
+            for n in range(weights.shape[1]):
+                if kept[m, n] > 0:
+                    of_prior -= loss_of(squared[m, n], loss)[0]
+        loss[1] = GATE
+        total = of_prior + data_cost(squared, loss)
+    cost[0] = total

@@ -1,0 +1,142 @@
+"""The cost of one body's ranges at a pose, its gradient and Gauss-Newton Hessian.
+
+The textbook form is `rbl_gym.estimators.costs.range_cost`. Matrices are written below and on the
+diagonal only; a link of weight 0 was not measured, and its range may be anything.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from rbl_gym.kernels.jit import helper
+
+
+@helper
+def loss_of(squared: float, loss: Any) -> tuple[float, float]:
+    """Cost of a squared whitened residual, and the share of its weight that is left.
+
+    `loss` is (threshold, cutoff, scale): Huber's up to a cutoff, or that of Geman and McClure
+    where the scale is finite.
+    """
+    threshold, cutoff, scale = loss[0], loss[1], loss[2]
+    if scale < math.inf:
+        square = scale * scale
+        share = square / (squared + square)
+        return 0.5 * squared * share, share * share
+    inside = squared <= cutoff * cutoff
+    if not inside:
+        squared = cutoff * cutoff
+    share = 1.0
+    if squared > threshold * threshold:
+        share = threshold / math.sqrt(squared)
+    cost = share * squared * (1 - 0.5 * share)
+    return cost, share if inside else 0.0
+
+
+@helper
+def is_plain(loss: Any) -> bool:
+    """Whether a loss is half the square."""
+    return loss[0] == math.inf and loss[1] == math.inf and loss[2] == math.inf
+
+
+@helper
+def linearize(
+    Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, g: Any, H: Any
+) -> float:
+    """The cost; the gradient (6,) and the Hessian (6, 6) by (w, v) into g and H.
+
+    With u the unit vectors from anchors to a tag, ``S = sum_m w u u^T`` is the information about
+    its place, ``f = sum_m w (d - r) u`` the force on it, and ``[[Q c]x; I]`` takes both to the
+    pose.
+    """
+    plain = is_plain(loss)
+    cost = 0.0
+    for i in range(6):
+        g[i] = 0.0
+        for j in range(i + 1):
+            H[i, j] = 0.0
+    for n in range(tags.shape[0]):
+        x = Q[0, 0] * tags[n, 0] + Q[0, 1] * tags[n, 1] + Q[0, 2] * tags[n, 2]
+        y = Q[1, 0] * tags[n, 0] + Q[1, 1] * tags[n, 1] + Q[1, 2] * tags[n, 2]
+        z = Q[2, 0] * tags[n, 0] + Q[2, 1] * tags[n, 1] + Q[2, 2] * tags[n, 2]
+        tx, ty, tz = x + t[0], y + t[1], z + t[2]
+        fx = fy = fz = sxx = syx = syy = szx = szy = szz = 0.0
+        for m in range(anchors.shape[0]):
+            weight = weights[m, n]
+            if weight == 0.0:
+                continue
+            ux, uy, uz = tx - anchors[m, 0], ty - anchors[m, 1], tz - anchors[m, 2]
+            # Where an anchor stands on a tag the difference is zero, and so is the direction.
+            distance = math.sqrt(max(ux * ux + uy * uy + uz * uz, 1e-200))
+            residual = distance - ranges[m, n]
+            if plain:
+                cost += 0.5 * weight * residual * residual
+            else:
+                part, share = loss_of(weight * residual * residual, loss)
+                cost += part
+                weight *= share
+            inverse = 1 / distance
+            ux *= inverse
+            uy *= inverse
+            uz *= inverse
+            pull = weight * residual
+            fx += pull * ux
+            fy += pull * uy
+            fz += pull * uz
+            wx, wy, wz = weight * ux, weight * uy, weight * uz
+            sxx += wx * ux
+            syx += wy * ux
+            syy += wy * uy
+            szx += wz * ux
+            szy += wz * uy
+            szz += wz * uz
+        g[0] += y * fz - z * fy
+        g[1] += z * fx - x * fz
+        g[2] += x * fy - y * fx
+        g[3] += fx
+        g[4] += fy
+        g[5] += fz
+        # [p]x S, whose transposed is the block of translation by rotation.
+        axx, axy, axz = y * szx - z * syx, y * szy - z * syy, y * szz - z * szy
+        ayx, ayy, ayz = z * sxx - x * szx, z * syx - x * szy, z * szx - x * szz
+        azx, azy, azz = x * syx - y * sxx, x * syy - y * syx, x * szy - y * szx
+        H[0, 0] += y * axz - z * axy
+        H[1, 0] += y * ayz - z * ayy
+        H[1, 1] += z * ayx - x * ayz
+        H[2, 0] += y * azz - z * azy
+        H[2, 1] += z * azx - x * azz
+        H[2, 2] += x * azy - y * azx
+        H[3, 0] += axx
+        H[3, 1] += ayx
+        H[3, 2] += azx
+        H[4, 0] += axy
+        H[4, 1] += ayy
+        H[4, 2] += azy
+        H[5, 0] += axz
+        H[5, 1] += ayz
+        H[5, 2] += azz
+        H[3, 3] += sxx
+        H[4, 3] += syx
+        H[4, 4] += syy
+        H[5, 3] += szx
+        H[5, 4] += szy
+        H[5, 5] += szz
+    return cost
+
+
+@helper
+def squared_residuals(
+    Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, out: Any
+) -> None:
+    """Squared whitened residuals (M, N), 0 where a link is missing."""
+    for n in range(tags.shape[0]):
+        x = Q[0, 0] * tags[n, 0] + Q[0, 1] * tags[n, 1] + Q[0, 2] * tags[n, 2] + t[0]
+        y = Q[1, 0] * tags[n, 0] + Q[1, 1] * tags[n, 1] + Q[1, 2] * tags[n, 2] + t[1]
+        z = Q[2, 0] * tags[n, 0] + Q[2, 1] * tags[n, 1] + Q[2, 2] * tags[n, 2] + t[2]
+        for m in range(anchors.shape[0]):
+            out[m, n] = 0.0
+            if weights[m, n] > 0:
+                dx, dy, dz = x - anchors[m, 0], y - anchors[m, 1], z - anchors[m, 2]
+                residual = math.sqrt(dx * dx + dy * dy + dz * dz) - ranges[m, n]
+                out[m, n] = weights[m, n] * residual * residual
