@@ -12,7 +12,7 @@ import pytest
 from rbl_gym import estimators, motion
 from rbl_gym.estimators.linear import engines
 from rbl_gym.estimators.linear.kalman import KalmanState
-from rbl_gym.estimators.linear.squared_range import information, statistic
+from rbl_gym.estimators.linear.squared_range import information
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
@@ -240,9 +240,9 @@ def test_the_batched_engine_keeps_the_digits_of_a_vague_prior(tags, scale):
     ranges = rng.uniform(12, 18, (9, 7, len(tags)))
     root = rng.standard_normal((9, 12, 12))
     prior = scale * (root @ root.swapaxes(-1, -2) + np.eye(12))
-    stat = statistic(ranges, anchors, tags, np.ones((9, 7, 1)))
-    want = exact_posterior(prior, information(stat)[0])
-    _, got = engines.Batched.update(rng.standard_normal((9, 12)), prior, stat)
+    epoch = engines.Epoch(ranges, anchors, tags, np.ones((9, 7, 1)))
+    want = exact_posterior(prior, information(epoch.statistic())[0])
+    _, got = engines.Batched.update(rng.standard_normal((9, 12)), prior, epoch)
     np.testing.assert_array_equal(got, got.swapaxes(-1, -2))
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-8 * np.abs(want).max())
 

@@ -7,8 +7,9 @@ import pytest
 from scipy.optimize import minimize
 
 from rbl_gym import estimators, motion
-from rbl_gym.estimators.linear.kalman import expand_covariance, state_jacobian
+from rbl_gym.estimators.linear.kalman import expand_covariance
 from rbl_gym.estimators.linear.least_squares import vec
+from rbl_gym.estimators.linear.unitary import state_jacobian
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from tests.helpers import load, random_world, simulate, textbook_model

@@ -7,6 +7,7 @@ import pytest
 
 from rbl_gym import kernels, metrics
 from rbl_gym.bounds import pose, posterior
+from rbl_gym.estimators.linear import engines, least_squares, unitary
 from rbl_gym.geometry import obstacles, rotations
 from rbl_gym.measurements import noise_laws, ranging
 from rbl_gym.metrics import Figures
@@ -210,6 +211,86 @@ def test_scores_of_what_is_no_information_are_nan():
         for form in (posterior.of_ranges.kernel, posterior.of_ranges.textbook):
             with np.errstate(all="ignore"):
                 assert np.isnan(form(*args)[1]).all()
+
+
+# --- linear filters ------------------------------------------------------------------------------
+
+
+class Linear:
+    """States of 12 numbers with their covariances, and an epoch of ranges of the true poses."""
+
+    def __init__(self, batch, m, n, weights, seed=0):
+        world = World(batch, m, n, seed=seed)
+        rng = world.rng
+        self.tags, self.anchors = world.tags, world.anchors
+        turn = rotations.exp(0.1 * rng.standard_normal((*batch, 3))) @ world.rotation
+        place = world.translation + rng.standard_normal((*batch, 3))
+        self.mean = np.concatenate([least_squares.vec(turn), place], axis=-1)
+        root = rng.standard_normal((*batch, 12, 12))
+        self.P = 0.01 * (root @ np.swapaxes(root, -1, -2) + np.eye(12))
+        positions = ranging.tag_positions(world.rotation, world.translation, self.tags)
+        self.ranges = ranging.distances(self.anchors, positions) + 0.05
+        self.weights = rng.uniform(0.01, 1, (*batch, m, 1 if weights == "common" else n))
+        if weights == "lost":
+            self.weights *= rng.random(self.weights.shape) < 0.6
+            # A tag that nobody hears, and an anchor that hears nobody.
+            self.weights[..., 0] = 0.0
+            self.weights[..., -1, :] = 0.0
+
+    @property
+    def epoch(self):
+        return self.ranges, self.anchors, self.tags, self.weights
+
+
+every_weight = pytest.mark.parametrize("weights", ["common", "of each link", "lost"])
+
+
+@every_batch
+def test_linear_prediction(batch):
+    rng, linear = np.random.default_rng(5), Linear(batch, 4, 5, "common")
+    turn, shift = rng.standard_normal((2, *batch, 3))
+    for turn_of_all in (turn, np.zeros(3), np.array([0.0, 3.0, 0.1])):
+        assert_equal_forms(engines.predict_mean, linear.mean, turn_of_all, shift)
+        for P in (linear.P, np.eye(12)):
+            assert_equal_forms(engines.predict_covariance, P, turn_of_all, rng.random(12))
+
+
+@every_batch
+@every_weight
+@pytest.mark.parametrize(("m", "n"), [(1, 2), (4, 5), (10, 6)])
+@pytest.mark.parametrize("flat", [False, True])
+def test_linear_update(batch, weights, m, n, flat):
+    linear = Linear(batch, m, n, weights)
+    if flat:
+        linear.anchors[..., 2], linear.tags[:, 1] = 0.0, 0.0
+    P = assert_equal_forms(engines.update_covariance, linear.P, *linear.epoch[1:])[0]
+    assert_equal_forms(engines.update_covariance, np.eye(12), *linear.epoch[1:])
+    # The textbook form adds and subtracts numbers of the size of the squared ranges.
+    assert_equal_forms(engines.update_mean, linear.mean, P, *linear.epoch, atol=1e-8)
+
+
+@every_batch
+@pytest.mark.parametrize(("m", "n"), [(4, 5), (10, 6)])
+def test_linear_constraints_and_beliefs(batch, m, n):
+    linear = Linear(batch, m, n, "common")
+    assert_equal_forms(unitary.coupled_fit, linear.mean, linear.P)
+    assert_equal_forms(unitary.decoupled_fit, linear.mean, linear.P, *linear.epoch)
+    for form in (unitary.projected_belief, unitary.constrained_belief):
+        assert_equal_forms(form, linear.mean, linear.P, np.eye(3), np.zeros(6))
+
+
+@every_batch
+@pytest.mark.parametrize("rank", [1, 3, 9])
+def test_procrustes(batch, rank):
+    rng = np.random.default_rng(6)
+    root = rng.standard_normal((*batch, 9, rank))
+    weight, target = root @ np.swapaxes(root, -1, -2), rng.standard_normal((*batch, 9))
+    start = rotations.random(rng, batch)
+    _, cost = least_squares._newton.kernel(weight, target, start)
+    _, want = least_squares._newton.textbook(weight, target, start)
+    np.testing.assert_allclose(cost, want, rtol=1e-9, atol=1e-9)
+    if rank == 9:
+        assert_equal_forms(least_squares._newton, weight, target, start)
 
 
 # --- errors ------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """The linear algebra of a Kalman filter with 12 states: batched, or by filterpy for one body.
 
-Both read the statistic of an epoch; a test holds them to each other on the same trials.
+A test holds both to each other on the same trials.
 """
 
 from __future__ import annotations
@@ -10,26 +10,58 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.bounds.pose import symmetric
-from rbl_gym.checks import FloatArray
-from rbl_gym.estimators.linear.squared_range import Statistic, compressed, information
+from rbl_gym.checks import FloatArray, kernel
+from rbl_gym.estimators.linear.squared_range import (
+    Statistic,
+    compressed,
+    information,
+    statistic,
+)
+from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
+
+# Behind the door: what comes to it was checked.
+_EXP = kernel(rotations.exp)
 
 
 class Prediction(NamedTuple):
-    """What a step of time does: ``Q <- step Q + noise``, ``t <- t + shift + noise``.
+    """What a step of time does: ``Q <- exp(turn) Q + noise``, ``t <- t + shift + noise``.
 
     Attributes
     ----------
-    step
-        Rotation (..., 3, 3).
+    turn
+        Rotation vector (..., 3), radians.
     shift
         (..., 3), metres.
     noise
         Variances (12,) that are added, one for all entries of Q.
     """
 
-    step: FloatArray
+    turn: FloatArray
     shift: FloatArray
     noise: FloatArray
+
+
+class Epoch(NamedTuple):
+    """One epoch, checked: what the linear update reads.
+
+    Attributes
+    ----------
+    ranges, anchors, tags
+        (..., M, N), 0 where there is no link, (..., M, 3) and (N, 3); metres.
+    weights
+        Inverse variances of the squared ranges [1/m^4], 0 where there is no link: (..., M, 1)
+        where all tags share them, else (..., M, N).
+    """
+
+    ranges: FloatArray
+    anchors: FloatArray
+    tags: FloatArray
+    weights: FloatArray
+
+    def statistic(self) -> Statistic:
+        """G and b of `squared_range`."""
+        return statistic(*self)
 
 
 class Batched:
@@ -40,20 +72,57 @@ class Batched:
         mean: FloatArray, P: FloatArray, motion: Prediction
     ) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance after ``x <- F x + [0; shift]``, ``P <- F P F^T + Q``."""
-        F = transition(motion.step)
-        mean = (F @ mean[..., None])[..., 0]
-        mean[..., 9:] += motion.shift
-        P = symmetric(F @ P @ np.swapaxes(F, -1, -2))
-        np.einsum("...ii->...i", P)[...] += motion.noise
-        return mean, P
+        turn, shift, noise = motion
+        return predict_mean(mean, turn, shift), predict_covariance(P, turn, noise)
 
     @staticmethod
-    def update(mean: FloatArray, P: FloatArray, stat: Statistic) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance after an epoch, ``P <- (I + P G)^-1 P``: exact for vague priors."""
-        matrix, vector = information(stat)
-        P = symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
-        innovation = vector[..., None] - matrix @ mean[..., None]
-        return mean + (P @ innovation)[..., 0], P
+    def update(mean: FloatArray, P: FloatArray, epoch: Epoch) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance after an epoch."""
+        P = update_covariance(P, *epoch[1:])
+        return update_mean(mean, P, *epoch), P
+
+
+@compiled("linear_filter:predict_mean")
+def predict_mean(mean: FloatArray, turn: FloatArray, shift: FloatArray) -> FloatArray:
+    """``F x + [0; shift]`` (..., 12), ``F = blkdiag(R, R, R, I)``, ``R = exp(turn)``."""
+    mean = (transition(_EXP(turn)) @ mean[..., None])[..., 0]
+    mean[..., 9:] += shift
+    return mean
+
+
+@compiled("linear_filter:predict_covariance")
+def predict_covariance(P: FloatArray, turn: FloatArray, noise: FloatArray) -> FloatArray:
+    """``F P F^T + diag(noise)`` (..., 12, 12), F as of `predict_mean`."""
+    F = transition(_EXP(turn))
+    return symmetric(F @ P @ np.swapaxes(F, -1, -2)) + noise[..., None] * np.eye(12)
+
+
+@compiled("linear_filter:update_covariance")
+def update_covariance(
+    P: FloatArray, anchors: FloatArray, tags: FloatArray, weights: FloatArray
+) -> FloatArray:
+    """Covariance (..., 12, 12) after an epoch, ``(I + P G)^-1 P``: exact for vague priors.
+
+    It depends on the weights, not on the ranges.
+    """
+    ranges = np.zeros((anchors.shape[-2], tags.shape[-2]))
+    matrix, _ = information(statistic(ranges, anchors, tags, weights))
+    return symmetric(np.linalg.solve(np.eye(12) + P @ matrix, P))
+
+
+@compiled("linear_filter:update_mean")
+def update_mean(
+    mean: FloatArray,
+    P: FloatArray,
+    ranges: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
+    """Mean (..., 12) after an epoch, ``x + P (y - G x)``, with the covariance P after it."""
+    matrix, vector = information(statistic(ranges, anchors, tags, weights))
+    innovation = vector[..., None] - matrix @ mean[..., None]
+    return mean + (P @ innovation)[..., 0]
 
 
 def transition(step: FloatArray) -> FloatArray:
@@ -74,19 +143,17 @@ class FilterPy:
     ) -> tuple[FloatArray, FloatArray]:
         """As `Batched.predict`."""
         kf = cls._filter(mean, P)
-        kf.F, kf.Q = transition(motion.step), np.diag(motion.noise)
+        kf.F, kf.Q = transition(_EXP(motion.turn)), np.diag(motion.noise)
         # Without B filterpy ignores u in silence.
         kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
         kf.predict(u=motion.shift[:, None])
         return cls._result(kf)
 
     @classmethod
-    def update(
-        cls, mean: FloatArray, P: FloatArray, stat: Statistic
-    ) -> tuple[FloatArray, FloatArray]:
+    def update(cls, mean: FloatArray, P: FloatArray, epoch: Epoch) -> tuple[FloatArray, FloatArray]:
         """As `Batched.update`, by filterpy's own gain and Joseph form."""
         kf = cls._filter(mean, P)
-        z, H = compressed(stat)
+        z, H = compressed(epoch.statistic())
         kf.R = np.eye(12)
         # A one-dimensional z would silently broadcast the state to a matrix.
         kf.update(z[:, None], H=H)

@@ -17,9 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.bounds.pose import symmetric
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of, kernel
-from rbl_gym.estimators.filter import PoseBelief, inverse, register
+from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
     check_batches,
@@ -27,10 +26,15 @@ from rbl_gym.estimators.inputs import (
     check_epoch,
     epoch_variance,
 )
-from rbl_gym.estimators.linear.engines import ENGINES, Prediction, engine_for
+from rbl_gym.estimators.linear.engines import ENGINES, Epoch, Prediction, engine_for
 from rbl_gym.estimators.linear.least_squares import unvec, vec
-from rbl_gym.estimators.linear.squared_range import Statistic, geometric_rank, statistic
-from rbl_gym.estimators.linear.unitary import coupled_fit, decoupled_fit
+from rbl_gym.estimators.linear.squared_range import geometric_rank
+from rbl_gym.estimators.linear.unitary import (
+    constrained_belief,
+    coupled_fit,
+    decoupled_fit,
+    projected_belief,
+)
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
@@ -140,12 +144,11 @@ class KalmanFamily:
         """State after `dt` seconds of the twist (..., 6): eqs (10)-(15), Omega carrying dt."""
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
-        step = rotations.exp(twist[..., :3] * dt)
         engine = engine_for(self.engine, state=state.mean.shape[:-1], twist=twist.shape[:-1])
         mean, covariance = engine.predict(
             state.mean,
             state.covariance,
-            Prediction(step, twist[..., 3:] * dt, dt * self._variance_rate),
+            Prediction(twist[..., :3] * dt, twist[..., 3:] * dt, dt * self._variance_rate),
         )
         return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
 
@@ -181,16 +184,19 @@ class KalmanFamily:
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
         check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
-        stat = statistic(ranges, anchors, self.tags, weights, mask)
+        if mask is not None:
+            weights = np.where(mask, weights, 0.0)
+        epoch = Epoch(ranges, anchors, self.tags, weights)
         engine = engine_for(
             self.engine,
             state=state.mean.shape[:-1],
-            ranges=stat.b.shape[:-2],
-            weights=stat.G.shape[:-3],
+            ranges=ranges.shape[:-2],
+            anchors=anchors.shape[:-2],
+            weights=weights.shape[:-2],
         )
-        mean, covariance = engine.update(state.mean, state.covariance, stat)
+        mean, covariance = engine.update(state.mean, state.covariance, epoch)
         posterior = KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
-        return _CONSTRAINTS[self.constraint](self, state, posterior, stat)
+        return _CONSTRAINTS[self.constraint](self, state, posterior, epoch)
 
     def belief(self, state: KalmanState) -> PoseBelief:
         """Pose, its covariance, and the raw matrix (copies).
@@ -198,20 +204,12 @@ class KalmanFamily:
         The covariance is that of the projected output, ``J^+ P J^+T``; of UC-KF, whose mean
         is constrained already, ``(J^T P^-1 J)^-1``.
         """
-        matrix = unvec(state.mean[..., :9])
-        on_group = self.constraint in ("newton", "always")
-        rotation = rotations.nearest(matrix)
-        J = state_jacobian(rotation)
-        transposed = np.swapaxes(J, -1, -2)
-        if self.constraint == "newton":
-            covariance = inverse(transposed @ np.linalg.solve(state.covariance, J))
-        else:
-            # J^T J = blkdiag(2 I, I): the pseudo-inverse needs no solver.
-            pinv = transposed * np.array([0.5] * 3 + [1.0] * 3)[:, None]
-            covariance = symmetric(pinv @ state.covariance @ np.swapaxes(pinv, -1, -2))
+        form = constrained_belief if self.constraint == "newton" else projected_belief
+        rotation, covariance = form(state.mean, state.covariance, np.eye(3), np.zeros(6))
         translation = state.mean[..., 9:].copy()
-        raw = rotation if on_group else matrix.copy(order="K")
-        return PoseBelief(rotation, translation, covariance, raw)
+        if self.constraint in ("newton", "always"):
+            return PoseBelief(rotation, translation, covariance, rotation)
+        return PoseBelief(rotation, translation, covariance, unvec(state.mean[..., :9]).copy())
 
     @cached_property
     def _variance_rate(self) -> FloatArray:
@@ -257,7 +255,7 @@ def _largest_of_three(values: FloatArray) -> FloatArray:
 
 
 def _no_constraint(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     return posterior
 
@@ -271,13 +269,13 @@ def _project(posterior: KalmanState, where: BoolArray) -> KalmanState:
 
 
 def _always(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     return _project(posterior, np.ones(posterior.mean.shape[:-1], bool))
 
 
 def _above_threshold(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     matrix = unvec(posterior.mean[..., :9])
     defect = np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)
@@ -285,17 +283,16 @@ def _above_threshold(
 
 
 def _newton(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, stat: Statistic
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
 ) -> KalmanState:
     """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
 
     The covariance stays that of the linear update, (22) as printed: an overestimate.
     """
-    if stat.is_common and not family.coupled:
-        rotation, translation = decoupled_fit(prior.mean, prior.covariance, stat)
+    if epoch.weights.shape[-1] == 1 and not family.coupled:
+        mean = decoupled_fit(prior.mean, prior.covariance, *epoch)
     else:
-        rotation, translation = coupled_fit(posterior.mean, posterior.covariance)
-    mean = np.concatenate([vec(rotation), translation], axis=-1)
+        mean = coupled_fit(posterior.mean, posterior.covariance)
     return KalmanState(mean, posterior.covariance, np.ones(mean.shape[:-1], bool))
 
 
@@ -308,15 +305,6 @@ _CONSTRAINTS: dict[str, Callable[..., KalmanState]] = {
 
 
 # --- between 6 and 12 states ---------------------------------------------------------------
-
-
-def state_jacobian(rotation: FloatArray) -> FloatArray:
-    """Derivative (..., 12, 6) of ``[vec Q; t]`` by the pose error (w, v)."""
-    J = np.zeros((*rotation.shape[:-2], 12, 6))
-    for k in range(3):
-        J[..., 3 * k : 3 * k + 3, :3] = -_HAT(rotation[..., :, k])
-    J[..., 9:, 3:] = np.eye(3)
-    return J
 
 
 def expand_covariance(covariance: FloatArray) -> FloatArray:

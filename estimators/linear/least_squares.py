@@ -14,12 +14,14 @@ from rbl_gym.bounds.pose import information_rank
 from rbl_gym.checks import FloatArray, kernel
 from rbl_gym.estimators.linear.squared_range import Statistic, information
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 
 # Behind the doors: entries of what is not determined are NaN here.
 _NEAREST = kernel(rotations.nearest)
 # From a step on the tangent space to a rotation, equal to second order.
 RETRACTIONS = {"exponential": kernel(rotations.exp), "cayley": kernel(rotations.cayley)}
 
+_ITERATIONS = 30
 # The generators of SO(3): E[i] = [e_i]x.
 _E = rotations.hat(np.eye(3))
 # Symmetrised products (E_i E_j + E_j E_i) / 2, the second-order term of exp.
@@ -41,7 +43,6 @@ def procrustes(
     weight: FloatArray,
     target: FloatArray,
     start: FloatArray,
-    iterations: int = 30,
     retraction: str = "exponential",
 ) -> tuple[FloatArray, FloatArray]:
     """Rotation that minimises ``(vec Q - q)^T W (vec Q - q) / 2`` by Newton's method on SO(3).
@@ -56,8 +57,6 @@ def procrustes(
         W (..., 9, 9), positive semidefinite, and q (..., 9).
     start
         Rotation (..., 3, 3) to start from.
-    iterations
-        At the most; it stops when all trials stand still.
     retraction
         One of `RETRACTIONS`.
 
@@ -65,13 +64,29 @@ def procrustes(
     -------
     The rotation (..., 3, 3) and its cost (...).
     """
+    if retraction == "exponential":
+        return _newton(weight, target, start)
+    return _newton_by(weight, target, start, retraction)
+
+
+@compiled("rotation_fits:procrustes")
+def _newton(
+    weight: FloatArray, target: FloatArray, start: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """`procrustes` with the exponential."""
+    return _newton_by(weight, target, start, "exponential")
+
+
+def _newton_by(
+    weight: FloatArray, target: FloatArray, start: FloatArray, retraction: str
+) -> tuple[FloatArray, FloatArray]:
     batch = np.broadcast_shapes(weight.shape[:-2], target.shape[:-1], start.shape[:-2])
     Q = np.broadcast_to(start, (*batch, 3, 3))
     residual = vec(Q) - target
     pull = (weight @ residual[..., None])[..., 0]
     cost = 0.5 * np.einsum("...i,...i->...", residual, pull)
     damping = np.zeros(batch)
-    for _ in range(iterations):
+    for _ in range(_ITERATIONS):
         tangent = vec(_E @ Q[..., None, :, :])  # (..., 3, 9): derivative of vec Q
         gradient = (tangent @ pull[..., None])[..., 0]
         gauss = tangent @ weight @ np.swapaxes(tangent, -1, -2)

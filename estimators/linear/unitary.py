@@ -1,57 +1,108 @@
-"""UC-KF on SO(3): the weighted problems (23), (26) and (27) of the tracking paper."""
+"""From the 12 states to poses: UC-KF's problems (23), (26) and (27), and beliefs on SO(3)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.bounds.pose import symmetric
+from rbl_gym.checks import FloatArray, kernel
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.estimators.linear.least_squares import procrustes, unvec, vec
-from rbl_gym.estimators.linear.squared_range import Statistic
+from rbl_gym.estimators.linear.squared_range import statistic
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
+
+# Behind the doors: what is not determined is NaN.
+_HAT, _NEAREST = kernel(rotations.hat), kernel(rotations.nearest)
 
 
+@compiled("linear_beliefs:decoupled_fit")
 def decoupled_fit(
-    mean: FloatArray, covariance: FloatArray, stat: Statistic
-) -> tuple[FloatArray, FloatArray]:
+    mean: FloatArray,
+    covariance: FloatArray,
+    ranges: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
     """Rotation from the centred tags and its prior block (26), then the translation (27).
 
     Parameters
     ----------
     mean, covariance
         Prior (..., 12) and (..., 12, 12).
-    stat
-        Of common weights.
+    ranges, anchors, tags, weights
+        Of an epoch (`engines.Epoch`), weights (..., M, 1) common to all tags.
 
     Returns
     -------
-    Rotation (..., 3, 3) and translation (..., 3).
+    ``[vec Q; t]`` (..., 12), Q a rotation.
     """
+    stat = statistic(ranges, anchors, tags, weights)
     P_q = inverse(covariance[..., :9, :9])
     P_t = inverse(covariance[..., 9:, 9:])
-    tags = stat.tags - stat.tags.mean(axis=-2, keepdims=True)
+    centred = tags - tags.mean(axis=-2, keepdims=True)
     G = stat.G[..., 0, :, :]
-    gram = np.swapaxes(tags, -1, -2) @ tags
+    gram = np.swapaxes(centred, -1, -2) @ centred
     kron = np.einsum("...kl,...ij->...kilj", gram, G)
     weight = P_q + kron.reshape(*kron.shape[:-4], 9, 9)
-    pull = (P_q @ mean[..., :9, None])[..., 0] + vec(np.swapaxes(stat.b, -1, -2) @ tags)
+    pull = (P_q @ mean[..., :9, None])[..., 0] + vec(np.swapaxes(stat.b, -1, -2) @ centred)
     rotation = _fit_rotation(weight, np.linalg.solve(weight, pull[..., None])[..., 0])
-    n_tags = stat.b.shape[-2]
-    turned = (rotation @ stat.tags.sum(axis=-2)[..., None])[..., 0]
+    turned = (rotation @ tags.sum(axis=-2)[..., None])[..., 0]
     right = (
         (P_t @ mean[..., 9:, None])[..., 0] + stat.b.sum(axis=-2) - (G @ turned[..., None])[..., 0]
     )
-    return rotation, np.linalg.solve(P_t + n_tags * G, right[..., None])[..., 0]
+    translation = np.linalg.solve(P_t + tags.shape[-2] * G, right[..., None])[..., 0]
+    return np.concatenate([vec(rotation), translation], axis=-1)
 
 
-def coupled_fit(mean: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The pose nearest to a linear posterior in its own covariance, (23)."""
+@compiled("linear_beliefs:coupled_fit")
+def coupled_fit(mean: FloatArray, covariance: FloatArray) -> FloatArray:
+    """The pose (..., 12) nearest to a linear posterior in its own covariance, (23)."""
     q, t = mean[..., :9], mean[..., 9:]
     weight = inverse(covariance[..., :9, :9])
     rotation = _fit_rotation(weight, q)
     moved = weight @ (vec(rotation) - q)[..., None]
-    return rotation, t + (covariance[..., 9:, :9] @ moved)[..., 0]
+    t = t + (covariance[..., 9:, :9] @ moved)[..., 0]
+    return np.concatenate([vec(rotation), t], axis=-1)
 
 
 def _fit_rotation(weight: FloatArray, q: FloatArray) -> FloatArray:
-    return procrustes(weight, q, rotations.nearest(unvec(q)))[0]
+    return procrustes(weight, q, _NEAREST(unvec(q)))[0]
+
+
+@compiled("linear_beliefs:projected_belief")
+def projected_belief(
+    mean: FloatArray, covariance: FloatArray, like: FloatArray, size: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The nearest rotation (..., 3, 3), and the covariance ``J^+ P J^+T`` of the projected pose.
+
+    `like` (3, 3) and `size` (6,) only tell a kernel how large the results are.
+    """
+    rotation = _NEAREST(unvec(mean[..., :9]))
+    # J^T J = blkdiag(2 I, I): the pseudo-inverse needs no solver.
+    halves = np.array([0.5] * 3 + [1.0] * 3)[:, None]
+    pinv = np.swapaxes(state_jacobian(rotation), -1, -2) * halves
+    return rotation, symmetric(pinv @ covariance @ np.swapaxes(pinv, -1, -2))
+
+
+@compiled("linear_beliefs:constrained_belief")
+def constrained_belief(
+    mean: FloatArray, covariance: FloatArray, like: FloatArray, size: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The rotation of the state, and the covariance ``(J^T P^-1 J)^-1`` of the pose on SO(3).
+
+    As `projected_belief`.
+    """
+    rotation = _NEAREST(unvec(mean[..., :9]))
+    J = state_jacobian(rotation)
+    return rotation, inverse(np.swapaxes(J, -1, -2) @ np.linalg.solve(covariance, J))
+
+
+def state_jacobian(rotation: FloatArray) -> FloatArray:
+    """Derivative (..., 12, 6) of ``[vec Q; t]`` by the pose error (w, v)."""
+    J = np.zeros((*rotation.shape[:-2], 12, 6))
+    for k in range(3):
+        J[..., 3 * k : 3 * k + 3, :3] = -_HAT(rotation[..., :, k])
+    J[..., 9:, 3:] = np.eye(3)
+    return J

@@ -13,8 +13,8 @@ from rbl_gym.estimators.costs.levenberg_marquardt import Solution
 from rbl_gym.estimators.costs.map_problem import minimize
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.linear import least_squares
-from rbl_gym.estimators.linear.kalman import state_jacobian
 from rbl_gym.estimators.linear.squared_range import Statistic, information
+from rbl_gym.estimators.linear.unitary import state_jacobian
 from rbl_gym.estimators.locating.maximum_likelihood import (
     Alternatives,
     maximum_likelihood,

@@ -19,21 +19,25 @@ _STATES = 12
 _cholesky, _, _invert_factored = of_size(_STATES)
 
 
-@gufunc("(p),(p,p),(d),(d),(p)->(p),(p,p)")
-def predict(
-    mean: Any, P: Any, turn: Any, shift: Any, noise: Any, new_mean: Any, new_P: Any
-) -> None:
-    """``x <- F x + [0; shift]``, ``P <- F P F^T + diag(noise)``, F = blkdiag(R, R, R, I)."""
+@gufunc("(p),(d),(d)->(p)")
+def predict_mean(mean: Any, turn: Any, shift: Any, new_mean: Any) -> None:
+    """``x <- F x + [0; shift]``, F = blkdiag(R, R, R, I), R the rotation of the vector `turn`."""
+    R = np.empty((3, 3))
+    rotations.exp(turn[0], turn[1], turn[2], R)
+    for i in range(3):
+        for k in range(3):
+            new_mean[3 * k + i] = (
+                R[i, 0] * mean[3 * k] + R[i, 1] * mean[3 * k + 1] + R[i, 2] * mean[3 * k + 2]
+            )
+        new_mean[9 + i] = mean[9 + i] + shift[i]
+
+
+@gufunc("(p,p),(d),(p)->(p,p)")
+def predict_covariance(P: Any, turn: Any, noise: Any, new_P: Any) -> None:
+    """``P <- F P F^T + diag(noise)``, F as of `predict_mean`."""
     work = np.empty((2, 3, 3))
     R, half = work[0], work[1]
     rotations.exp(turn[0], turn[1], turn[2], R)
-    for k in range(4):
-        for i in range(3):
-            if k == 3:
-                new_mean[9 + i] = mean[9 + i] + shift[i]
-            else:
-                a, b, c = mean[3 * k], mean[3 * k + 1], mean[3 * k + 2]
-                new_mean[3 * k + i] = R[i, 0] * a + R[i, 1] * b + R[i, 2] * c
     for k in range(4):
         for m in range(k + 1):
             row, column = 3 * k, 3 * m
@@ -133,17 +137,6 @@ def _add_information(H: Any, anchors: Any, tags: Any, weights: Any) -> None:
 
 
 @helper
-def _posterior(P: Any, anchors: Any, tags: Any, weights: Any, work: Any, new_P: Any) -> None:
-    """``(P^-1 + information)^-1``; work is (2, 12, 12)."""
-    L, information = work[0], work[1]
-    _cholesky(P, L)
-    _invert_factored(L, information)
-    _add_information(information, anchors, tags, weights)
-    _cholesky(information, L)
-    _invert_factored(L, new_P)
-
-
-@helper
 def innovation(
     mean: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, arms: Any, y: Any
 ) -> None:
@@ -182,40 +175,28 @@ def innovation(
             y[k, 2] += c * b2
 
 
-@helper
-def _correct(mean: Any, P: Any, y: Any, new_mean: Any) -> None:
-    """``x + P y`` with the posterior P."""
-    for i in range(_STATES):
-        total = mean[i]
-        for k in range(4):
-            for j in range(3):
-                total += P[i, 3 * k + j] * y[k, j]
-        new_mean[i] = total
-
-
-@gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p),(p,p)")
-def update(
-    mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any, new_P: Any
-) -> None:
-    """Mean and covariance after an epoch, in the information form."""
-    work = np.empty((2, _STATES, _STATES))
-    y = work[0, :4, :3]
-    _posterior(P, anchors, tags, weights, work, new_P)
-    innovation(mean, ranges, anchors, tags, weights, tags, y)
-    _correct(mean, new_P, y, new_mean)
-
-
 @gufunc("(p,p),(m,d),(n,d),(m,w)->(p,p)")
 def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) -> None:
-    """The covariance of `update`, which needs no ranges."""
-    _posterior(P, anchors, tags, weights, np.empty((2, _STATES, _STATES)), new_P)
+    """``(P^-1 + information)^-1``: the covariance after an epoch, which needs no ranges."""
+    work = np.empty((2, _STATES, _STATES))
+    L, information = work[0], work[1]
+    _cholesky(P, L)
+    _invert_factored(L, information)
+    _add_information(information, anchors, tags, weights)
+    _cholesky(information, L)
+    _invert_factored(L, new_P)
 
 
 @gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p)")
 def update_mean(
     mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any
 ) -> None:
-    """The mean of `update`, with the covariance P after the epoch."""
+    """``x + P y``: the mean after an epoch, with the covariance P after it."""
     y = np.empty((4, 3))
     innovation(mean, ranges, anchors, tags, weights, tags, y)
-    _correct(mean, P, y, new_mean)
+    for i in range(_STATES):
+        total = mean[i]
+        for k in range(4):
+            for j in range(3):
+                total += P[i, 3 * k + j] * y[k, j]
+        new_mean[i] = total
