@@ -76,12 +76,12 @@ def test_ring_and_orbit_reach_their_radius_and_angles(difficulty, name):
     env.reset(seed=1)
     rng, angles = np.random.default_rng(1), []
     for _ in range(99):
-        env.step(controllers.MOBILE[name](env, rng))
-        gap = env.anchors[..., :2] - env.at.translation[:, None, :2]
+        truth = env.step(controllers.MOBILE[name](env, rng))[4]["translation"]
+        gap = env.anchors[..., :2] - truth[:, None, :2]
         angles.append(np.sort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1))
     pair = difficulty == "hard"
     depths = getattr(controllers, f"{'PAIR_' if pair else ''}{name.upper()}_DEPTHS")
-    radius = depths * np.maximum(-env.at.translation[:, 2], 10)
+    radius = depths * np.maximum(-truth[:, 2], 10)
     # The process pushes the vehicle by .3 m a step, and craft overtake on a chord.
     error = np.linalg.norm(gap, axis=-1) / radius[:, None] - 1
     # Two craft know the vehicle to metres only, on a ring as small as three.
@@ -125,8 +125,8 @@ def test_a_plan_costs_the_mean_log_score_along_it():
     got = controllers._plan_cost(env, plans, controllers._predicted(env))
     scene, tags = env.scene, np.array(env.scene.tags)
     for world, sample in itertools.product(range(2), (0, 4)):
-        pose = env.state.rotation[world], env.state.translation[world]
-        twist, covariance = env.twist[world], env.state.covariance[world]
+        pose = env.belief.rotation[world], env.belief.translation[world]
+        twist, covariance = env.twist[world], env.belief.covariance[world]
         anchors, cost = env.anchors[world].copy(), 0.0
         for step in plans[world, sample]:
             anchors[:, :2] += 8 * step
@@ -145,7 +145,7 @@ def test_a_plan_costs_the_mean_log_score_along_it():
 def predicted_score(env, world, chosen, with_map):
     """b of the predicted belief with the chosen anchors added, in plain steps."""
     scene, tags = env.scene, np.array(env.scene.tags)
-    state, twist = env.state, env.twist[world]
+    state, twist = env.belief, env.twist[world]
     pose = motion.propagate(state.rotation[world], state.translation[world], twist, scene.dt)
     covariance = bounds.predict_covariance(state.covariance[world], twist, scene.dt, scene.process)
     information = np.linalg.inv(covariance)
@@ -187,7 +187,7 @@ def test_nearest_takes_the_nearest():
         env = AnchorSelectionVectorEnv(4, mode)
         env.reset(seed=2)
         rng = np.random.default_rng(0)
-        distance = np.linalg.norm(env.anchors - env.state.translation[:, None], axis=-1)
+        distance = np.linalg.norm(env.anchors - env.belief.translation[:, None], axis=-1)
         chosen = env.step(controllers.nearest(env, rng))[4]["chosen"]
         for world in range(4):
             assert set(np.flatnonzero(chosen[world])) == set(np.argsort(distance[world])[:3])

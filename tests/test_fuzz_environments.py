@@ -25,8 +25,14 @@ WORLDS: dict[str, dict[str, Any]] = {
         "scene": SHORT, "mode": "sequential", "racks": 1, "n_anchors": 4, "mirror": True,
         "sight": True,
     },
-    "MobileAnchors": {"difficulty": "easy", "scene": "auv_craft", "sort_craft": True},
-    "AnchorSelection": {"mode": "top-k", "k": 3, "price": 0.05, "scene": SHORT},
+    "MobileAnchors": {
+        "difficulty": "easy", "scene": "auv_craft", "sort_craft": True, "filter": "iekf",
+        "options": {"robust": True},
+    },
+    "AnchorSelection": {
+        "mode": "top-k", "k": 3, "price": 0.05, "scene": SHORT, "filter": "iekf",
+        "options": {"robust": True},
+    },
     "BaseStation": {"scene": {"steps": 3}, "angle_std_rad": 0.01, "reward": "bound"},
     "PlanarNetwork": {
         "n_nodes": 5, "side_m": 10.0, "radius_m": 8.0, "blind_m": 0.5, "bearing_std_rad": 0.05,
@@ -79,7 +85,9 @@ def test_constructors(name, vector):
                 env = made(name, vector, **{**arguments, argument: value})
                 episode(env, name)
             except (ValueError, TypeError) as error:
-                if not names(error, {argument, "scene"}):
+                # Of options the filter names the one that is wrong.
+                known = {argument, "scene", *(map(str, value) if isinstance(value, dict) else ())}
+                if not names(error, known):
                     problems.append(f"{argument} = {value!r:.60}: {error}")
             except Exception as error:
                 problems.append(f"{argument} = {value!r:.60}: {type(error).__name__}: {error}")

@@ -56,11 +56,6 @@ CLASSES = {
 }
 
 
-def batch_of(env: Any) -> Any:
-    """The vector environment of one world that a scalar one is."""
-    return env.unwrapped._batch
-
-
 def short(kind: str, steps: int = 4) -> tuple[type, type, dict[str, Any]]:
     """Scalar class, vector class, and arguments with short episodes."""
     env_id, arguments = WORLDS[kind]
@@ -122,7 +117,7 @@ def test_episodes_truncate_after_their_steps_and_types_are_pythons(kind):
     env_id, arguments = WORLDS[kind]
     steps = 100 if env_id == MOBILE else 50
     world: Any = gym.make(env_id, **arguments).unwrapped
-    assert world._batch.scene.steps == steps
+    assert world.scene.steps == steps
     if kind not in ("easy", "top 3"):
         steps, arguments = 8, short(kind, 8)[2]
     env = gym.make(env_id, **arguments).unwrapped
@@ -180,8 +175,9 @@ def test_a_shorter_limit_truncates(kind):
 class Replay:
     """One world by the scene's episode, plain distances, and a filter of its own."""
 
-    def __init__(self, scene, seed: int) -> None:
+    def __init__(self, scene, seed: int, name: str = "iekf", **options) -> None:
         self.scene, self.tags = scene, np.array(scene.tags)
+        self.name, self.options = name, options or {"iterations": 2}
         self.episode = simulation.draw_episode(scene, seeding.np_random(seed)[0])
         self.anchors = np.array(self.episode.anchors)
         self.state: Any = self.filter().initial(
@@ -193,8 +189,8 @@ class Replay:
 
     def filter(self, noise=None) -> Any:
         return estimators.make(
-            "iekf", tags=self.tags, noise=noise or self.scene.noise, process=self.scene.process,
-            iterations=2,
+            self.name, tags=self.tags, noise=noise or self.scene.noise,
+            process=self.scene.process, **self.options,
         )  # fmt: skip
 
     def predict(self, k: int) -> None:
@@ -217,7 +213,11 @@ class Replay:
         self.state = self.filter(noise).update(self.state, ranges, self.anchors, links)
 
     def score(self) -> float:
-        return score_by_hand(self.state.covariance, self.state.rotation, self.tags)
+        return score_by_hand(self.belief.covariance, self.belief.rotation, self.tags)
+
+    @property
+    def belief(self):
+        return self.filter().belief(self.state)
 
     def log_std(self):
         prior = [self.scene.initial_rotation_rad] * 3 + [self.scene.initial_translation_m] * 3
@@ -232,7 +232,7 @@ class Replay:
 @pytest.mark.parametrize("seed", [3, 11])
 def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
     env = MobileAnchorsEnv(difficulty)
-    scene = batch_of(env).scene
+    scene = env.scene
     m, speed = (3, 4.0) if difficulty == "easy" else (2, 2.0)
     assert (scene.n_anchors, scene.anchor_speed_m_s, scene.dt, scene.steps) == (m, speed, 2, 100)
     twin, rng = Replay(scene, seed), np.random.default_rng(seed)
@@ -253,7 +253,7 @@ def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
             step = action[2 * j : 2 * j + 2]
             twin.anchors[i, :2] += 2.0 * speed * step / max(1.0, np.linalg.norm(step))
         observation, reward, _, _, info = env.step(action)
-        np.testing.assert_allclose(batch_of(env).anchors[0], twin.anchors, atol=1e-9)
+        np.testing.assert_allclose(env.anchors, twin.anchors, atol=1e-9)
         twin.predict(k)
         twin.update(k)
         np.testing.assert_allclose(reward, -math.log(twin.score()), rtol=1e-6)
@@ -266,7 +266,7 @@ def test_mobile_rewards_and_observations_by_a_separate_filter(difficulty, seed):
 @pytest.mark.parametrize("seed", [1, 5])
 def test_selection_rewards_and_observations_by_a_separate_filter(mode, seed):
     env = AnchorSelectionEnv(mode, price=0.07)
-    scene = batch_of(env).scene
+    scene = env.scene
     assert scene.blocked_information == 0.02
     twin, rng = Replay(scene, seed), np.random.default_rng(seed)
     observation, info = env.reset(seed=seed)
@@ -296,7 +296,7 @@ def test_selection_rewards_and_observations_by_a_separate_filter(mode, seed):
 
 def test_a_blocked_link_carries_two_percent_and_the_filter_is_told():
     env = AnchorSelectionEnv(k=1)
-    scene = batch_of(env).scene
+    scene = env.scene
     for seed in range(20):
         probe = Replay(scene, seed)
         shares = [share_by_hand(scene, a, probe.episode.translation[1]) for a in probe.anchors]
@@ -305,7 +305,7 @@ def test_a_blocked_link_carries_two_percent_and_the_filter_is_told():
     env.reset(seed=seed)
     blocked = shares.index(0.02)
     env.step(np.eye(12)[blocked])
-    got = batch_of(env).state.covariance[0]
+    got = env.belief.covariance
     beliefs = []
     for told in (True, False):
         twin = Replay(scene, seed)
@@ -324,25 +324,61 @@ def test_a_blocked_link_carries_two_percent_and_the_filter_is_told():
 def test_without_anchors_the_belief_is_the_prediction():
     env = AnchorSelectionVectorEnv(4, "priced")
     env.reset(seed=2)
-    before = env.state
+    before = env.belief
     _, reward, _, _, info = env.step(np.zeros((4, 12), np.int8))
     pose = motion.propagate(before.rotation, before.translation, env.twist, 0.2)
     covariance = bounds.predict_covariance(before.covariance, env.twist, 0.2, env.scene.process)
-    np.testing.assert_allclose(env.state.rotation, pose[0], atol=1e-12)
-    np.testing.assert_allclose(env.state.translation, pose[1], atol=1e-12)
-    np.testing.assert_allclose(env.state.covariance, covariance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(env.belief.rotation, pose[0], atol=1e-12)
+    np.testing.assert_allclose(env.belief.translation, pose[1], atol=1e-12)
+    np.testing.assert_allclose(env.belief.covariance, covariance, rtol=1e-9, atol=1e-12)
     score = bounds.score(covariance, pose[0], np.array(env.scene.tags))
     np.testing.assert_allclose(reward, -np.log(score))
     assert not info["chosen"].any()
     # Beside worlds that measure, too.
     mixed = np.zeros((4, 12), np.int8)
     mixed[[1, 3]] = 1
-    before = env.state
+    before = env.belief
     env.step(mixed)
     alone = bounds.predict_covariance(before.covariance, env.twist, 0.2, env.scene.process)
-    np.testing.assert_allclose(env.state.covariance[[0, 2]], alone[[0, 2]], rtol=1e-9, atol=1e-12)
-    traces = np.trace(env.state.covariance - alone, axis1=1, axis2=2)
+    np.testing.assert_allclose(env.belief.covariance[[0, 2]], alone[[0, 2]], rtol=1e-9, atol=1e-12)
+    traces = np.trace(env.belief.covariance - alone, axis1=1, axis2=2)
     assert (traces[[1, 3]] < 0).all()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "filter", "options"),
+    [
+        (MOBILE, "iekf-bank", {"robust": False}),
+        (MOBILE, "iekf", {"robust": True}),
+        (SELECTION, "uc-kf", {"sigma_q_scale": 0.8}),
+        (SELECTION, "iekf-cv", {"iterations": 3}),
+    ],
+)
+def test_any_filter_by_a_plain_loop(env_id, filter, options):
+    scene = {"name": "auv_craft" if env_id == MOBILE else "hall", "steps": 8}
+    env: Any = gym.make(env_id, filter=filter, options=options, scene=scene).unwrapped
+    extra = {"iterations": 2} if filter == "iekf" else {}
+    twin, rng = Replay(env.scene, 4, filter, **extra, **options), np.random.default_rng(4)
+    env.reset(seed=4)
+    if env_id == MOBILE:
+        twin.update(0)
+    for k in range(1, 9):
+        action = rng.uniform(-1, 1, env.action_space.shape)
+        _, reward, _, _, info = env.step(action)
+        twin.anchors = env.anchors.copy()
+        twin.predict(k)
+        twin.update(k, np.argsort(action)[-3:] if env_id == SELECTION else None)
+        np.testing.assert_allclose(reward, -math.log(twin.score()), rtol=1e-6)
+        error = twin.belief.translation - twin.episode.translation[k]
+        np.testing.assert_allclose(info["position_error_m"], np.linalg.norm(error), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["kf", "iekf-bank", "iekf-bias"])
+def test_other_filters_equal_scalar_environments(name):
+    arguments = {"filter": name, "scene": {"name": "hall", "steps": 4}, "k": 5}
+    native = AnchorSelectionVectorEnv(2, **arguments)
+    peer = peer_of(AnchorSelectionEnv, AutoresetMode.NEXT_STEP, 2, arguments)
+    assert_steps_alike(native, peer, 6, 3, TOLERANCE)
 
 
 # --- actions ----------------------------------------------------------------------------------
@@ -387,20 +423,27 @@ def test_each_anchor_costs_its_price():
         np.testing.assert_allclose(rewards[0.0] - rewards[price], lost, atol=1e-12)
 
 
-def test_craft_numbers_change_nothing_when_sorted():
+@pytest.mark.parametrize("sort", [True, False])
+def test_craft_numbers_change_nothing_when_sorted(sort):
     turn = np.array([2, 0, 3, 1])
-    scene = {"name": "auv_craft", "n_anchors": 4}
-    for sort in (True, False):
-        env, peer = (MobileAnchorsVectorEnv(8, scene=scene, sort_craft=sort) for _ in range(2))
-        env.reset(seed=3)
-        peer.reset(seed=3)
-        peer.anchors = env.anchors[:, turn].copy()
-        peer._sort()
-        assert np.array_equal(env._observe(), peer._observe()) is sort
-        actions = np.random.default_rng(0).uniform(-1, 1, (8, 8))
-        env.step(actions)
-        peer.step(actions)
-        assert np.allclose(peer.anchors, env.anchors[:, turn], atol=1e-9) is sort
+    env = MobileAnchorsVectorEnv(8, scene={"name": "auv_craft", "n_anchors": 4}, sort_craft=sort)
+    env.reset(seed=3)
+    seen = env.seen
+    assert seen is not None
+    other = {**seen, "anchors": seen["anchors"][:, turn]}
+    assert np.array_equal(env._show(seen), env._show(other)) is sort
+    actions = np.random.default_rng(0).uniform(-1, 1, (8, 8))
+    env.step(actions)
+    moved = env.anchors
+    env.reset(seed=3)
+    env.seen = other
+    renumbered = env._velocities(actions).reshape(8, 4, 3)
+    env.seen = seen
+    # The same craft get the same commands, whatever their numbers.
+    back = np.argsort(turn)
+    env.inner.step(renumbered[:, back].reshape(8, 12))
+    got = env.inner.unwrapped._anchors
+    assert np.allclose(got, moved, atol=1e-9) is sort
 
 
 def test_craft_move_at_their_limit_at_most_and_stay_on_the_water():
@@ -423,16 +466,16 @@ def test_craft_move_at_their_limit_at_most_and_stay_on_the_water():
 # --- consistency ------------------------------------------------------------------------------
 
 
-def test_a_state_that_was_handed_out_outlives_its_episode():
+def test_a_belief_that_was_handed_out_outlives_its_episode():
     envs = MobileAnchorsVectorEnv(num_envs=3, autoreset_mode="Disabled")
     envs.reset(seed=1)
-    held = envs.state
+    held = envs.belief
     before = [field.copy() for field in held]
     envs.reset(options={"reset_mask": np.array([True, False, True])})
     for field, old in zip(held, before, strict=True):
         np.testing.assert_array_equal(field, old)
-    assert not np.array_equal(envs.state.translation[0], before[1][0])
-    np.testing.assert_array_equal(envs.state.translation[1], before[1][1])
+    assert not np.array_equal(envs.belief.translation[0], before[1][0])
+    np.testing.assert_array_equal(envs.belief.translation[1], before[1][1])
 
 
 @pytest.mark.parametrize("kind", ["easy", "hard", "selection"])
@@ -533,18 +576,18 @@ def test_bad_vector_arguments_are_named(kind, arguments, message):
 @pytest.mark.parametrize(
     ("kind", "action", "message"),
     [
-        ("easy", np.zeros(4), r"actions must be numbers of shape \(1, 6\)"),
-        ("easy", [0, 0, math.nan, 0, 0, 0], "actions must be finite, got nan"),
-        ("easy", [math.inf, 0, 0, 0, 0, 0], "actions must be finite, got inf"),
-        ("top 3", "all", "actions must be numbers"),
-        ("top 3", np.full(12, math.nan), "actions must be finite"),
-        ("priced", np.full(12, 2), "actions must lie in"),
-        ("priced", np.full(12, 256), "actions must lie in"),
-        ("priced", np.full(12, -255), "actions must lie in"),
-        ("priced", np.full(12, 0.5), "actions must lie in"),
-        ("priced", np.full(12, 1e300), "actions must lie in"),
-        ("priced", np.full(12, math.nan), "actions must be finite"),
-        ("priced", np.ones(11, int), r"actions must be numbers of shape \(1, 12\)"),
+        ("easy", np.zeros(4), r"action must be numbers of shape \(6,\)"),
+        ("easy", [0, 0, math.nan, 0, 0, 0], "action must be finite, got nan"),
+        ("easy", [math.inf, 0, 0, 0, 0, 0], "action must be finite, got inf"),
+        ("top 3", "all", "action must be numbers"),
+        ("top 3", np.full(12, math.nan), "action must be finite"),
+        ("priced", np.full(12, 2), "action must lie in"),
+        ("priced", np.full(12, 256), "action must lie in"),
+        ("priced", np.full(12, -255), "action must lie in"),
+        ("priced", np.full(12, 0.5), "action must lie in"),
+        ("priced", np.full(12, 1e300), "action must lie in"),
+        ("priced", np.full(12, math.nan), "action must be finite"),
+        ("priced", np.ones(11, int), r"action must be numbers of shape \(12,\)"),
     ],
 )
 def test_bad_actions_are_named_and_change_nothing(kind, action, message):

@@ -2,6 +2,14 @@
 
 from rbl_gym.wrappers.estimate import EstimatePose
 from rbl_gym.wrappers.estimate_network import EstimateNetwork, VectorEstimateNetwork
+from rbl_gym.wrappers.select_anchors import SelectAnchors, VectorSelectAnchors
 from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
-__all__ = ["EstimateNetwork", "EstimatePose", "VectorEstimateNetwork", "VectorEstimatePose"]
+__all__ = [
+    "EstimateNetwork",
+    "EstimatePose",
+    "SelectAnchors",
+    "VectorEstimateNetwork",
+    "VectorEstimatePose",
+    "VectorSelectAnchors",
+]

@@ -57,8 +57,8 @@ def _around(env: MobileAnchorsVectorEnv, depths: float, ahead: float) -> FloatAr
 
     `ahead`: how many steps of travel along the ring they lie before the craft.
     """
-    centre = env.state.translation[:, None, :2] + env.twist[:, None, 3:5] * env.scene.dt
-    radius = depths * np.maximum(np.abs(env.state.translation[:, 2]), 10.0)[:, None]
+    centre = env.belief.translation[:, None, :2] + env.twist[:, None, 3:5] * env.scene.dt
+    radius = depths * np.maximum(np.abs(env.belief.translation[:, 2]), 10.0)[:, None]
     gap = env.anchors[..., :2] - centre
     angle = np.arctan2(gap[..., 1], gap[..., 0])
     rank = np.argsort(np.argsort(angle, axis=-1), axis=-1)
@@ -109,7 +109,7 @@ def receding_horizon(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> n
 
 def _predicted(env: MobileAnchorsVectorEnv) -> list[tuple[FloatArray, FloatArray]]:
     """Poses (B, 1, ...) of the next steps if the twist stays what it is."""
-    pose = env.state.rotation[:, None], env.state.translation[:, None]
+    pose = env.belief.rotation[:, None], env.belief.translation[:, None]
     poses = []
     for _ in range(_HORIZON):
         pose = propagate(*pose, env.twist[:, None], env.scene.dt)
@@ -122,7 +122,7 @@ def _plan_cost(
 ) -> FloatArray:
     """Mean log b (B, S) of plans (B, S, H, M, 2) along the predicted poses."""
     scene, tags = env.scene, np.asarray(env.scene.tags)
-    information = np.linalg.inv(env.state.covariance)[:, None]
+    information = np.linalg.inv(env.belief.covariance)[:, None]
     anchors = np.broadcast_to(env.anchors[:, None], (*plans.shape[:2], *env.anchors.shape[1:]))
     cost = np.zeros(plans.shape[:2])
     for k, (rotation, translation) in enumerate(poses):
@@ -150,7 +150,7 @@ def random_anchors(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> n
 
 def nearest(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
     """The k nearest to the estimate."""
-    distance = np.linalg.norm(env.anchors - env.state.translation[:, None], axis=-1)
+    distance = np.linalg.norm(env.anchors - env.belief.translation[:, None], axis=-1)
     scores = 1 - 2 * np.argsort(np.argsort(distance, axis=-1), axis=-1) / env.scene.n_anchors
     if env.mode == "top-k":
         return scores
@@ -164,7 +164,7 @@ def greedy_blind(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.
 
 def greedy_with_map(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
     """As `greedy_blind`, with the racks known."""
-    _, translation = propagate(*env.state[:2], env.twist, env.scene.dt)
+    _, translation = propagate(env.belief.rotation, env.belief.translation, env.twist, env.scene.dt)
     return _greedy(env, env.scene.obstruction.share(env.anchors, translation[:, None])[:, 0])
 
 
@@ -172,8 +172,10 @@ def _greedy(env: AnchorSelectionVectorEnv, quality: FloatArray) -> np.ndarray:
     """Actions that choose greedily, links weighted by `quality` (B, M)."""
     scene, tags = env.scene, np.asarray(env.scene.tags)
     rows = np.arange(env.num_envs)
-    pose = propagate(*env.state[:2], env.twist, scene.dt)
-    covariance = bounds.predict_covariance(env.state.covariance, env.twist, scene.dt, scene.process)
+    pose = propagate(env.belief.rotation, env.belief.translation, env.twist, scene.dt)
+    covariance = bounds.predict_covariance(
+        env.belief.covariance, env.twist, scene.dt, scene.process
+    )
     rotation, translation = pose[0][:, None], pose[1][:, None]
     parts = (
         bounds.information_at(env.anchors[:, :, None], tags, rotation, translation, scene.noise)

@@ -147,11 +147,7 @@ def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
 
 def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
     """A named filter that knows the scene's tags, and the laws of what `env` measures."""
-    if options is not None and not (
-        isinstance(options, Mapping) and all(isinstance(key, str) for key in options)
-    ):
-        raise ValueError(f"options must be a dict by names, or None, got {options!r:.80}")
-    told = {} if options is None else dict(options)
+    told = check_options_of(options)
     law = getattr(env.unwrapped, "noise", scene.noise)
     if isinstance(law, AngleNoise):
         told = {"measurement": "doa", **told}
@@ -160,6 +156,20 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
     )
     check_takes_obstacles(name, filter, scene)
     return filter
+
+
+def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Options of a filter as a dict, or a ValueError."""
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping) or not all(isinstance(key, str) for key in options):
+        raise ValueError(f"options must be a dict by names, or None, got {options!r:.80}")
+    for key in ("name", "tags", "noise", "process"):
+        if key in options:
+            raise ValueError(
+                f"options must not have {key!r}, which the wrapper gives, got {options!r:.80}"
+            )
+    return dict(options)
 
 
 def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:

@@ -1,24 +1,28 @@
 """Learning tasks with a filter in the loop: move the anchors, or choose them, for the belief.
 
-World + iterated EKF + observation + reward. The world is that of `RBL/Tracking-v0`; the policy
-sees the belief, not the ranges, and is paid for how good the belief says it is.
+`RBL/Tracking-v0`, `EstimatePose`, and a policy's view of both: the policy sees the belief, not the
+ranges, and is paid for how good the belief says it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import rendering
-from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
-from rbl_gym.envs.batch import ScalarEnv
-from rbl_gym.worlds import scenes, simulation
+from rbl_gym.checks import FloatArray, check_count, check_number, check_one_of
+from rbl_gym.envs.batch import check_actions
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
-from rbl_gym.wrappers.filter_loop import FilterLoop
+from rbl_gym.wrappers.compositions import TaskEnv, VectorTaskEnv
+from rbl_gym.wrappers.estimate import EstimatePose, check_options_of
+from rbl_gym.wrappers.select_anchors import SelectAnchors, VectorSelectAnchors
+from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
 # An observation is of order one; what is far outside says no more than that.
 _LIMIT = 10.0
@@ -27,6 +31,8 @@ DIFFICULTIES: dict[str, dict[str, Any]] = {
     "hard": {"n_anchors": 2, "anchor_speed_m_s": 2.0},
 }
 SELECTIONS = ("top-k", "priced")
+# Iterations of the iterated EKF; two are as good as four here, and faster.
+_ITERATIONS = 2
 
 
 def _world(scene: Any, **defaults: Any) -> Scene:
@@ -35,83 +41,137 @@ def _world(scene: Any, **defaults: Any) -> Scene:
     return scenes.get({**defaults, **changes} if isinstance(changes, Mapping) else changes)
 
 
-def _flat(parts: list[FloatArray]) -> np.ndarray:
-    return np.clip(np.concatenate(parts, axis=-1), -_LIMIT, _LIMIT).astype(np.float32)
+def _options(filter: Any, options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The options of the filter, the tasks' own where none are given."""
+    usual = {"iterations": _ITERATIONS} if isinstance(filter, str) and filter == "iekf" else {}
+    return {**usual, **check_options_of(options)}
+
+
+class _View:
+    """The part of a flat observation that both tasks have, of arrays with any leading axes."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.speed = max(scene.speed_m_s, float(np.abs(scene.twist[3:]).max()), 1e-3)
+        self.prior_variance = np.diagonal(scene.prior_covariance).copy()
+
+    def write(self, flat: FloatArray, observation: Mapping[str, np.ndarray]) -> None:
+        """Log standard deviations and two columns of the rotation into flat (..., 12)."""
+        covariance = observation["belief_covariance"]
+        variance = covariance.reshape(*covariance.shape[:-2], 36)[..., ::7]
+        # Less that of their usual size.
+        flat[..., :6] = 0.5 * np.log(np.maximum(variance, 1e-24) / self.prior_variance) + 1.0
+        rotation = observation["belief_rotation"]
+        flat[..., 6:9], flat[..., 9:12] = rotation[..., 0], rotation[..., 1]
+
+
+def _worlds(batch: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """Indices that stand before those (B, M) of each world's craft."""
+    return tuple(np.arange(n)[:, None] for n in batch)
+
+
+def _cut(flat: FloatArray) -> np.ndarray:
+    return np.minimum(np.maximum(flat, -_LIMIT), _LIMIT).astype(np.float32)
 
 
 # --- surface craft and a diving vehicle -------------------------------------------------------
 
 
-class MobileAnchorsVectorEnv(FilterLoop):
+class _MobileAnchors:
+    """Craft in the order of the observation: what scalar and vector forms share."""
+
+    scene: Scene
+    # The last observation that was sorted, and its order.
+    _sorted: tuple[Any, np.ndarray] | None = None
+
+    def _configure(self, difficulty: str, scene: Any, sort_craft: bool) -> None:
+        level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
+        self.scene = _world(scene, **level)
+        if self.scene.anchor_speed_m_s <= 0:
+            raise ValueError("scene must have anchors that move, got anchor_speed_m_s = 0")
+        if not isinstance(sort_craft, bool):
+            raise ValueError(f"sort_craft must be True or False, got {sort_craft!r}")
+        self.sort_craft = sort_craft
+        self._view = _View(self.scene)
+
+    def _spaces(self) -> tuple[spaces.Box, spaces.Box]:
+        m = self.scene.n_anchors
+        return (
+            spaces.Box(-_LIMIT, _LIMIT, (15 + 3 * m,), np.float32),
+            spaces.Box(-1.0, 1.0, (2 * m,), np.float32),
+        )
+
+    @property
+    def order(self) -> np.ndarray:
+        """Numbers (..., M) of the craft in the order of the observation."""
+        return self._order(self._told())  # pyright: ignore[reportAttributeAccessIssue]
+
+    def _order(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        """By bearing from the estimate, so that equal situations look equal."""
+        if self._sorted is None or self._sorted[0] is not observation:
+            gap = observation["anchors"] - observation["belief_translation"][..., None, :]
+            order = np.argsort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1)
+            if not self.sort_craft:
+                order[...] = np.arange(order.shape[-1])
+            self._sorted = observation, order
+        return self._sorted[1]
+
+    def _velocities(self, level: FloatArray) -> FloatArray:
+        """Actions of the world (..., 3 M) of level velocities (..., 2 M) in order."""
+        batch, m = level.shape[:-1], self.scene.n_anchors
+        velocity = np.zeros((*batch, m, 3))
+        # Action k is that of the k-th craft in the observation.
+        velocity[(*_worlds(batch), self.order, slice(2))] = level.reshape(*batch, m, 2)
+        return velocity.reshape(*batch, 3 * m)
+
+    def _show(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        estimate, anchors = observation["belief_translation"], observation["anchors"]
+        batch, m = anchors.shape[:-2], anchors.shape[-2]
+        flat = np.empty((*batch, 15 + 3 * m))
+        flat[..., 0] = estimate[..., 2] / 50
+        flat[..., 1:3] = observation["twist"][..., 3:5] / self._view.speed
+        self._view.write(flat[..., 3:15], observation)
+        gap = anchors[..., :2] - estimate[..., None, :2]
+        gap = gap[(*_worlds(batch), self._order(observation))] / 100
+        flat[..., 15 : 15 + 2 * m] = gap.reshape(*batch, 2 * m)
+        square = gap[..., 0] ** 2 + gap[..., 1] ** 2 + (estimate[..., 2:] / 100) ** 2
+        flat[..., 15 + 2 * m :] = 0.5 * np.log(np.maximum(square, 1e-16))
+        return _cut(flat)
+
+
+class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
     """`num_envs` independent `MobileAnchorsEnv`; seeding and autoreset as `BatchEnv`."""
 
     def __init__(
         self,
         num_envs: int = 1,
         difficulty: str = "easy",
-        scene: str | Mapping[str, Any] = "auv_craft",
+        scene: str | Mapping[str, Any] | Scene = "auv_craft",
         sort_craft: bool = True,
+        filter: str = "iekf",
+        options: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
-        world = _world(scene, **level)
-        if world.anchor_speed_m_s <= 0:
-            raise ValueError("scene must have anchors that move, got anchor_speed_m_s = 0")
-        if not isinstance(sort_craft, bool):
-            raise ValueError(f"sort_craft must be True or False, got {sort_craft!r}")
-        self.sort_craft = sort_craft
-        size = 15 + 3 * world.n_anchors
-        self.single_action_space = spaces.Box(-1.0, 1.0, (2 * world.n_anchors,), np.float32)
-        self.single_observation_space = spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32)
-        self.film = rendering.film_of(render_mode, world)
-        self._configure(num_envs, render_mode, world.steps, max_episode_steps, autoreset_mode)
-        self._configure_loop(world, num_envs)
-        self.order = np.tile(np.arange(world.n_anchors), (num_envs, 1))
-
-    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        self._start(chosen, generators)
-        self._update(chosen)
-        self._sort()
-
-    def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        rows = np.flatnonzero(moving)
-        velocity = np.zeros((len(rows), self.scene.n_anchors, 3))
-        level = actions[rows].reshape(len(rows), self.scene.n_anchors, 2)
-        # Action k is that of the k-th craft in the observation.
-        np.put_along_axis(velocity[..., :2], self.order[rows][..., None], level, axis=1)
-        self.anchors[rows] = simulation.move_anchors(
-            self.scene, self.anchors[rows], velocity.reshape(len(rows), -1)
+        self._configure(difficulty, scene, sort_craft)
+        self.single_observation_space, self.single_action_space = self._spaces()
+        envs = TrackingVectorEnv(
+            num_envs, self.scene, "none", render_mode, max_episode_steps, autoreset_mode
         )
-        self._predict(rows)
-        self._update(rows)
-        self._sort()
-        return -np.log(self.score_m), np.zeros(self.num_envs, dtype=np.bool_)
+        self._compose(VectorEstimatePose(envs, filter, _options(filter, options)))
 
-    def _sort(self) -> None:
-        """Craft by bearing from the estimate, so that equal situations look equal."""
-        if self.sort_craft:
-            gap = self.anchors - self.state.translation[:, None]
-            self.order = np.argsort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1)
-
-    def _observe(self) -> np.ndarray:
-        gap = self.anchors[..., :2] - self.state.translation[:, None, :2]
-        gap = np.take_along_axis(gap, self.order[..., None], axis=1)
-        depth = self.state.translation[:, 2:]
-        distance = np.sqrt((gap**2).sum(axis=-1) + depth**2)
-        return _flat([
-            depth / 50, self._velocity()[:, :2], self._log_std(), self._columns(),
-            gap.reshape(self.num_envs, -1) / 100, np.log(np.maximum(distance, 1e-6) / 100),
-        ])  # fmt: skip
+    def _command(self, action: Any) -> FloatArray:
+        self._told()
+        space = self.single_action_space
+        return self._velocities(check_actions("actions", action, space, self.num_envs))
 
 
-class MobileAnchorsEnv(ScalarEnv):
+class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     """Surface craft range to a diving vehicle: where do they go, so that its pose is known well?
 
     ## Description
     M craft on the water measure ranges to the tags of a vehicle that dives through way-points;
-    an iterated EKF knows the commanded twist and the noise law and tracks its pose.
+    a filter knows the commanded twist and the noise law and tracks its pose.
     ``difficulty="easy"``: three craft at up to 4 m/s. ``"hard"``: two at up to 2 m/s, where no
     static layout works and the craft must orbit.
 
@@ -133,8 +193,9 @@ class MobileAnchorsEnv(ScalarEnv):
     Truncates after 100 steps of 2 s.
 
     ## Info
-    `score_m` (b of the belief), real errors `rotation_error_rad`, `position_error_m`,
-    `tag_error_m`, `nees` (6 degrees of freedom), `epoch`.
+    That of `EstimatePose`: `score_m` (b of the belief), real errors `rotation_error_rad`,
+    `position_error_m`, `tag_error_m`, `nees` (6 degrees of freedom); and that of
+    `RBL/Tracking-v0`: `epoch`, the true `rotation` and `translation`, `nlos`.
 
     ## Rendering
     ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
@@ -146,27 +207,80 @@ class MobileAnchorsEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/MobileAnchors-v0", difficulty="hard")
     ```
     `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`; the anchors must move.
+    `filter`, `options`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
 
     ## Version history
     * v0: first version.
     """
 
-    batch_class = MobileAnchorsVectorEnv
-
     def __init__(
         self,
         difficulty: str = "easy",
-        scene: str | Mapping[str, Any] = "auv_craft",
+        scene: str | Mapping[str, Any] | Scene = "auv_craft",
         sort_craft: bool = True,
+        filter: str = "iekf",
+        options: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self._configure(render_mode, difficulty=difficulty, scene=scene, sort_craft=sort_craft)
+        self._configure(difficulty, scene, sort_craft)
+        self.observation_space, self.action_space = self._spaces()
+        env = TrackingEnv(self.scene, "none", render_mode)
+        self._compose(EstimatePose(env, filter, _options(filter, options)))
+
+    def _command(self, action: Any) -> FloatArray:
+        self._told()
+        return self._velocities(check_actions("action", action, self.action_space))
 
 
 # --- choosing anchors in a hall with racks ----------------------------------------------------
 
 
-class AnchorSelectionVectorEnv(FilterLoop):
+class _AnchorSelection:
+    """Choices and their price: what scalar and vector forms share."""
+
+    scene: Scene
+
+    def _configure(self, mode: str, k: int, price: float, scene: Any) -> None:
+        self.scene = _world(scene, steps=50)
+        self.mode = check_one_of("mode", mode, SELECTIONS)
+        self.k = check_count("k", k, most=self.scene.n_anchors)
+        self.price = check_number("price", price, low=0.0)
+        self._view = _View(self.scene)
+        low, high = self.scene.volume.bounds()
+        self._centre = 0.5 * (low + high)
+        # In a volume without height, deviations count by what the prior leaves open.
+        self._half = np.maximum(0.5 * (high - low), self.scene.initial_translation_m)
+
+    def _spaces(self) -> tuple[spaces.Box, spaces.Space[Any]]:
+        m = self.scene.n_anchors
+        return (
+            spaces.Box(-_LIMIT, _LIMIT, (18,), np.float32),
+            spaces.Box(-1.0, 1.0, (m,), np.float32)
+            if self.mode == "top-k"
+            else spaces.MultiBinary(m),
+        )
+
+    def _choice(self, action: np.ndarray) -> np.ndarray:
+        """Which anchors (..., M) an action chooses, int8; ties go to the lower number."""
+        if self.mode == "priced":
+            return action
+        best = np.argsort(-action, axis=-1, kind="stable")[..., : self.k]
+        chosen = np.zeros(action.shape, dtype=np.int8)
+        np.put_along_axis(chosen, best, 1, axis=-1)
+        return chosen
+
+    def _price(self, info: dict[str, Any]) -> Any:
+        return self.price * info["chosen"].sum(axis=-1) if self.mode == "priced" else 0.0
+
+    def _show(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+        flat = np.empty((*observation["twist"].shape[:-1], 18))
+        flat[..., :3] = (observation["belief_translation"] - self._centre) / self._half
+        flat[..., 3:6] = observation["twist"][..., 3:] / self._view.speed
+        self._view.write(flat[..., 6:], observation)
+        return _cut(flat)
+
+
+class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
     """`num_envs` independent `AnchorSelectionEnv`; seeding and autoreset as `BatchEnv`."""
 
     def __init__(
@@ -175,73 +289,33 @@ class AnchorSelectionVectorEnv(FilterLoop):
         mode: str = "top-k",
         k: int = 3,
         price: float = 0.05,
-        scene: str | Mapping[str, Any] = "hall",
+        scene: str | Mapping[str, Any] | Scene = "hall",
+        filter: str = "iekf",
+        options: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        world = _world(scene, steps=50)
-        self.mode = check_one_of("mode", mode, SELECTIONS)
-        self.k = check_count("k", k, most=world.n_anchors)
-        self.price = check_number("price", price, low=0.0)
-        self.single_action_space = (
-            spaces.Box(-1.0, 1.0, (world.n_anchors,), np.float32)
-            if mode == "top-k"
-            else spaces.MultiBinary(world.n_anchors)
+        self._configure(mode, k, price, scene)
+        self.single_observation_space, self.single_action_space = self._spaces()
+        envs = TrackingVectorEnv(
+            num_envs, self.scene, "none", render_mode, max_episode_steps, autoreset_mode
         )
-        self.single_observation_space = spaces.Box(-_LIMIT, _LIMIT, (18,), np.float32)
-        self.film = rendering.film_of(render_mode, world)
-        self._configure(num_envs, render_mode, world.steps, max_episode_steps, autoreset_mode)
-        self._configure_loop(world, num_envs)
-        self._chosen = np.zeros((num_envs, world.n_anchors), dtype=np.bool_)
+        selected = VectorSelectAnchors(envs)
+        self._compose(VectorEstimatePose(selected, filter, _options(filter, options)))
 
-    def _restart(self, chosen: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        # The first ranges are those of the first choice.
-        self._start(chosen, generators)
-        self._chosen[chosen] = False
-
-    def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        rows = np.flatnonzero(moving)
-        self._chosen[rows] = self._choice(actions[rows])
-        self._predict(rows)
-        # A world that chose nothing has nothing to update with.
-        measuring = rows[self._chosen[rows].any(axis=-1)]
-        if len(measuring):
-            self._update(measuring, self._chosen)
-        reward = -np.log(self.score_m)
-        if self.mode == "priced":
-            reward -= self.price * self._chosen.sum(axis=-1)
-        return reward, np.zeros(self.num_envs, dtype=np.bool_)
-
-    def _choice(self, actions: np.ndarray) -> BoolArray:
-        """Which anchors (B, M) actions choose; ties go to the lower number."""
-        if self.mode == "priced":
-            return actions.astype(np.bool_)
-        best = np.argsort(-actions, axis=-1, kind="stable")[..., : self.k]
-        chosen = np.zeros(actions.shape, dtype=np.bool_)
-        np.put_along_axis(chosen, best, True, axis=-1)
-        return chosen
-
-    def _observe(self) -> np.ndarray:
-        low, high = self.scene.volume.bounds()
-        # In a volume without height, deviations count by what the prior leaves open.
-        half = np.maximum(0.5 * (high - low), self.scene.initial_translation_m)
-        place = (self.state.translation - 0.5 * (low + high)) / half
-        return _flat([place, self._velocity(), self._log_std(), self._columns()])
-
-    def _measuring(self) -> BoolArray:
-        return self._chosen
-
-    def _inform(self) -> dict[str, np.ndarray]:
-        return {**super()._inform(), "chosen": self._chosen.astype(np.int8)}
+    def _command(self, action: Any) -> np.ndarray:
+        self._told()
+        space = self.single_action_space
+        return self._choice(check_actions("actions", action, space, self.num_envs))
 
 
-class AnchorSelectionEnv(ScalarEnv):
+class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     """Twelve anchors on the walls of a hall, racks between: which ones range to the body now?
 
     ## Description
     A body with six tags drives through a hall. At every step the policy chooses anchors, the
-    body moves, the chosen anchors measure, and an iterated EKF updates. Racks block sight: a
+    body moves, the chosen anchors measure, and a filter updates. Racks block sight: a
     range without it carries 2 % of the information. The receiver learns a link's quality with
     the range; the policy does not see the racks and has to learn where they are.
 
@@ -261,8 +335,9 @@ class AnchorSelectionEnv(ScalarEnv):
     Truncates after 50 steps of 0.2 s.
 
     ## Info
-    `chosen` (12), `score_m`, real errors `rotation_error_rad`, `position_error_m`,
-    `tag_error_m`, `nees`, `epoch`.
+    `chosen` (12); that of `EstimatePose`: `score_m`, real errors `rotation_error_rad`,
+    `position_error_m`, `tag_error_m`, `nees`; and that of `RBL/Tracking-v0`: `epoch`, the true
+    `rotation` and `translation`, `nlos`.
 
     ## Rendering
     ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
@@ -273,20 +348,30 @@ class AnchorSelectionEnv(ScalarEnv):
 
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", k=3)
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", mode="priced", price=0.05)
+    env = gym.make("rbl_gym:RBL/AnchorSelection-v0", filter="uc-kf", k=6)
     ```
+    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. `filter`, `options`: as
+    `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
 
     ## Version history
     * v0: first version.
     """
-
-    batch_class = AnchorSelectionVectorEnv
 
     def __init__(
         self,
         mode: str = "top-k",
         k: int = 3,
         price: float = 0.05,
-        scene: str | Mapping[str, Any] = "hall",
+        scene: str | Mapping[str, Any] | Scene = "hall",
+        filter: str = "iekf",
+        options: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self._configure(render_mode, mode=mode, k=k, price=price, scene=scene)
+        self._configure(mode, k, price, scene)
+        self.observation_space, self.action_space = self._spaces()
+        env = SelectAnchors(TrackingEnv(self.scene, "none", render_mode))
+        self._compose(EstimatePose(env, filter, _options(filter, options)))
+
+    def _command(self, action: Any) -> np.ndarray:
+        self._told()
+        return self._choice(check_actions("action", action, self.action_space))

@@ -171,7 +171,7 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         """Step every world; see the autoreset mode for those whose episode is over."""
         if not self._generators:
             raise gym.error.ResetNeeded("call reset() before step()")
-        checked = self._checked(actions)
+        checked = check_actions("actions", actions, self.single_action_space, self.num_envs)
         ended = self._done.copy()
         if ended.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
@@ -235,30 +235,36 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
             )
         return info
 
-    def _checked(self, actions: ArrayLike) -> np.ndarray:
-        """Actions as an array that fits the action space in shape and is finite."""
-        space = self.single_action_space
-        array = as_array("actions", actions)
-        shape = (self.num_envs, *(space.shape or ()))
-        # Learners hand on binary choices as floating-point zeros and ones.
-        whole = isinstance(space, gym.spaces.Discrete)
-        if array.shape != shape or array.dtype.kind not in ("iub" if whole else "fiub"):
-            kind = "integers" if whole else "numbers"
-            raise ValueError(
-                f"actions must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
-            )
-        if not whole and not np.isfinite(array).all():
-            raise ValueError(f"actions must be finite, got {array[~np.isfinite(array)][0]}")
-        if isinstance(space, gym.spaces.Box):
-            return array.astype(np.float64)
-        # Before the cast: a narrow type would wrap large numbers round into the space.
-        if isinstance(space, gym.spaces.Discrete):
-            legal = (array >= space.start) & (array < space.start + space.n)
-        else:
-            legal = np.isin(array, (0, 1))
-        if not legal.all():
-            raise ValueError(f"actions must lie in {self.action_space}, got {array!r:.120}")
-        return array.astype(self.action_space.dtype)
+
+def check_actions(
+    name: str, actions: ArrayLike, space: gym.Space[Any], num_envs: int | None = None
+) -> np.ndarray:
+    """Actions of a space, of `num_envs` worlds where given, as a finite array; or a ValueError.
+
+    Those of a box are float64 and may lie outside of it.
+    """
+    shape = space.shape or ()
+    shape = shape if num_envs is None else (num_envs, *shape)
+    array = actions if isinstance(actions, np.ndarray) else as_array(name, actions)
+    # Learners hand on binary choices as floating-point zeros and ones.
+    whole = isinstance(space, gym.spaces.Discrete)
+    if array.shape != shape or array.dtype.kind not in ("iub" if whole else "fiub"):
+        kind = "integers" if whole else "numbers"
+        raise ValueError(
+            f"{name} must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
+        )
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ValueError(f"{name} must be finite, got {array[~np.isfinite(array)][0]}")
+    if isinstance(space, gym.spaces.Box):
+        return array.astype(np.float64)
+    # Before the cast: a narrow type would wrap large numbers round into the space.
+    if isinstance(space, gym.spaces.Discrete):
+        legal = (array >= space.start) & (array < space.start + space.n)
+    else:
+        legal = (array == 0) | (array == 1)
+    if not legal.all():
+        raise ValueError(f"{name} must lie in {space}, got {array!r:.120}")
+    return array.astype(space.dtype)
 
 
 def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:

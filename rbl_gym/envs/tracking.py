@@ -98,7 +98,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     def __init__(
         self,
-        scene: str | Mapping[str, Any] = "uwb_room",
+        scene: str | Mapping[str, Any] | Scene = "uwb_room",
         reward: str = "bound",
         render_mode: str | None = None,
     ) -> None:

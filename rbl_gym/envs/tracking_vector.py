@@ -20,6 +20,7 @@ from rbl_gym.envs.tracking import (
     observation_space,
 )
 from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.worlds.scene import Scene
 
 _PRIOR = ("prior_rotation", "prior_translation", "prior_covariance")
 
@@ -47,7 +48,7 @@ class TrackingVectorEnv(BatchEnv):
     def __init__(
         self,
         num_envs: int = 1,
-        scene: str | Mapping[str, Any] = "uwb_room",
+        scene: str | Mapping[str, Any] | Scene = "uwb_room",
         reward: str = "bound",
         render_mode: str | None = None,
         max_episode_steps: int | None = None,

@@ -5,7 +5,17 @@ the same episode gives the same pixels. Matplotlib is imported by the first fram
 """
 
 from rbl_gym.rendering.body import film_of, shot
-from rbl_gym.rendering.film import RENDER_MODES, Film, check_mode, picture, tell
+from rbl_gym.rendering.film import RENDER_MODES, Film, check_mode, picture, select, tell
 from rbl_gym.rendering.shots import Pose
 
-__all__ = ["RENDER_MODES", "Film", "Pose", "check_mode", "film_of", "picture", "shot", "tell"]
+__all__ = [
+    "RENDER_MODES",
+    "Film",
+    "Pose",
+    "check_mode",
+    "film_of",
+    "picture",
+    "select",
+    "shot",
+    "tell",
+]

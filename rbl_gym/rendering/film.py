@@ -49,6 +49,11 @@ class Film:
         """The beliefs after the last epoch that was taken."""
         self._taken[-1][2] = mapped(np.array, belief)
 
+    def select(self, chosen: np.ndarray) -> None:
+        """Of the last shot, which has a field `measuring` (B, M), only these anchors measure."""
+        shot = self._taken[-1][1]
+        self._taken[-1][1] = shot._replace(measuring=shot.measuring & chosen)
+
     def frame(self, world: int) -> Image:
         """A picture of a world as it is now.
 
@@ -97,3 +102,10 @@ def tell(env: Any, belief: Any, single: bool = False) -> None:
     film = getattr(env.unwrapped, "film", None)
     if film is not None:
         film.believe(mapped(lambda field: field[None], belief) if single else belief)
+
+
+def select(env: Any, chosen: np.ndarray) -> None:
+    """Show that only some anchors (..., M) of an environment that is rendered measure."""
+    film = getattr(env.unwrapped, "film", None)
+    if film is not None:
+        film.select(chosen)

@@ -1,0 +1,91 @@
+"""SelectAnchors below EstimatePose: what the chosen anchors measure, and nothing else."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose, VectorSelectAnchors
+from tests.helpers import assert_same
+from tests.side_by_side import assert_masks_alike, assert_steps_alike, of_its_spec, peer_of
+
+HALL = {"name": "hall", "steps": 4, "links": {"drop_probability": 0.2}}
+MOVABLE = {"name": "auv_buoys", "steps": 4}
+TOLERANCE = {"rtol": 1e-9, "atol": 1e-12}
+
+
+@pytest.mark.parametrize("scene", [HALL, MOVABLE])
+def test_an_observation_has_the_links_of_the_chosen_anchors_and_no_others(scene):
+    world = TrackingEnv(scene)
+    env = SelectAnchors(TrackingEnv(scene))
+    still = np.zeros(world.action_space.shape or (), world.action_space.dtype)
+    assert not env.reset(seed=3)[0]["links"].any()
+    world.reset(seed=3)
+    rng = np.random.default_rng(1)
+    for _ in range(4):
+        chosen = rng.integers(0, 2, env.action_space.shape)
+        got, *_, info = env.step(chosen)
+        want, *_ = world.step(still)
+        assert env.observation_space.contains(got)
+        np.testing.assert_array_equal(info["chosen"], chosen)
+        on = chosen == 1
+        for key in want:
+            if key in ("twist", "anchors"):
+                np.testing.assert_array_equal(got[key], want[key])
+            else:
+                np.testing.assert_array_equal(got[key][on], want[key][on])
+        assert not got["links"][~on].any()
+        assert not got["ranges"][~on].any()
+        assert (got.get("quality", np.ones(len(on)))[~on] == 1).all()
+
+
+def stacked(scene=HALL):
+    return EstimatePose(SelectAnchors(TrackingEnv(scene, "none")), "iekf")
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("scene", [HALL, MOVABLE])
+def test_the_vector_twin_equals_scalar_stacks(mode, scene):
+    envs = VectorSelectAnchors(TrackingVectorEnv(3, scene, "none", autoreset_mode=mode))
+    peer = peer_of(stacked, mode, 3, {"scene": scene})
+    assert_steps_alike(VectorEstimatePose(envs, "iekf"), peer, 11, [5, 3, 8], TOLERANCE)
+
+
+def test_worlds_reset_by_masks_have_chosen_nothing_and_the_others_keep_their_choice():
+    mode = AutoresetMode.DISABLED
+    envs = VectorSelectAnchors(TrackingVectorEnv(3, HALL, "none", autoreset_mode=mode))
+    peer = peer_of(stacked, mode, 3, {})
+    known = "chosen", "score_m"
+    assert_masks_alike(VectorEstimatePose(envs, "iekf"), peer, 11, known, TOLERANCE)
+
+
+def test_specs_round_trip():
+    env = gym.make("rbl_gym:RBL/Tracking-v0", scene=HALL, reward="none")
+    env = EstimatePose(SelectAnchors(env), "iekf")
+    again = of_its_spec(env)
+    assert_same(again.reset(seed=2), env.reset(seed=2))
+    assert_same(again.step(np.ones(12, np.int8)), env.step(np.ones(12, np.int8)))
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.zeros(11), r"action must be numbers of shape \(12,\)"),
+        (np.full(12, 0.5), "action must lie in MultiBinary"),
+        (np.full(12, np.nan), "action must be finite"),
+    ],
+)
+def test_bad_actions_are_named(action, message):
+    env = SelectAnchors(TrackingEnv(HALL))
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+
+
+def test_an_environment_without_a_scene_is_refused():
+    with pytest.raises(ValueError, match="env must have a rbl_gym Scene"):
+        SelectAnchors(gym.make("CartPole-v1"))

@@ -1,0 +1,151 @@
+"""Environments that are a stack of wrappers inside and one environment outside.
+
+A task shows a policy a flat view of a belief and takes its actions. What makes the belief are an
+environment and `EstimatePose`, or their vector twins. The stack is `inner`; `unwrapped` and `spec`
+are the task's own, so that checkers, specifications and ``make_vec`` see one environment.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from rbl_gym import rendering
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.envs.batch import StatedLength
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.worlds.scene import Scene
+
+
+class _Task(StatedLength):
+    """What scalar and vector tasks share. Arrays have leading axes (B,) in the vector form.
+
+    A subclass fills in `_command` and `_show`, and `_price` where actions cost something.
+
+    Attributes
+    ----------
+    inner
+        The stack: its observation is that of `EstimatePose`, a dict with the belief.
+    scene
+        The world.
+    seen
+        The last observation of `inner`, None before the first reset.
+    """
+
+    inner: Any
+    scene: Scene
+    seen: dict[str, np.ndarray] | None = None
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode."""
+        return self.inner.unwrapped.episode_steps
+
+    @property
+    def film(self) -> rendering.Film | None:
+        """What the frames are drawn from, with a render mode."""
+        return self.inner.unwrapped.film
+
+    @property
+    def belief(self) -> PoseBelief:
+        """The filter's belief now."""
+        told = self._told()
+        rotation = told["belief_rotation"]
+        return PoseBelief(rotation, told["belief_translation"], told["belief_covariance"], rotation)
+
+    @property
+    def anchors(self) -> FloatArray:
+        """Places of the anchors now, (..., M, 3)."""
+        return self._told()["anchors"]
+
+    @property
+    def twist(self) -> FloatArray:
+        """Known twist (..., 6) of the interval that ended now."""
+        return self._told()["twist"]
+
+    def render(self) -> Any:
+        """A frame, (height, width, 3) of uint8, of a vector one for each world."""
+        return self.inner.render()
+
+    def _told(self) -> dict[str, np.ndarray]:
+        if self.seen is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        return self.seen
+
+    def _command(self, action: Any) -> Any:
+        """The action of `inner`, or a ValueError."""
+        raise NotImplementedError
+
+    def _show(self, observation: dict[str, np.ndarray]) -> np.ndarray:
+        """The policy's view of an observation of `inner`."""
+        raise NotImplementedError
+
+    def _price(self, info: dict[str, Any]) -> Any:
+        """What the step that these infos are of costs."""
+        return 0.0
+
+
+class TaskEnv(_Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """One world of a task."""
+
+    metadata: dict[str, Any] = TrackingEnv.metadata
+
+    def _compose(self, inner: gym.Env[Any, Any]) -> None:
+        self.inner, self.render_mode = inner, inner.render_mode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; `options` must be empty."""
+        self.seen, info = self.inner.reset(seed=seed, options=options)
+        world = self.inner.unwrapped
+        self._np_random, self._np_random_seed = world.np_random, world.np_random_seed
+        return self._show(self._told()), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One step of the world and of its filter."""
+        self.seen, reward, *ended, info = self.inner.step(self._command(action))
+        return self._show(self._told()), float(reward - self._price(info)), *ended, info
+
+    def close(self) -> None:
+        """Close the stack."""
+        self.inner.close()
+
+
+class VectorTaskEnv(_Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """`num_envs` worlds of a task; seeding and autoreset as `BatchEnv`."""
+
+    def _compose(self, inner: VectorEnv[Any, Any, Any]) -> None:
+        self.inner, self.num_envs = inner, inner.num_envs
+        self.metadata, self.render_mode = inner.metadata, inner.render_mode
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
+        self.seen, info = self.inner.reset(seed=seed, options=options)
+        return self._show(self._told()), info
+
+    def step(
+        self, actions: Any
+    ) -> tuple[np.ndarray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """One step of every world and of its filter."""
+        self.seen, reward, *ended, info = self.inner.step(self._command(actions))
+        price = self._price(info)
+        if "final_obs" in info:
+            final = info["_final_obs"]
+            for i in np.flatnonzero(final):
+                info["final_obs"][i] = self._show(info["final_obs"][i])
+            price = np.where(final, self._price(info["final_info"]), price)
+        return self._show(self._told()), reward - price, *ended, info
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the stack."""
+        self.inner.close(**kwargs)

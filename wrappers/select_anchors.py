@@ -1,0 +1,126 @@
+"""SelectAnchors: the action says which anchors measure."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.vector import VectorEnv, VectorWrapper
+from gymnasium.vector.utils import batch_space
+
+from rbl_gym import rendering
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.envs.batch import check_actions
+from rbl_gym.wrappers.estimate import scene_of
+
+
+class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Only the anchors that the action chooses measure, and all of them stand still.
+
+    Wraps `RBL/Tracking-v0`, below `EstimatePose`. The action is ``MultiBinary(M)``. Links of the
+    other anchors are 0, and so are their ranges; their `quality` is 1, for it is learned with a
+    range. At reset nothing was chosen yet, and nothing is measured.
+
+    Info
+    ----
+    `chosen` (M,), int8: the anchors that measured.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from rbl_gym.wrappers import EstimatePose, SelectAnchors
+    >>> env = gym.make("rbl_gym:RBL/Tracking-v0", scene="hall", reward="none")
+    >>> env = EstimatePose(SelectAnchors(env), "iekf")
+    >>> observation, info = env.reset(seed=1)
+    >>> observation, *_, info = env.step([1, 1, 1] + [0] * 9)
+    >>> observation["links"].any(axis=-1).sum()
+    np.int64(3)
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+        self._n_anchors = scene_of(env).n_anchors
+        self.action_space = spaces.MultiBinary(self._n_anchors)
+        self._still = _zeros(env.action_space)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode: its first epoch has no range."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._selected(observation, info, np.zeros(self._n_anchors, dtype=np.bool_)), info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment; `action` (M,) says which anchors measure."""
+        chosen = check_actions("action", action, self.action_space).view(np.bool_)
+        observation, reward, terminated, truncated, info = self.env.step(self._still)
+        return self._selected(observation, info, chosen), reward, terminated, truncated, info
+
+    def _selected(self, observation: Any, info: dict[str, Any], chosen: BoolArray) -> Any:
+        info["chosen"] = chosen.astype(np.int8)
+        rendering.select(self.env, chosen)
+        return select(observation, chosen)
+
+
+class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
+    """`SelectAnchors` for a vector environment, in every autoreset mode."""
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        VectorWrapper.__init__(self, env)
+        self._shape = env.num_envs, scene_of(env).n_anchors
+        self.single_action_space = spaces.MultiBinary(self._shape[1])
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
+        self._still = _zeros(env.action_space)
+        self._chosen = np.zeros(self._shape, dtype=np.bool_)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start episodes: their first epoch has no range."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._selected(observation, info, self._chosen), info
+
+    def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Step the worlds; `actions` (B, M) say which anchors measure."""
+        space = self.single_action_space
+        chosen = check_actions("actions", actions, space, self.num_envs).view(np.bool_)
+        observation, *result, info = self.env.step(self._still)
+        if "final_obs" in info:
+            last = info["_final_obs"]
+            for i in np.flatnonzero(last):
+                info["final_obs"][i] = select(info["final_obs"][i], chosen[i])
+            info["final_info"]["chosen"] = (chosen & last[:, None]).astype(np.int8)
+            info["final_info"]["_chosen"] = last.copy()
+        return self._selected(observation, info, chosen), *result, info
+
+    def _selected(self, observation: Any, info: dict[str, Any], chosen: BoolArray) -> Any:
+        """The selection of the worlds that went on; those that began have chosen nothing."""
+        began = info.get("_prior_rotation", np.zeros(self.num_envs, dtype=np.bool_))
+        self._chosen = chosen = chosen & ~began[:, None]
+        info["chosen"] = chosen.astype(np.int8)
+        info["_chosen"] = np.ones(self.num_envs, dtype=np.bool_)
+        rendering.select(self.env, chosen)
+        return select(observation, chosen)
+
+
+def select(observation: dict[str, np.ndarray], chosen: BoolArray) -> dict[str, np.ndarray]:
+    """An observation with the links (..., M, N) of the chosen anchors (..., M) alone."""
+    each = chosen[..., None]
+    selected = {
+        **observation,
+        "ranges": observation["ranges"] * each,
+        "links": observation["links"] * each,
+    }
+    if "quality" in observation:
+        selected["quality"] = np.where(chosen, observation["quality"], 1.0)
+    return selected
+
+
+def _zeros(space: spaces.Space[Any]) -> np.ndarray:
+    """The action that leaves the anchors where they are."""
+    return np.zeros(space.shape or (), dtype=space.dtype)
