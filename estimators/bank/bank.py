@@ -32,7 +32,7 @@ from rbl_gym.estimators.bank.hypotheses import (
 from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state, update_pose
-from rbl_gym.estimators.inputs import check_batches, spanned_dimensions
+from rbl_gym.estimators.inputs import check_batches, plain, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
 from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
@@ -113,6 +113,7 @@ class IteratedEkfBank:
 
     def predict(self, state: BankState, twist: ArrayLike, dt: float) -> BankState:
         """State after `dt` seconds of the twist (..., 6), of all hypotheses."""
+        state = plain(state)
         twist = check_array("twist", twist, (6,))
         leader = self._filter.predict(leader_of(state), twist, dt)
         batch = leader.translation.shape[:-1]
@@ -142,6 +143,7 @@ class IteratedEkfBank:
         ValueError
             As `IteratedEkf.update`.
         """
+        state = plain(state)
         ranges, weights, anchors = self._filter.weighed(ranges, anchors, links, noise)
         check_batches(state=state.log_odds.shape[:-1], ranges=ranges.shape[:-2])
         batch = np.broadcast_shapes(
@@ -179,6 +181,7 @@ class IteratedEkfBank:
         probability; of rivals less likely than `_ALIVE` nothing. `probabilities` gives the odds,
         and the state holds the leader's own covariance.
         """
+        state = plain(state)
         belief = self._filter.belief(leader_of(state))
         odds = np.where(state.log_odds > _ALIVE, state.log_odds, -np.inf)
         if np.isneginf(odds).all():

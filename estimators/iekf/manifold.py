@@ -28,6 +28,7 @@ from rbl_gym.estimators.inputs import (
     check_covariance,
     check_epoch,
     epoch_variance,
+    plain,
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
@@ -97,6 +98,7 @@ class IteratedEkf:
 
     def predict(self, state: PoseState, twist: ArrayLike, dt: float) -> PoseState:
         """State after `dt` seconds of the twist (..., 6), ``P <- F P F^T + Q``."""
+        state = plain(state)
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         check_batches(state=state.translation.shape[:-1], twist=twist.shape[:-1])
@@ -123,6 +125,7 @@ class IteratedEkf:
         ValueError
             On wrong shapes, NaN, ranges that are not positive.
         """
+        state = plain(state)
         ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
         batch = state.translation.shape[:-1]
         check_batches(state=batch, ranges=ranges.shape[:-2])

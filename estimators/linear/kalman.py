@@ -25,6 +25,7 @@ from rbl_gym.estimators.inputs import (
     check_covariance,
     check_epoch,
     epoch_variance,
+    plain,
 )
 from rbl_gym.estimators.linear.engines import ENGINES, Epoch, Prediction, engine_for
 from rbl_gym.estimators.linear.least_squares import unvec, vec
@@ -142,6 +143,7 @@ class KalmanFamily:
 
     def predict(self, state: KalmanState, twist: ArrayLike, dt: float) -> KalmanState:
         """State after `dt` seconds of the twist (..., 6): eqs (10)-(15), Omega carrying dt."""
+        state = plain(state)
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         engine = engine_for(self.engine, state=state.mean.shape[:-1], twist=twist.shape[:-1])
@@ -171,6 +173,7 @@ class KalmanFamily:
             cannot determine the 12 states and the state is too vague to stand in (the
             message names the rank).
         """
+        state = plain(state)
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
         self._check_determined(state, anchors)
         if self.weights is None:
@@ -204,6 +207,7 @@ class KalmanFamily:
         The covariance is that of the projected output, ``J^+ P J^+T``; of UC-KF, whose mean
         is constrained already, ``(J^T P^-1 J)^-1``.
         """
+        state = plain(state)
         form = constrained_belief if self.constraint == "newton" else projected_belief
         rotation, covariance = form(state.mean, state.covariance, np.eye(3), np.zeros(6))
         translation = state.mean[..., 9:].copy()
