@@ -10,14 +10,14 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
-from rbl_gym import bounds, rendering
-from rbl_gym.bounds import doa
+from rbl_gym import rendering
+from rbl_gym.bounds import posterior
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv, ScalarEnv
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
 from rbl_gym.geometry import bodies
-from rbl_gym.measurements import bearing, ranging
+from rbl_gym.measurements import bearing
 from rbl_gym.measurements.ranging import LinkModel
 from rbl_gym.worlds import scenes, simulation
 from rbl_gym.worlds.scene import Scene
@@ -77,8 +77,7 @@ class BaseStationVectorEnv(BatchEnv):
         self.scene = world(scene)
         self.noise = bearing.AngleNoise(check_number("angle_std_rad", angle_std_rad, low=1e-12))
         self.reward_mode = check_one_of("reward", reward, REWARDS)
-        self._tags = np.asarray(self.scene.tags)
-        shape = (2, len(self._tags))
+        shape = (2, len(self.scene.tags))
         of_ranges = observation_space(self.scene)
         place = of_ranges["anchors"]
         assert isinstance(place, spaces.Box)
@@ -98,6 +97,7 @@ class BaseStationVectorEnv(BatchEnv):
         self._angles = np.zeros((num_envs, *shape))
         self._information = np.zeros((num_envs, 6, 6))
         self._score_m = np.zeros(num_envs)
+        self._at: simulation.Epoch | None = None
 
     def _restart(
         self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
@@ -107,57 +107,57 @@ class BaseStationVectorEnv(BatchEnv):
             generator.standard_normal(out=self._normals[row])
         self._stations[chosen] = start["anchors"]
         self._information[chosen] = np.linalg.inv(start["prior_covariance"])
-        self._measure(chosen, self._at(chosen))
+        self._measure(chosen, 0.0)
         return {name: start[name] for name in _PRIOR}
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        rows = np.flatnonzero(moving)
-        if len(rows):
-            if self.scene.anchor_speed_m_s > 0:
-                self._stations[rows] = simulation.move_anchors(
-                    self.scene, self._stations[rows], actions[rows]
-                )
-            at = self._at(rows)
-            if self.reward_mode == "bound":
-                self._information[rows] = bounds.predict_information(
-                    self._information[rows], at.twist, self.scene.dt, self.scene.process
-                )
-            self._measure(rows, at)
+        rows = slice(None) if moving.all() else np.flatnonzero(moving)
+        if self.scene.anchor_speed_m_s > 0:
+            self._stations[rows] = simulation.move_anchors(
+                self.scene, self._stations[rows], actions[rows]
+            )
+        self._measure(rows, self.scene.dt)
         reward = np.zeros(self.num_envs)
         if self.reward_mode == "bound":
             reward = -np.log(self._score_m)
         return reward, np.zeros(self.num_envs, dtype=np.bool_)
 
-    def _at(self, rows: np.ndarray) -> simulation.Epoch:
-        """Some worlds at their epochs."""
-        at = self._episodes.at(self._epochs)
-        fields = (None if field is None else np.ascontiguousarray(field[rows]) for field in at)
-        return simulation.Epoch(*fields)  # pyright: ignore[reportArgumentType]
-
-    def _measure(self, rows: np.ndarray, at: simulation.Epoch) -> None:
-        """Angles of an epoch, and what they tell."""
-        away = at.translation - self._stations[rows, 0]
-        seen = bearing.angles(ranging.tag_positions(at.rotation, away, self._tags))
-        self._angles[rows] = self.noise.sample(seen, self._normals[rows, self._epochs[rows]])
+    def _measure(self, rows: np.ndarray | slice, step: float) -> None:
+        """Angles of some worlds at their epochs, and what they tell after `step` seconds."""
+        self._at = self._episodes.at(self._epochs)
+        rotation, translation, twist = (field[rows] for field in self._at[:3])
+        station, std = self._stations[rows], self.noise.std_rad
+        normals = self._normals[np.arange(self.num_envs), self._epochs][rows]
+        self._angles[rows] = bearing.sample(
+            rotation, translation, self.scene.body, station[:, 0], normals, std
+        )
         if self.reward_mode == "bound":
-            self._information[rows] += doa.doa_information_at(
-                self._tags, at.rotation, away, self.noise
-            )
-            covariance = np.linalg.inv(self._information[rows])
-            self._score_m[rows] = bounds.score(covariance, at.rotation, self._tags)
+            information, score = posterior.of_angles(
+                self._information[rows], twist[:, None], np.array([step]),
+                self.scene.process.std(), station, self.scene.body, rotation[:, None],
+                translation[:, None], std,
+            )  # fmt: skip
+            if not np.isfinite(score).all():
+                raise ValueError("the information about the pose is singular or not finite")
+            self._information[rows], self._score_m[rows] = information[:, 0], score[:, 0]
+
+    @property
+    def _seen(self) -> simulation.Epoch:
+        """All worlds as they were measured last."""
+        assert self._at is not None
+        return self._at
 
     def _observe(self) -> dict[str, np.ndarray]:
         return {
             "angles": self._angles.copy(),
             "station": self._stations[:, 0].copy(),
-            "twist": np.array(self._episodes.at(self._epochs).twist, order="C"),
+            "twist": self._seen.twist.copy(),
         }
 
     def _inform(self) -> dict[str, np.ndarray]:
-        at = self._episodes.at(self._epochs)
         info = {
-            "rotation": np.array(at.rotation, order="C"),
-            "translation": np.array(at.translation, order="C"),
+            "rotation": self._seen.rotation.copy(),
+            "translation": self._seen.translation.copy(),
             "epoch": self._epochs.copy(),
         }
         if self.reward_mode == "bound":
@@ -165,7 +165,7 @@ class BaseStationVectorEnv(BatchEnv):
         return info
 
     def _shot(self) -> tuple[Any, None]:
-        at = self._episodes.at(self._epochs)
+        at = self._seen
         bound = np.linalg.inv(self._information) if self.reward_mode == "bound" else None
         seen = np.ones((self.num_envs, 1, 1), dtype=np.bool_)
         return rendering.shot(seen, self._stations, at.rotation, at.translation, bound), None

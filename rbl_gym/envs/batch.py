@@ -7,6 +7,7 @@ same code with one world, so that the scalar environment and world i of a vector
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -24,6 +25,8 @@ from rbl_gym.checks import BoolArray, FloatArray, as_array, check_count, check_o
 Observation = Any
 # More than any machine holds.
 MOST_ENVS = 10**8
+# The mask of a world that moves, and is the only one.
+_ALONE = np.ones(1, dtype=np.bool_)
 
 
 class StatedLength:
@@ -202,6 +205,22 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
             info[name], info[f"_{name}"] = value, last.copy()
         return self._observe(), reward, terminated, truncated, info
 
+    def step_alone(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Any]:
+        """`step` of the only world, without the masks of many; observation and infos of it."""
+        if not self._generators:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        actions = check_actions("action", action, self.single_action_space)[None]
+        if self._done[0]:
+            raise gym.error.ResetNeeded("the episode is over: reset")
+        self._epochs[0] += 1
+        reward, over = self._advance(actions, _ALONE)
+        terminated = bool(over[0])
+        truncated = not terminated and bool(self._epochs[0] >= self.steps_limit)
+        self._done[0] = terminated or truncated
+        self._shoot()
+        observation, info = _first(self._observe()), _scalars(self._inform())
+        return observation, float(reward[0]), terminated, truncated, info
+
     def render(self) -> Any:
         """A frame of every world, (height, width, 3) of uint8."""
         return rendering.picture(self.film, self.num_envs)
@@ -253,7 +272,10 @@ def check_actions(
         raise ValueError(
             f"{name} must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
         )
-    if array.dtype.kind == "f" and not np.isfinite(array).all():
+    # Mostly one product tells that all are finite; it may overflow.
+    if array.dtype.kind == "f" and not (
+        math.isfinite(np.vdot(array, array)) or np.isfinite(array).all()
+    ):
         raise ValueError(f"{name} must be finite, got {array[~np.isfinite(array)][0]}")
     if isinstance(space, gym.spaces.Box):
         return array.astype(np.float64)
@@ -373,17 +395,18 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
         super().reset(seed=seed)
         self._batch._generators = [self.np_random]
         observation, info = self._batch.reset()
-        return _row(observation, 0), _scalars(info)
+        return _first(observation), _scalars(info)
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step."""
-        observation, reward, terminated, truncated, info = self._batch.step(
-            as_array("action", action)[None]
-        )
-        return (
-            _row(observation, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]),
-            _scalars(info),
-        )  # fmt: skip
+        return self._batch.step_alone(action)
+
+
+def _first(observation: Observation) -> Observation:
+    """The observation of the first world, not copied."""
+    if isinstance(observation, dict):
+        return {key: value[0] for key, value in observation.items()}
+    return observation[0]
 
 
 def _scalars(info: dict[str, Any]) -> dict[str, Any]:

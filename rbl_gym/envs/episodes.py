@@ -1,4 +1,4 @@
-"""The running episodes of many worlds, in memory that runs along the worlds."""
+"""The running episodes of many worlds."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.components import whole_rows
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scene import Scene
 
@@ -17,10 +16,9 @@ _BLOCK = 256
 
 
 class EpisodeStore:
-    """The running episodes of B worlds: arrays (B, T + 1, ...) in Fortran's order.
+    """The running episodes of B worlds: arrays (B, T + 1, ...).
 
-    An epoch is then whole rows of worlds, which a step computes with. The arrays are written
-    anew by every reset, not made anew: fresh memory is slow.
+    They are written anew by every reset, not made anew: fresh memory is slow.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
@@ -47,9 +45,8 @@ class EpisodeStore:
             simulation.draw_each(self._draws, block, generators[first : first + _BLOCK])
             rows = _rows(block)
             draws = simulation.Draws(*(field[rows] for field in self._draws))
-            with whole_rows():
-                episode = simulation.build_episode(self._scene, draws)
-                self._write(rows, episode)
+            episode = simulation.build_episode(self._scene, draws)
+            self._write(rows, episode)
             starts.append(episode[len(simulation.Epoch._fields) :])
         # Views, taken anew because a pickled store comes back with copies of them.
         self._normals, self._uniforms = simulation.of_ranges(self._scene, self._draws)
@@ -62,19 +59,17 @@ class EpisodeStore:
     def _write(self, rows: slice | np.ndarray, episode: simulation.Episode) -> None:
         fields = episode.rotation, episode.translation, episode.twists
         if not self._timed:
-            self._timed = [
-                np.empty((self._num_envs, *field.shape[1:]), order="F") for field in fields
-            ]
+            self._timed = [np.empty((self._num_envs, *field.shape[1:])) for field in fields]
         for stored, field in zip(self._timed, fields, strict=True):
             stored[rows] = field
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
-        """All worlds, each at its epoch (B,), in Fortran's order."""
-        together = (epochs == epochs[0]).all()
-        rows = slice(None) if together else np.arange(self._num_envs)
-        where = rows, epochs[0] if together else epochs
+        """All worlds, each at its epoch (B,); copies."""
+        where: Any = np.arange(self._num_envs), epochs
+        if (epochs == epochs[0]).all():
+            where = slice(None), epochs[0]
         fields = *self._timed, self._normals, self._uniforms
-        return simulation.Epoch(*(f if f is None else np.asfortranarray(f[where]) for f in fields))  # pyright: ignore[reportArgumentType]
+        return simulation.Epoch(*(f if f is None else np.array(f[where]) for f in fields))  # pyright: ignore[reportArgumentType]
 
 
 def _rows(worlds: np.ndarray) -> slice | np.ndarray:

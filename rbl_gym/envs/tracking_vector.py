@@ -10,7 +10,6 @@ from gymnasium.vector import AutoresetMode
 
 from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
-from rbl_gym.components import whole_rows
 from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.envs.tracking import (
@@ -61,8 +60,7 @@ class TrackingVectorEnv(BatchEnv):
         self.film = rendering.film_of(render_mode, self.scene)
         self._configure(num_envs, render_mode, self.scene.steps, max_episode_steps, autoreset_mode)
         self._episodes = EpisodeStore(self.scene, num_envs)
-        # Worlds last in memory, as in the store.
-        self._anchors = np.empty((num_envs, self.scene.n_anchors, 3), order="F")
+        self._anchors = np.empty((num_envs, self.scene.n_anchors, 3))
         self._prior_covariance = np.empty((num_envs, 6, 6))
         self._information = np.empty((num_envs, 6, 6))
         self._score_m = np.empty(num_envs)
@@ -84,10 +82,7 @@ class TrackingVectorEnv(BatchEnv):
         self._seen = None
         if self.scene.anchor_speed_m_s > 0:
             # All at once: those that reset in this step get their anchors from the new episode.
-            with whole_rows():
-                moved = simulation.move_anchors(
-                    self.scene, self._anchors, np.asfortranarray(actions)
-                )
+            moved = simulation.move_anchors(self.scene, self._anchors, actions)
             if moving.all():
                 self._anchors = moved
             else:
@@ -103,15 +98,8 @@ class TrackingVectorEnv(BatchEnv):
         In memory that `_observe` and `_inform` give away.
         """
         if self._seen is None:
-            with whole_rows():
-                stored = self._episodes.at(self._epochs)
-                told = measure(self.scene, stored, self._anchors)
-            at = stored._replace(
-                rotation=stored.rotation.copy(),
-                translation=stored.translation.copy(),
-                twist=stored.twist.copy(),
-            )
-            self._seen = at, told
+            at = self._episodes.at(self._epochs)
+            self._seen = at, measure(self.scene, at, self._anchors)
         return self._seen
 
     def _observe(self) -> dict[str, np.ndarray]:

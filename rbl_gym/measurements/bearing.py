@@ -23,6 +23,7 @@ from rbl_gym.checks import (
     checked,
     kernel,
 )
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements.ranging import tag_positions
 
 __all__ = [
@@ -164,6 +165,28 @@ def information(positions: FloatArray, noise: AngleNoise) -> FloatArray:
     found, J = linearize(np.moveaxis(positions, -1, 0))
     weight = 1 / noise.variance(found)
     return np.moveaxis(np.einsum("k...,ki...,kj...->ij...", weight, J, J), (0, 1), (-2, -1))
+
+
+@compiled("epoch:measure_angles")
+def sample(
+    rotation: FloatArray,
+    translation: FloatArray,
+    tags: FloatArray,
+    station: FloatArray,
+    normals: FloatArray,
+    std_rad: float,
+) -> FloatArray:
+    """Noisy angles (..., 2, N) of bodies at given poses; behind doors: nothing is checked.
+
+    Parameters
+    ----------
+    rotation, translation, tags, station
+        (..., 3, 3), (..., 3), (..., N, 3), (..., 3); metres.
+    normals, std_rad
+        Standard normals (..., 2, N), and the standard deviation of `AngleNoise`.
+    """
+    positions = kernel(tag_positions)(rotation, translation - station, tags)
+    return fold(angles(positions) + std_rad * normals)
 
 
 @checked(tags=("N", 3), rotation=(3, 3), translation=(3,))
