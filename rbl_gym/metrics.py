@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -164,8 +165,9 @@ def judge(
     figures = Figures(
         *_judge(rotation_hat, translation_hat, covariance, rotation, translation, tags)
     )
-    # A NaN or inf of any of them is one here.
-    if not np.isfinite(figures.nees + figures.score_m + figures.tag_error_m).all():
+    # A NaN or inf of any of them is one here; mostly one product tells, which may overflow.
+    total = figures.nees + figures.score_m + figures.tag_error_m
+    if not (math.isfinite(np.vdot(total, total)) or np.isfinite(total).all()):
         wrong = covariance if np.isfinite(figures.tag_error_m).all() else translation_hat
         raise ValueError(
             "beliefs must be finite, and their covariance positive definite, got "

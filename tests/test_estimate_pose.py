@@ -165,7 +165,7 @@ def test_without_a_reward_of_the_environment_no_bound_is_computed(monkeypatch):
     def refuse(*_: Any) -> None:
         raise AssertionError("the bound was computed")
 
-    monkeypatch.setattr(scene_bounds, "posterior_of_episode", refuse)
+    monkeypatch.setattr(scene_bounds, "posterior_step", refuse)
     with pytest.raises(AssertionError, match="the bound"):
         wrapped(short("uwb_room")).reset(seed=0)
     assert len(rollout(EstimatePose(raw(short("uwb_room"), reward="none")))) == 13

@@ -9,11 +9,12 @@ from rbl_gym import kernels, metrics
 from rbl_gym.bounds import pose, posterior
 from rbl_gym.estimators.linear import engines, least_squares, unitary
 from rbl_gym.geometry import obstacles, rotations
-from rbl_gym.measurements import noise_laws, ranging
+from rbl_gym.measurements import bearing, noise_laws, ranging
 from rbl_gym.metrics import Figures
 from rbl_gym.motion import kinematics
 from rbl_gym.placement import gradient
 from rbl_gym.placement import problem as placement
+from rbl_gym.worlds import simulation
 
 pytestmark = pytest.mark.skipif(not kernels.enabled(), reason="kernels are off")
 
@@ -126,6 +127,14 @@ def test_walk(batch):
     assert_equal_forms(kinematics._walk, *start, np.zeros((7, 6)), normals, std, 0.1)
 
 
+@every_batch
+def test_moves_of_anchors(batch):
+    rng = np.random.default_rng(7)
+    places, velocity = rng.normal(size=(2, *batch, 4, 3))
+    velocity[..., 0, :] = 0.0
+    assert_equal_forms(simulation._move, places, velocity, 2.5)
+
+
 @pytest.mark.parametrize("count", [0, 1, 3])
 @every_batch
 def test_sight(batch, count):
@@ -174,43 +183,51 @@ def test_a_law_that_no_kernel_knows_takes_the_textbook_form():
 
 @every_batch
 @every_law
-def test_posterior_of_ranges(law, batch):
-    steps = 3
-    world = World((*batch, steps))
-    prior = world.matrix[..., 0, :, :]
-    twists, dt = world.rng.standard_normal((*batch, steps, 6)), np.array([0.0, 0.2, 0.1])
+def test_posterior_step_with_ranges(law, batch):
+    world = World(batch)
+    twist = world.rng.standard_normal((*batch, 6))
     args = world.anchors, world.tags, world.rotation, world.translation, law.numbers, world.share
     for std in (np.zeros(6), np.array([0.1, 0.2, 0.3, 1, 2, 3])):
-        for J in (prior, np.zeros((6, 6)), 1e12 * prior):
-            with np.errstate(all="ignore"):
-                got, _ = posterior.of_ranges.kernel(J, twists, dt, std, *args)
-                want, _ = posterior.of_ranges.textbook(J, twists, dt, std, *args)
-            scale = np.sqrt(np.einsum("...ii->...i", want))
-            scale = scale[..., :, None] * scale[..., None, :]
-            np.testing.assert_allclose(got / scale, want / scale, rtol=0, atol=1e-9)
-        assert_equal_forms(posterior.of_ranges, prior, twists, dt, std, *args)
+        for dt in (0.0, 0.2):
+            for J in (world.matrix, np.zeros((6, 6)), 1e12 * world.matrix):
+                with np.errstate(all="ignore"):
+                    got, _ = posterior.step_of_ranges.kernel(J, twist, dt, std, *args)
+                    want, _ = posterior.step_of_ranges.textbook(J, twist, dt, std, *args)
+                scale = np.sqrt(np.einsum("...ii->...i", want))
+                scale = scale[..., :, None] * scale[..., None, :]
+                np.testing.assert_allclose(got / scale, want / scale, rtol=0, atol=1e-9)
+            assert_equal_forms(posterior.step_of_ranges, world.matrix, twist, dt, std, *args)
 
 
 @every_batch
-def test_posterior_of_angles(batch):
-    world = World((*batch, 2), m=1)
-    twists = world.rng.standard_normal((*batch, 2, 6))
+def test_posterior_step_with_angles(batch):
+    world = World(batch, m=1)
     assert_equal_forms(
-        posterior.of_angles, world.matrix[..., 0, :, :], twists, np.array([0.0, 0.3]), np.ones(6),
-        world.anchors[..., 0, :], world.tags, world.rotation, world.translation, 0.01,
+        posterior.step_of_angles, world.matrix, world.rng.standard_normal((*batch, 6)), 0.3,
+        np.ones(6), world.anchors[..., 0, :], world.tags, world.rotation, world.translation, 0.01,
     )  # fmt: skip
 
 
+@every_batch
+def test_angles_of_an_epoch(batch):
+    world = World(batch, m=1)
+    normals = world.rng.standard_normal((*batch, 2, 5))
+    for std in (0.01, 100.0):
+        assert_equal_forms(
+            bearing.sample, world.rotation, world.translation, world.tags,
+            world.anchors[..., 0, :], normals, std,
+        )  # fmt: skip
+
+
 def test_scores_of_what_is_no_information_are_nan():
-    world = World((1,))
+    world = World(())
     for J in (np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6)):
         args = (
-            J, np.zeros((1, 6)), np.zeros(1), np.zeros(6), *world.places, LAWS["own"].numbers,
-            np.zeros((1, 4, 5)),
+            J, np.zeros(6), 0.0, np.zeros(6), *world.places, LAWS["own"].numbers, np.zeros((4, 5))
         )  # fmt: skip
-        for form in (posterior.of_ranges.kernel, posterior.of_ranges.textbook):
+        for form in (posterior.step_of_ranges.kernel, posterior.step_of_ranges.textbook):
             with np.errstate(all="ignore"):
-                assert np.isnan(form(*args)[1]).all()
+                assert np.isnan(form(*args)[1])
 
 
 # --- linear filters ------------------------------------------------------------------------------

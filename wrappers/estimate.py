@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from rbl_gym import bounds, estimators, metrics, rendering
+from rbl_gym import estimators, metrics, rendering
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import check_takes_noise
@@ -108,9 +109,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._state = self._filter.predict(self._state, observation["twist"], self._scene.dt)
         belief = self._update(observation)
         info = self._judged(belief, info)
-        reward = (
-            -float(np.log(info["score_m"])) if self._reward == "belief" else -info["tag_error_m"]
-        )
+        reward = -math.log(info["score_m"]) if self._reward == "belief" else -info["tag_error_m"]
         return self._observation(observation, belief), reward, terminated, truncated, info
 
     def _update(self, observation: dict[str, np.ndarray]) -> PoseBelief:
@@ -121,7 +120,10 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """The infos with the errors against the true pose."""
         figures = judge(belief, info["rotation"], info["translation"], self._tags)
         rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
-        return {**with_bound(info), **{name: float(value) for name, value in figures.items()}}
+        info = with_bound(info)
+        for name, value in figures.items():
+            info[name] = float(value)
+        return info
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
         return present(self._kind, observation, belief, self._scene)
@@ -203,15 +205,7 @@ def judge(
     belief: PoseBelief, rotation: FloatArray, translation: FloatArray, tags: FloatArray
 ) -> dict[str, FloatArray]:
     """Errors of beliefs against true poses, their NEES and score, arrays (...)."""
-    truth = rotation, translation
-    error = metrics.pose_error(belief.rotation, belief.translation, *truth)
-    return {
-        "rotation_error_rad": metrics.length(error[..., :3]),
-        "position_error_m": metrics.length(error[..., 3:]),
-        "tag_error_m": metrics.tag_error(belief.rotation, belief.translation, *truth, tags),
-        "nees": metrics.nees(error, belief.covariance),
-        "score_m": bounds.score(belief.covariance, belief.rotation, tags),
-    }
+    return metrics.judge(*belief[:3], rotation, translation, tags)._asdict()
 
 
 def present(

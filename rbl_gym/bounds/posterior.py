@@ -95,14 +95,14 @@ def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
     return turned
 
 
-# --- whole episodes, behind the doors of environments: nothing is checked ---------------------
+# --- a step and its score, behind the doors of environments: nothing is checked --------------
 
 
-@compiled("pose_bound:posterior_of_ranges")
-def of_ranges(
+@compiled("pose_bound:step_of_ranges")
+def step_of_ranges(
     prior: FloatArray,
-    twists: FloatArray,
-    dt: FloatArray,
+    twist: FloatArray,
+    dt: ArrayLike,
     std: FloatArray,
     anchors: FloatArray,
     tags: FloatArray,
@@ -111,75 +111,61 @@ def of_ranges(
     law: FloatArray,
     share: FloatArray | BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Information (..., T, 6, 6) after each of T epochs of ranges, and its score (..., T).
+    """Information (..., 6, 6) after an epoch of ranges, and the score (...) of its inverse.
 
     Parameters
     ----------
     prior
-        Information (..., 6, 6) before the first interval.
-    twists, dt, std
-        Known twists (..., T, 6) and lengths (T,) of the intervals that end at the epochs, 0 where
-        there is none; standard deviations (6,) of the motion after 1 s.
+        Information (..., 6, 6) after the epoch before.
+    twist, dt, std
+        Known twist (..., 6) and length of the interval from there, 0 where there is none; standard
+        deviations (6,) of the motion after 1 s.
     anchors, tags, rotation, translation
-        (..., T, M, 3), (..., N, 3), (..., T, 3, 3), (..., T, 3); the poses are the true ones.
+        (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3) at this epoch; the pose is the true one.
     law
         Numbers of the noise law (`ranging.numbers_of`).
     share
-        (..., T, M, N), of its information that each link has.
+        (..., M, N), of its information that each link has.
 
     Returns
     -------
     NaN is the score of information that is not positive definite.
     """
-    noise = ranging.law_of(law)
-    told = pose.information_at(anchors, tags[..., None, :, :], rotation, translation, noise, share)
-    return _recursion(prior, twists, dt, std, told, rotation, tags)
+    told = pose.information_at(anchors, tags, rotation, translation, ranging.law_of(law), share)
+    return _with_score(_predicted(prior, twist, dt, std) + told, rotation, tags)
 
 
-@compiled("pose_bound:posterior_of_angles")
-def of_angles(
+@compiled("pose_bound:step_of_angles")
+def step_of_angles(
     prior: FloatArray,
-    twists: FloatArray,
-    dt: FloatArray,
+    twist: FloatArray,
+    dt: ArrayLike,
     std: FloatArray,
-    stations: FloatArray,
+    station: FloatArray,
     tags: FloatArray,
     rotation: FloatArray,
     translation: FloatArray,
     angle_std: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """As `of_ranges`, of angles at stations (..., T, 3) with this standard deviation in radians."""
-    body, noise = tags[..., None, :, :], bearing.AngleNoise(angle_std)
-    places = ranging.tag_positions(rotation, translation - stations, body)
-    told = pose.lift(pose.tag_jacobian(rotation, body), bearing.information(places, noise))
-    return _recursion(prior, twists, dt, std, told, rotation, tags)
+    """`step_of_ranges`, of angles at a station (..., 3) with this standard deviation in radians."""
+    noise = bearing.AngleNoise(angle_std)
+    places = ranging.tag_positions(rotation, translation - station, tags)
+    told = pose.lift(pose.tag_jacobian(rotation, tags), bearing.information(places, noise))
+    return _with_score(_predicted(prior, twist, dt, std) + told, rotation, tags)
 
 
-def _recursion(
-    prior: FloatArray,
-    twists: FloatArray,
-    dt: FloatArray,
-    std: FloatArray,
-    told: FloatArray,
-    rotation: FloatArray,
-    tags: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
+def _predicted(prior: FloatArray, twist: FloatArray, dt: ArrayLike, std: FloatArray) -> FloatArray:
     process = ProcessNoise(tuple(std[:3].tolist()), tuple(std[3:].tolist()))
-    information, steps = prior, []
-    for k in range(twists.shape[-2]):
-        predicted = predict_information(information, twists[..., k, :], dt[k], process)
-        information = predicted + told[..., k, :, :]
-        steps.append(information)
-    after = np.stack(steps, axis=-3)
-    return after, _score(after, rotation, tags[..., None, :, :])
+    return predict_information(prior, twist, dt, process)
 
 
-def _score(information: FloatArray, rotation: FloatArray, tags: FloatArray) -> FloatArray:
-    """Score (...) of information (..., 6, 6), NaN where that is not positive definite."""
+def _with_score(
+    information: FloatArray, rotation: FloatArray, tags: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     good = np.isfinite(information).all(axis=(-2, -1))
     safe = np.where(good[..., None, None], information, 0.0)
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", safe), 1e-300))
     scaled = safe / (scale[..., :, None] * scale[..., None, :])
     good &= np.linalg.eigvalsh(scaled)[..., 0] > 1e-14
     covariance = np.linalg.inv(np.where(good[..., None, None], information, np.eye(6)))
-    return np.where(good, pose.score(covariance, rotation, tags), np.nan)
+    return information, np.where(good, pose.score(covariance, rotation, tags), np.nan)

@@ -97,7 +97,7 @@ class BaseStationVectorEnv(BatchEnv):
         self._angles = np.zeros((num_envs, *shape))
         self._information = np.zeros((num_envs, 6, 6))
         self._score_m = np.zeros(num_envs)
-        self._at: simulation.Epoch | None = None
+        self._at: simulation.Motion | None = None
 
     def _restart(
         self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
@@ -124,25 +124,24 @@ class BaseStationVectorEnv(BatchEnv):
 
     def _measure(self, rows: np.ndarray | slice, step: float) -> None:
         """Angles of some worlds at their epochs, and what they tell after `step` seconds."""
-        self._at = self._episodes.at(self._epochs)
-        rotation, translation, twist = (field[rows] for field in self._at[:3])
+        self._at = self._episodes.motion_at(self._epochs)
+        rotation, translation, twist = (field[rows] for field in self._at)
         station, std = self._stations[rows], self.noise.std_rad
         normals = self._normals[np.arange(self.num_envs), self._epochs][rows]
         self._angles[rows] = bearing.sample(
             rotation, translation, self.scene.body, station[:, 0], normals, std
         )
         if self.reward_mode == "bound":
-            information, score = posterior.of_angles(
-                self._information[rows], twist[:, None], np.array([step]),
-                self.scene.process.std(), station, self.scene.body, rotation[:, None],
-                translation[:, None], std,
+            information, score = posterior.step_of_angles(
+                self._information[rows], twist, step, self.scene.process.std(), station[:, 0],
+                self.scene.body, rotation, translation, std,
             )  # fmt: skip
-            if not np.isfinite(score).all():
+            if not math.isfinite(np.vdot(score, score)):
                 raise ValueError("the information about the pose is singular or not finite")
-            self._information[rows], self._score_m[rows] = information[:, 0], score[:, 0]
+            self._information[rows], self._score_m[rows] = information, score
 
     @property
-    def _seen(self) -> simulation.Epoch:
+    def _seen(self) -> simulation.Motion:
         """All worlds as they were measured last."""
         assert self._at is not None
         return self._at

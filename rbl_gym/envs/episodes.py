@@ -65,11 +65,19 @@ class EpisodeStore:
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
         """All worlds, each at its epoch (B,); copies."""
-        where: Any = np.arange(self._num_envs), epochs
-        if (epochs == epochs[0]).all():
-            where = slice(None), epochs[0]
-        fields = *self._timed, self._normals, self._uniforms
-        return simulation.Epoch(*(f if f is None else np.array(f[where]) for f in fields))  # pyright: ignore[reportArgumentType]
+        where = self._where(epochs)
+        uniforms = None if self._uniforms is None else np.array(self._uniforms[where])
+        return simulation.Epoch(*self.motion_at(epochs), np.array(self._normals[where]), uniforms)
+
+    def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
+        """The motion of all worlds, each at its epoch (B,); copies."""
+        where = self._where(epochs)
+        return simulation.Motion(*(np.array(field[where]) for field in self._timed))
+
+    def _where(self, epochs: np.ndarray) -> Any:
+        if self._num_envs == 1 or (epochs == epochs[0]).all():
+            return slice(None), epochs[0]
+        return np.arange(self._num_envs), epochs
 
 
 def _rows(worlds: np.ndarray) -> slice | np.ndarray:

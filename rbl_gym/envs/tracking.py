@@ -127,13 +127,9 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self._epoch = 0
         self._anchors = episode.anchors.copy()
         self._measured: dict[str, np.ndarray] | None = None
-        self._bound: tuple[FloatArray, FloatArray] | None = None
         if self.scene.anchor_speed_m_s == 0:
-            # No action can change what anchors that stand still will measure, nor its bound.
+            # No action can change what anchors that stand still will measure.
             self._measured = measure(self.scene, simulation.whole(episode), episode.anchors[None])
-            if self.reward_mode == "bound":
-                links = self._measured["links"].view(np.bool_)
-                self._bound = scene_bounds.posterior_of_episode(self.scene, episode, links)
         self._information: FloatArray | None = None
         observation, info, _ = self._observe()
         info["prior_rotation"] = episode.prior_rotation.copy()
@@ -189,18 +185,12 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         return rendering.picture(self.film)
 
     def _carry_bound(self, at: simulation.Epoch, links: np.ndarray) -> float:
-        """Score of the posterior Cramer-Rao bound of this epoch."""
-        if self._bound is not None:
-            self._information, score = (field[self._epoch] for field in self._bound)
-        else:
-            self._information, score = scene_bounds.posterior_step(
-                self.scene,
-                at,
-                self._anchors,
-                links.view(np.bool_),
-                self._information,
-                self._episode.prior_covariance,  # pyright: ignore[reportOptionalMemberAccess]
-            )
+        """Score of the posterior Cramer-Rao bound of this epoch, from that of the one before."""
+        assert self._episode is not None
+        self._information, score = scene_bounds.posterior_step(
+            self.scene, at, self._anchors, links.view(np.bool_), self._information,
+            self._episode.prior_covariance,
+        )  # fmt: skip
         return float(score)
 
 

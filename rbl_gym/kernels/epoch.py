@@ -48,6 +48,18 @@ def walk(
         translations_after[k, 2] = translation[2] + z
 
 
+@gufunc("(m,d),(m,d),()->(m,d)")
+def move(places: Any, velocity: Any, reach: float, moved: Any) -> None:
+    """Places after a step of `reach` along each velocity, of which no more than length 1 counts."""
+    for m in range(places.shape[0]):
+        square = 0.0
+        for i in range(places.shape[1]):
+            square += velocity[m, i] * velocity[m, i]
+        step = reach / max(math.sqrt(square), 1.0)
+        for i in range(places.shape[1]):
+            moved[m, i] = velocity[m, i] * step + places[m, i]
+
+
 @helper
 def tag_position(rotation: Any, translation: Any, tags: Any, n: int) -> tuple[float, float, float]:
     """``s_n = Q c_n + t``."""

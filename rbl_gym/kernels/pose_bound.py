@@ -183,36 +183,30 @@ def square_of_information(J: Any, rotation: Any, tags: Any, work: Any) -> float:
     return tag_square(P, rotation, tags)
 
 
-@gufunc("(s,s),(t,s),(t),(s),(t,m,d),(n,d),(t,d,d),(t,d),(l),(t,m,n)->(t,s,s),(t)")
-def posterior_of_ranges(
-    prior: Any, twists: Any, dt: Any, std: Any, anchors: Any, tags: Any, rotation: Any,
+@gufunc("(s,s),(s),(),(s),(m,d),(n,d),(d,d),(d),(l),(m,n)->(s,s),()")
+def step_of_ranges(
+    prior: Any, twist: Any, dt: float, std: Any, anchors: Any, tags: Any, rotation: Any,
     translation: Any, law: Any, share: Any, information: Any, score: Any,
 ) -> None:  # fmt: skip
-    """The posterior Cramer-Rao recursion over T epochs of ranges, and the score of each."""
+    """A step of the posterior Cramer-Rao recursion with ranges, and the score after it."""
     work = np.empty((4, 6, 6))
-    for k in range(twists.shape[0]):
-        before = prior if k == 0 else information[k - 1]
-        _predict(before, twists[k], dt[k], std, work, information[k])
-        add_range_information(
-            information[k], anchors[k], tags, rotation[k], translation[k], law, share[k]
-        )
-        score[k] = math.sqrt(square_of_information(information[k], rotation[k], tags, work))
+    _predict(prior, twist, dt, std, work, information)
+    add_range_information(information, anchors, tags, rotation, translation, law, share)
+    score[0] = math.sqrt(square_of_information(information, rotation, tags, work))
 
 
-@gufunc("(s,s),(t,s),(t),(s),(t,d),(n,d),(t,d,d),(t,d),()->(t,s,s),(t)")
-def posterior_of_angles(
-    prior: Any, twists: Any, dt: Any, std: Any, stations: Any, tags: Any, rotation: Any,
+@gufunc("(s,s),(s),(),(s),(d),(n,d),(d,d),(d),()->(s,s),()")
+def step_of_angles(
+    prior: Any, twist: Any, dt: float, std: Any, station: Any, tags: Any, rotation: Any,
     translation: Any, angle_std: float, information: Any, score: Any,
 ) -> None:  # fmt: skip
-    """The posterior Cramer-Rao recursion over T epochs of angles, and the score of each."""
+    """A step of the posterior Cramer-Rao recursion with angles, and the score after it."""
     work = np.empty((4, 6, 6))
-    for k in range(twists.shape[0]):
-        before = prior if k == 0 else information[k - 1]
-        _predict(before, twists[k], dt[k], std, work, information[k])
-        _add_angle_information(
-            information[k], stations[k], tags, rotation[k], translation[k], 1 / angle_std**2
-        )
-        score[k] = math.sqrt(square_of_information(information[k], rotation[k], tags, work))
+    _predict(prior, twist, dt, std, work, information)
+    _add_angle_information(
+        information, station, tags, rotation, translation, 1 / (angle_std * angle_std)
+    )
+    score[0] = math.sqrt(square_of_information(information, rotation, tags, work))
 
 
 # As near to the station (m) no direction is one: its gradient counts as zero.

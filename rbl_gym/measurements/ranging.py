@@ -6,6 +6,7 @@ The noise laws of `noise_laws` are handed on.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -66,6 +67,11 @@ class LinkModel:
         check_number("nlos_bias_m", self.nlos_bias_m, low=0.0)
         if self.reach_m is not None:
             check_number("reach_m", self.reach_m, low=0.0)
+
+    @functools.cached_property
+    def never_fails(self) -> bool:
+        """Whether every link measures, without a bias."""
+        return not self.is_random and self.reach_m is None
 
     @property
     def is_random(self) -> bool:
@@ -157,7 +163,7 @@ def lose_links(
     """What a link model leaves of noisy ranges of all links; arguments as `measure`."""
     links = np.ones(ranges.shape, dtype=np.bool_)
     nlos = np.zeros(ranges.shape, dtype=np.bool_)
-    if link_model is None or not (link_model.is_random or link_model.reach_m is not None):
+    if link_model is None or link_model.never_fails:
         return Measurement(ranges, links, nlos)
     if link_model.is_random:
         if uniforms is None:

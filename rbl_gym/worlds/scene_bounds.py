@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rbl_gym.bounds import posterior
@@ -10,7 +12,7 @@ from rbl_gym.measurements import ranging
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scene import Scene
 
-__all__ = ["posterior_of_episode", "posterior_step"]
+__all__ = ["posterior_step"]
 
 
 def posterior_step(
@@ -42,46 +44,20 @@ def posterior_step(
     ValueError
         If the information is singular or not finite.
     """
-    step = 0.0 if previous is None else scene.dt
-    before = np.linalg.inv(prior_covariance) if previous is None else previous
-    share = simulation.shares(scene, at, anchors, links)
-    information, score = _recursion(
-        scene, before, np.array([step]), at.twist[..., None, :], anchors[..., None, :, :],
-        at.rotation[..., None, :, :], at.translation[..., None, :], share[..., None, :, :],
-    )  # fmt: skip
-    return information[..., 0, :, :], score[..., 0]
-
-
-def posterior_of_episode(
-    scene: Scene, episode: simulation.Episode, links: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """`posterior_step` of all epochs (..., T + 1, ...) of an episode whose anchors stand still."""
-    at = simulation.whole(episode)
-    anchors = episode.anchors[..., None, :, :]
-    step = np.full(scene.steps + 1, scene.dt)
-    step[0] = 0.0
-    before = np.linalg.inv(episode.prior_covariance)
-    share = simulation.shares(scene, at, anchors, links)
-    anchors = np.broadcast_to(anchors, (*share.shape[:-2], *anchors.shape[-2:]))
-    return _recursion(scene, before, step, at.twist, anchors, at.rotation, at.translation, share)
-
-
-def _recursion(
-    scene: Scene,
-    before: FloatArray,
-    step: FloatArray,
-    twist: FloatArray,
-    anchors: FloatArray,
-    rotation: FloatArray,
-    translation: FloatArray,
-    share: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
     law = ranging.numbers_of(scene.noise, len(scene.tags))
     assert law is not None  # the laws of scenes have numbers
-    information, score = posterior.of_ranges(
-        before, twist, step, scene.process.std(), anchors, scene.body, rotation, translation, law,
-        share,
-    )  # fmt: skip
-    if not np.isfinite(score).all():
+    information, score = posterior.step_of_ranges(
+        np.linalg.inv(prior_covariance) if previous is None else previous,
+        at.twist,
+        0.0 if previous is None else scene.dt,
+        scene.process.std(),
+        anchors,
+        scene.body,
+        at.rotation,
+        at.translation,
+        law,
+        simulation.shares(scene, at, anchors, links),
+    )
+    if not math.isfinite(np.vdot(score, score)):
         raise ValueError("the information about the pose is singular or not finite")
     return information, score

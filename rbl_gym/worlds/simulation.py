@@ -14,6 +14,7 @@ import numpy as np
 from rbl_gym import bounds, motion
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
 from rbl_gym.worlds.scene import Scene
 
@@ -67,6 +68,14 @@ class Epoch(NamedTuple):
     twist: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
+
+
+class Motion(NamedTuple):
+    """True poses at one epoch and the known twist that led there: three fields of `Epoch`."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    twist: FloatArray
 
 
 # Standard normals of an episode besides those of steps and ranges: rotation, spin, prior.
@@ -294,9 +303,14 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
     `action` (..., 3 M) holds a velocity per anchor in units of the scene's limit; a longer
     one than 1 is cut to 1, and the place is projected onto the anchors' region.
     """
-    velocity = action.reshape(*action.shape[:-1], scene.n_anchors, 3)
-    length = np.sqrt(np.add.reduce(velocity * velocity, axis=-1))
-    reach = (scene.anchor_speed_m_s * scene.dt) / np.maximum(length, 1.0)
-    moved = velocity * reach[..., None]
-    moved += anchors
+    velocity = action.reshape((*action.shape[:-1], scene.n_anchors, 3))
+    moved = _move(anchors, velocity, scene.anchor_speed_m_s * scene.dt)
     return scene.anchor_region.project(moved)
+
+
+@compiled("epoch:move")
+def _move(places: FloatArray, velocity: FloatArray, reach: float) -> FloatArray:
+    """Places (..., M, 3) after a step of `reach` along velocities of length 1 at the most."""
+    length = np.linalg.norm(velocity, axis=-1, keepdims=True)
+    reach = np.asarray(reach)[..., None, None]
+    return velocity * (reach / np.maximum(length, 1.0)) + places
