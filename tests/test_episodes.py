@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym.components import whole_rows
 from rbl_gym.envs.episodes import EpisodeStore
 from rbl_gym.worlds import scenes, simulation
 
@@ -50,10 +49,3 @@ def test_more_worlds_than_are_built_together_are_all_begun():
     last = simulation.draw_episode(scene, np.random.default_rng(299))
     at = store.at(np.full(300, 2))
     np.testing.assert_allclose(at.translation[299], last.translation[2], rtol=1e-12)
-
-
-def test_numpys_buffer_is_put_back():
-    before = np.getbufsize()
-    with whole_rows():
-        assert np.getbufsize() < before
-    assert np.getbufsize() == before

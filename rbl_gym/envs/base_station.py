@@ -13,8 +13,9 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym import rendering
 from rbl_gym.bounds import posterior
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
-from rbl_gym.envs.batch import BatchEnv, ScalarEnv
+from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import bearing

@@ -25,8 +25,6 @@ from rbl_gym.checks import BoolArray, FloatArray, as_array, check_count, check_o
 Observation = Any
 # More than any machine holds.
 MOST_ENVS = 10**8
-# The mask of a world that moves, and is the only one.
-_ALONE = np.ones(1, dtype=np.bool_)
 
 
 class StatedLength:
@@ -205,22 +203,6 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
             info[name], info[f"_{name}"] = value, last.copy()
         return self._observe(), reward, terminated, truncated, info
 
-    def step_alone(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Any]:
-        """`step` of the only world, without the masks of many; observation and infos of it."""
-        if not self._generators:
-            raise gym.error.ResetNeeded("call reset() before step()")
-        actions = check_actions("action", action, self.single_action_space)[None]
-        if self._done[0]:
-            raise gym.error.ResetNeeded("the episode is over: reset")
-        self._epochs[0] += 1
-        reward, over = self._advance(actions, _ALONE)
-        terminated = bool(over[0])
-        truncated = not terminated and bool(self._epochs[0] >= self.steps_limit)
-        self._done[0] = terminated or truncated
-        self._shoot()
-        observation, info = _first(self._observe()), _scalars(self._inform())
-        return observation, float(reward[0]), terminated, truncated, info
-
     def render(self) -> Any:
         """A frame of every world, (height, width, 3) of uint8."""
         return rendering.picture(self.film, self.num_envs)
@@ -349,70 +331,3 @@ def _row(observation: Observation, i: int) -> Observation:
     if isinstance(observation, dict):
         return {key: value[i].copy() for key, value in observation.items()}
     return observation[i].copy()
-
-
-class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """One world of a `BatchEnv`, as a scalar environment.
-
-    A subclass names its `batch_class`; its ``__init__`` hands the arguments on to
-    `_configure`.
-    """
-
-    batch_class: ClassVar[Any]
-    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own form)
-        "render_modes": rendering.RENDER_MODES,
-        "render_fps": BatchEnv.render_fps,
-    }
-
-    def _configure(self, render_mode: str | None, **arguments: Any) -> None:
-        self.render_mode = render_mode
-        self._batch: Any = self.batch_class(
-            num_envs=1, render_mode=render_mode, autoreset_mode="Disabled", **arguments
-        )
-        self.observation_space = self._batch.single_observation_space
-        self.action_space = self._batch.single_action_space
-        self.metadata = {**self.metadata, "render_fps": self._batch.render_fps}
-
-    @property
-    def episode_steps(self) -> int:
-        """Steps of an episode."""
-        return self._batch.episode_steps
-
-    @property
-    def film(self) -> rendering.Film | None:
-        """What the frames are drawn from, with a render mode."""
-        return self._batch.film
-
-    def render(self) -> Any:
-        """A frame, (height, width, 3) of uint8."""
-        return rendering.picture(self.film)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode; `options` must be empty."""
-        check_options(options)
-        super().reset(seed=seed)
-        self._batch._generators = [self.np_random]
-        observation, info = self._batch.reset()
-        return _first(observation), _scalars(info)
-
-    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One step."""
-        return self._batch.step_alone(action)
-
-
-def _first(observation: Observation) -> Observation:
-    """The observation of the first world, not copied."""
-    if isinstance(observation, dict):
-        return {key: value[0] for key, value in observation.items()}
-    return observation[0]
-
-
-def _scalars(info: dict[str, Any]) -> dict[str, Any]:
-    """Infos of the one world: numbers as Python's own."""
-    return {
-        key: value[0].item() if value[0].ndim == 0 else value[0]
-        for key, value in info.items()
-        if not key.startswith("_")
-    }

@@ -11,7 +11,8 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number, check_one_of
-from rbl_gym.envs.batch import BatchEnv, ScalarEnv
+from rbl_gym.envs.batch import BatchEnv
+from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.networks.bounds import Sensing, linked_covariance, linked_pose_covariance
 from rbl_gym.networks.graphs import components
 from rbl_gym.networks.sensing import proj

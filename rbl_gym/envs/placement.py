@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode
 
 from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
-from rbl_gym.envs.batch import BatchEnv, ScalarEnv
+from rbl_gym.envs.batch import BatchEnv
+from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.geometry.regions import Region
 from rbl_gym.placement.problem import Context
 from rbl_gym.rendering import placement as rendering

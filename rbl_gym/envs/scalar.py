@@ -1,0 +1,94 @@
+"""One world of a vector environment, as a scalar environment."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import rendering
+from rbl_gym.envs.batch import BatchEnv, Observation, StatedLength, check_actions, check_options
+
+# The mask of a world that moves, and is the only one.
+_ALONE = np.ones(1, dtype=np.bool_)
+
+
+class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+    """One world of a `BatchEnv`, as a scalar environment.
+
+    A subclass names its `batch_class`; its ``__init__`` hands the arguments on to
+    `_configure`.
+    """
+
+    batch_class: ClassVar[Any]
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium's own form)
+        "render_modes": rendering.RENDER_MODES,
+        "render_fps": BatchEnv.render_fps,
+    }
+
+    def _configure(self, render_mode: str | None, **arguments: Any) -> None:
+        self.render_mode = render_mode
+        self._batch: Any = self.batch_class(
+            num_envs=1, render_mode=render_mode, autoreset_mode="Disabled", **arguments
+        )
+        self.observation_space = self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
+        self.metadata = {**self.metadata, "render_fps": self._batch.render_fps}
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode."""
+        return self._batch.episode_steps
+
+    @property
+    def film(self) -> rendering.Film | None:
+        """What the frames are drawn from, with a render mode."""
+        return self._batch.film
+
+    def render(self) -> Any:
+        """A frame, (height, width, 3) of uint8."""
+        return rendering.picture(self.film)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode; `options` must be empty."""
+        check_options(options)
+        super().reset(seed=seed)
+        self._batch._generators = [self.np_random]
+        observation, info = self._batch.reset()
+        return _first(observation), _scalars(info)
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One step."""
+        # What `BatchEnv.step` does, without the masks of many worlds.
+        batch = self._batch
+        if not batch._generators or batch._done[0]:
+            raise gym.error.ResetNeeded("the episode is over or never began: call reset()")
+        actions = check_actions("action", action, self.action_space)[None]
+        batch._epochs[0] += 1
+        reward, over = batch._advance(actions, _ALONE)
+        terminated = bool(over[0])
+        truncated = not terminated and bool(batch._epochs[0] >= batch.steps_limit)
+        batch._done[0] = terminated or truncated
+        batch._shoot()
+        observation, info = _first(batch._observe()), _scalars(batch._inform())
+        return observation, float(reward[0]), terminated, truncated, info
+
+
+def _first(observation: Observation) -> Observation:
+    """The observation of the first world, not copied."""
+    if isinstance(observation, dict):
+        return {key: value[0] for key, value in observation.items()}
+    return observation[0]
+
+
+def _scalars(info: dict[str, Any]) -> dict[str, Any]:
+    """Infos of the one world: numbers as Python's own."""
+    return {
+        key: value[0].item() if value[0].ndim == 0 else value[0]
+        for key, value in info.items()
+        if not key.startswith("_")
+    }
