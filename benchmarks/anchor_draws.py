@@ -40,7 +40,7 @@ def main() -> None:
 def judge(anchors: Any, trials: int, seed: int) -> tuple[list[str], float]:
     """Claims of the paper that fail, and the ratio of the rotation's RMSE over all steps."""
     world = scenes.get({"name": "camsap2013", "steps": camsap2013.STEPS - 1, "anchors": anchors})
-    result = camsap2013.run(trials, seed, world=world)
+    result = camsap2013.tracking_experiment(trials, seed, world=world)
     failed = [
         claim["statement"]
         for claim in result["claims"]

@@ -29,17 +29,17 @@ def main() -> None:
         parser.add_argument(name, type=int, default=default)
     options = parser.parse_args()
     scene = scenes.get(SCENE)
-    honest = monte_carlo.simulate_world(scene, options.trials, np.random.default_rng(options.seed))
+    honest = monte_carlo.simulate_trials(scene, options.trials, np.random.default_rng(options.seed))
     told = honest.episode.twists + DRIFT
     drifting = honest._replace(episode=honest.episode._replace(twists=told))
     print("last of 100 steps            rotation (deg)   position (m)")
     for label, world in (("without drift", honest), ("with drift", drifting)):
         show(f"dead reckoning, {label}", dead_reckoning(world))
         for name, (filter, settings) in camsap2013.FILTERS.items():
-            show(f"{name}, {label}", monte_carlo.run(world, filter, settings).error[-1])
+            show(f"{name}, {label}", monte_carlo.track_trials(world, filter, settings).error[-1])
 
 
-def dead_reckoning(world: monte_carlo.World) -> np.ndarray:
+def dead_reckoning(world: monte_carlo.SimulatedTrials) -> np.ndarray:
     """Errors (B, 6) at the last epoch of the integrated twist, from the true pose at epoch 0."""
     episode = world.episode
     rotation, translation = episode.rotation[:, 0], episode.translation[:, 0]

@@ -22,13 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym import bounds, estimators, metrics
+from rbl_gym import bounds, metrics
 from rbl_gym.bounds import twist as twist_bounds
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.motion import unknown_twist as ut
 from rbl_gym.studies import monte_carlo
-from rbl_gym.worlds import scenes, simulation
+from rbl_gym.studies.epochs import stack_beliefs, timed
+from rbl_gym.worlds import scenes
 
 SCENE = scenes.get("drone_yard")
 LAW = ut.WanderingTwist(SCENE.spin_rad_s, 3.0, 0.1, 1.0)
@@ -78,7 +79,7 @@ def drawn(sensor: ut.TwistSensor | None, options: argparse.Namespace) -> dict[st
             "speed_std_m_s": sensor.speed_std_m_s,
             "frame": sensor.frame,
         }
-    filter = monte_carlo.make(SCENE, "iekf-cv", OPTIONS | of_sensor)
+    filter = monte_carlo.scene_filter(SCENE, "iekf-cv", OPTIONS | of_sensor)
     offset = np.sqrt(np.diag(P)) * rng.standard_normal((trials, 6))
     state = filter.initial(rotations.exp(offset[:, :3]) @ rotation, start + offset[:, 3:], P)
     J = np.diag([*1 / np.diag(P), *LAW.prior_std() ** -2.0])
@@ -113,27 +114,19 @@ def way_points(options: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Bodies on the scene's way-points: the twist known, ignored, and as a random walk."""
     scene = scenes.get({"name": "drone_yard", "steps": options.steps})
     rng = np.random.default_rng(options.seed)
-    world = monte_carlo.simulate_world(scene, options.trials, rng)
+    world = monte_carlo.simulate_trials(scene, options.trials, rng)
     free = OPTIONS | {"speed_m_s": 5.0, "acceleration": 3.0, "turn_acceleration": 0.01}
     rows = {}
     for name, kind, more in (
         ("way-points, iekf, twist known", "iekf", {}),
         ("way-points, iekf-cv", "iekf-cv", free),
     ):
-        errors, beliefs = [], []
-        begin = time.process_time()
-        for k, (_, belief) in enumerate(
-            monte_carlo.beliefs(world, estimators.make(
-                kind, tags=scene.tags, noise=scene.noise, process=scene.process, **more
-            ))
-        ):  # fmt: skip
-            at = simulation.epoch_of(world.episode, k)
-            errors.append(
-                metrics.pose_error(belief.rotation, belief.translation, at.rotation, at.translation)
-            )
-            beliefs.append(belief.covariance)
-        seconds = time.process_time() - begin
-        rows[name] = judged(np.array(errors), np.array(beliefs), world.bound, seconds)
+        filter = monte_carlo.scene_filter(scene, kind, more)
+        steps, seconds = zip(*timed(monte_carlo.trial_steps(world, filter)), strict=True)
+        belief = stack_beliefs(step.belief for step in steps)
+        truth = (np.moveaxis(part, 1, 0) for part in world.episode[:2])
+        error = metrics.pose_error(*belief[:2], *truth)
+        rows[name] = judged(error, belief.covariance, world.bound, sum(seconds))
     return rows
 
 

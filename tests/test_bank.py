@@ -33,7 +33,7 @@ def make(tags=TAGS, name="iekf-bank", **options):
 
 def world(scene, seed, trials, steps=10, **links):
     scene = scenes.get({"name": scene, "steps": steps, "links": links})
-    return monte_carlo.simulate_world(scene, trials, np.random.default_rng(seed))
+    return monte_carlo.simulate_trials(scene, trials, np.random.default_rng(seed))
 
 
 def told_wrong(world, seed):
@@ -59,14 +59,15 @@ def near(world, trace):
 def test_without_a_doubt_it_is_the_iterated_ekf(robust):
     here = world("uwb_room", 1, 20, nlos_probability=0.1 if robust else 0.0)
     filters = [
-        monte_carlo.make(here.scene, name, {"robust": robust}) for name in ("iekf", "iekf-bank")
+        monte_carlo.scene_filter(here.scene, name, {"robust": robust})
+        for name in ("iekf", "iekf-bank")
     ]
-    runs = [list(monte_carlo.beliefs(here, filter)) for filter in filters]
-    for (_, plain), (state, banked) in zip(*runs, strict=True):
-        for a, b in zip(plain, banked, strict=True):
+    runs = [list(monte_carlo.trial_steps(here, filter)) for filter in filters]
+    for plain, banked in zip(*runs, strict=True):
+        for a, b in zip(plain.belief, banked.belief, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-12)
-        assert np.isneginf(state.log_odds).all()
-    np.testing.assert_array_equal(filters[1].probabilities(state)[:, 0], 1.0)
+        assert np.isneginf(banked.state.log_odds).all()
+    np.testing.assert_array_equal(filters[1].probabilities(runs[1][-1].state)[:, 0], 1.0)
 
 
 @pytest.mark.parametrize("scene", ["uwb_room", "drone_yard", "satellite", "auv_buoys"])
@@ -75,7 +76,7 @@ def test_half_a_turn_and_ten_metres_off_it_comes_back(scene, trials):
     """At least 99 % are back within 10 epochs, where the plain filter is still lost."""
     here = world(scene, 2, trials)
     back = {
-        name: near(here, monte_carlo.run(told_wrong(here, 3), name, {})).mean(axis=1)
+        name: near(here, monte_carlo.track_trials(told_wrong(here, 3), name, {})).mean(axis=1)
         for name in ("iekf", "iekf-bank")
     }
     assert back["iekf-bank"][10] >= 0.99
@@ -84,7 +85,7 @@ def test_half_a_turn_and_ten_metres_off_it_comes_back(scene, trials):
 
 def test_it_comes_back_among_reflected_paths():
     here = world("drone_yard", 4, 60, nlos_probability=0.1)
-    trace = monte_carlo.run(told_wrong(here, 5), "iekf-bank", {"robust": True})
+    trace = monte_carlo.track_trials(told_wrong(here, 5), "iekf-bank", {"robust": True})
     assert near(here, trace)[10].mean() >= 0.97
 
 
@@ -95,7 +96,7 @@ def test_from_nothing():
         prior_translation=np.zeros((60, 3)),
         prior_covariance=np.broadcast_to(np.diag([np.pi**2] * 3 + [1e4] * 3), (60, 6, 6)),
     )
-    trace = monte_carlo.run(here._replace(episode=episode), "iekf-bank", {})
+    trace = monte_carlo.track_trials(here._replace(episode=episode), "iekf-bank", {})
     assert near(here, trace)[0].all()
 
 
@@ -108,7 +109,7 @@ def test_after_an_outage_without_odometry():
         for k, m in enumerate(here.measurements)
     ]
     lost = here._replace(episode=here.episode._replace(twists=twists), measurements=blind)
-    back = near(here, monte_carlo.run(lost, "iekf-bank", {}))
+    back = near(here, monte_carlo.track_trials(lost, "iekf-bank", {}))
     assert back[4].all()
     assert back[35].mean() < 0.2
     assert back[45].mean() >= 0.99

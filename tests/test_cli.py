@@ -60,7 +60,7 @@ LONG = [pytest.param((1000, seed), marks=pytest.mark.long) for seed in (0, 1, 2)
 
 @pytest.fixture(scope="module", params=[(300, 0), *LONG], ids=str)
 def experiment(request):
-    return camsap2013.run(*request.param)
+    return camsap2013.tracking_experiment(*request.param)
 
 
 def test_the_tracking_papers_claims_hold(experiment):
@@ -296,7 +296,9 @@ def test_static_runs_of_a_real_recording(every, tmp_path):
             write(tmp_path / "truth.csv", ["t", "x", "y", "yaw_deg"], ends),
             LIAS / "calibration_8_14.csv",
         )
-        found = replay.errors(recording, replay.run(recording, settings), settings)
+        found = replay.track_errors(
+            recording, replay.replay_recording(recording, settings), settings
+        )
         assert found is not None
         squares.append(np.mean(found.position[found.known] ** 2))
         nees.append(found.nees[found.known].mean() / 3)

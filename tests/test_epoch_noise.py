@@ -12,7 +12,7 @@ from rbl_gym import estimators, motion, recordings
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import bearing, ranging
 from rbl_gym.studies import monte_carlo, replay
-from rbl_gym.studies.bench import run as bench_run
+from rbl_gym.studies.bench import stages
 from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import random_world, simulate
@@ -66,13 +66,13 @@ def test_a_delegate_has_the_nees_of_iekf_in_a_hall_with_racks():
 
 def test_every_loop_gives_it_the_law_of_the_epoch():
     scene = scenes.get({"name": "hall", "steps": 5})
-    world = monte_carlo.simulate_world(scene, 8, np.random.default_rng(0))
-    stage = bench_run.scene_stage({"name": "hall", "steps": 5}, "nominal", 8, 0)
-    for run in (lambda name: monte_carlo.run(world, name, {}).nees,
-                lambda name: bench_run.run(stage, name, {})[0]["anees"]):  # fmt: skip
+    world = monte_carlo.simulate_trials(scene, 8, np.random.default_rng(0))
+    stage = stages.scene_stage({"name": "hall", "steps": 5}, "nominal", 8, 0)
+    for run in (lambda name: monte_carlo.track_trials(world, name, {}).nees,
+                lambda name: stages.run_filter(stage, name, {})[0]["anees"]):  # fmt: skip
         np.testing.assert_allclose(run(NEW), run("iekf"), rtol=1e-12)
     # Blind to the racks the same filter claims far too much.
-    assert monte_carlo.run(world, "iekf", {}).nees.mean() < 9
+    assert monte_carlo.track_trials(world, "iekf", {}).nees.mean() < 9
 
 
 def log(std: float) -> recordings.Recording:
@@ -98,8 +98,8 @@ def test_a_recording_with_its_own_noise_is_weighed_by_it(name):
     settings = replay.Settings(filter=name, robust=False)
     found = []
     for std in (0.02, 10.0):
-        track = replay.run(log(std), settings)
-        errors = replay.errors(log(std), track, settings)
+        track = replay.replay_recording(log(std), settings)
+        errors = replay.track_errors(log(std), track, settings)
         assert errors is not None
         found.append(errors.tags[-1])
     told_wrong, told_right = found
@@ -116,17 +116,17 @@ def test_a_filter_of_the_old_interface_is_refused_by_name_where_it_matters():
     with pytest.raises(ValueError, match=REFUSAL):
         VectorEstimatePose(halls, OLD)
     with pytest.raises(ValueError, match=REFUSAL):
-        monte_carlo.make(scenes.get("hall"), OLD, {})
+        monte_carlo.scene_filter(scenes.get("hall"), OLD, {})
     with pytest.raises(ValueError, match=REFUSAL + ".*recording"):
-        replay.run(log(0.02), replay.Settings(filter=OLD))
-    stage = bench_run.scene_stage({"name": "hall", "steps": 2}, "nominal", 2, 0)
-    record, _ = bench_run.run(stage, OLD, {})
+        replay.replay_recording(log(0.02), replay.Settings(filter=OLD))
+    stage = stages.scene_stage({"name": "hall", "steps": 2}, "nominal", 2, 0)
+    record, _ = stages.run_filter(stage, OLD, {})
     assert record["status"] == "refused"
     assert "OldInterface' must take update(" in record["message"]
     # Elsewhere it runs as ever.
     env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene="uwb_room"), OLD)
     assert env.reset(seed=1)[1]["nees"] > 0
-    replay.run(log(0.02), replay.Settings(filter=OLD, range_std_m=0.1))
+    replay.replay_recording(log(0.02), replay.Settings(filter=OLD, range_std_m=0.1))
 
 
 @pytest.mark.parametrize("name", ["kf", "iekf", "iekf-bank", "iekf-cv", "iekf-bias"])

@@ -279,11 +279,15 @@ def test_filter_errors_by_hand(name):
 
 
 def test_filters_and_references_by_task():
-    assert transfer.filters(rl_task("auv_buoys")) == ["iekf", "iekf-bank", "iekf, reflections"]
-    everywhere = transfer.filters(rl_task("auv_buoys"))
-    assert transfer.filters(rl_task("mounts")) == [*everywhere, "uc-kf"]
-    assert transfer.references(rl_task("mounts")) == ["random", "greedy-swaps"]
-    assert transfer.references(rl_task("satellite"))[-1] == "cma-es"
+    assert transfer.tracking_filters(rl_task("auv_buoys")) == [
+        "iekf",
+        "iekf-bank",
+        "iekf, reflections",
+    ]
+    everywhere = transfer.tracking_filters(rl_task("auv_buoys"))
+    assert transfer.tracking_filters(rl_task("mounts")) == [*everywhere, "uc-kf"]
+    assert transfer.transfer_references(rl_task("mounts")) == ["random", "greedy-swaps"]
+    assert transfer.transfer_references(rl_task("satellite"))[-1] == "cma-es"
 
 
 def test_the_strongest_search_stays_the_one_that_counts_as_1(monkeypatch):

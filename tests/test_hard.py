@@ -42,7 +42,7 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(part, tmp
     result = json.loads(figures.read_text())
     assert_table_holds(table, result, least=50)
     units = []
-    again = hard.run(4, 0, lambda: units.append(1))
+    again = hard.compare_hard_conditions(4, 0, lambda: units.append(1))
     assert len(units) == hard.work_units()
     for one in (result, again):
         for row in one["links"]["uwb_room"].values():
@@ -62,9 +62,9 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(part, tmp
 def test_the_bound_of_good_links_by_hand():
     """An episode whose bound is taken with its own links has the bound of its world."""
     scene = hard.scenes.get({"name": "uwb_room", "steps": 5, "links": {"drop_probability": 0.4}})
-    world = monte_carlo.simulate_world(scene, 3, np.random.default_rng(1))
-    links = [m.links for m in world.measurements]
-    np.testing.assert_allclose(hard._bound(world, links), world.bound)
+    world = monte_carlo.simulate_trials(scene, 3, np.random.default_rng(1))
+    links = np.array([m.links for m in world.measurements])
+    np.testing.assert_allclose(monte_carlo.bound_of(scene, world.episode, links), world.bound)
     error = np.random.default_rng(2).standard_normal((6, 3, 6))
     np.testing.assert_allclose(
         hard._squared_distance(error, world.bound), metrics.nees(error, world.bound)
@@ -74,13 +74,13 @@ def test_the_bound_of_good_links_by_hand():
 def test_in_an_outage_filters_hear_and_know_nothing():
     case = hard._start("uwb_room", "outage", 2, np.random.default_rng(3))
     gone = hard._GONE
-    for epoch, measured in enumerate(case.world.measurements):
+    for epoch, measured in enumerate(case.trials.measurements):
         assert measured.links.any() == (epoch not in gone)
-    twists = case.world.episode.twists
+    twists = case.trials.episode.twists
     # The interval that ends at the first epoch with links belongs to the outage too.
     assert not twists[:, gone.start : gone.stop + 1].any()
     assert twists[:, gone.start - 1].any()
     assert twists[:, gone.stop + 1].any()
-    truth = simulation.epoch_of(case.world.episode, gone.stop).translation
-    before = simulation.epoch_of(case.world.episode, gone.start - 1).translation
+    truth = simulation.epoch_of(case.trials.episode, gone.stop).translation
+    before = simulation.epoch_of(case.trials.episode, gone.start - 1).translation
     assert np.linalg.norm(truth - before, axis=-1).max() > 1.0

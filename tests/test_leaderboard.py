@@ -53,21 +53,26 @@ def rows(data: bytes):
 @pytest.fixture(scope="module")
 def worlds():
     scene = scenes.get({**SHORT, "steps": 10})
-    return {name: bench_worlds.simulate(scene, name, 40, 3) for name in bench_worlds.CONDITIONS}
+    return {
+        name: bench_worlds.simulate_condition(scene, name, 40, 3)
+        for name in bench_worlds.CONDITIONS
+    }
 
 
 @pytest.mark.parametrize("name", [n for n in bench_worlds.CONDITIONS if n != "nominal"])
 def test_motion_and_prior_are_the_same_under_every_condition(worlds, name):
-    for field in ("rotation", "translation", "twists", "anchors", "tags"):
+    for field in ("rotation", "translation", "anchors", "tags"):
         np.testing.assert_array_equal(
             getattr(worlds[name], field), getattr(worlds["nominal"], field)
         )
+    for one, other in zip(worlds[name].readings[1:], worlds["nominal"].readings[1:], strict=True):
+        np.testing.assert_array_equal(one.twist, other.twist)
     for one, other in zip(worlds[name].prior, worlds["nominal"].prior, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def ranges(world):
-    return np.array([seen["ranges"] for seen in world.observations])
+    return np.array([reading.ranges for reading in world.readings])
 
 
 def true_ranges(world):
@@ -94,7 +99,7 @@ def test_a_tenth_of_the_ranges_is_reflected(worlds):
 
 
 def test_half_of_the_links_are_lost_and_the_bound_knows(worlds):
-    links = np.array([seen["links"] for seen in worlds["lost-links"].observations])
+    links = np.array([reading.links for reading in worlds["lost-links"].readings])
     assert 0.48 < links.mean() < 0.52
     np.testing.assert_array_equal(ranges(worlds["lost-links"]), ranges(worlds["nominal"]) * links)
     traces = [np.trace(worlds[n].bound, axis1=2, axis2=3).mean() for n in ("lost-links", "nominal")]
@@ -103,7 +108,7 @@ def test_half_of_the_links_are_lost_and_the_bound_knows(worlds):
 
 def test_an_anchor_and_a_tag_are_told_wrong_and_nothing_else(worlds):
     nominal = worlds["nominal"]
-    told = worlds["anchor-off"].observations[0]["anchors"] - nominal.anchors
+    told = worlds["anchor-off"].readings[0].anchors - nominal.anchors
     np.testing.assert_allclose(np.linalg.norm(told[:, 0], axis=-1), 0.5)
     np.testing.assert_array_equal(told[:, 1:], 0.0)
     assert np.abs(told[:, 0].mean(axis=0)).max() < 0.2
@@ -116,13 +121,13 @@ def test_an_anchor_and_a_tag_are_told_wrong_and_nothing_else(worlds):
 
 def test_another_seed_and_another_scene_are_another_world():
     scene = scenes.get(SHORT)
-    first = bench_worlds.simulate(scene, "nominal", 2, 0)
+    first = bench_worlds.simulate_condition(scene, "nominal", 2, 0)
     for other in (
-        bench_worlds.simulate(scene, "nominal", 2, 1),
-        bench_worlds.simulate(scenes.get({**SHORT, "speed_m_s": 1.1}), "nominal", 2, 0),
+        bench_worlds.simulate_condition(scene, "nominal", 2, 1),
+        bench_worlds.simulate_condition(scenes.get({**SHORT, "speed_m_s": 1.1}), "nominal", 2, 0),
     ):
         assert np.abs(other.translation[0] - first.translation[0]).max() > 0.01
-    again = bench_worlds.simulate(scene, "nominal", 2, 0)
+    again = bench_worlds.simulate_condition(scene, "nominal", 2, 0)
     np.testing.assert_array_equal(again.translation, first.translation)
 
 
@@ -140,11 +145,13 @@ def test_the_scene_hash_sees_every_field():
 
 
 def test_mirror_images_are_those_of_the_anchors_plane():
-    flat = bench_worlds.simulate(scenes.get({"name": "auv_buoys", "steps": 2}), "nominal", 3, 0)
+    flat = bench_worlds.simulate_condition(
+        scenes.get({"name": "auv_buoys", "steps": 2}), "nominal", 3, 0
+    )
     image = bench_worlds.mirrored(flat)
     assert image is not None
     np.testing.assert_allclose(image, flat.translation * [1, 1, -1], atol=1e-9)
-    room = bench_worlds.simulate(scenes.get(SHORT), "nominal", 3, 0)
+    room = bench_worlds.simulate_condition(scenes.get(SHORT), "nominal", 3, 0)
     assert bench_worlds.mirrored(room) is None
 
 
@@ -197,7 +204,7 @@ def test_lost_and_flipped_are_what_they_say():
     error[-2:, 2] = 5.0  # ends far off
     error[-1, 3] = np.nan
     rotation[-1, 4] = 120.0
-    errors = bench_figures.Errors(error, rotation, error, np.full((K, B), 6.0))
+    errors = bench_figures.BenchErrors(error, rotation, error, np.full((K, B), 6.0))
     mirror = np.array([9.0, 9.0, 4.0, 9.0, 9.0])
     bound = {part: np.full((K, B), 0.01) for part in bench_figures.PARTS}
     reference = bench_figures.Reference(bound, np.full(B, 0.5), mirror)
@@ -211,15 +218,15 @@ def test_a_record_has_the_figures_of_a_plain_loop(tmp_path, short):
     _, data = bench(tmp_path, "--scenes", short, "--filters", "uc-kf", "--conditions", "nominal")
     record = rows(data)[0]
     scene = scenes.get(SHORT)
-    world = bench_worlds.simulate(scene, "nominal", 6, 0)
+    world = bench_worlds.simulate_condition(scene, "nominal", 6, 0)
     filter = estimators.make("uc-kf", tags=scene.tags, noise=scene.noise, process=scene.process)
     tags, nees, position = [], [], []
     for b in range(6):
         state = filter.initial(*(array[b] for array in world.prior))
-        for k, seen in enumerate(world.observations):
+        for k, reading in enumerate(world.readings):
             if k:
-                state = filter.predict(state, world.twists[k, b], scene.dt)
-            state = filter.update(state, seen["ranges"][b], world.anchors[b])
+                state = filter.predict(state, reading.twist[b], scene.dt)
+            state = filter.update(state, reading.ranges[b], world.anchors[b])
             belief = filter.belief(state)
             truth = world.rotation[k, b], world.translation[k, b]
             tags.append(metrics.tag_error(*belief[:2], *truth, world.tags))
@@ -243,7 +250,7 @@ def test_a_record_has_the_figures_of_a_plain_loop(tmp_path, short):
 
 def test_the_iterated_ekf_is_at_the_bound_and_honest():
     task = leaderboard.Task("room", "uwb_room", "nominal", ("iekf",), 100, 0)
-    ((record, microseconds),) = leaderboard.run(task)
+    ((record, microseconds),) = leaderboard.run_task(task)
     for part in bench_figures.PARTS:
         assert 0.95 < record[part]["to_bound"] < 1.03
     assert record["verdict"] == "consistent"
@@ -347,8 +354,8 @@ def test_a_run_that_was_cut_off_goes_on_and_ends_in_the_same_bytes(
     # The second record is missing, the last was being written.
     (tmp_path / "cut.jsonl").write_bytes(lines[0] + lines[2] + lines[3][:100])
     ran = []
-    run = leaderboard.run
-    monkeypatch.setattr(leaderboard, "run", lambda task: ran.append(task) or run(task))
+    run = leaderboard.run_task
+    monkeypatch.setattr(leaderboard, "run_task", lambda task: ran.append(task) or run(task))
     _, again = bench(tmp_path, *options, name="cut.jsonl")
     assert again == whole
     assert [(task.condition, task.filters) for task in ran] == [
@@ -480,8 +487,8 @@ def test_a_recording_is_a_scene(tmp_path, recording, capsys):
     settings = replay.Settings(range_std_m=0.03, walk_m=0.5, walk_deg=25, robust=False)
     files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags", "truth")}
     log = read_recording(**files)
-    track = replay.run(log, settings)
-    figures = replay.figures(log, track, replay.errors(log, track, settings), settings)
+    track = replay.replay_recording(log, settings)
+    figures = replay.track_figures(log, track, replay.track_errors(log, track, settings), settings)
     # The stretches leave out what the last of 41 epochs does not fill.
     for part, name in (("position_m", "position_rmse_m"), ("rotation_deg", "rotation_rmse_deg")):
         np.testing.assert_allclose(first[part]["rmse"], figures[name], rtol=0.02)

@@ -91,7 +91,7 @@ def test_weights_bend_the_picture_neither(tmp_path):
     path = tmp_path / "a.g2o"
     path.write_text("EDGE_SE2 0 1 1 0 0 90 0 0 90 0 400\nEDGE_SE2 1 2 1 0 0 90 0 0 90 0 400\n"
                     "EDGE_SE2 0 2 9 7 0 1e-6 0 0 1e-6 0 400\n")  # fmt: skip
-    places = network.run(str(path)).positions
+    places = network.solve_network(str(path)).positions
     assert places is not None
     np.testing.assert_allclose(places, [[0, 0], [1, 0], [2, 0]], atol=1e-6)
 
@@ -246,7 +246,7 @@ def test_network2009_takes_points_footprints_and_a_variance(small, tmp_path, cap
 
 def test_kappa_grows_as_section_iv_e_says():
     """O(1 / n^3) for cycles of n edges in complete graphs, O(1 / n) for triangulations."""
-    growth = network_growth.run(np.random.default_rng(0))
+    growth = network_growth.kappa_growth(np.random.default_rng(0))
     assert growth["worst"]["slope"]["trace"] == pytest.approx(-3, abs=0.15)
     assert growth["triangulation"]["slope"]["trace"] == pytest.approx(-1, abs=0.1)
     for row in growth["triangulation"]["rows"]:
@@ -270,5 +270,5 @@ def test_the_limit_of_all_trials_at_once_is_the_iterations():
 def test_the_same_seed_gives_the_same_figures(small, monkeypatch):
     monkeypatch.setattr(network2009, "BASES", network2009.BASES[:1])
     monkeypatch.setattr(network2009, "LOOPS", network2009.LOOPS[:1])
-    results = [network2009.run(2, seed, lambda: None) for seed in (3, 3, 4)]
+    results = [network2009.network_experiment(2, seed, lambda: None) for seed in (3, 3, 4)]
     assert results[0] == results[1] != results[2]

@@ -78,7 +78,7 @@ needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrom
 
 @pytest.fixture(scope="module")
 def result() -> dict:
-    return camsap2013.run(5, 1)
+    return camsap2013.tracking_experiment(5, 1)
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,7 @@ def test_logarithmic_axes_are_labelled_with_whole_numbers(result):
 
 
 def test_a_page_needs_no_network_and_is_the_same_for_the_same_result(demo):
-    again = track_pages.demo(camsap2013.run(5, 1), camsap2013.example(1))
+    again = track_pages.demo(camsap2013.tracking_experiment(5, 1), camsap2013.example(1))
     # Only the times of the processor differ.
     table = r"<td data-value=\"[\d.]+\">[\d.]+</td></tr>"
     assert re.sub(table, "", demo) == re.sub(table, "", again)

@@ -41,7 +41,7 @@ def with_rack():
 def placed(with_rack):
     before = place._GENERATIONS
     place._GENERATIONS = 8
-    found = place.run(with_rack, range(4, 6), 1, N_TRIALS)
+    found = place.place_anchors(with_rack, range(4, 6), 1, N_TRIALS)
     place._GENERATIONS = before
     return found
 
@@ -66,15 +66,15 @@ def test_the_design_is_legal_and_no_usual_layout_is_better(placed):
 @pytest.mark.parametrize("scene", ["auv_buoys", "satellite", "icassp2013"])
 def test_every_kind_of_legal_space(scene):
     problem = scene_files.problem(scene, 4)
-    found = place.design(problem, 0)
+    found = place.design_layout(problem, 0)
     assert placement.is_legal(problem.task, found.anchors, 1e-3).all()
-    assert place_figures.figure(place.run(problem, range(4, 5), 0, 20)) is not None
+    assert place_figures.figure(place.place_anchors(problem, range(4, 5), 0, 20)) is not None
 
 
 def test_a_plane_and_a_line_are_regions_too():
     for high in ([7, 5, 1], [7, 1, 1]):
         problem = scene_files.problem("uwb_room", 4, ([1, 1, 1], high))
-        found = place.run(problem, range(4, 5), 0, 20)
+        found = place.place_anchors(problem, range(4, 5), 0, 20)
         assert place_figures.figure(found) is not None
         assert found.result["predicted"]["position_m"]["worst"] < 1
 
@@ -135,7 +135,7 @@ def test_maps_leave_obstacles_out_and_agree_with_predictions(placed):
 def test_filters_reach_what_is_predicted():
     problem = scene_files.problem("uwb_room")
     anchors = np.array([[8, 6, 3], [5, 8, 0.3], [2, 6, 3], [2, 2, 3], [5, 0, 0.3], [8, 2, 3.0]])
-    filters = place_check.run(problem, anchors, 3000, 0)["filters"]
+    filters = place_check.check_layout(problem, anchors, 3000, 0)["filters"]
     assert list(filters) == ["iterated EKF", "locate, from nothing"]
     for figures in filters.values():
         assert figures["lost"] < 0.001
@@ -156,7 +156,7 @@ def test_lost_bodies_count_in_the_figures_of_all():
     }
     problem = scene_files.of_mapping(tables)
     anchors = np.array([[0, 0, 2], [4, 0, 2], [4, 3, 2], [0, 3, 2], [1.3, 1, 2], [2.6, 2, 2.0]])
-    check = place_check.run(problem, anchors, 400, 0)
+    check = place_check.check_layout(problem, anchors, 400, 0)
     found = check["filters"]["locate, from nothing"]
     # The side is a toss of a coin: within four standard deviations of a half.
     assert found["lost"] == pytest.approx(0.5, abs=0.1)
@@ -167,7 +167,7 @@ def test_lost_bodies_count_in_the_figures_of_all():
 
 def test_blocked_links_are_noisier_by_what_is_left_of_their_information(with_rack):
     anchors = np.array([[0, 0, 1], [8, 6, 1], [0, 6, 2.5], [8, 0, 2.5], [4, 3, 3.0]])
-    drawn = place_check.simulate(with_rack, anchors, 2000, np.random.default_rng(0))
+    drawn = place_check.draw_bodies(with_rack, anchors, 2000, np.random.default_rng(0))
     tags = np.array(with_rack.task.scene.tags)
     positions = drawn.translation[:, None] + tags @ np.swapaxes(drawn.rotation, -1, -2)
     error = drawn.ranges - np.linalg.norm(positions[:, None] - anchors[:, None], axis=-1)
@@ -179,7 +179,7 @@ def test_blocked_links_are_noisier_by_what_is_left_of_their_information(with_rac
 
 
 def test_a_filter_that_is_not_told_does_worse(with_rack, placed):
-    filters = place_check.run(with_rack, placed.design.anchors, 1000, 0)["filters"]
+    filters = place_check.check_layout(with_rack, placed.design.anchors, 1000, 0)["filters"]
     told, untold = filters["iterated EKF"], filters["iterated EKF, not told"]
     assert told["nees"] == pytest.approx(6, abs=0.6)
     assert untold["position_ratio"] > told["position_ratio"]
@@ -189,9 +189,9 @@ def test_links_without_information_are_not_measured(with_rack):
     tables = {**GOOD, "noise": {"floor_m": 0.1, "blocked_information": 0}}
     problem = scene_files.of_mapping(tables)
     anchors = np.array([[0, 0, 1], [8, 6, 1], [0, 6, 2.5], [8, 0, 2.5], [4, 3, 3.0]])
-    drawn = place_check.simulate(problem, anchors, 200, np.random.default_rng(0))
+    drawn = place_check.draw_bodies(problem, anchors, 200, np.random.default_rng(0))
     assert not drawn.links.all()
-    figures = place_check.run(problem, anchors, 300, 0)["filters"]["iterated EKF"]
+    figures = place_check.check_layout(problem, anchors, 300, 0)["filters"]["iterated EKF"]
     assert figures["position_ratio"] == pytest.approx(1, abs=0.15)
 
 
@@ -261,7 +261,7 @@ def test_the_picture_is_the_same_for_the_same_result(placed, tmp_path):
 
 def test_coplanar_anchors_are_warned_of():
     problem = scene_files.problem("auv_buoys", 3)
-    result = place.run(problem, range(3, 4), 0, 20).result
+    result = place.place_anchors(problem, range(3, 4), 0, 20).result
     assert result["coplanar"]
     assert result["criteria"]["conditioning"] is None
     assert any("mirror image" in note for note in place_report.notes(result))

@@ -42,9 +42,9 @@ def record(anchors, tags, seed=0, epochs=25, noise_m=0.03, start=(1.5, 1.2, 0.8)
 
 def outcome(recording, **options):
     settings = replay.Settings(**{**OPTIONS, **options})
-    track = replay.run(recording, settings)
-    found = replay.errors(recording, track, settings)
-    return track, replay.figures(recording, track, found, settings)
+    track = replay.replay_recording(recording, settings)
+    found = replay.track_errors(recording, track, settings)
+    return track, replay.track_figures(recording, track, found, settings)
 
 
 @pytest.mark.parametrize("name", ["iekf", "iekf-bank", "iekf-bias"])
@@ -121,7 +121,7 @@ def test_one_range_at_a_time():
         links=one, ranges=whole.ranges * one, range_std=np.where(one, 0.03, 0.0)
     )
     settings = replay.Settings(walk_m=0.3, walk_deg=20)
-    judge = replay.make_filter(recording, settings)
+    judge = replay.recording_filter(recording, settings)
     P = np.broadcast_to(1e-3 * np.eye(6), (count, 6, 6))
     assert whole.truth is not None
     poses = whole.truth.rotation, whole.truth.translation, P
@@ -137,7 +137,10 @@ def test_one_range_at_a_time():
 
 def test_a_mirrored_planar_track_is_held_by_its_height():
     recording = record(CEILING, FLAT)
-    assert replay.run(recording, replay.Settings(planar=True, height_offset_m=1.2)).other is None
+    assert (
+        replay.replay_recording(recording, replay.Settings(planar=True, height_offset_m=1.2)).other
+        is None
+    )
 
 
 def test_map_coordinates_give_the_track_of_local_ones():
@@ -150,7 +153,7 @@ def test_map_coordinates_give_the_track_of_local_ones():
     )
     for name in ("iekf", "iekf-bank"):
         tracks = [
-            replay.run(
+            replay.replay_recording(
                 recording, replay.Settings(**{**OPTIONS, "filter": name, "below_anchors": True})
             )
             for recording in (near, far)
@@ -210,18 +213,18 @@ def test_wrong_volumes_are_named(volume, message):
 def test_a_volume_out_of_reach_is_named():
     settings = replay.Settings(volume=(None, None, None, None, 50, None))
     with pytest.raises(ValueError, match=r"volume must be in reach of the anchors, .* got \(None"):
-        replay.make_filter(record(CEILING, FLAT, epochs=2), settings)
+        replay.recording_filter(record(CEILING, FLAT, epochs=2), settings)
     settings = replay.Settings(volume=(None, None, None, None, 2.5, None), below_anchors=True)
     with pytest.raises(ValueError, match="volume must reach below the anchors' mean height of 2 m"):
-        replay.make_filter(record(CEILING, FLAT, epochs=2), settings)
+        replay.recording_filter(record(CEILING, FLAT, epochs=2), settings)
 
 
 def test_the_bank_covers_its_rivals():
     """Its covariance is the second moment about the leader of a mixture."""
     recording = record(CEILING, FLAT)
     settings = replay.Settings(**OPTIONS, filter="iekf-bank")
-    bank: Any = replay.make_filter(recording, settings)
-    states = [state for state, _ in replay.steps(recording, settings, bank)]
+    bank: Any = replay.recording_filter(recording, settings)
+    states = [step.state for step in replay.recording_steps(recording, settings, bank)]
     state, belief = states[3], bank.belief(states[3])
     share = bank.probabilities(state)
     poses = [(state.rotation, state.translation, state.covariance)]

@@ -43,7 +43,9 @@ def pair(truth, step_s=0.1, seed=0):
 
 def outcome(truth, settings=replay.Settings(), **options):  # noqa: B008
     recording, track = pair(truth, **options)
-    return replay.figures(recording, track, replay.errors(recording, track, settings), settings)
+    return replay.track_figures(
+        recording, track, replay.track_errors(recording, track, settings), settings
+    )
 
 
 @pytest.mark.parametrize("step_s", [0.01, 0.1, 0.37])
@@ -171,8 +173,8 @@ def test_a_planar_offset_of_the_heading_is_hinted():
     turn = rotations.exp(np.array([0, 0, -0.2]))
     recording, track = pair(Truth(times, flat.rotation @ turn, flat.translation))
     track = track._replace(rotation=rotations.exp(0.4 * track.times[:, None] * [0, 0, 1]))
-    found = replay.errors(recording, track, settings)
-    notes = replay.figures(recording, track, found, settings)["notes"]
+    found = replay.track_errors(recording, track, settings)
+    notes = replay.track_figures(recording, track, found, settings)["notes"]
     assert len(notes) == 1
     assert "body frame, turned by (0.0, 0.0, 11.5) deg" in notes[0].replace("-0.0", "0.0")
 
@@ -184,7 +186,7 @@ def test_another_order_of_quaternions_is_hinted_for_planar_bodies():
     turned = rotations.from_quaternion(np.roll(q, -1, axis=-1))
     recording, track = pair(Truth(times, turned, place))
     track = track._replace(rotation=rotations.exp(0.4 * track.times[:, None] * [0, 0, 1]))
-    found = replay.errors(recording, track, settings)
-    notes = replay.figures(recording, track, found, settings)["notes"]
+    found = replay.track_errors(recording, track, settings)
+    notes = replay.track_figures(recording, track, found, settings)["notes"]
     assert len(notes) == 1
     assert re.search("quaternions look like x, y, z, w under the names w, x, y, z: ", notes[0])

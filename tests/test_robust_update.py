@@ -117,13 +117,13 @@ def test_one_range_in_ten_over_a_reflection(scene):
     """300 trials x 16 epochs: within 1.15 of the CLEAN bound, honest; the plain filter is lost."""
     base = {"name": scene, "steps": 15}
     links = {"nlos_probability": 0.1}
-    world = monte_carlo.simulate_world(
+    world = monte_carlo.simulate_trials(
         scenes.get({**base, "links": links}), 300, np.random.default_rng(5)
     )
     variance = np.diagonal(world.bound, axis1=-2, axis2=-1).mean(axis=1)
     ratio = {}
     for robust in (False, True):
-        trace = monte_carlo.run(world, "iekf", {"robust": robust})
+        trace = monte_carlo.track_trials(world, "iekf", {"robust": robust})
         square = np.square(trace.error).mean(axis=1)
         ratio[robust] = [
             np.sqrt(square[:, axes].sum(-1) / variance[:, axes].sum(-1)).mean()
@@ -138,10 +138,10 @@ def test_one_range_in_ten_over_a_reflection(scene):
 def test_half_the_links_lost():
     """Within 1.05 of the bound for the links that remain."""
     scene = scenes.get({"name": "uwb_room", "steps": 15, "links": {"drop_probability": 0.5}})
-    world = monte_carlo.simulate_world(scene, 300, np.random.default_rng(6))
+    world = monte_carlo.simulate_trials(scene, 300, np.random.default_rng(6))
     variance = np.diagonal(world.bound, axis1=-2, axis2=-1).mean(axis=1)
     for robust in (False, True):
-        trace = monte_carlo.run(world, "iekf", {"robust": robust})
+        trace = monte_carlo.track_trials(world, "iekf", {"robust": robust})
         square = np.square(trace.error).mean(axis=1)
         for axes in (slice(0, 3), slice(3, 6)):
             ratio = np.sqrt(square[:, axes].sum(-1) / variance[:, axes].sum(-1)).mean()

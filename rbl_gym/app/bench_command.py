@@ -81,7 +81,7 @@ def _bench(options: argparse.Namespace) -> int:
         options.seed,
     )
     with progress("bench", sum(len(task.filters) for task in tasks)) as advance:
-        records, timings = bench_files.run(
+        records, timings = bench_files.run_tasks(
             tasks, Path(options.out), fresh=options.fresh, advance=advance, **workers
         )
     result = leaderboard.summary(records, timings)

@@ -142,7 +142,7 @@ def _demo(options: argparse.Namespace) -> int:
 
     check_html(options)
     with progress("tracking", camsap2013.work_units()) as advance:
-        result = camsap2013.run(options.trials, options.seed, advance)
+        result = camsap2013.tracking_experiment(options.trials, options.seed, advance)
     from rbl_gym.app import figures, reports
 
     example = camsap2013.example(options.seed)
@@ -182,7 +182,7 @@ def _reproduce(options: argparse.Namespace) -> int:
 def _network(options: argparse.Namespace) -> int:
     from rbl_gym.studies import network
 
-    solved = network.run(options.file, options.weights)
+    solved = network.solve_network(options.file, options.weights)
     if options.plot:
         from rbl_gym.app import figures, network_figures
 
@@ -208,7 +208,7 @@ def _place(options: argparse.Namespace) -> int:
     numbers = numbers or range(problem.task.n_anchors, problem.task.n_anchors + 1)
     scene_files.check_n_anchors(numbers[0])
     with progress("placing", place.work_units(numbers)) as advance:
-        placed = place.run(problem, numbers, options.seed, options.trials, advance)
+        placed = place.place_anchors(problem, numbers, options.seed, options.trials, advance)
     if options.plot:
         from rbl_gym.app import figures, place_figures
 

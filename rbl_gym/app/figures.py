@@ -16,7 +16,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.rotations import error as rotation_error
 from rbl_gym.recordings.reading import Recording
 from rbl_gym.studies.papers.camsap2013 import Example
-from rbl_gym.studies.replay import Errors, Track
+from rbl_gym.studies.replay import Track, TrackErrors
 
 COLOURS = {
     "KF": "#d1495b",
@@ -109,7 +109,7 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
 
 def _trajectory(axes: Any, example: Example) -> None:
     """The track seen from above, the beliefs of a magnified error around it."""
-    episode = example.world.episode
+    episode = example.trials.episode
     truth = episode.translation[0]
     axes.plot(*truth[:, :2].T, color="0.6", lw=1, zorder=1)
     axes.plot(*truth[:, :2].T, "k.", ms=4, label="true position", zorder=4)
@@ -146,11 +146,11 @@ def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
 
 def _errors(axes: Any, example: Example) -> None:
     """The same trial's rotation error about one axis inside its 3-sigma band."""
-    steps = np.arange(1, len(example.world.measurements) + 1)
+    steps = np.arange(1, len(example.trials.measurements) + 1)
     for name, beliefs in example.beliefs.items():
         errors, bands = [], []
         for k, belief in enumerate(beliefs):
-            error = rotation_error(belief.rotation[0], example.world.episode.rotation[0, k])
+            error = rotation_error(belief.rotation[0], example.trials.episode.rotation[0, k])
             errors.append(np.rad2deg(error[2]))
             bands.append(3 * np.rad2deg(np.sqrt(belief.covariance[0, 2, 2])))
         band = np.array(bands)
@@ -231,7 +231,7 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
 
 
 @styled
-def replay(recording: Recording, track: Track, found: Errors | None) -> Figure:
+def replay(recording: Recording, track: Track, found: TrackErrors | None) -> Figure:
     """The track from above with the anchors, and, where truth exists, the errors over time."""
     figure = new_figure(12, 5.2 if found is not None else 6)
     grid = figure.add_gridspec(

@@ -128,14 +128,14 @@ def _transfer(options: argparse.Namespace) -> int:
 
     task = rl_task(options.task)
     loaded = _policies(options.policy)
-    filters = transfer.filters(task)
-    references = _references(options, transfer.references(task))
+    filters = transfer.tracking_filters(task)
+    references = _references(options, transfer.transfer_references(task))
     units = (len(filters) + 1) * (len(references) + len(loaded))
     with progress(options.task, units) as advance:
         problem, contexts, layouts = evaluation.layouts_of(
             task, loaded, references, options.worlds, options.seed, advance
         )
-        result = transfer.run(
+        result = transfer.track_layouts(
             problem, contexts, layouts, filters, options.repeats, options.seed, advance
         )
     result |= {"task": options.task, "worlds": options.worlds, "seed": options.seed}

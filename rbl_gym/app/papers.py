@@ -49,42 +49,46 @@ def experiments() -> dict[str, Experiment]:
         "camsap2013": Experiment(
             "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), ET-KF's trade",
             camsap2013.work_units(trade=True),
-            lambda trials, seed, advance: camsap2013.run(trials, seed, advance, trade=True),
+            lambda trials, seed, advance: camsap2013.tracking_experiment(
+                trials, seed, advance, trade=True
+            ),
             _camsap2013_figure,
             _late("reports", "print_camsap2013"),
         ),
         "doa2019": Experiment(
             "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
             doa2019.work_units(),
-            doa2019.run,
+            doa2019.doa_experiment,
             _drawn("doa_figures", "doa2019_figure"),
             _late("doa_figures", "print_doa2019"),
         ),
         "hard": Experiment(
             "hard conditions: lost and reflected links, wrong starts, outages (docs)",
             hard.work_units(),
-            hard.run,
+            hard.compare_hard_conditions,
             _drawn("hard_figures", "hard_figure"),
             _late("hard_figures", "print_hard"),
         ),
         "icassp2013": Experiment(
             "static: LS, CLS, Procrustes, ML at reference ranges of 40 to 100 dB (Figs 2 and 3)",
-            icassp2013.work_units(icassp2013.settings()),
-            lambda *arguments: icassp2013.run("icassp2013", icassp2013.settings(), *arguments),
+            icassp2013.work_units(icassp2013.static_settings()),
+            lambda *arguments: icassp2013.static_experiment(
+                "icassp2013", icassp2013.static_settings(), *arguments
+            ),
             _drawn("figures", "static"),
             _late("reports", "print_static"),
         ),
         "slides2013": Experiment(
             "5 tags on a rectangular pyramid, 4 anchors: static, and the tracking experiment",
             slides2013.work_units(),
-            slides2013.run,
+            slides2013.slides_experiment,
             _drawn("figures", "slides2013"),
             _late("reports", "print_slides2013"),
         ),
         "network2009": Experiment(
             "planar networks: cycle consensus (Figs 3 to 6), convergence, kappa against n",
             network2009.work_units(),
-            network2009.run,
+            network2009.network_experiment,
             _drawn("network2009_figures", "network2009_figure"),
             _late("network2009_figures", "print_network2009"),
             ("positions", "footprints", "variance"),

@@ -157,13 +157,13 @@ def _replay(options: argparse.Namespace) -> int:
     # What is wrong is said before the work begins.
     offset = replay.height_offset(recording, settings)
     settings = dataclasses.replace(settings, height_offset_m=offset)
-    replay.make_filter(recording, settings)
+    replay.recording_filter(recording, settings)
     if recording.truth is not None:
         replay.check_overlap(recording.truth, recording.times, settings.truth_gap_s)
     with progress("replay", len(recording.times)) as advance:
-        track = replay.run(recording, settings, advance)
-    found = replay.errors(recording, track, settings)
-    result = replay.figures(recording, track, found, settings)
+        track = replay.replay_recording(recording, settings, advance)
+    found = replay.track_errors(recording, track, settings)
+    result = replay.track_figures(recording, track, found, settings)
     if options.plot:
         from rbl_gym.app import figures
 

@@ -26,7 +26,7 @@ _LEGEND = (
 
 def demo(result: dict[str, Any], example: Example) -> str:
     """The tracking paper's experiment: one trial to look at, and all of them in figures."""
-    scene, episode = example.world.scene, example.world.episode
+    scene, episode = example.trials.scene, example.trials.episode
     beliefs = {
         name: Beliefs(
             np.array([belief.rotation[0] for belief in steps]),

@@ -9,10 +9,9 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
-from rbl_gym.measurements import ranging
 from rbl_gym.studies import monte_carlo
-from rbl_gym.studies.monte_carlo import World
-from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.studies.monte_carlo import SimulatedTrials
+from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
 LINK_SCENES = ("uwb_room", "drone_yard")
@@ -43,15 +42,15 @@ AFTER = (0, 1, 2, 5, 10)
 
 
 class _Case(NamedTuple):
-    """A world, its bound by which errors are judged, and the epoch at which links are back."""
+    """Trials, information by which errors are judged, and the epoch at which links are back."""
 
-    world: World
+    trials: SimulatedTrials
     information: FloatArray
     back: int
 
 
 def work_units() -> int:
-    """How often `run` calls `advance`."""
+    """How often `compare_hard_conditions` calls `advance`."""
     links = len(LINK_SCENES) * len(CONDITIONS) * len(FILTERS)
     return links + len(STARTS) * sum(len(_start_filters(name)) for name in START_SCENES)
 
@@ -60,7 +59,9 @@ def _start_filters(scene: str) -> tuple[str, ...]:
     return (*START_FILTERS, "bank, volume") if scene in _COPLANAR else START_FILTERS
 
 
-def run(trials: int, seed: int, advance: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def compare_hard_conditions(
+    trials: int, seed: int, advance: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
     """All filters under all conditions, and all starts.
 
     Returns
@@ -96,17 +97,16 @@ def run(trials: int, seed: int, advance: Callable[[], None] = lambda: None) -> d
 
 
 def _links(
-    scene: Scene, trials: int, rng: np.random.Generator, advance: Callable[[], None]
+    scene: Scene, count: int, rng: np.random.Generator, advance: Callable[[], None]
 ) -> dict[str, Any]:
     """All filters on the same episodes of one scene and condition."""
-    world = monte_carlo.simulate_world(scene, trials, rng)
-    measured = _ranges(world)
-    good = [m.links & ~m.nlos for m in measured]
-    clean = _bound(world, [np.ones_like(m.links) for m in measured])
-    straight = _bound(world, good)
+    trials = monte_carlo.simulate_trials(scene, count, rng)
+    good = np.array([m.links & ~m.nlos for m in trials.measurements])
+    clean = monte_carlo.bound_of(scene, trials.episode, np.ones_like(good))
+    straight = monte_carlo.bound_of(scene, trials.episode, good)
     row: dict[str, Any] = {"share_good": float(np.mean(good)), "filters": {}}
     for label, (name, options) in FILTERS.items():
-        trace = monte_carlo.run(world, name, options)
+        trace = monte_carlo.track_trials(trials, name, options)
         distance = _squared_distance(trace.error, straight)
         row["filters"][label] = {
             "clean": _ratios(trace.error, clean),
@@ -122,22 +122,6 @@ def _links(
         }
         advance()
     return row
-
-
-def _ranges(world: World) -> list[ranging.Measurement]:
-    return [m for m in world.measurements if isinstance(m, ranging.Measurement)]
-
-
-def _bound(world: World, links: list[Any]) -> FloatArray:
-    """Posterior Cramer-Rao bound (K, B, 6, 6) of an episode's true poses with these links."""
-    episode, rows, information = world.episode, [], None
-    for epoch, mask in enumerate(links):
-        at = simulation.epoch_of(episode, epoch)
-        information, _ = scene_bounds.posterior_step(
-            world.scene, at, episode.anchors, mask, information, episode.prior_covariance
-        )
-        rows.append(np.linalg.inv(information))
-    return np.array(rows)
 
 
 def _ratios(error: FloatArray, bound: FloatArray) -> dict[str, float]:
@@ -162,18 +146,18 @@ def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Cas
     links = {"nlos_probability": 0.1} if "NLOS" in start else {}
     back = _GONE.stop if start == "outage" else 0
     scene = scenes.get({"name": name, "links": links, "steps": back + _START_STEPS})
-    world = monte_carlo.simulate_world(scene, trials, rng)
-    information = np.linalg.inv(world.bound)
-    episode = world.episode
+    simulated = monte_carlo.simulate_trials(scene, trials, rng)
+    information = np.linalg.inv(simulated.bound)
+    episode = simulated.episode
     if start == "outage":
         twists = episode.twists.copy()
         twists[:, _GONE.start : _GONE.stop + 1] = 0.0
         measurements = [
             m._replace(links=np.zeros_like(m.links)) if epoch in _GONE else m
-            for epoch, m in enumerate(_ranges(world))
+            for epoch, m in enumerate(simulated.measurements)
         ]
         return _Case(
-            world._replace(episode=episode._replace(twists=twists), measurements=measurements),
+            simulated._replace(episode=episode._replace(twists=twists), measurements=measurements),
             information,
             back,
         )
@@ -192,15 +176,17 @@ def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Cas
     episode = episode._replace(
         prior_rotation=rotation, prior_translation=translation, prior_covariance=covariance
     )
-    return _Case(world._replace(episode=episode), information, back)
+    return _Case(simulated._replace(episode=episode), information, back)
 
 
 def _back(case: _Case, label: str, robust: bool, advance: Callable[[], None]) -> dict[str, Any]:
     """Who is back when, and what a step took."""
     options: dict[str, Any] = {"robust": robust}
     if label == "bank, volume":
-        options["volume"] = case.world.scene.volume.bounds()
-    trace = monte_carlo.run(case.world, "iekf" if label == "iekf" else "iekf-bank", options)
+        options["volume"] = case.trials.scene.volume.bounds()
+    trace = monte_carlo.track_trials(
+        case.trials, "iekf" if label == "iekf" else "iekf-bank", options
+    )
     distance = np.einsum("...i,...ij,...j->...", trace.error, case.information, trace.error)
     share = (distance < LOST).mean(axis=1)
     advance()

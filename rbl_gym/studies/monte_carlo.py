@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym import bounds, estimators, metrics
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.linear.kalman import KalmanState
 from rbl_gym.measurements import ranging
+from rbl_gym.studies.epochs import Reading, Step, pose_errors, stack_beliefs, timed, track_epochs
 from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import check_takes_obstacles
 
 
-class World(NamedTuple):
-    """A batch of episodes with its measurements and its posterior Cramer-Rao bound.
+class SimulatedTrials(NamedTuple):
+    """A batch of episodes with their measurements and their posterior Cramer-Rao bound.
 
     `bound` (K, B, 6, 6) is a covariance per epoch and trial.
     """
@@ -62,24 +62,71 @@ class Trace(NamedTuple):
     seconds: float
 
 
-def simulate_world(scene: Scene, trials: int, rng: np.random.Generator) -> World:
+def simulate_trials(scene: Scene, trials: int, rng: np.random.Generator) -> SimulatedTrials:
     """Episodes of a scene, with anchors that stay where they start."""
     episode = simulation.draw_episode(scene, rng, (trials,))
-    measurements, covariances = [], []
-    information = None
-    for epoch in range(scene.steps + 1):
-        at = simulation.epoch_of(episode, epoch)
-        measured = simulation.measure(scene, at, episode.anchors)
-        information, _ = scene_bounds.posterior_step(
-            scene, at, episode.anchors, measured.links, information, episode.prior_covariance
-        )
-        measurements.append(measured)
-        covariances.append(np.linalg.inv(information))
-    return World(scene, episode, measurements, np.array(covariances))
+    measurements = measure_episode(scene, episode)
+    links = np.array([measured.links for measured in measurements])
+    return SimulatedTrials(scene, episode, measurements, bound_of(scene, episode, links))
 
 
-def make(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
-    """A named filter that knows the scene's tags and laws."""
+def measure_episode(scene: Scene, episode: simulation.Episode) -> list[ranging.Measurement]:
+    """Ranges and links (B, M, N) of every epoch of episodes whose anchors stand still."""
+    anchors = episode.anchors[:, None]
+    measured = simulation.measure(scene, simulation.whole(episode), anchors)
+    columns = (np.moveaxis(column, 1, 0) for column in measured)
+    return [ranging.Measurement(*epoch) for epoch in zip(*columns, strict=True)]
+
+
+def bound_of(scene: Scene, episode: simulation.Episode, links: BoolArray) -> FloatArray:
+    """Posterior Cramer-Rao covariances (K, B, 6, 6) of true poses, by the links (K, B, M, N)."""
+    by_trial = np.moveaxis(links, 0, 1)
+    information, _ = scene_bounds.posterior_of_episode(scene, episode, by_trial)
+    return np.moveaxis(np.linalg.inv(information), 1, 0)
+
+
+def told_readings(
+    scene: Scene,
+    episode: simulation.Episode,
+    measurements: Sequence[ranging.Measurement],
+    told: Scene | None = None,
+    anchors: FloatArray | None = None,
+) -> list[Reading]:
+    """What filters are told of episodes whose anchors stand still, an entry per epoch.
+
+    In scenes with obstacles each epoch has a law of its own: receivers learn how good a link is.
+
+    Parameters
+    ----------
+    scene, episode, measurements
+        The truth, and what was measured.
+    told
+        The scene as filters know it; None: as it is.
+    anchors
+        Places (B, M, 3) that filters are told; None: the true ones.
+    """
+    told = scene if told is None else told
+    anchors = episode.anchors if anchors is None else anchors
+    readings = []
+    for epoch, measured in enumerate(measurements):
+        at, law = simulation.epoch_of(episode, epoch), None
+        if scene.obstacles:
+            quality = simulation.link_quality(scene, at, episode.anchors)
+            law = simulation.perceived_noise(told, measured.ranges, measured.links, quality)
+        twist = at.twist if epoch else None
+        readings.append(Reading(measured.ranges, anchors, measured.links, law, twist, told.dt))
+    return readings
+
+
+def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
+    """A named filter that knows the scene's tags and laws.
+
+    Raises
+    ------
+    ValueError
+        As `estimators.make`; and for a filter that takes no law of an epoch, in a scene whose
+        obstacles give one to every epoch.
+    """
     filter = estimators.make(
         name, tags=scene.tags, noise=scene.noise, process=scene.process, **options
     )
@@ -87,62 +134,54 @@ def make(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
     return filter
 
 
-def beliefs(world: World, filter: estimators.Filter) -> Iterator[tuple[Any, estimators.PoseBelief]]:
-    """State and belief of a filter after every epoch, started from the episodes' prior."""
-    episode = world.episode
-    state = filter.initial(
-        episode.prior_rotation, episode.prior_translation, episode.prior_covariance
-    )
-    for epoch, measured in enumerate(world.measurements):
-        if epoch:
-            state = filter.predict(state, episode.twists[:, epoch], world.scene.dt)
-        state = filter.update(
-            state, measured.ranges, episode.anchors, measured.links, **_law(world, epoch)
-        )
-        yield state, filter.belief(state)
+def trial_steps(trials: SimulatedTrials, filter: estimators.Filter) -> Iterator[Step]:
+    """A filter over all trials at once, epoch by epoch, started from their priors."""
+    episode = trials.episode
+    prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
+    readings = told_readings(trials.scene, episode, trials.measurements)
+    return track_epochs(filter, prior, readings)
 
 
-def _law(world: World, epoch: int) -> dict[str, ranging.NoiseLaw]:
-    """The argument `noise` of an epoch, where obstacles give it a law of its own."""
-    if not world.scene.obstacles:
-        return {}
-    measured = world.measurements[epoch]
-    at = simulation.epoch_of(world.episode, epoch)
-    quality = simulation.link_quality(world.scene, at, world.episode.anchors)
-    return {
-        "noise": simulation.perceived_noise(world.scene, measured.ranges, measured.links, quality)
-    }
-
-
-def run(
-    world: World, name: str, options: dict[str, Any], advance: Callable[[], None] = lambda: None
+def track_trials(
+    trials: SimulatedTrials,
+    name: str,
+    options: dict[str, Any],
+    advance: Callable[[], None] = lambda: None,
 ) -> Trace:
-    """A named filter over all episodes of a world; `advance` is called after every epoch."""
-    scene, episode = world.scene, world.episode
-    tags = np.asarray(scene.tags)
-    filter = make(scene, name, options)
-    rows = []
-    start = time.process_time()
-    seconds = 0.0
-    for epoch, (state, belief) in enumerate(beliefs(world, filter)):
-        seconds += time.process_time() - start
-        truth = episode.rotation[:, epoch], episode.translation[:, epoch]
-        error = metrics.pose_error(belief.rotation, belief.translation, *truth)
-        rows.append(
-            (
-                np.linalg.norm(belief.matrix - truth[0], axis=(-2, -1)),
-                metrics.mean_angular_error(belief.matrix, truth[0]),
-                error,
-                metrics.nees(error, belief.covariance),
-                bounds.score(belief.covariance, belief.rotation, tags),
-                *_own_variances(state),
-                getattr(state, "constrained", np.zeros(len(error))),
-            )
-        )
+    """A named filter over all trials, and everything that judges it.
+
+    Parameters
+    ----------
+    trials
+        Of `simulate_trials`.
+    name, options
+        Of the filter (`estimators.make`).
+    advance
+        Called after every epoch.
+    """
+    episode, tags = trials.episode, np.asarray(trials.scene.tags)
+    beliefs, rows, seconds = [], [], 0.0
+    filter = scene_filter(trials.scene, name, options)
+    for step, taken in timed(trial_steps(trials, filter)):
+        seconds += taken
+        beliefs.append(step.belief)
+        none = np.zeros(step.belief.translation.shape[:-1])
+        rows.append((*_own_variances(step.state), getattr(step.state, "constrained", none)))
         advance()
-        start = time.process_time()
-    columns = [np.array(column) for column in zip(*rows, strict=True)]
-    return Trace._make([*columns, seconds / columns[0].size])
+    belief = stack_beliefs(beliefs)
+    count = len(beliefs)
+    rotation = np.moveaxis(episode.rotation[:, :count], 1, 0)
+    translation = np.moveaxis(episode.translation[:, :count], 1, 0)
+    errors = pose_errors(belief, rotation, translation, tags)
+    return Trace(
+        np.linalg.norm(belief.matrix - rotation, axis=(-2, -1)),
+        metrics.mean_angular_error(belief.matrix, rotation),
+        errors.pose,
+        errors.nees,
+        bounds.score(belief.covariance, belief.rotation, tags),
+        *(np.array(column) for column in zip(*rows, strict=True)),
+        seconds / errors.nees.size,
+    )
 
 
 def _own_variances(state: Any) -> tuple[FloatArray, FloatArray]:

@@ -32,7 +32,7 @@ class Solved(NamedTuple):
     positions: FloatArray | None  # (n, 2), where the file has displacements
 
 
-def run(path: str, weights: str = "information") -> Solved:
+def solve_network(path: str, weights: str = "information") -> Solved:
     """Read a file, solve, certify.
 
     Parameters

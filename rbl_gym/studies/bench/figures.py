@@ -21,7 +21,7 @@ RESAMPLES = 2000
 _DIGITS = 9
 
 
-class Errors(NamedTuple):
+class BenchErrors(NamedTuple):
     """Errors of a filter over K epochs and B trials, (K, B) each.
 
     `position_m`, `rotation_deg` and `tags_m` (root mean square over the tags) are lengths;
@@ -54,7 +54,7 @@ class Reference(NamedTuple):
     mirror_m: FloatArray | None
 
 
-def figures(errors: Errors, reference: Reference | None) -> dict[str, Any]:
+def error_figures(errors: BenchErrors, reference: Reference | None) -> dict[str, Any]:
     """All figures of a filter under a condition, as plain numbers; None for what is not finite.
 
     Without a reference (a recording, whose trials are stretches of it) what is relative to the
@@ -124,7 +124,7 @@ def is_lost(tags_m: FloatArray, reference: Reference) -> np.ndarray:
     return end > np.maximum(LOST_BOUNDS * bound, reference.prior_tags_m)
 
 
-def is_flipped(errors: Errors, reference: Reference) -> np.ndarray:
+def is_flipped(errors: BenchErrors, reference: Reference) -> np.ndarray:
     """Trials (B,) whose last pose is of the wrong side.
 
     It is turned by more than 90 degrees, or nearer to the truth's mirror image behind the

@@ -26,8 +26,7 @@ import rbl_gym
 from rbl_gym import estimators, wrappers
 from rbl_gym.checks import check_one_of
 from rbl_gym.estimators.filter import factory_of
-from rbl_gym.studies.bench import figures, recordings, worlds
-from rbl_gym.studies.bench import run as bench_run
+from rbl_gym.studies.bench import figures, recordings, stages, worlds
 from rbl_gym.studies.bench.worlds import CONDITIONS
 from rbl_gym.worlds import scenes
 
@@ -110,7 +109,7 @@ def is_recording(spec: str | Mapping[str, Any]) -> bool:
 def digest_of(spec: str | Mapping[str, Any]) -> str:
     """The hash of a scene, or of a recording with its files."""
     if is_recording(spec):
-        return recordings.load(spec).digest  # pyright: ignore[reportArgumentType]
+        return recordings.load_recording(spec).digest  # pyright: ignore[reportArgumentType]
     return worlds.scene_hash(scenes.get(spec))
 
 
@@ -129,18 +128,18 @@ def keys_of(task: Task) -> dict[str, str]:
     return {filter: key_of(_head(task, filter)) for filter in task.filters}
 
 
-def run(task: Task) -> list[tuple[dict[str, Any], float | None]]:
+def run_task(task: Task) -> list[tuple[dict[str, Any], float | None]]:
     """Records of a task's filters, each with its microseconds per step (None: it did not finish).
 
     Every filter meets the same world.
     """
     if is_recording(task.scene):
-        stage = bench_run.recording_stage(task.scene, task.condition, task.seed)  # pyright: ignore[reportArgumentType]
+        stage = stages.recording_stage(task.scene, task.condition, task.seed)  # pyright: ignore[reportArgumentType]
     else:
-        stage = bench_run.scene_stage(task.scene, task.condition, task.trials, task.seed)
+        stage = stages.scene_stage(task.scene, task.condition, task.trials, task.seed)
     results = []
     for text in task.filters:
-        found, microseconds = bench_run.run(stage, *parse_filter(text))
+        found, microseconds = stages.run_filter(stage, *parse_filter(text))
         results.append((_head(task, text) | found, microseconds))
     return results
 

@@ -41,7 +41,7 @@ class Log(NamedTuple):
     digest: str
 
 
-def load(spec: Mapping[str, Any]) -> Log:
+def load_recording(spec: Mapping[str, Any]) -> Log:
     """The recording that a mapping describes: its files, and fields of `replay.Settings`.
 
     Raises
@@ -65,7 +65,7 @@ def load(spec: Mapping[str, Any]) -> Log:
 
 @functools.lru_cache(maxsize=2)
 def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...]) -> Log:
-    """`load` of a checked mapping; the stamps tell files that were written again."""
+    """`load_recording` of a checked mapping; the stamps tell files that were written again."""
     spec = dict(items)
     paths = {key: spec[key] for key in FILES if key in spec}
     recording = read_recording(**paths)
@@ -110,9 +110,9 @@ def stressed(log: Log, condition: str, seed: int) -> Stressed:
     return Stressed(told, settings)
 
 
-def errors(log: Log, track: replay.Track) -> figures.Errors:
+def recording_errors(log: Log, track: replay.Track) -> figures.BenchErrors:
     """Errors where truth is known, its epochs cut into `SEGMENTS` stretches."""
-    found = replay.errors(log.recording, track, log.settings)
+    found = replay.track_errors(log.recording, track, log.settings)
     assert found is not None
     known = np.flatnonzero(found.known)
     count = min(SEGMENTS, len(known))
@@ -121,7 +121,7 @@ def errors(log: Log, track: replay.Track) -> figures.Errors:
     def cut(values: np.ndarray) -> np.ndarray:
         return values[known][: length * count].reshape(count, length).T
 
-    return figures.Errors(
+    return figures.BenchErrors(
         cut(found.position),
         np.rad2deg(cut(found.rotation)),
         cut(found.tags),

@@ -26,7 +26,7 @@ def timings_path(path: Path) -> Path:
     return path.with_suffix(".timings.jsonl")
 
 
-def run(
+def run_tasks(
     tasks: Sequence[Task],
     path: Path,
     *,
@@ -72,7 +72,7 @@ def run(
     advance(sum(key in found for key in wanted))
     with path.open("a", encoding="utf-8") as file, timings_path(path).open("a") as times:
         for _, results in backends.each(
-            leaderboard.run, _left(tasks, found), jobs, backend, address
+            leaderboard.run_task, _left(tasks, found), jobs, backend, address
         ):
             for record, microseconds in results:
                 _check_same_run("a worker", [record], tasks)
@@ -237,7 +237,9 @@ def rerun(
     """
     before = {_place(record): record for record in records}
     rows, versions, sources, identical = [], {}, {}, 0
-    for _, results in backends.each(leaderboard.run, tasks_of(records), jobs, backend, address):
+    for _, results in backends.each(
+        leaderboard.run_task, tasks_of(records), jobs, backend, address
+    ):
         for record, _ in results:
             old = before[_place(record)]
             found = compare(old, record)

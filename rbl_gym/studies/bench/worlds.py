@@ -16,7 +16,9 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
-from rbl_gym.worlds import scene_bounds, simulation
+from rbl_gym.studies import monte_carlo
+from rbl_gym.studies.epochs import Reading
+from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scene import Scene
 
 NLOS_PROBABILITY, DROP_PROBABILITY = 0.1, 0.5
@@ -33,7 +35,7 @@ CONDITIONS = {
 _WORLD, _LINKS, _TOLD = range(3)
 
 
-class World(NamedTuple):
+class BenchWorld(NamedTuple):
     """A batch of B episodes of K epochs.
 
     Attributes
@@ -44,11 +46,8 @@ class World(NamedTuple):
         True places on the body (N, 3).
     rotation, translation
         True poses (K, B, 3, 3), (K, B, 3).
-    twists
-        Of the interval that ends at each epoch (K, B, 6).
-    observations
-        One per epoch: `ranges`, `links`, `anchors` as told, and in scenes with obstacles
-        `quality`.
+    readings
+        What filters are told, one per epoch.
     prior
         Rotation, translation and covariance before the first epoch.
     bound
@@ -62,47 +61,33 @@ class World(NamedTuple):
     tags: FloatArray
     rotation: FloatArray
     translation: FloatArray
-    twists: FloatArray
-    observations: list[dict[str, np.ndarray]]
+    readings: list[Reading]
     prior: tuple[FloatArray, FloatArray, FloatArray]
     bound: FloatArray
     anchors: FloatArray
 
 
-def simulate(scene: Scene, condition: str, trials: int, seed: int) -> World:
+def simulate_condition(scene: Scene, condition: str, trials: int, seed: int) -> BenchWorld:
     """The world of a scene under one of `CONDITIONS`.
 
     Anchors stay where they start.
     """
     true = _true_scene(scene, condition)
     entropy = [seed, int(scene_hash(scene), 16)]
-    draws = _draws(scene, true, trials, entropy)
-    episode = simulation.build_episode(true, draws)
+    episode = simulation.build_episode(true, _draws(scene, true, trials, entropy))
     told, anchors = _told(
         scene, condition, episode.anchors, np.random.default_rng([*entropy, _TOLD])
     )
-    observations, covariances = [], []
-    information = None
-    for epoch in range(true.steps + 1):
-        at = simulation.epoch_of(episode, epoch)
-        measured = simulation.measure(true, at, episode.anchors)
-        information, _ = scene_bounds.posterior_step(
-            true, at, episode.anchors, measured.links, information, episode.prior_covariance
-        )
-        seen = {"ranges": measured.ranges, "links": measured.links, "anchors": anchors}
-        if true.obstacles:
-            seen["quality"] = simulation.link_quality(true, at, episode.anchors)
-        observations.append(seen)
-        covariances.append(np.linalg.inv(information))
-    return World(
+    measurements = monte_carlo.measure_episode(true, episode)
+    links = np.array([measured.links for measured in measurements])
+    return BenchWorld(
         told,
         np.asarray(scene.tags),
         np.moveaxis(episode.rotation, 1, 0),
         np.moveaxis(episode.translation, 1, 0),
-        np.moveaxis(np.broadcast_to(episode.twists, (*episode.translation.shape[:2], 6)), 1, 0),
-        observations,
+        monte_carlo.told_readings(true, episode, measurements, told, anchors),
         (episode.prior_rotation, episode.prior_translation, episode.prior_covariance),
-        np.array(covariances),
+        monte_carlo.bound_of(true, episode, links),
         np.asarray(episode.anchors),
     )
 
@@ -165,7 +150,7 @@ def off_by(points: FloatArray, distance_m: float, rng: np.random.Generator) -> F
     return moved
 
 
-def pose_rank(world: World) -> int:
+def pose_rank(world: BenchWorld) -> int:
     """How many of the 6 directions of the pose the first epoch's full links determine."""
     information = bounds.information_at(
         world.anchors, world.tags, world.rotation[0], world.translation[0], world.told.noise
@@ -173,7 +158,7 @@ def pose_rank(world: World) -> int:
     return int(bounds.information_rank(information).min())
 
 
-def mirrored(world: World) -> FloatArray | None:
+def mirrored(world: BenchWorld) -> FloatArray | None:
     """Images (K, B, 3) of the true positions behind the plane of the anchors, if they have one."""
     centre = world.anchors.mean(axis=-2)
     _, size, axes = np.linalg.svd(world.anchors - centre[:, None], full_matrices=False)

@@ -7,7 +7,7 @@ the layouts were made for, and the filter's root mean square tag error.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,11 +15,14 @@ import numpy as np
 from rbl_gym import estimators, metrics, motion, placement
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import rotations as rot
+from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import search
 from rbl_gym.placement.problem import Context, PlacementTask
+from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.learning import evaluation
 from rbl_gym.studies.learning.rl_tasks import RlTask
+from rbl_gym.worlds.scene import Scene
 
 # Steps of an episode, of which the first are the filter's settling; way-points of an episode.
 _STEPS, _SETTLING, _POINTS = 40, 10, 12
@@ -33,13 +36,13 @@ FILTERS = {
 }
 
 
-def references(task: RlTask) -> list[str]:
+def transfer_references(task: RlTask) -> list[str]:
     """Layouts besides those of policies, as far as the task knows them."""
     known = evaluation.references(task)
     return [name for name in ("random", "ring", "greedy-swaps", "cma-es") if name in known]
 
 
-def filters(task: RlTask) -> list[str]:
+def tracking_filters(task: RlTask) -> list[str]:
     """Filters that can track in the task's scene: UC-KF needs anchors that are not coplanar."""
     low, high = placement.task(task.arguments["scene"]).scene.anchor_region.bounds()
     return [name for name in FILTERS if name != "uc-kf" or (high > low).all()]
@@ -56,7 +59,7 @@ class Bodies(NamedTuple):
     prior: tuple[FloatArray, FloatArray]
 
 
-def run(
+def track_layouts(
     task: PlacementTask,
     contexts: Context,
     layouts: dict[str, FloatArray],
@@ -149,12 +152,26 @@ def _tag_rmse(
     obstacles = task.obstacles(Context(*(np.repeat(field, repeats, axis=0) for field in contexts)))
     laws = {"tags": tags, "noise": scene.noise, "process": scene.process}
     filter = estimators.make(kind, **laws, **options)
-    state: Any = None
+    readings = _readings(scene, obstacles, anchors, bodies, reflections)
     total = np.zeros(len(anchors))
-    for k in range(_STEPS + 1):
-        rotation, translation = bodies.rotation[k], bodies.translation[k]
+    steps = track_epochs(filter, (*bodies.prior, scene.prior_covariance), readings)
+    for k, step in enumerate(steps):
+        if k > _SETTLING:
+            truth = bodies.rotation[k], bodies.translation[k]
+            total += metrics.tag_error(*step.belief[:2], *truth, tags) ** 2
+    return np.sqrt(total.reshape(-1, repeats).mean(axis=-1) / (_STEPS - _SETTLING))
+
+
+def _readings(
+    scene: Scene, obstacles: Obstacles, anchors: FloatArray, bodies: Bodies, reflections: bool
+) -> Iterator[Reading]:
+    """What a filter is told of the bodies: ranges of all links, the law of those without sight."""
+    for k, (rotation, translation) in enumerate(
+        zip(bodies.rotation, bodies.translation, strict=True)
+    ):
         scale = obstacles.share(anchors, translation[:, None])[:, 0, :, None] ** -0.5
-        distance = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
+        positions = ranging.tag_positions(rotation, translation, np.asarray(scene.tags))
+        distance = ranging.distances(anchors, positions)
         ranges = scene.noise.sample(distance, scale * bodies.normals[k])
         if reflections:
             ranges = ranges + NLOS_BIAS_M * bodies.reflected[k]
@@ -162,15 +179,5 @@ def _tag_rmse(
         law = None
         if obstacles:
             law = ranging.LinkNoise(scale * np.sqrt(scene.noise.variance(ranges)))
-        if k == 0:
-            state = filter.initial(*bodies.prior, scene.prior_covariance)
-        else:
-            state = filter.predict(state, bodies.twists[k - 1], scene.dt)
-        state = filter.update(state, ranges, anchors, noise=law)
-        if k > _SETTLING:
-            belief = filter.belief(state)
-            error = metrics.tag_error(
-                belief.rotation, belief.translation, rotation, translation, tags
-            )
-            total += error**2
-    return np.sqrt(total.reshape(-1, repeats).mean(axis=-1) / (_STEPS - _SETTLING))
+        twist = bodies.twists[k - 1] if k else None
+        yield Reading(ranges, anchors, noise=law, twist=twist, dt=scene.dt)

@@ -15,7 +15,7 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.studies import monte_carlo
-from rbl_gym.studies.monte_carlo import Trace, World, rms
+from rbl_gym.studies.monte_carlo import SimulatedTrials, Trace, rms
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
@@ -42,9 +42,9 @@ _SIGMAS = 4.0
 
 
 class Example(NamedTuple):
-    """A world of one trial, and the beliefs of some filters, one per step."""
+    """One trial, and the beliefs of some filters, one per step."""
 
-    world: World
+    trials: SimulatedTrials
     beliefs: dict[str, list[PoseBelief]]
 
 
@@ -57,12 +57,12 @@ class Claim(NamedTuple):
     figures: str
 
 
-def scene() -> Scene:
+def paper_scene() -> Scene:
     """The paper's world, cut to its 20 epochs."""
     return scenes.get({"name": "camsap2013", "steps": STEPS - 1})
 
 
-def run(
+def tracking_experiment(
     trials: int,
     seed: int,
     advance: Callable[[], None] = lambda: None,
@@ -78,7 +78,7 @@ def run(
     trade
         Also run ET-KF over `THRESHOLDS`: its error against how often it projects.
     world
-        Another scene in place of `scene`.
+        Another scene in place of `paper_scene`.
     filters
         Label -> name and options. KF, KF-ortho, UC-KF and the iterated EKF must be among them.
 
@@ -87,14 +87,14 @@ def run(
     A dict of plain numbers and lists: ``filters`` (with the series of Figs 2 and 3 in
     ``per_step``), ``bound``, ``claims``, ``assumed``, and ``trade`` where asked.
     """
-    simulated = monte_carlo.simulate_world(
-        world or scene(), trials, np.random.default_rng([seed, 0])
+    simulated = monte_carlo.simulate_trials(
+        world or paper_scene(), trials, np.random.default_rng([seed, 0])
     )
     traces = {
-        label: monte_carlo.run(simulated, name, options, advance)
+        label: monte_carlo.track_trials(simulated, name, options, advance)
         for label, (name, options) in filters.items()
     }
-    consistent = monte_carlo.run(simulated, *_CONSISTENT_KF, advance)
+    consistent = monte_carlo.track_trials(simulated, *_CONSISTENT_KF, advance)
     bound = bound_per_step(simulated)
     result = {
         "experiment": "camsap2013",
@@ -102,7 +102,7 @@ def run(
         "seed": seed,
         "assumed": list(ASSUMED),
         "bound": {key: value.tolist() for key, value in bound.items()},
-        "filters": {label: summary(trace, bound) for label, trace in traces.items()},
+        "filters": {label: filter_figures(trace, bound) for label, trace in traces.items()},
         "claims": [claim._asdict() for claim in claims(traces, consistent, bound)],
     }
     if trade:
@@ -111,14 +111,14 @@ def run(
 
 
 def work_units(*, trade: bool = False, filters: Filters = FILTERS) -> int:
-    """How often `run` calls `advance`."""
+    """How often `tracking_experiment` calls `advance`."""
     return (len(filters) + 1 + (len(THRESHOLDS) if trade else 0)) * STEPS
 
 
-def _trade(world: World, advance: Callable[[], None]) -> list[dict[str, float]]:
+def _trade(trials: SimulatedTrials, advance: Callable[[], None]) -> list[dict[str, float]]:
     rows = []
     for threshold in THRESHOLDS:
-        trace = monte_carlo.run(world, "et-kf", {"threshold": threshold}, advance)
+        trace = monte_carlo.track_trials(trials, "et-kf", {"threshold": threshold}, advance)
         rows.append(
             {
                 "threshold": threshold,
@@ -129,16 +129,16 @@ def _trade(world: World, advance: Callable[[], None]) -> list[dict[str, float]]:
     return rows
 
 
-def bound_per_step(world: World) -> dict[str, FloatArray]:
+def bound_per_step(trials: SimulatedTrials) -> dict[str, FloatArray]:
     """Posterior Cramer-Rao bound of each step: rotation (Frobenius) and translation RMSE (K,)."""
-    variance = np.diagonal(world.bound, axis1=-2, axis2=-1).mean(axis=1)
+    variance = np.diagonal(trials.bound, axis1=-2, axis2=-1).mean(axis=1)
     return {
         "rotation_rmse": np.sqrt(2 * variance[:, :3].sum(axis=-1)),
         "translation_rmse_m": np.sqrt(variance[:, 3:].sum(axis=-1)),
     }
 
 
-def summary(trace: Trace, bound: dict[str, FloatArray]) -> dict[str, Any]:
+def filter_figures(trace: Trace, bound: dict[str, FloatArray]) -> dict[str, Any]:
     """The figures of a filter: over all steps, and per step."""
     rotation, translation = rms(trace.frobenius, axis=1), _translation_rmse(trace)
     ratios = rotation / bound["rotation_rmse"], translation / bound["translation_rmse_m"]
@@ -273,10 +273,10 @@ def _range_of(ratio: FloatArray) -> str:
 
 def example(seed: int) -> Example:
     """One trial, for the picture."""
-    world = monte_carlo.simulate_world(scene(), 1, np.random.default_rng([seed, 1]))
-    steps = {}
+    trial = monte_carlo.simulate_trials(paper_scene(), 1, np.random.default_rng([seed, 1]))
+    beliefs = {}
     for label in ("KF", "iterated EKF"):
         name, options = FILTERS[label]
-        filter = monte_carlo.make(world.scene, name, options)
-        steps[label] = [belief for _, belief in monte_carlo.beliefs(world, filter)]
-    return Example(world, steps)
+        filter = monte_carlo.scene_filter(trial.scene, name, options)
+        beliefs[label] = [step.belief for step in monte_carlo.trial_steps(trial, filter)]
+    return Example(trial, beliefs)

@@ -40,11 +40,13 @@ _NEAR = 6.0
 
 
 def work_units() -> int:
-    """How often `run` calls `advance`."""
+    """How often `doa_experiment` calls `advance`."""
     return len(SETTINGS) * len(SIGMAS_DEG) * len(METHODS)
 
 
-def run(trials: int, seed: int, advance: Callable[[], None] = lambda: None) -> dict[str, Any]:
+def doa_experiment(
+    trials: int, seed: int, advance: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
     """Every method at every noise of both settings, with the constrained Cramer-Rao bound.
 
     Returns

@@ -56,7 +56,7 @@ class Setting(NamedTuple):
 N_ANCHORS = 10
 
 
-def settings() -> dict[str, Setting]:
+def static_settings() -> dict[str, Setting]:
     """Figs 2 and 3: both anchor regions, redrawn and fixed; (a) without, (b) with perturbation."""
     body = bodies.icassp2013()
     return {
@@ -68,7 +68,7 @@ def settings() -> dict[str, Setting]:
     }
 
 
-def run(
+def static_experiment(
     name: str,
     settings: dict[str, Setting],
     trials: int,
@@ -111,7 +111,7 @@ def run(
 
 
 def work_units(settings: dict[str, Setting]) -> int:
-    """How often `run` calls `advance`."""
+    """How often `static_experiment` calls `advance`."""
     return len(settings) * len(REFERENCE_RANGES_DB)
 
 

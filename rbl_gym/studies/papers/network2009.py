@@ -48,7 +48,7 @@ _NETWORKS = 10
 _STRETCHES = 6
 
 
-class Sample(NamedTuple):
+class DrawnNetwork(NamedTuple):
     """A network of the experiment."""
 
     positions: FloatArray
@@ -58,11 +58,11 @@ class Sample(NamedTuple):
 
 
 def work_units() -> int:
-    """How often `run` calls `advance`."""
+    """How often `network_experiment` calls `advance`."""
     return 4
 
 
-def run(
+def network_experiment(
     trials: int,
     seed: int,
     advance: Callable[[], None] = lambda: None,
@@ -97,7 +97,7 @@ def run(
     and estimated orientations. ``convergence``: for each cycle basis and rule for kappa lambda_min
     and lambda_max, the measured and the true factor, and Theorem 19's, with the share of networks
     where it holds. ``asynchronous``: rounds for each share of lost messages. ``history``: errors of
-    a run. ``growth``: `network_growth.run`. ``space``: three nodes in space.
+    a run. ``growth``: `network_growth.kappa_growth`. ``space``: three nodes in space.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def run(
     ]  # fmt: skip
     advance()
     result["run"] = _run(places, graphs[-1], float(sigma[1]), np.random.default_rng([seed, 500]))
-    samples = [sample(EXAMPLE_LOOPS, np.random.default_rng([seed, 1000, k]))
+    samples = [draw_network(EXAMPLE_LOOPS, np.random.default_rng([seed, 1000, k]))
                for k in range(_NETWORKS)]  # fmt: skip
     result["convergence"] = {
         basis: {rule: _convergence(samples, basis, rule) for rule in RULES} for basis in BASES
@@ -138,7 +138,7 @@ def run(
     result["asynchronous"] = [_asynchronous(samples, loss, rng) for loss in LOSSES]
     result["history"] = {basis: _history(samples[0], basis) for basis in BASES}
     advance()
-    result["growth"] = network_growth.run(np.random.default_rng([seed, 3000]))
+    result["growth"] = network_growth.kappa_growth(np.random.default_rng([seed, 3000]))
     advance()
     result["space"] = network_growth.three_in_space(trials, np.random.default_rng([seed, 4000]))
     advance()
@@ -189,7 +189,7 @@ def _seen(places: FloatArray, radius: float) -> IntArray:
     return edges
 
 
-def sample(loops: int, rng: np.random.Generator) -> Sample:
+def draw_network(loops: int, rng: np.random.Generator) -> DrawnNetwork:
     """A connected unit-disk graph with this many loops, its truth and its edge angles."""
     pairs = np.array(list(itertools.combinations(range(N_NODES), 2)))
     while True:
@@ -201,7 +201,7 @@ def sample(loops: int, rng: np.random.Generator) -> Sample:
     theta = rng.uniform(-np.pi, np.pi, N_NODES)
     theta = proj(theta - theta[0])
     bearings = sensing.measure(positions, theta, edges, BEARING_STD_RAD, rng)
-    return Sample(positions, theta, edges, sensing.edge_angles(bearings))
+    return DrawnNetwork(positions, theta, edges, sensing.edge_angles(bearings))
 
 
 def _accuracy(
@@ -269,7 +269,7 @@ def _run(
     }
 
 
-def _convergence(samples: list[Sample], basis: str, rule: str) -> dict[str, Any]:
+def _convergence(samples: list[DrawnNetwork], basis: str, rule: str) -> dict[str, Any]:
     """Means over the networks; the measured factor against the true one at its worst."""
     rows = [_one_convergence(one, basis, rule) for one in samples]
     table = {key: np.array([row[key] for row in rows]) for key in rows[0]}
@@ -279,7 +279,7 @@ def _convergence(samples: list[Sample], basis: str, rule: str) -> dict[str, Any]
     }
 
 
-def _one_convergence(one: Sample, basis: str, rule: str) -> dict[str, float]:
+def _one_convergence(one: DrawnNetwork, basis: str, rule: str) -> dict[str, float]:
     C = network_graphs.cycle_matrix(one.edges, N_NODES, basis)
     low, high = consensus.eigenvalues(C)
     run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, rule, history=True)
@@ -300,14 +300,14 @@ def _one_convergence(one: Sample, basis: str, rule: str) -> dict[str, float]:
     }
 
 
-def errors(C: Any, y: FloatArray, run: consensus.CycleRun) -> FloatArray:
+def distances_from_limit(C: Any, y: FloatArray, run: consensus.CycleRun) -> FloatArray:
     """Distance of every psi of a run from the limit on its branch."""
     assert run.history is not None
     limit = consensus.cycle_projection(C, y, run.branch)
     return np.linalg.norm(run.history - limit, axis=1)
 
 
-def measured_factor(one: Sample, C: Any, run: consensus.CycleRun) -> float:
+def measured_factor(one: DrawnNetwork, C: Any, run: consensus.CycleRun) -> float:
     """Factor of a step, from late errors that rounding does not yet touch.
 
     They are stretched to their first size and iterated on, until one mode is left.
@@ -318,7 +318,7 @@ def measured_factor(one: Sample, C: Any, run: consensus.CycleRun) -> float:
     for _ in range(_STRETCHES):
         again = consensus.cycle_iteration(one.edges, psi, N_NODES, C, run.kappa, history=True,
                                           branch=run.branch)  # fmt: skip
-        distance = errors(C, one.y, again)
+        distance = distances_from_limit(C, one.y, again)
         late = np.flatnonzero(distance > 1e-8 * distance[0])
         first, last = late[len(late) // 2], late[-1]
         factor = float((distance[last] / distance[first]) ** (1 / (last - first)))
@@ -329,7 +329,9 @@ def measured_factor(one: Sample, C: Any, run: consensus.CycleRun) -> float:
     return factor
 
 
-def _asynchronous(samples: list[Sample], loss: float, rng: np.random.Generator) -> dict[str, Any]:
+def _asynchronous(
+    samples: list[DrawnNetwork], loss: float, rng: np.random.Generator
+) -> dict[str, Any]:
     steps, off = [], []
     for one in samples:
         C = network_graphs.cycle_matrix(one.edges, N_NODES, "paton")
@@ -341,12 +343,12 @@ def _asynchronous(samples: list[Sample], loss: float, rng: np.random.Generator) 
     return {"loss": loss, "rounds": float(np.mean(steps)), "largest_error_rad": max(off)}
 
 
-def _history(one: Sample, basis: str) -> dict[str, Any]:
+def _history(one: DrawnNetwork, basis: str) -> dict[str, Any]:
     """Distances from the limit over the steps of a run, and the factor that Theorem 19 prints."""
     C = network_graphs.cycle_matrix(one.edges, N_NODES, basis)
     run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, history=True)
     assert run.kappa is not None
     return {
-        "distance": errors(C, one.y, run).tolist(),
+        "distance": distances_from_limit(C, one.y, run).tolist(),
         "printed_factor_squared": consensus.printed_factor(run.kappa),
     }

@@ -29,7 +29,7 @@ SHAPES = {
 SPACE_STD_RAD = (0.001, 0.01, 0.05)
 
 
-def run(rng: np.random.Generator) -> dict[str, Any]:
+def kappa_growth(rng: np.random.Generator) -> dict[str, Any]:
     """Kappa by every rule, and the true factor with it, for growing networks.
 
     Returns

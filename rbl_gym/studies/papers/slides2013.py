@@ -25,7 +25,7 @@ ANCHORS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1.0]])
 FILTERS = {label: value for label, value in camsap2013.FILTERS.items() if label != "ET-KF"}
 
 
-def settings() -> dict[str, Setting]:
+def slides_settings() -> dict[str, Setting]:
     """Of the static part."""
     return {
         "[0, 100]^3": Setting(0, 100, 100 * ANCHORS, 0.0, TAGS),
@@ -33,18 +33,22 @@ def settings() -> dict[str, Setting]:
     }
 
 
-def scene() -> Scene:
+def slides_scene() -> Scene:
     """Of the dynamic part: the tracking paper's world with the body of the slides."""
-    return dataclasses.replace(camsap2013.scene(), tags=as_tuples(TAGS))
+    return dataclasses.replace(camsap2013.paper_scene(), tags=as_tuples(TAGS))
 
 
-def run(trials: int, seed: int, advance: Callable[[], None] = lambda: None) -> dict[str, Any]:
-    """Both parts: `icassp2013.run`, with `camsap2013.run` as its ``"dynamic"``."""
-    static = icassp2013.run("slides2013", settings(), trials, seed, advance)
-    dynamic = camsap2013.run(trials, seed, advance, world=scene(), filters=FILTERS)
+def slides_experiment(
+    trials: int, seed: int, advance: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
+    """The static experiment, with `camsap2013.tracking_experiment` as its ``"dynamic"``."""
+    static = icassp2013.static_experiment("slides2013", slides_settings(), trials, seed, advance)
+    dynamic = camsap2013.tracking_experiment(
+        trials, seed, advance, world=slides_scene(), filters=FILTERS
+    )
     return static | {"dynamic": dynamic | {"experiment": "slides2013, dynamic"}}
 
 
 def work_units() -> int:
-    """How often `run` calls `advance`."""
-    return icassp2013.work_units(settings()) + camsap2013.work_units(filters=FILTERS)
+    """How often `slides_experiment` calls `advance`."""
+    return icassp2013.work_units(slides_settings()) + camsap2013.work_units(filters=FILTERS)

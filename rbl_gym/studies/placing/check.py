@@ -12,6 +12,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.placement.scene_files import Problem
+from rbl_gym.studies.epochs import Reading, track_epochs
 
 # A consistent belief is this far from the truth once in a million: such a pose is lost, for
 # instance the mirror image behind a plane of anchors.
@@ -20,7 +21,7 @@ _LOST_NEES = float(special.chdtri(6, 1e-6))
 _LEAST_RANGE_M = 1e-3
 
 
-class Trials(NamedTuple):
+class DrawnBodies(NamedTuple):
     """Bodies (B, ...) at random poses, their ranges (B, M, N) and what is known of them.
 
     Attributes
@@ -45,7 +46,7 @@ class Trials(NamedTuple):
     information: FloatArray
 
 
-def run(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[str, Any]:
+def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[str, Any]:
     """Errors of real filters beside what the bound predicts for the same poses.
 
     - ``iterated EKF``: one update from a prior drawn around the truth; told which links are
@@ -54,7 +55,7 @@ def run(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[s
       are obstacles.
     - ``locate, from nothing``: maximum likelihood without a prior; told as well.
     """
-    drawn = simulate(problem, anchors, trials, np.random.default_rng([seed, 1]))
+    drawn = draw_bodies(problem, anchors, trials, np.random.default_rng([seed, 1]))
     scene = problem.task.scene
     prior = scene.prior_covariance
     with_prior = np.linalg.inv(drawn.information + np.linalg.inv(prior))
@@ -66,14 +67,16 @@ def run(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[s
         filter = estimators.IteratedEkf(
             np.array(scene.tags), scene.noise, scene.process, robust=robust
         )
-        state = filter.initial(drawn.prior_rotation, drawn.prior_translation, prior)
-        epoch = drawn.ranges, anchors, drawn.links
-        belief = filter.belief(filter.update(state, *epoch, noise=law))
-        result[name] = figures(drawn, belief, with_prior)
+        start = drawn.prior_rotation, drawn.prior_translation, prior
+        reading = Reading(drawn.ranges, anchors, drawn.links, law)
+        (step,) = track_epochs(filter, start, [reading])
+        result[name] = found_figures(drawn, step.belief, with_prior)
     if (bounds.information_rank(drawn.information) == 6).all():
         tags = np.asarray(scene.tags)
         found = estimators.locate(drawn.ranges, anchors, tags, drawn.told, links=drawn.links)
-        result["locate, from nothing"] = figures(drawn, found, np.linalg.inv(drawn.information))
+        result["locate, from nothing"] = found_figures(
+            drawn, found, np.linalg.inv(drawn.information)
+        )
     std = np.sqrt(np.diag(prior))
     return {
         "trials": trials,
@@ -83,9 +86,9 @@ def run(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[s
     }
 
 
-def simulate(
+def draw_bodies(
     problem: Problem, anchors: FloatArray, trials: int, rng: np.random.Generator
-) -> Trials:
+) -> DrawnBodies:
     """Bodies uniform over the free part of the region, turned anyhow, and one epoch of ranges."""
     task = problem.task
     scene = task.scene
@@ -102,7 +105,7 @@ def simulate(
     ranges = np.maximum(ranges, _LEAST_RANGE_M)
     std = np.sqrt(scene.noise.variance(ranges)) * np.where(weight > 0, scale, 1.0)
     offset = rng.standard_normal((trials, 6))
-    return Trials(
+    return DrawnBodies(
         rotation,
         translation,
         ranges,
@@ -124,7 +127,7 @@ def _free_places(problem: Problem, count: int, rng: np.random.Generator) -> Floa
     return free[:count]
 
 
-def figures(drawn: Trials, found: Any, bound: FloatArray) -> dict[str, float]:
+def found_figures(drawn: DrawnBodies, found: Any, bound: FloatArray) -> dict[str, float]:
     """Real and predicted root mean squares, of all bodies and of those found, and their ratios.
 
     `lost` is the share of bodies further off than chance allows, or without a pose. Keys with

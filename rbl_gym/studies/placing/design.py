@@ -14,6 +14,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.placement import criteria, layouts, scene_files, search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.placement.scene_files import Problem
+from rbl_gym.studies.monte_carlo import rms
 from rbl_gym.studies.placing import check
 from rbl_gym.studies.placing.accuracy import accuracy, free_grid, free_sample
 
@@ -59,7 +60,7 @@ class Design(NamedTuple):
 # --- design ----------------------------------------------------------------------------------
 
 
-def design(
+def design_layout(
     problem: Problem,
     seed: int,
     advance: Callable[[], None] = lambda: None,
@@ -110,7 +111,7 @@ def design(
     }  # fmt: skip
     # Judged over more places than those that the search has seen.
     places = free_sample(problem)
-    scores = {name: rms(accuracy(problem, x, places).score) for name, x in legal.items()}
+    scores = {name: float(rms(accuracy(problem, x, places).score)) for name, x in legal.items()}
     best = min(scores, key=scores.__getitem__)
     return Design(_in_order(legal[best], context.centre), best, searched)
 
@@ -155,11 +156,11 @@ class Placed(NamedTuple):
 
 
 def work_units(numbers: range) -> int:
-    """How often `run` advances."""
+    """How often `place_anchors` advances."""
     return len(numbers) * SEARCH_STEPS + 1
 
 
-def run(
+def place_anchors(
     problem: Problem,
     numbers: range,
     seed: int,
@@ -182,7 +183,7 @@ def run(
     rows, best, found = [], None, None
     for number in numbers:
         problem = scene_files.with_anchors(problem, number)
-        found = design(problem, seed, advance, best)
+        found = design_layout(problem, seed, advance, best)
         best = found.anchors
         rows.append({"n_anchors": number, **_summary(problem, best)})
     assert found is not None
@@ -209,7 +210,7 @@ def run(
         "predicted": prediction(problem, found.anchors),
         "criteria": _criteria(task, problem.context, found.anchors),
         "layouts": comparison(problem, found, seed),
-        "check": check.run(problem, found.anchors, trials, seed),
+        "check": check.check_layout(problem, found.anchors, trials, seed),
     }
     if len(numbers) > 1:
         result["against_number"] = rows
@@ -230,18 +231,13 @@ def prediction(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
         worst = int(values.argmax())
         inner = values[: len(sample)]
         result[name] = {
-            "rms": rms(inner),
+            "rms": float(rms(inner)),
             "median": float(np.median(inner)),
             "p95": float(np.quantile(inner, 0.95)),
             "worst": float(values[worst]),
             "worst_at_m": found.places[worst].tolist(),
         }
     return result
-
-
-def rms(values: FloatArray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _summary(problem: Problem, anchors: FloatArray) -> dict[str, float]:

@@ -28,7 +28,7 @@ from rbl_gym.studies.replay.truth import (
 _NEARER = 0.25
 
 
-class Errors(NamedTuple):
+class TrackErrors(NamedTuple):
     """Errors where truth exists: mask (K,), distance (m), yaw (rad), rotation angle (rad), NEES.
 
     `tags`: root mean square over the tags (m).
@@ -66,7 +66,7 @@ def _as_judged(rotation: FloatArray, settings: Settings) -> FloatArray:
     return offset @ rotation
 
 
-def errors(recording: Recording, track: Track, settings: Settings) -> Errors | None:
+def track_errors(recording: Recording, track: Track, settings: Settings) -> TrackErrors | None:
     """Errors against the recording's truth, interpolated; None without truth.
 
     Planar: position in x and y, NEES of (yaw, x, y); the truth's roll and pitch are not read.
@@ -82,7 +82,7 @@ def errors(recording: Recording, track: Track, settings: Settings) -> Errors | N
     place = translation.copy()
     if settings.planar:
         place[:, 2] = track.translation[:, 2]
-    return Errors(
+    return TrackErrors(
         known,
         np.linalg.norm(error[:, 3 : 5 if settings.planar else 6], axis=-1),
         (turn + np.pi) % (2 * np.pi) - np.pi,
@@ -92,8 +92,8 @@ def errors(recording: Recording, track: Track, settings: Settings) -> Errors | N
     )
 
 
-def figures(
-    recording: Recording, track: Track, found: Errors | None, settings: Settings
+def track_figures(
+    recording: Recording, track: Track, found: TrackErrors | None, settings: Settings
 ) -> dict[str, Any]:
     """The figures of a run as plain numbers; those of errors are absent without truth."""
     result: dict[str, Any] = {
@@ -125,7 +125,7 @@ def figures(
 
 
 def _notes(
-    recording: Recording, track: Track, found: Errors | None, settings: Settings
+    recording: Recording, track: Track, found: TrackErrors | None, settings: Settings
 ) -> dict[str, Any]:
     """The mirror pose, and what a reader is to be warned of, a sentence each."""
     result: dict[str, Any] = {}
@@ -154,12 +154,12 @@ def _notes(
     return {**result, "notes": notes}
 
 
-def _nearer(recording: Recording, track: Track, found: Errors, settings: Settings) -> Track:
+def _nearer(recording: Recording, track: Track, found: TrackErrors, settings: Settings) -> Track:
     """The track, or that of the mirror pose where both are alive and the truth is at that one."""
     if track.other is None:
         return track
     image = Track(track.times, *track.other[:3])
-    off = errors(recording, image, settings)
+    off = track_errors(recording, image, settings)
     assert off is not None
     where = found.known & track.other.alive
     far, near = (np.square(e.position[where]).sum() for e in (found, off))

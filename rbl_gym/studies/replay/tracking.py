@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from rbl_gym.estimators.filter import check_takes_noise
 from rbl_gym.geometry.mirror import mirror_pose
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings.reading import Recording
+from rbl_gym.studies.epochs import Reading, Step, stack_beliefs, track_epochs
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
 from rbl_gym.studies.replay.settings import (
     DEFAULT_RANGE_STD_M,
@@ -44,7 +46,7 @@ class Track(NamedTuple):
     other: Mirror | None = None
 
 
-def run(
+def replay_recording(
     recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
 ) -> Track:
     """Filter a recording causally, epoch by epoch; `advance` is called after each.
@@ -52,8 +54,8 @@ def run(
     Where a mirror pose explains the ranges as well, the belief covers both (`replay.mirror`).
     """
     beliefs = []
-    for _, belief in steps(recording, settings, make_filter(recording, settings)):
-        beliefs.append(belief)
+    for step in recording_steps(recording, settings, recording_filter(recording, settings)):
+        beliefs.append(step.belief)
         advance()
     track = track_of(recording, beliefs)
     if settings.planar:
@@ -70,10 +72,10 @@ def run(
     return track._replace(covariance=covering(other, poses), other=other)
 
 
-def steps(
+def recording_steps(
     recording: Recording, settings: Settings, filter: estimators.Filter
-) -> Iterator[tuple[Any, estimators.PoseBelief]]:
-    """State and belief of a filter after every epoch of a recording, started from nothing.
+) -> Iterator[Step]:
+    """A filter over the epochs of a recording, started from nothing.
 
     Standard deviations that the recording reports itself are the law of their epoch. A belief
     outside the settings' volume starts again from its mirror image, where that is inside.
@@ -83,26 +85,30 @@ def steps(
     local = recording._replace(anchors=recording.anchors - origin)
     volume = volume_of(recording, settings)
     volume = None if volume is None else volume - origin
-    state = filter.initial(*_prior(local, settings, volume))
-    before = local.times[0]
-    for k, now in enumerate(local.times):
-        if now > before:
-            state = filter.predict(state, np.zeros(6), now - before)
-        epoch = local.ranges[k], local.anchors, local.links[k]
-        law = {}
-        if local.range_std is not None and has_own_std(local, settings):
-            law["noise"] = ranging.LinkNoise(local.range_std[k])
-        state = filter.update(state, *epoch, **law)
-        belief = filter.belief(state)
-        if volume is not None and (image := _image_inside(local, belief, volume)) is not None:
-            state = filter.update(filter.initial(*image), *epoch, **law)
-            belief = filter.belief(state)
-        yield state, belief._replace(translation=belief.translation + origin)
-        before = now
+    prior = _prior(local, settings, volume)
+    restart = None if volume is None else partial(_image_inside, local, volume)
+    for step in track_epochs(filter, prior, _readings(local, settings), restart):
+        belief = step.belief
+        yield step._replace(belief=belief._replace(translation=belief.translation + origin))
+
+
+def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
+    """The epochs of a recording, without odometry."""
+    own = recording.range_std if has_own_std(recording, settings) else None
+    elapsed = np.diff(recording.times, prepend=recording.times[0])
+    for k, dt in enumerate(elapsed):
+        yield Reading(
+            recording.ranges[k],
+            recording.anchors,
+            recording.links[k],
+            None if own is None else ranging.LinkNoise(own[k]),
+            np.zeros(6) if dt > 0 else None,
+            dt,
+        )
 
 
 def _image_inside(
-    recording: Recording, belief: estimators.PoseBelief, volume: FloatArray
+    recording: Recording, volume: FloatArray, belief: estimators.PoseBelief
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """The mirror image of a belief that is outside the volume, if that is inside; widened."""
     if not is_outside(volume, belief.translation, belief.covariance):
@@ -124,15 +130,10 @@ def range_std_of(recording: Recording, settings: Settings) -> float | str:
 
 def track_of(recording: Recording, beliefs: list[estimators.PoseBelief]) -> Track:
     """Beliefs after every epoch as arrays."""
-    return Track(
-        recording.times,
-        np.array([belief.rotation for belief in beliefs]),
-        np.array([belief.translation for belief in beliefs]),
-        np.array([belief.covariance for belief in beliefs]),
-    )
+    return Track(recording.times, *stack_beliefs(beliefs)[:3])
 
 
-def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
+def recording_filter(recording: Recording, settings: Settings) -> estimators.Filter:
     """The named filter with the recording's tags, a random walk and the range noise."""
     return named_filter(recording, settings, settings.filter, _options(settings))
 
@@ -140,7 +141,7 @@ def make_filter(recording: Recording, settings: Settings) -> estimators.Filter:
 def named_filter(
     recording: Recording, settings: Settings, name: str, options: dict[str, Any]
 ) -> estimators.Filter:
-    """`make_filter` for any filter and options of its own.
+    """`recording_filter` for any filter and options of its own.
 
     Raises
     ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -11,20 +10,17 @@ import numpy as np
 from rbl_gym import bounds, estimators, metrics
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.linear.squared_range import geometric_rank
-from rbl_gym.studies import replay
-from rbl_gym.studies.bench import figures as bench_figures
+from rbl_gym.studies import monte_carlo, replay
 from rbl_gym.studies.bench import recordings, worlds
-from rbl_gym.studies.bench.figures import Errors, Reference
+from rbl_gym.studies.bench.figures import BenchErrors, Reference, error_figures, plain
+from rbl_gym.studies.epochs import Step, pose_errors, stack_beliefs, timed, track_epochs
 from rbl_gym.worlds import scenes
-from rbl_gym.wrappers.estimate import check_takes_obstacles, update
 
 
 class Tracked(NamedTuple):
-    """What a filter did: pose (K, B, ...), covariance, how often it triggered, its seconds."""
+    """What a filter did: beliefs (K, B, ...), how often it triggered, its seconds."""
 
-    rotation: FloatArray
-    translation: FloatArray
-    covariance: FloatArray
+    belief: estimators.PoseBelief
     trigger_rate: float | None
     seconds: float
 
@@ -37,15 +33,15 @@ class StoppedError(Exception):
         self.epoch, self.error = epoch, error
 
 
-class Stage(NamedTuple):
+class BenchStage(NamedTuple):
     """A world as filters meet it.
 
     Attributes
     ----------
     make
         A filter of a name and options that knows what it is told.
-    beliefs
-        State and belief of a filter after every epoch.
+    track
+        A filter over all epochs.
     figures
         All figures of what it did.
     anchors, tags
@@ -56,7 +52,7 @@ class Stage(NamedTuple):
     """
 
     make: Callable[[str, dict[str, Any]], estimators.Filter]
-    beliefs: Callable[[estimators.Filter], Iterator[tuple[Any, estimators.PoseBelief]]]
+    track: Callable[[estimators.Filter], Iterator[Step]]
     figures: Callable[[Tracked], dict[str, Any]]
     anchors: FloatArray
     tags: FloatArray
@@ -64,43 +60,43 @@ class Stage(NamedTuple):
     batch: tuple[int, ...]
 
 
-def scene_stage(spec: Any, condition: str, trials: int, seed: int) -> Stage:
+def scene_stage(spec: Any, condition: str, trials: int, seed: int) -> BenchStage:
     """The stage of a simulated scene."""
-    world = worlds.simulate(scenes.get(spec), condition, trials, seed)
+    world = worlds.simulate_condition(scenes.get(spec), condition, trials, seed)
     told = world.told
     mirror = worlds.mirrored(world)
     expected, prior = _expected(world), _prior_tags(world)
 
-    def make(name: str, options: dict[str, Any]) -> estimators.Filter:
-        laws = {"tags": told.tags, "noise": told.noise, "process": told.process}
-        filter = estimators.make(name, **laws, **options)
-        check_takes_obstacles(name, filter, told)
-        return filter
-
     def figures(tracked: Tracked) -> dict[str, Any]:
         distance = None
         if mirror is not None:
-            distance = metrics.length(tracked.translation[-1] - mirror[-1])
+            distance = metrics.length(tracked.belief.translation[-1] - mirror[-1])
         reference = Reference(expected, prior, distance)
-        return bench_figures.figures(_errors(world, tracked), reference)
+        return error_figures(_errors(world, tracked.belief), reference)
 
     rank = worlds.pose_rank(world)
     geometry = world.anchors, world.tags, rank
-    return Stage(make, lambda f: _beliefs(world, f), figures, *geometry, (trials,))
+    return BenchStage(
+        lambda name, options: monte_carlo.scene_filter(told, name, options),
+        lambda filter: track_epochs(filter, world.prior, world.readings),
+        figures,
+        *geometry,
+        (trials,),
+    )
 
 
-def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> Stage:
+def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> BenchStage:
     """The stage of a recording; its trials are stretches of it."""
-    log = recordings.load(spec)
+    log = recordings.load_recording(spec)
     told, settings = recordings.stressed(log, condition, seed)
 
     def figures(tracked: Tracked) -> dict[str, Any]:
-        track = replay.Track(told.times, *tracked[:3])
-        return bench_figures.figures(recordings.errors(log, track), None)
+        track = replay.Track(told.times, *tracked.belief[:3])
+        return error_figures(recordings.recording_errors(log, track), None)
 
-    return Stage(
+    return BenchStage(
         lambda name, options: replay.named_filter(told, settings, name, options),
-        lambda filter: replay.steps(told, settings, filter),
+        lambda filter: replay.recording_steps(told, settings, filter),
         figures,
         log.recording.anchors,
         log.recording.tags,
@@ -109,7 +105,9 @@ def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> Stage
     )
 
 
-def run(stage: Stage, name: str, options: dict[str, Any]) -> tuple[dict[str, Any], float | None]:
+def run_filter(
+    stage: BenchStage, name: str, options: dict[str, Any]
+) -> tuple[dict[str, Any], float | None]:
     """A filter on a stage: what a record says of it, and its microseconds per step and trial.
 
     `status` is ``"ok"``; ``"unobservable"`` where the geometry does not determine its states
@@ -128,51 +126,34 @@ def run(stage: Stage, name: str, options: dict[str, Any]) -> tuple[dict[str, Any
     if result["rank"] is not None and result["rank"] < result["states"]:
         result["status"] = "unobservable"
     try:
-        tracked = _track(stage.beliefs(filter), stage.batch)
+        tracked = _track(stage.track(filter), stage.batch)
     except StoppedError as stop:
         return result | _stopped(stop), None
-    result["trigger_rate"] = bench_figures.plain(tracked.trigger_rate)
-    steps = tracked.translation[..., 0].size
+    result["trigger_rate"] = plain(tracked.trigger_rate)
+    steps = tracked.belief.translation[..., 0].size
     return result | stage.figures(tracked), 1e6 * tracked.seconds / steps
 
 
-def _beliefs(
-    world: worlds.World, filter: estimators.Filter
-) -> Iterator[tuple[Any, estimators.PoseBelief]]:
-    state = filter.initial(*world.prior)
-    for epoch, seen in enumerate(world.observations):
-        if epoch:
-            state = filter.predict(state, world.twists[epoch], world.told.dt)
-        state = update(filter, state, seen, world.told)
-        yield state, filter.belief(state)
-
-
-def _track(beliefs: Iterator[tuple[Any, estimators.PoseBelief]], batch: tuple[int, ...]) -> Tracked:
+def _track(steps: Iterator[Step], batch: tuple[int, ...]) -> Tracked:
     """All beliefs of a filter; a StoppedError where it raises or gives none."""
-    rows, triggers, epoch = [], [], 0
-    start = time.process_time()
+    beliefs, triggers, seconds = [], [], 0.0
     # What a filter that diverges overflows is told by its figures.
     with np.errstate(all="ignore"):
         try:
-            for state, belief in beliefs:
-                rows.append((belief.rotation, belief.translation, belief.covariance))
-                for value, core in zip(rows[-1], ((3, 3), (3,), (6, 6)), strict=True):
-                    if np.shape(value) != (*batch, *core):
-                        raise TypeError(
-                            f"beliefs must have arrays (..., 3, 3), (..., 3), (..., 6, 6) for "
-                            f"batch {batch}, got {[np.shape(array) for array in rows[-1]]}; see "
-                            "rbl_gym.testing.check_filter"
-                        )
-                triggers.append(getattr(state, "constrained", None))
-                epoch += 1
+            for step, taken in timed(steps):
+                seconds += taken
+                shapes = [np.shape(array) for array in step.belief[:3]]
+                if shapes != [(*batch, *core) for core in ((3, 3), (3,), (6, 6))]:
+                    raise TypeError(
+                        f"beliefs must have arrays (..., 3, 3), (..., 3), (..., 6, 6) for "
+                        f"batch {batch}, got {shapes}; see rbl_gym.testing.check_filter"
+                    )
+                beliefs.append(step.belief)
+                triggers.append(getattr(step.state, "constrained", None))
         except Exception as error:
-            raise StoppedError(epoch, error) from error
-    seconds = time.process_time() - start
-    rotation, translation, covariance = (
-        np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)
-    )
+            raise StoppedError(len(beliefs), error) from error
     rate = None if triggers[0] is None else float(np.mean(triggers))
-    return Tracked(rotation, translation, covariance, rate, seconds)
+    return Tracked(stack_beliefs(beliefs), rate, seconds)
 
 
 def _stopped(stop: StoppedError) -> dict[str, Any]:
@@ -185,23 +166,13 @@ def _stopped(stop: StoppedError) -> dict[str, Any]:
     }
 
 
-def _errors(world: worlds.World, tracked: Tracked) -> Errors:
-    truth = world.rotation, world.translation
-    with np.errstate(all="ignore"):
-        error = metrics.pose_error(tracked.rotation, tracked.translation, *truth)
-        tags = metrics.tag_error(tracked.rotation, tracked.translation, *truth, world.tags)
-        try:
-            nees = metrics.nees(error, tracked.covariance)
-        except np.linalg.LinAlgError:
-            nees = np.full(tags.shape, np.inf)
-    # A covariance that is not positive claims the impossible.
-    nees = np.where(nees >= 0, nees, np.inf)
-    return Errors(
-        metrics.length(error[..., 3:]), np.rad2deg(metrics.length(error[..., :3])), tags, nees
-    )
+def _errors(world: worlds.BenchWorld, belief: estimators.PoseBelief) -> BenchErrors:
+    found = pose_errors(belief, world.rotation, world.translation, world.tags)
+    turn, shift = metrics.length(found.pose[..., :3]), metrics.length(found.pose[..., 3:])
+    return BenchErrors(shift, np.rad2deg(turn), found.tags_m, found.nees)
 
 
-def _expected(world: worlds.World) -> dict[str, FloatArray]:
+def _expected(world: worlds.BenchWorld) -> dict[str, FloatArray]:
     """Errors (K, B) that the bound expects, by part."""
     variance = np.diagonal(world.bound, axis1=-2, axis2=-1)
     return {
@@ -211,7 +182,7 @@ def _expected(world: worlds.World) -> dict[str, FloatArray]:
     }
 
 
-def _prior_tags(world: worlds.World) -> FloatArray:
+def _prior_tags(world: worlds.BenchWorld) -> FloatArray:
     """Tag error (B,) that the prior expects; no rotation is farther off than a random one."""
     rotation, _, covariance = world.prior
     spread = np.sqrt(np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1) / 3)

@@ -1,0 +1,215 @@
+"""The loop over epochs: a filter predicts, updates and says what it believes, epoch by epoch.
+
+Everything that runs a filter over more than one epoch runs this loop: Monte Carlo, the benchmark,
+replayed recordings, tracking among designed layouts.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import metrics
+from rbl_gym.bounds.pose import range_jacobian
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators import Filter, PoseBelief
+from rbl_gym.measurements.ranging import NoiseLaw
+
+__all__ = [
+    "PoseErrors",
+    "Reading",
+    "Step",
+    "nis",
+    "pose_errors",
+    "stack_beliefs",
+    "timed",
+    "track_epochs",
+]
+
+Prior = tuple[ArrayLike, ArrayLike, ArrayLike]
+
+
+class Reading(NamedTuple):
+    """What a filter is told of one epoch; arrays may have leading axes.
+
+    Attributes
+    ----------
+    ranges, anchors
+        Ranges (..., M, N) in metres and places of the anchors (..., M, 3).
+    links
+        (..., M, N), True where a range was measured; None: all.
+    noise
+        Law of this epoch; None: the law that the filter was made with.
+    twist
+        (..., 6), rad/s and m/s, of the interval that ends at this epoch; None: no time has
+        passed, as at the first epoch.
+    dt
+        Length of that interval, seconds.
+    """
+
+    ranges: FloatArray
+    anchors: FloatArray
+    links: BoolArray | None = None
+    noise: NoiseLaw | None = None
+    twist: FloatArray | None = None
+    dt: float = 0.0
+
+
+class Step(NamedTuple):
+    """A filter after an epoch: its state before and after the ranges, and its belief."""
+
+    predicted: Any
+    state: Any
+    belief: PoseBelief
+
+
+def track_epochs(
+    filter: Filter,
+    prior: Prior,
+    readings: Iterable[Reading],
+    restart: Callable[[PoseBelief], Prior | None] | None = None,
+) -> Iterator[Step]:
+    """Run a filter over epochs, one step after the other.
+
+    Parameters
+    ----------
+    filter
+        Made by `estimators.make`, or anything with its interface.
+    prior
+        Rotation (..., 3, 3), translation (..., 3) and covariance (..., 6, 6) at the first epoch,
+        before its ranges.
+    readings
+        What the filter is told, an epoch each.
+    restart
+        Called with every belief. Where it returns a prior, the filter starts again from that one
+        and takes the ranges of the same epoch.
+
+    Yields
+    ------
+    Step
+        One per epoch, as soon as it is there.
+    """
+    state = filter.initial(*prior)
+    for reading in readings:
+        if reading.twist is not None:
+            state = filter.predict(state, reading.twist, reading.dt)
+        predicted, state = state, _updated(filter, state, reading)
+        belief = filter.belief(state)
+        if restart is not None and (other := restart(belief)) is not None:
+            predicted = filter.initial(*other)
+            state = _updated(filter, predicted, reading)
+            belief = filter.belief(state)
+        yield Step(predicted, state, belief)
+
+
+def _updated(filter: Filter, state: Any, reading: Reading) -> Any:
+    # A filter that knows no law of an epoch has no such argument.
+    law = {} if reading.noise is None else {"noise": reading.noise}
+    return filter.update(state, reading.ranges, reading.anchors, reading.links, **law)
+
+
+def timed(steps: Iterable[Step]) -> Iterator[tuple[Step, float]]:
+    """Steps, each with the processor time that it took, in seconds."""
+    iterator = iter(steps)
+    while True:
+        start = time.process_time()
+        try:
+            step = next(iterator)
+        except StopIteration:
+            return
+        yield step, time.process_time() - start
+
+
+def stack_beliefs(beliefs: Iterable[PoseBelief]) -> PoseBelief:
+    """Beliefs of K epochs as one, with arrays (K, ...)."""
+    columns = zip(*beliefs, strict=True)
+    return PoseBelief(*(np.array(column, dtype=np.float64) for column in columns))
+
+
+class PoseErrors(NamedTuple):
+    """Errors of beliefs.
+
+    Attributes
+    ----------
+    pose
+        (..., 6), radians and metres: ``Q_hat = exp(w) Q``, ``t_hat = t + v``.
+    tags_m
+        Root mean square displacement (...) of the tags.
+    nees
+        ``e^T P^-1 e`` (...), of mean 6 for an honest belief; inf where the covariance is not
+        positive.
+    """
+
+    pose: FloatArray
+    tags_m: FloatArray
+    nees: FloatArray
+
+
+def pose_errors(
+    belief: PoseBelief, rotation: FloatArray, translation: FloatArray, tags: FloatArray
+) -> PoseErrors:
+    """Errors of beliefs against true poses.
+
+    What a filter that diverges overflows is inf or NaN here, and raises no warning.
+
+    Parameters
+    ----------
+    belief
+        Of the filter, arrays (...).
+    rotation, translation
+        The truth, (..., 3, 3) and (..., 3).
+    tags
+        True places on the body (N, 3).
+    """
+    truth = rotation, translation
+    with np.errstate(all="ignore"):
+        error = metrics.pose_error(belief.rotation, belief.translation, *truth)
+        tags_m = metrics.tag_error(belief.rotation, belief.translation, *truth, tags)
+        singular = np.linalg.slogdet(belief.covariance)[0] == 0
+        safe = np.where(singular[..., None, None], np.eye(6), belief.covariance)
+        nees = metrics.nees(error, safe)
+    return PoseErrors(error, tags_m, np.where(singular | ~(nees >= 0), np.inf, nees))
+
+
+def nis(
+    predicted: PoseBelief, reading: Reading, tags: FloatArray, noise: NoiseLaw
+) -> tuple[FloatArray, np.ndarray]:
+    """Normalised innovation squared of ranges: how well a prediction foretold them.
+
+    ``v^T (H P H^T + R)^-1 v``, v the measured ranges minus those of the predicted pose, H their
+    derivative there. An honest filter has the number of ranges as its mean. No truth is needed.
+
+    Parameters
+    ----------
+    predicted
+        Belief before the ranges, ``filter.belief(step.predicted)``.
+    reading
+        The epoch; its own `noise` comes first.
+    tags
+        Places on the body (N, 3).
+    noise
+        Law of the ranges where the epoch has none of its own.
+
+    Returns
+    -------
+    The statistic (...), and how many ranges (...) it is of.
+    """
+    law = noise if reading.noise is None else reading.noise
+    distance, H = range_jacobian(reading.anchors, tags, *predicted[:2])
+    links = np.broadcast_to(True if reading.links is None else reading.links, distance.shape)
+    variance = np.broadcast_to(law.variance(reading.ranges), distance.shape)
+    weight = (links / np.where(links, variance, 1.0)).reshape(*distance.shape[:-2], -1)
+    v = np.where(links, reading.ranges - distance, 0.0).reshape(weight.shape)
+    # (H P H^T + R)^-1 = R^-1 - R^-1 H (P^-1 + H^T R^-1 H)^-1 H^T R^-1
+    information = np.linalg.inv(predicted.covariance) + (H * weight[..., None, :]) @ np.swapaxes(
+        H, -1, -2
+    )
+    pull = np.einsum("...ij,...j->...i", H, weight * v)
+    explained = np.einsum(
+        "...i,...i->...", pull, np.linalg.solve(information, pull[..., None])[..., 0]
+    )
+    return (weight * v**2).sum(axis=-1) - explained, links.sum(axis=(-2, -1))

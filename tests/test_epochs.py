@@ -1,0 +1,161 @@
+"""The loop over epochs, errors of beliefs, and the innovation's statistic."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym import estimators, metrics, motion
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.studies import monte_carlo
+from rbl_gym.studies.epochs import (
+    PoseErrors,
+    Reading,
+    Step,
+    nis,
+    pose_errors,
+    stack_beliefs,
+    timed,
+    track_epochs,
+)
+from rbl_gym.worlds import scenes
+from tests.helpers import random_world
+
+NOISE = ranging.RangeNoise(0.05)
+PROCESS = motion.ProcessNoise(0.02, 0.1)
+COVARIANCE = np.diag([0.01] * 3 + [0.04] * 3)
+
+
+def world(epochs: int = 5):
+    """A body at rest, an epoch a second; the third at the same time, with half the links."""
+    rng = np.random.default_rng(1)
+    anchors, tags, rotation, translation = random_world(rng, 5, 4)
+    true = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
+    readings = [
+        Reading(
+            true + 0.05 * rng.standard_normal(true.shape),
+            anchors,
+            rng.random(true.shape) < 0.5 if k == 2 else None,
+            ranging.LinkNoise(np.full(true.shape, 0.2)) if k == 3 else None,
+            None if k in (0, 2) else np.zeros(6),
+            1.0,
+        )
+        for k in range(epochs)
+    ]
+    return tags, (rotation, translation, COVARIANCE), readings
+
+
+@pytest.mark.parametrize("name", ["iekf", "kf", "uc-kf"])
+def test_the_loop_is_the_plain_one(name):
+    tags, prior, readings = world()
+    filter = estimators.make(name, tags=tags, noise=NOISE, process=PROCESS)
+    steps = list(track_epochs(filter, prior, iter(readings)))
+    state = filter.initial(*prior)
+    for k, (seen, step) in enumerate(zip(readings, steps, strict=True)):
+        if k in (1, 3, 4):
+            state = filter.predict(state, np.zeros(6), 1.0)
+        for mine, theirs in zip(state, step.predicted, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+        state = filter.update(state, seen.ranges, seen.anchors, seen.links, noise=seen.noise)
+        for mine, theirs in zip(filter.belief(state), step.belief, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+    stacked = stack_beliefs(step.belief for step in steps)
+    assert stacked.covariance.shape == (5, 6, 6)
+    np.testing.assert_array_equal(stacked.translation[3], steps[3].belief.translation)
+
+
+def test_a_filter_can_be_started_again_at_an_epoch():
+    tags, prior, readings = world()
+    filter = estimators.make("iekf", tags=tags, noise=NOISE, process=PROCESS)
+    wrong = prior[0], prior[1] + 3.0, prior[2]
+    asked = []
+
+    def restart(belief: PoseBelief):
+        asked.append(belief)
+        return prior if len(asked) == 1 else None
+
+    steps = list(track_epochs(filter, wrong, readings, restart))
+    expected = list(track_epochs(filter, prior, readings))
+    assert len(asked) == len(steps)
+    for mine, theirs in zip(steps, expected, strict=True):
+        np.testing.assert_array_equal(mine.belief.translation, theirs.belief.translation)
+
+
+def test_time_is_taken_of_the_filter_alone():
+    tags, prior, readings = world(3)
+    filter = estimators.make("iekf", tags=tags, noise=NOISE, process=PROCESS)
+    pairs = list(timed(track_epochs(filter, prior, readings)))
+    assert [type(step) for step, _ in pairs] == [Step] * 3
+    assert all(seconds >= 0 for _, seconds in pairs)
+
+
+def test_errors_of_beliefs_by_hand_and_of_impossible_ones():
+    rng = np.random.default_rng(2)
+    _, tags, rotation, translation = random_world(rng, 4, 4)
+    turn = 0.1 * rng.standard_normal((4, 3))
+    shift = rng.standard_normal((4, 3))
+    hat = rotations.exp(turn) @ rotation
+    P = np.tile(np.diag([0.1] * 3 + [0.2] * 3), (4, 1, 1))
+    P[2] = 0.0  # claims to know everything
+    P[3] = -P[3]  # claims the impossible
+    belief = PoseBelief(hat, translation + shift, P, hat)
+    found = pose_errors(belief, rotation, translation, tags)
+    assert isinstance(found, PoseErrors)
+    np.testing.assert_allclose(found.pose, np.concatenate([turn, shift], axis=1), atol=1e-12)
+    moved = tags @ np.swapaxes(hat - rotation, -1, -2) + shift[:, None]
+    np.testing.assert_allclose(found.tags_m, np.sqrt((moved**2).sum(-1).mean(-1)), rtol=1e-12)
+    expected = (turn[:2] ** 2).sum(-1) / 0.1 + (shift[:2] ** 2).sum(-1) / 0.2
+    np.testing.assert_allclose(found.nees, [*expected, np.inf, np.inf], rtol=1e-9)
+
+
+def test_nis_by_the_full_innovation_covariance():
+    tags, prior, readings = world()
+    filter = estimators.make("iekf", tags=tags, noise=NOISE, process=PROCESS)
+    for k, step in enumerate(track_epochs(filter, prior, readings)):
+        seen, belief = readings[k], filter.belief(step.predicted)
+        links = np.ones(seen.ranges.shape, dtype=bool) if seen.links is None else seen.links
+
+        def predicted(error, belief=belief, seen=seen):
+            Q = rotations.exp(error[:3]) @ belief.rotation
+            places = tags @ Q.T + belief.translation + error[3:]
+            return np.linalg.norm(places - seen.anchors[:, None], axis=-1)
+
+        steps = 1e-6 * np.eye(6)
+        H = np.stack([(predicted(e) - predicted(-e))[links] / 2e-6 for e in steps], axis=1)
+        v = (seen.ranges - predicted(np.zeros(6)))[links]
+        std = 0.2 if k == 3 else 0.05
+        S = H @ belief.covariance @ H.T + std**2 * np.eye(len(v))
+        value, count = nis(belief, seen, tags, NOISE)
+        np.testing.assert_allclose(value, v @ np.linalg.solve(S, v), rtol=1e-5)
+        assert count == links.sum()
+
+
+def test_an_honest_filter_foretells_its_ranges_as_well_as_it_says():
+    """The mean NIS is the number of ranges; three hundred trials know it to 4 sigma."""
+    scene = scenes.get({"name": "uwb_room", "steps": 3})
+    trials = monte_carlo.simulate_trials(scene, 300, np.random.default_rng(3))
+    filter = monte_carlo.scene_filter(scene, "iekf", {})
+    readings = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
+    tags = np.asarray(scene.tags)
+    for step, reading in zip(monte_carlo.trial_steps(trials, filter), readings, strict=True):
+        value, count = nis(filter.belief(step.predicted), reading, tags, scene.noise)
+        size = scene.n_anchors * len(tags)
+        assert (count == size).all()
+        # Before the first epoch 10 degrees and half a metre bend the ranges: then no claim.
+        if reading.twist is not None:
+            assert abs(value.mean() - size) < 4 * np.sqrt(2 * size / 300)
+
+
+def test_a_trace_is_of_the_beliefs():
+    scene = scenes.get({"name": "hall", "steps": 3})
+    trials = monte_carlo.simulate_trials(scene, 2, np.random.default_rng(4))
+    assert trials.bound.shape == (4, 2, 6, 6)
+    trace = monte_carlo.track_trials(trials, "iekf", {})
+    truth = trials.episode.rotation[:, 2], trials.episode.translation[:, 2]
+    filter = monte_carlo.scene_filter(scene, "iekf", {})
+    belief = list(monte_carlo.trial_steps(trials, filter))[2].belief
+    error = metrics.pose_error(belief.rotation, belief.translation, *truth)
+    np.testing.assert_allclose(trace.error[2], error, rtol=1e-12)
+    np.testing.assert_allclose(trace.nees[2], metrics.nees(error, belief.covariance), rtol=1e-9)
