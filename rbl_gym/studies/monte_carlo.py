@@ -66,7 +66,7 @@ def simulate_trials(scene: Scene, trials: int, rng: np.random.Generator) -> Simu
     """Episodes of a scene, with anchors that stay where they start."""
     episode = simulation.draw_episode(scene, rng, (trials,))
     measurements = measure_episode(scene, episode)
-    links = np.array([measured.links for measured in measurements])
+    links = [measured.links for measured in measurements]
     return SimulatedTrials(scene, episode, measurements, bound_of(scene, episode, links))
 
 
@@ -78,11 +78,16 @@ def measure_episode(scene: Scene, episode: simulation.Episode) -> list[ranging.M
     return [ranging.Measurement(*epoch) for epoch in zip(*columns, strict=True)]
 
 
-def bound_of(scene: Scene, episode: simulation.Episode, links: BoolArray) -> FloatArray:
+def bound_of(scene: Scene, episode: simulation.Episode, links: Sequence[BoolArray]) -> FloatArray:
     """Posterior Cramer-Rao covariances (K, B, 6, 6) of true poses, by the links (K, B, M, N)."""
-    by_trial = np.moveaxis(links, 0, 1)
-    information, _ = scene_bounds.posterior_of_episode(scene, episode, by_trial)
-    return np.moveaxis(np.linalg.inv(information), 1, 0)
+    covariances, information = [], None
+    for epoch, measured in enumerate(links):
+        at = simulation.epoch_of(episode, epoch)
+        information, _ = scene_bounds.posterior_step(
+            scene, at, episode.anchors, measured, information, episode.prior_covariance
+        )
+        covariances.append(np.linalg.inv(information))
+    return np.array(covariances)
 
 
 def told_readings(

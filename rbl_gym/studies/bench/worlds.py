@@ -79,7 +79,7 @@ def simulate_condition(scene: Scene, condition: str, trials: int, seed: int) -> 
         scene, condition, episode.anchors, np.random.default_rng([*entropy, _TOLD])
     )
     measurements = monte_carlo.measure_episode(true, episode)
-    links = np.array([measured.links for measured in measurements])
+    links = [measured.links for measured in measurements]
     return BenchWorld(
         told,
         np.asarray(scene.tags),
