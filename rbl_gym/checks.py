@@ -209,9 +209,10 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
     if not mask.size:
         raise ValueError(f"links must not be empty, got shape {mask.shape}")
     if mask.dtype != np.bool_:
-        if mask.dtype.kind not in "iuf" or not np.isin(mask, (0, 1)).all():
+        measured = mask != 0
+        if mask.dtype.kind not in "iuf" or (measured != mask).any():
             raise ValueError("links must be boolean (True: measured), got other values")
-        mask = mask.astype(np.bool_)
+        mask = measured
     return mask
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from rbl_gym import kernels, metrics
 from rbl_gym.bounds import pose, posterior
-from rbl_gym.estimators.linear import engines, least_squares, unitary
+from rbl_gym.estimators.linear import engines, kalman, least_squares, unitary
 from rbl_gym.geometry import obstacles, rotations
 from rbl_gym.measurements import bearing, noise_laws, ranging
 from rbl_gym.metrics import Figures
@@ -189,7 +189,8 @@ def test_posterior_step_with_ranges(law, batch):
     args = world.anchors, world.tags, world.rotation, world.translation, law.numbers, world.share
     for std in (np.zeros(6), np.array([0.1, 0.2, 0.3, 1, 2, 3])):
         for dt in (0.0, 0.2):
-            for J in (world.matrix, np.zeros((6, 6)), 1e12 * world.matrix):
+            seen = np.outer(np.arange(6.0), np.arange(6.0))
+            for J in (world.matrix, np.zeros((6, 6)), 1e12 * world.matrix, seen):
                 with np.errstate(all="ignore"):
                     got, _ = posterior.step_of_ranges.kernel(J, twist, dt, std, *args)
                     want, _ = posterior.step_of_ranges.textbook(J, twist, dt, std, *args)
@@ -284,6 +285,31 @@ def test_linear_update(batch, weights, m, n, flat):
     assert_equal_forms(engines.update_covariance, np.eye(12), *linear.epoch[1:])
     # The textbook form adds and subtracts numbers of the size of the squared ranges.
     assert_equal_forms(engines.update_mean, linear.mean, P, *linear.epoch, atol=1e-8)
+
+
+@every_batch
+@every_weight
+def test_compressed_measurements(batch, weights):
+    """Two factors of the same information: H^T H and H^T z are equal."""
+    linear = Linear(batch, 4, 5, weights)
+    told = []
+    with np.errstate(all="ignore"):
+        for form in (engines.compress.kernel, engines.compress.textbook):
+            z, H = form(*linear.epoch, linear.mean)
+            transposed = np.swapaxes(H, -1, -2)
+            told.append((transposed @ H, (transposed @ z[..., None])[..., 0]))
+    for mine, plain in zip(*told, strict=True):
+        np.testing.assert_allclose(mine, plain, rtol=0, atol=1e-9 * np.abs(plain).max())
+
+
+@every_batch
+@pytest.mark.parametrize("factor", [1.0, 100.0, 1e6])
+def test_vague_states(batch, factor):
+    linear = Linear(batch, 4, 5, "common")
+    for spread in (np.ones(12), np.repeat([1e-3, 1.0], [9, 3]), np.repeat([1.0, 1e-3], [9, 3])):
+        P = factor * linear.P * np.sqrt(spread[:, None] * spread)
+        got = kalman._is_vague.kernel(P, linear.anchors, 1 / 3)
+        np.testing.assert_array_equal(got, kalman._is_vague.textbook(P, linear.anchors, 1 / 3))
 
 
 @every_batch

@@ -5,6 +5,8 @@ A test holds both to each other on the same trials.
 
 from __future__ import annotations
 
+import copy
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -134,6 +136,21 @@ def transition(step: FloatArray) -> FloatArray:
     return F
 
 
+@compiled("linear_filter:compress")
+def compress(
+    ranges: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    weights: FloatArray,
+    like: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """`squared_range.compressed` of an epoch: z (..., 12) and H (..., 12, 12), by any factor.
+
+    `like` (12,) only tells a kernel how large the results are.
+    """
+    return compressed(statistic(ranges, anchors, tags, weights))
+
+
 class FilterPy:
     """filterpy's KalmanFilter on the compressed measurement; one body."""
 
@@ -144,8 +161,6 @@ class FilterPy:
         """As `Batched.predict`."""
         kf = cls._filter(mean, P)
         kf.F, kf.Q = transition(_EXP(motion.turn)), np.diag(motion.noise)
-        # Without B filterpy ignores u in silence.
-        kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
         kf.predict(u=motion.shift[:, None])
         return cls._result(kf)
 
@@ -153,17 +168,15 @@ class FilterPy:
     def update(cls, mean: FloatArray, P: FloatArray, epoch: Epoch) -> tuple[FloatArray, FloatArray]:
         """As `Batched.update`, by filterpy's own gain and Joseph form."""
         kf = cls._filter(mean, P)
-        z, H = compressed(epoch.statistic())
-        kf.R = np.eye(12)
+        z, H = compress(*epoch, mean)
         # A one-dimensional z would silently broadcast the state to a matrix.
         kf.update(z[:, None], H=H)
         return cls._result(kf)
 
     @staticmethod
     def _filter(mean: FloatArray, P: FloatArray) -> Any:
-        from filterpy.kalman import KalmanFilter  # slow to import, and not always needed
-
-        kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
+        kf = copy.copy(_kalman_filter())
+        # It never writes into its arrays; a shallow copy shares those that stay the same.
         kf.x, kf.P = mean[:, None].copy(), P.copy()
         return kf
 
@@ -200,3 +213,14 @@ def engine_for(name: str, **arrays: tuple[int, ...]) -> type[Batched] | type[Fil
             "use engine='batched'"
         )
     return FilterPy
+
+
+@functools.cache
+def _kalman_filter() -> Any:
+    """A KalmanFilter to copy: making one takes as long as two steps of it."""
+    from filterpy.kalman import KalmanFilter  # slow to import, and not always needed
+
+    kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
+    # Without B filterpy ignores u in silence.
+    kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
+    return kf

@@ -37,6 +37,7 @@ from rbl_gym.estimators.linear.unitary import (
     projected_belief,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -223,21 +224,7 @@ class KalmanFamily:
         return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
 
     def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
-        variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
-        rotation = np.maximum(np.maximum(variance[..., :3], variance[..., 3:6]), variance[..., 6:9])
-        vague_rotation = _largest_of_three(rotation) > VAGUE_ENTRY_VARIANCE
-        largest = _largest_of_three(variance[..., 9:])
-        # The first and last anchor bound the extent from below, and mostly settle it.
-        apart = _largest_of_three(np.abs(anchors[..., 0, :] - anchors[..., -1, :]))
-        doubted = vague_rotation | (largest > apart**2)
-        if not doubted.any():
-            return
-        if anchors.ndim > 2:
-            anchors, largest, vague_rotation = (  # pyright: ignore[reportAssignmentType]
-                np.broadcast_to(array, (*doubted.shape, *array.shape[array.ndim - core :]))[doubted]
-                for array, core in ((anchors, 2), (largest, 0), (vague_rotation, 0))
-            )
-        vague = vague_rotation | (largest > np.ptp(anchors, axis=-2).max(axis=-1) ** 2)
+        vague = np.asarray(_is_vague(state.covariance, anchors, VAGUE_ENTRY_VARIANCE))
         if not vague.any():
             return
         rank = geometric_rank(anchors, self.tags)
@@ -250,9 +237,13 @@ class KalmanFamily:
             )
 
 
-def _largest_of_three(values: FloatArray) -> FloatArray:
-    """Maximum (...) over a last axis of 3, which a reduction would walk through slowly."""
-    return np.maximum(np.maximum(values[..., 0], values[..., 1]), values[..., 2])
+@compiled("linear_filter:is_vague")
+def _is_vague(P: FloatArray, anchors: FloatArray, vague_entry: float) -> BoolArray:
+    """Whether a covariance says nothing (...): of an entry of Q, or beyond the anchors' extent."""
+    variance = np.diagonal(P, axis1=-2, axis2=-1)
+    extent = np.ptp(anchors, axis=-2).max(axis=-1)
+    vague = variance[..., :9].max(axis=-1) > vague_entry
+    return vague | (variance[..., 9:].max(axis=-1) > extent**2)
 
 
 # --- constraints: what happens to the rotation after the linear update --------------------

@@ -93,6 +93,29 @@ cholesky6, solve_factored6, invert_factored6 = of_size(6)
 
 
 @helper
+def factor_semidefinite(A: Any, L: Any) -> None:
+    """Lower factor ``L L^T = A`` of any rank, the diagonal itself in L, zeros above it.
+
+    A column without a pivot is zero: of a semidefinite matrix nothing is left in it.
+    """
+    n = A.shape[0]
+    for j in range(n):
+        pivot = A[j, j]
+        floor = 10 * PIVOT_FLOOR * pivot
+        for k in range(j):
+            pivot -= L[j, k] * L[j, k]
+            L[k, j] = 0.0
+        root = math.sqrt(pivot) if pivot > floor or pivot != pivot else 0.0
+        inverse = 0.0 if root == 0.0 else 1 / root
+        L[j, j] = root
+        for i in range(j + 1, n):
+            total = A[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = total * inverse
+
+
+@helper
 def multiply(A: Any, B: Any, out: Any) -> None:
     """``out = A B`` of matrices; `out` is neither of them."""
     for i in range(A.shape[0]):

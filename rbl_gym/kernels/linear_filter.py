@@ -13,7 +13,7 @@ import numpy as np
 
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
-from rbl_gym.kernels.linear_algebra import of_size
+from rbl_gym.kernels.linear_algebra import factor_semidefinite, of_size
 
 _STATES = 12
 _cholesky, _, _invert_factored = of_size(_STATES)
@@ -200,3 +200,40 @@ def update_mean(
             for j in range(3):
                 total += P[i, 3 * k + j] * y[k, j]
         new_mean[i] = total
+
+
+@gufunc("(m,n),(m,d),(n,d),(m,w),(p)->(p),(p,p)")
+def compress(ranges: Any, anchors: Any, tags: Any, weights: Any, like: Any, z: Any, H: Any) -> None:
+    """Twelve measurements z with unit noise and their matrix H, that tell what an epoch does.
+
+    ``H^T H`` is the information and ``H^T z`` its vector, H the transposed Cholesky factor. `like`
+    (12,) only tells how large the results are.
+    """
+    work = np.zeros((3, _STATES, _STATES))
+    L, information, y = work[0], work[1], work[2, :4, :3]
+    _add_information(information, anchors, tags, weights)
+    factor_semidefinite(information, L)
+    # The innovation of a state of zeros.
+    innovation(work[2, 4], ranges, anchors, tags, weights, tags, y)
+    for i in range(_STATES):
+        total = y[i // 3, i % 3]
+        for k in range(i):
+            total -= L[i, k] * z[k]
+        z[i] = total / L[i, i] if L[i, i] > 0 else 0.0
+        for j in range(_STATES):
+            H[i, j] = L[j, i]
+
+
+@gufunc("(p,p),(m,d),()->()", "fffb")
+def is_vague(P: Any, anchors: Any, vague_entry: float, vague: Any) -> None:
+    """Whether a covariance says nothing: of an entry of Q, or beyond the anchors' extent."""
+    rotation = place = extent = 0.0
+    for i in range(9):
+        rotation = max(rotation, P[i, i])
+    for i in range(3):
+        place = max(place, P[9 + i, 9 + i])
+        low = high = anchors[0, i]
+        for m in range(anchors.shape[0]):
+            low, high = min(low, anchors[m, i]), max(high, anchors[m, i])
+        extent = max(extent, high - low)
+    vague[0] = rotation > vague_entry or place > extent * extent

@@ -13,7 +13,11 @@ import numpy as np
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.epoch import tag_position
 from rbl_gym.kernels.jit import gufunc, helper
-from rbl_gym.kernels.linear_algebra import cholesky6, invert_factored6
+from rbl_gym.kernels.linear_algebra import (
+    cholesky6,
+    factor_semidefinite,
+    invert_factored6,
+)
 from rbl_gym.kernels.noise_laws import reference_of, weight
 
 
@@ -124,12 +128,7 @@ def _predict(J: Any, twist: Any, dt: float, std: Any, work: Any, predicted: Any)
             turned[i, 3 + j] = A[i, 3 + j]
             turned[3 + j, i] = A[i, 3 + j]
             turned[3 + i, 3 + j] = J[3 + i, 3 + j]
-    for i in range(6):
-        for j in range(i + 1, 6):
-            L[i, j] = 0.0
-    cholesky6(turned, L)
-    for i in range(6):
-        L[i, i] = 1 / L[i, i]
+    factor_semidefinite(turned, L)
     # turned = Q L, A = I + L^T Q L.
     for j in range(6):
         for i in range(3):
