@@ -3,7 +3,7 @@
 One step is predict and update, from ranges to state; filterpy has a KalmanFilter per trial on the
 squared ranges (`benchmarks/filters.py`), its measurement matrix of (M - 1) N rows ready-made. The
 two do not compute the same thing: filterpy's loop is the yardstick of the machine. The iterated
-EKF is first held to a plain loop over trials. One body alone is timed as well.
+EKF is first held to a plain loop over trials. One body alone is timed as well, with its belief.
 Process time, one thread, medians over interleaved repeats.
 
     python benchmarks/iekf.py [--json F] [--repeats 7] [--trials 1024] [--seed 0]
@@ -25,7 +25,7 @@ from rbl_gym.geometry import rotations
 
 SIZES = ((4, 5), (10, 6))
 ITERATIONS = (2, 4)
-PEER_TRIALS, ONE_BODY_REPEATS = 10, 20
+PEER_TRIALS, ONE_BODY_REPEATS = 10, 200
 
 
 def main() -> None:
@@ -53,7 +53,7 @@ def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, s
         check(run(), prior, world, iterations)
         one = runner(
             filter, PoseState(*(field[0] for field in prior)), world.twist[0],
-            [ranges[0] for ranges in world.ranges], world.anchors[0],
+            [ranges[0] for ranges in world.ranges], world.anchors[0], belief=True,
         )  # fmt: skip
         name = f"{iterations} iterations"
         jobs[name] = side_by_side.Job(run, filters.STEPS * trials)
@@ -66,14 +66,21 @@ def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, s
 
 
 def runner(
-    filter: Any, prior: PoseState, twist: np.ndarray, epochs: list[np.ndarray], anchors: np.ndarray
+    filter: Any,
+    prior: PoseState,
+    twist: np.ndarray,
+    epochs: list[np.ndarray],
+    anchors: np.ndarray,
+    belief: bool = False,
 ) -> Callable[[], PoseState]:
-    """All steps of all trials."""
+    """All steps of all trials, with the beliefs or without."""
 
     def run() -> PoseState:
         state = prior
         for ranges in epochs:
             state = filter.update(filter.predict(state, twist, filters.DT), ranges, anchors)
+            if belief:
+                filter.belief(state)
         return state
 
     return run

@@ -19,6 +19,7 @@ from rbl_gym.checks import (
 from rbl_gym.measurements.ranging import NoiseLaw
 
 State = TypeVar("State", bound=tuple[Any, ...])
+_FLOAT64 = np.dtype(np.float64)
 
 # Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
 VAGUE_ENTRY_VARIANCE = 1 / 3
@@ -70,9 +71,21 @@ def check_epoch(
     return ranges, anchors, mask
 
 
+def is_one_epoch(ranges: Any, anchors: Any, tags: FloatArray) -> bool:
+    """Whether these are arrays (M, N) and (M, 3) of float64 for tags (N, 3), values aside."""
+    return (
+        type(ranges) is type(anchors) is np.ndarray
+        and ranges.dtype is anchors.dtype is _FLOAT64
+        and anchors.ndim == tags.ndim == 2
+        and anchors.shape[1] == 3
+        and ranges.shape == (len(anchors), len(tags))
+        and ranges.size > 0
+    )
+
+
 def check_batches(**batches: tuple[int, ...]) -> None:
     """A ValueError where the leading axes of arguments, given by their names, do not broadcast."""
-    if sum(map(bool, batches.values())) < 2:
+    if not any(batches.values()):
         return
     try:
         np.broadcast_shapes(*batches.values())
@@ -96,7 +109,7 @@ def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
 
 def are_positive(values: FloatArray) -> bool:
     """Whether all are positive and finite, without a mask of them: NaN fails both comparisons."""
-    return bool(values.min(initial=1.0) > 0 and values.max(initial=1.0) < HUGE)
+    return bool(values.min() > 0 and (np.vdot(values, values) < HUGE or values.max() < HUGE))
 
 
 def epoch_variance(
@@ -118,7 +131,8 @@ def epoch_variance(
     law = law_of(noise, own)
     try:
         variance = (law.squared_range_variance if squared else law.variance)(ranges, links)
-        np.broadcast_shapes(variance.shape, ranges.shape)
+        if variance.shape != ranges.shape:
+            np.broadcast_shapes(variance.shape, ranges.shape)
     except ValueError as error:
         raise ValueError(f"noise does not fit ranges of shape {ranges.shape}: {error}") from error
     return check_variance(variance, links)
@@ -130,7 +144,7 @@ def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
         used = links if variance.shape[-1] == links.shape[-1] else links.any(-1, keepdims=True)
         variance = np.where(used, variance, 1.0)
     # False of NaN too.
-    if not variance.min(initial=1.0) > 0:
+    if not variance.min() > 0:
         raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
     return variance
 

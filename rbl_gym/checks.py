@@ -94,11 +94,10 @@ def check_shape(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
     array = value if type(value) is np.ndarray else as_float(name, value)
     if array.dtype is not _FLOAT64:
         array = as_float(name, array)
-    sizes = array.shape[array.ndim - len(shape) :]
-    if array.ndim < len(shape) or any(
-        (got != want if isinstance(want, int) else got < 1)
-        for got, want in zip(sizes, shape, strict=True)
-    ):
+    fits = array.ndim >= len(shape)
+    for got, want in zip(reversed(array.shape), reversed(shape), strict=False):
+        fits = fits and (got == want if isinstance(want, int) else got > 0)
+    if not fits:
         wanted = ", ".join(["...", *map(str, shape)])
         raise ValueError(f"{name} must have shape ({wanted}), got {array.shape}")
     if not array.size:

@@ -84,6 +84,12 @@ def test_nan_makes_no_warning_in_either_form(kernel_of_half):
     half._run = None
 
 
+@needs_numba
+def test_it_runs_within_another_call_of_itself(kernel_of_half):
+    """As a second thread does while the first is in the same quiet context."""
+    assert kernels._QUIET.run(lambda: half(np.nan)) != 0
+
+
 # --- pickles ----------------------------------------------------------------------------------
 
 

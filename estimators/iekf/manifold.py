@@ -15,19 +15,34 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count, check_number, kernel
+from rbl_gym.checks import (
+    HUGE,
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_count,
+    check_number,
+    kernel,
+)
 from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
 from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positive_inverse
 from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.robust_update import GATE, HUBER, robust_solution
-from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, net_of_starts, settles
+from rbl_gym.estimators.iekf.vague_start import (
+    VAGUE_ROTATION_RAD,
+    global_start,
+    is_vague,
+    net_of_starts,
+    settles,
+)
 from rbl_gym.estimators.inputs import (
     check_batches,
     check_covariance,
     check_epoch,
     epoch_variance,
+    is_one_epoch,
     plain,
 )
 from rbl_gym.geometry import rotations
@@ -125,6 +140,10 @@ class IteratedEkf:
         ValueError
             On wrong shapes, NaN, ranges that are not positive.
         """
+        if links is None and noise is None:
+            found = self._update_one(state, ranges, anchors)
+            if found is not None:
+                return found
         state = plain(state)
         ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
         batch = state.translation.shape[:-1]
@@ -136,6 +155,32 @@ class IteratedEkf:
                 *state, ranges, weights, anchors, self.tags, *start, self.iterations, self.robust
             )[:3]
         )
+
+    def _update_one(
+        self, state: PoseState, ranges: ArrayLike, anchors: ArrayLike
+    ) -> PoseState | None:
+        """The update of one body by an epoch with nothing special about it, in few calls.
+
+        None where there is: then the long way says what, or does it. Most values are looked at
+        by `update_pose`.
+        """
+        P = state.covariance
+        if not is_one_epoch(ranges, anchors, self.tags) or P.ndim != 2:
+            return None
+        # An infinite range would have an infinite variance, and no weight.
+        if not np.vdot(ranges, ranges) < HUGE:  # pyright: ignore[reportArgumentType]
+            return None
+        variance = self.noise.variance(ranges)
+        if not variance.min() > 0 or P[0, 0] + P[1, 1] + P[2, 2] > VAGUE_ROTATION_RAD**2:
+            return None
+        weights = np.divide(1.0, variance, out=np.empty_like(ranges))
+        rotation, translation, P, _ = update_pose(
+            *state, ranges, weights, anchors, self.tags, state.rotation, state.translation,
+            self.iterations, self.robust,
+        )  # fmt: skip
+        if not math.isfinite(np.vdot(P, P)):
+            return None
+        return PoseState(rotation, translation, P)
 
     def weighed(
         self,
@@ -236,9 +281,10 @@ def update_pose(
 
     Returns
     -------
-    Rotation, translation, covariance (NaN where a matrix is not positive definite), cost (...).
+    Rotation, translation, covariance, cost (...). The covariance is NaN where a matrix is not
+    positive definite, a range that counts not positive, or anything not finite.
     """
-    prior = PoseState(rotation, translation, covariance)
+    prior = plain(PoseState(rotation, translation, covariance))
     data = RangeCost(ranges, weights, anchors, tags, SQUARES)
     problem = map_problem(prior, data)
     if robust:
@@ -248,7 +294,10 @@ def update_pose(
     else:
         found = minimize_pose(problem, start_rotation, start_translation, iterations)
         cost = found.at.cost
-    pose = PoseState(found.rotation, found.translation, positive_inverse(found.at.hessian))
+    sound = (weights == 0) | ((ranges > 0) & (ranges < HUGE) & np.isfinite(weights))
+    sound = sound.all(axis=(-2, -1)) & (np.abs(anchors) < HUGE).all(axis=(-2, -1))
+    covariance = np.where(sound[..., None, None], positive_inverse(found.at.hessian), np.nan)
+    pose = PoseState(found.rotation, found.translation, covariance)
     return *kept_wide(prior, pose, (weights > 0).any(axis=-2), tags), cost
 
 

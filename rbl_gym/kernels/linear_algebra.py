@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from rbl_gym.kernels.jit import helper
+from rbl_gym.kernels.jit import helper, inlined
 
 # A pivot that rounding leaves below this share of its diagonal entry is raised to it.
 PIVOT_FLOOR = 1e-14
@@ -22,7 +22,7 @@ def of_size(size: int) -> tuple[Callable[..., Any], ...]:
     None of them reads above a diagonal. 0: of any size.
     """
 
-    @helper
+    @inlined
     def cholesky(A: Any, L: Any) -> bool:
         """Lower factor of A into L; whether all pivots were good.
 
@@ -49,7 +49,7 @@ def of_size(size: int) -> tuple[Callable[..., Any], ...]:
                 L[i, j] = total * inverse
         return good
 
-    @helper
+    @inlined
     def solve_factored(L: Any, b: Any, x: Any) -> None:
         """The solution x of ``L L^T x = b``; x may be b."""
         n = size if size > 0 else L.shape[0]
@@ -64,7 +64,7 @@ def of_size(size: int) -> tuple[Callable[..., Any], ...]:
                 total -= L[k, i] * x[k]
             x[i] = total * L[i, i]
 
-    @helper
+    @inlined
     def invert_factored(L: Any, P: Any) -> None:
         """``P = (L L^T)^-1``, both halves; L becomes its own inverse.
 

@@ -13,7 +13,7 @@ import numpy as np
 from rbl_gym.kernels.eigen import eigen, nearest_rotation
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6, of_size
-from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
+from rbl_gym.kernels.pose_solver import copy_pose, room_to_solve, solve, take_linearization
 
 _cholesky3, _solve3, _invert3 = of_size(3)
 
@@ -294,10 +294,11 @@ def starts(
 @helper
 def search(
     ranges: Any, weights: Any, anchors: Any, tags: Any, net: Any, has_first: bool,
-    Q: Any, t: Any, g: Any, H: Any, other_Q: Any, other_t: Any, other_cost: Any, room: Any,
+    Q: Any, t: Any, other_Q: Any, other_t: Any, other_cost: Any, room: Any,
 ) -> tuple[float, bool]:  # fmt: skip
     """The best of many local solves and its rivals; `has_first`: (Q, t) is a solution already."""
-    centre, loss = np.zeros(3), np.array([math.inf, math.inf, math.inf])
+    centre, loss = np.zeros(3), room[3]
+    loss[0] = loss[1] = loss[2] = math.inf
     for n in range(tags.shape[0]):
         for i in range(3):
             centre[i] += tags[n, i] / tags.shape[0]
@@ -315,8 +316,8 @@ def search(
         for s in range(count):
             if stage == 0 or counted[s]:
                 costs[s], good[s] = solve(
-                    Qs[s], ts[s], False, Q, t, H, ranges, weights, anchors, tags, loss,
-                    25 if stage else 10, 1e-6 if stage else 1e-2, g, H, room,
+                    Qs[s], ts[s], False, Q, t, room[2], ranges, weights, anchors, tags, loss,
+                    25 if stage else 10, 1e-6 if stage else 1e-2, room,
                 )  # fmt: skip
             else:
                 costs[s] = math.inf
@@ -344,7 +345,7 @@ def search(
                     other_cost[kept - 2] = costs[s]
     copy_pose(Qs[order[0]], ts[order[0]], Q, t)
     # Where many poses are nearly as good the way along the valley is long.
-    return solve(Q, t, False, Q, t, H, ranges, weights, anchors, tags, loss, 100, 1e-6, g, H, room)
+    return solve(Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 100, 1e-6, room)
 
 
 @gufunc(
@@ -362,7 +363,9 @@ def most_likely_pose(
             other_t[k, i] = 0.0
             for j in range(3):
                 other_Q[k, i, j] = 1.0 if i == j else 0.0
-    room, loss = room_to_solve(), np.array([math.inf, math.inf, math.inf])
+    room = room_to_solve()
+    loss = room[3]
+    loss[0] = loss[1] = loss[2] = math.inf
     usable = True
     for i in range(3):
         usable = usable and math.isfinite(start_t[i])
@@ -372,11 +375,10 @@ def most_likely_pose(
     converged[0] = False
     if usable:
         cost[0], converged[0] = solve(
-            Q, t, False, Q, t, H, ranges, weights, anchors, tags, loss, 12, 3e-6, g, H, room
+            Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 12, 3e-6, room
         )
-    if not converged[0] or in_doubt(H, cost[0], weights, anchors):
+    if not converged[0] or in_doubt(room[1], cost[0], weights, anchors):
         cost[0], converged[0] = search(
-            ranges, weights, anchors, tags, net, usable, Q, t, g, H, other_Q, other_t,
-            other_cost, room,
-        )  # fmt: skip
-    mirror(H)
+            ranges, weights, anchors, tags, net, usable, Q, t, other_Q, other_t, other_cost, room
+        )
+    take_linearization(room, g, H)

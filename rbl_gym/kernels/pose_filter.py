@@ -16,6 +16,8 @@ from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
 from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
 from rbl_gym.kernels.range_cost import loss_of, squared_residuals
 
+# No length is as large.
+HUGE = 1e50
 # Whitened residual at which Huber's loss turns from squares to absolute values.
 HUBER = 1.5
 # Standard deviations beyond which a link contradicts a pose.
@@ -56,15 +58,28 @@ def predict(Q0, t0, P0, twist, dt, variance, Q, t, P):
 
 
 @helper
-def invert(A: Any, out: Any) -> bool:
-    """Inverse of a symmetric positive matrix; where it is none, NaN and False."""
-    L = np.empty((6, 6))
+def invert(A: Any, L: Any, out: Any) -> bool:
+    """Inverse of a symmetric positive matrix, L to work in; where it is none, NaN and False."""
     good = cholesky6(A, L)
     if good:
         invert_factored6(L, out)
     else:
         fill(math.nan, out)
     return good
+
+
+@helper
+def is_sound(ranges: Any, weights: Any, anchors: Any) -> bool:
+    """Whether ranges that count are positive and all numbers finite."""
+    for m in range(anchors.shape[0]):
+        for i in range(3):
+            if not abs(anchors[m, i]) < HUGE:
+                return False
+        for n in range(weights.shape[1]):
+            weight = weights[m, n]
+            if not 0 <= weight < math.inf or (weight > 0 and not 0 < ranges[m, n] < HUGE):
+                return False
+    return True
 
 
 @helper
@@ -144,42 +159,45 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
 
     `rbl_gym.estimators.costs.unseen_directions` says why.
     """
-    centre, gram = np.zeros(3), np.zeros((3, 3))
+    cx = cy = cz = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     heard = 0
     for again in range(2):
         for n in range(tags.shape[0]):
             is_heard = False
             for m in range(weights.shape[0]):
-                is_heard = is_heard or weights[m, n] > 0
+                if weights[m, n] > 0:
+                    is_heard = True
+                    break
             if not is_heard:
                 continue
-            if not again:
+            x, y, z = tags[n, 0] - cx, tags[n, 1] - cy, tags[n, 2] - cz
+            if again:
+                xx += x * x
+                xy += x * y
+                xz += x * z
+                yy += y * y
+                yz += y * z
+                zz += z * z
+            else:
                 heard += 1
-            for i in range(3):
-                if not again:
-                    centre[i] += tags[n, i]
-                else:
-                    for j in range(3):
-                        gram[i, j] += (tags[n, i] - centre[i]) * (tags[n, j] - centre[j])
+                sx += x
+                sy += y
+                sz += z
         if heard == 0:
             return
-        if not again:
-            for i in range(3):
-                centre[i] /= heard
-    trace = gram[0, 0] + gram[1, 1] + gram[2, 2]
-    squares = 0.0
-    for i in range(3):
-        for j in range(3):
-            squares += gram[i, j] * gram[i, j]
-    if not 0.5 * (trace * trace - squares) <= THIN * trace * trace:
+        cx, cy, cz = sx / heard, sy / heard, sz / heard
+    trace = xx + yy + zz
+    # The sum of products of two eigenvalues, over the square of their sum.
+    pairs = xx * yy + yy * zz + xx * zz - xy * xy - xz * xz - yz * yz
+    if not pairs <= THIN * trace * trace:
         return
     back, there, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     D, T = np.zeros((6, 6)), np.zeros((6, 6))
     a, b = np.zeros(3), np.zeros(3)
     for i in range(3):
+        a[i] = Q0[i, 0] * cx + Q0[i, 1] * cy + Q0[i, 2] * cz
+        b[i] = Q[i, 0] * cx + Q[i, 1] * cy + Q[i, 2] * cz
         for j in range(3):
-            a[i] += Q0[i, j] * centre[j]
-            b[i] += Q[i, j] * centre[j]
             back[i, j] = Q0[i, 0] * Q[j, 0] + Q0[i, 1] * Q[j, 1] + Q0[i, 2] * Q[j, 2]
             there[j, i] = back[i, j]
     x, y, z = rotations.log(there)
@@ -216,14 +234,13 @@ def update(
     follows tells otherwise, it starts again with Huber's loss on all of them (1), and leaves out
     those beyond each cutoff (2 and 3).
     """
-    information, H, g = np.empty((6, 6)), np.empty((6, 6)), np.empty(6)
     room = room_to_solve()
-    loss = np.empty(3)
+    H, information, loss, L = room[1], room[2], room[3], room[4]
     loss[0] = loss[1] = loss[2] = math.inf
     kept, tolerance = weights, 1e-6
-    squared = np.empty((0, 0))
+    squared = kept
     links = 0
-    if not invert(P0, information):
+    if not (is_sound(ranges, weights, anchors) and invert(P0, L, information)):
         copy_pose(Q0, t0, Q, t)
         fill(math.nan, P)
         cost[0] = math.nan
@@ -251,14 +268,14 @@ def update(
             copy_pose(start_Q, start_t, Q, t)
         total, _ = solve(
             Q, t, True, Q0, t0, information, ranges, kept, anchors, tags, loss,
-            iterations, tolerance, g, H, room,
+            iterations, tolerance, room,
         )  # fmt: skip
         if not robust:
             break
         squared_residuals(Q, t, ranges, weights, anchors, tags, squared)
     mirror(H)
     keep_wide(Q0, information, Q, weights, tags, H)
-    invert(H, P)
+    invert(H, L, P)
     if robust:
         # A link that contradicts the pose costs so much and no more, whoever left it out.
         of_prior = total

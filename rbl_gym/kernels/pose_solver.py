@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.jit import gufunc, helper, inlined
 from rbl_gym.kernels.linear_algebra import cholesky6, solve_factored6
 from rbl_gym.kernels.range_cost import linearize
 from rbl_gym.kernels.rotations import compose, exp, left_jacobian_inverse, log
@@ -18,7 +18,7 @@ from rbl_gym.kernels.rotations import compose, exp, left_jacobian_inverse, log
 _LONGEST = 1e12
 
 
-@helper
+@inlined
 def add_prior(
     Q: Any, t: Any, Q0: Any, t0: Any, information: Any, D: Any, e: Any, g: Any, H: Any
 ) -> float:
@@ -75,19 +75,35 @@ def add_prior(
 def solve(
     Q: Any, t: Any, has_prior: bool, Q0: Any, t0: Any, information: Any,
     ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any,
-    iterations: int, tolerance: float, g: Any, H: Any, room: Any,
+    iterations: int, tolerance: float, room: Any,
 ) -> tuple[float, bool]:  # fmt: skip
     """Move the pose (Q, t) to the least cost near it; the cost there, and whether it converged.
 
-    g and H become the gradient and the Hessian (its lower half) there; `room` comes from
-    `room_to_solve`.
+    `room` comes from `room_to_solve`; its first two become the gradient and the Hessian (its
+    lower half) there.
     """
-    new_Q, turn, D, new_t, new_g, step, e, new_H, L = room
-    cost = linearize(Q, t, ranges, weights, anchors, tags, loss, g, H)
-    if has_prior:
-        cost += add_prior(Q, t, Q0, t0, information, D, e, g, H)
-    damping, converged = 0.0, False
-    for _ in range(iterations):
+    g, H, _, _, L, new_g, new_H, new_Q, new_t, turn, D, step, e = room
+    copy_pose(Q, t, new_Q, new_t)
+    cost, decrease, damping, converged = 0.0, 0.0, 0.0, False
+    for k in range(iterations + 1):
+        new = linearize(new_Q, new_t, ranges, weights, anchors, tags, loss, new_g, new_H)
+        if has_prior:
+            new += add_prior(new_Q, new_t, Q0, t0, information, D, e, new_g, new_H)
+        # A step of 1e-4 standard deviations changes the cost by less than rounding may.
+        if k == 0 or new <= cost * (1 + 1e-12) or decrease < 1e-8:
+            cost = new
+            damping = 0.1 * damping if damping > 1e-5 else 0.0
+            copy_pose(new_Q, new_t, Q, t)
+            for i in range(6):
+                g[i] = new_g[i]
+                for j in range(i + 1):
+                    H[i, j] = new_H[i, j]
+        else:
+            damping = max(10 * damping, 1e-3)
+        # Damping shortens the step by about 1 + damping: a short step alone proves nothing.
+        converged = k > 0 and decrease < tolerance * tolerance
+        if converged or k == iterations:
+            break
         for i in range(6):
             for j in range(i):
                 new_H[i, j] = H[i, j]
@@ -103,43 +119,40 @@ def solve(
         compose(turn, Q, new_Q)
         for i in range(3):
             new_t[i] = t[i] + step[3 + i]
-        new = linearize(new_Q, new_t, ranges, weights, anchors, tags, loss, new_g, new_H)
-        if has_prior:
-            new += add_prior(new_Q, new_t, Q0, t0, information, D, e, new_g, new_H)
-        # Damping shortens the step by about 1 + damping: a short step alone proves nothing.
-        converged = decrease < tolerance * tolerance
-        # A step of 1e-4 standard deviations changes the cost by less than rounding may.
-        if new <= cost * (1 + 1e-12) or decrease < 1e-8:
-            cost = new
-            damping = 0.1 * damping if damping > 1e-5 else 0.0
-            copy_pose(new_Q, new_t, Q, t)
-            for i in range(6):
-                g[i] = new_g[i]
-                for j in range(i + 1):
-                    H[i, j] = new_H[i, j]
-        else:
-            damping = max(10 * damping, 1e-3)
-        if converged:
-            break
     return cost, converged
 
 
-@helper
+@inlined
 def room_to_solve() -> Any:
-    """Arrays that `solve` works in."""
+    """Arrays to work in, of two that are allocated, as that takes its time.
+
+    A gradient (6,), a Hessian (6, 6); an information (6, 6), a loss (3,) and a factor (6, 6) that
+    `solve` is given or leaves alone; what it needs besides.
+    """
+    large, small = np.empty((5, 6, 6)), np.empty((3, 3, 3))
+    rows = large[4]
     return (
-        np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3),
-        np.empty(6), np.empty(6), np.empty(6), np.empty((6, 6)), np.empty((6, 6)),
+        rows[0], large[0], large[1], rows[1], large[2], rows[2], large[3], small[0], rows[3],
+        small[1], small[2], rows[4], rows[5],
     )  # fmt: skip
 
 
-@helper
+@inlined
 def copy_pose(Q0: Any, t0: Any, Q: Any, t: Any) -> None:
     """``Q[:], t[:] = Q0, t0``."""
     for i in range(3):
         t[i] = t0[i]
         for j in range(3):
             Q[i, j] = Q0[i, j]
+
+
+@helper
+def take_linearization(room: Any, g: Any, H: Any) -> None:
+    """The gradient and the whole Hessian that `solve` left."""
+    for i in range(6):
+        g[i] = room[0][i]
+        for j in range(i + 1):
+            H[i, j] = H[j, i] = room[1][i, j]
 
 
 @helper
@@ -161,10 +174,11 @@ def minimize(
     """`solve` from a start; without a prior where its information is zero."""
     copy_pose(start_Q, start_t, Q, t)
     has_prior = False
+    room = room_to_solve()
     for i in range(6):
         has_prior = has_prior or information[i, i] != 0.0
     cost[0], converged[0] = solve(
         Q, t, has_prior, Q0, t0, information, ranges, weights, anchors, tags, loss,
-        iterations, tolerance, g, H, room_to_solve(),
+        iterations, tolerance, room,
     )  # fmt: skip
-    mirror(H)
+    take_linearization(room, g, H)

@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rbl_gym.kernels.jit import helper
+from rbl_gym.kernels.jit import helper, inlined
 
 
-@helper
+@inlined
 def loss_of(squared: float, loss: Any) -> tuple[float, float]:
     """Cost of a squared whitened residual, and the share of its weight that is left.
 
@@ -34,13 +34,13 @@ def loss_of(squared: float, loss: Any) -> tuple[float, float]:
     return cost, share if inside else 0.0
 
 
-@helper
+@inlined
 def is_plain(loss: Any) -> bool:
     """Whether a loss is half the square."""
     return loss[0] == math.inf and loss[1] == math.inf and loss[2] == math.inf
 
 
-@helper
+@inlined
 def linearize(
     Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, g: Any, H: Any
 ) -> float:
@@ -67,8 +67,9 @@ def linearize(
             if weight == 0.0:
                 continue
             ux, uy, uz = tx - anchors[m, 0], ty - anchors[m, 1], tz - anchors[m, 2]
-            # Where an anchor stands on a tag the difference is zero, and so is the direction.
-            distance = math.sqrt(max(ux * ux + uy * uy + uz * uz, 1e-200))
+            # Where an anchor stands on a tag the difference is zero, and so are all the terms.
+            square = max(ux * ux + uy * uy + uz * uz, 1e-200)
+            distance = math.sqrt(square)
             residual = distance - ranges[m, n]
             if plain:
                 cost += 0.5 * weight * residual * residual
@@ -76,11 +77,9 @@ def linearize(
                 part, share = loss_of(weight * residual * residual, loss)
                 cost += part
                 weight *= share
-            inverse = 1 / distance
-            ux *= inverse
-            uy *= inverse
-            uz *= inverse
-            pull = weight * residual
+            # The weight of the difference, which is no unit vector: a root less to divide by.
+            weight /= square
+            pull = weight * distance * residual
             fx += pull * ux
             fy += pull * uy
             fz += pull * uz

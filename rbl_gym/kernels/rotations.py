@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from rbl_gym.kernels.jit import helper
+from rbl_gym.kernels.jit import helper, inlined
 
 # Below these squared angles series take the place of the closed forms.
 _SMALL, _SMALL_INVERSE = 0.25, 1e-2
@@ -27,7 +27,7 @@ def coefficients(s: float) -> tuple[float, float, float]:
     return sine / x, 2 * half * half / s, (x - sine) / (s * x)
 
 
-@helper
+@inlined
 def series(x: float, y: float, z: float, a: float, b: float, diagonal: float, out: Any) -> None:
     """``diagonal I + a [w]x + b w w^T`` of w = (x, y, z): the form of exp and its Jacobians."""
     xy, xz, yz = b * x * y, b * x * z, b * y * z
@@ -39,7 +39,7 @@ def series(x: float, y: float, z: float, a: float, b: float, diagonal: float, ou
     out[1, 2], out[2, 1] = yz - a * x, yz + a * x
 
 
-@helper
+@inlined
 def compose(A: Any, B: Any, out: Any) -> None:
     """``out = A B`` of 3 x 3 matrices; `out` is neither of them."""
     for i in range(3):
@@ -47,7 +47,7 @@ def compose(A: Any, B: Any, out: Any) -> None:
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
 
 
-@helper
+@inlined
 def exp(x: float, y: float, z: float, out: Any) -> None:
     """The rotation matrix of the rotation vector (x, y, z)."""
     s = x * x + y * y + z * z
@@ -55,7 +55,7 @@ def exp(x: float, y: float, z: float, out: Any) -> None:
     series(x, y, z, a, b, 1 - b * s, out)
 
 
-@helper
+@inlined
 def left_jacobian(x: float, y: float, z: float, out: Any) -> None:
     """Left Jacobian of exp at (x, y, z)."""
     s = x * x + y * y + z * z
@@ -63,7 +63,7 @@ def left_jacobian(x: float, y: float, z: float, out: Any) -> None:
     series(x, y, z, b, c, 1 - c * s, out)
 
 
-@helper
+@inlined
 def left_jacobian_inverse(x: float, y: float, z: float, out: Any) -> None:
     """Inverse of the left Jacobian at (x, y, z), of length below 2 pi."""
     s = x * x + y * y + z * z
@@ -75,7 +75,7 @@ def left_jacobian_inverse(x: float, y: float, z: float, out: Any) -> None:
     series(x, y, z, -0.5, c, 1 - c * s, out)
 
 
-@helper
+@inlined
 def log(Q: Any) -> tuple[float, float, float]:
     """The rotation vector of a rotation matrix, of length at most pi."""
     x, y, z = 0.5 * (Q[2, 1] - Q[1, 2]), 0.5 * (Q[0, 2] - Q[2, 0]), 0.5 * (Q[1, 0] - Q[0, 1])
