@@ -113,7 +113,6 @@ class IteratedEkf:
 
     def predict(self, state: PoseState, twist: ArrayLike, dt: float) -> PoseState:
         """State after `dt` seconds of the twist (..., 6), ``P <- F P F^T + Q``."""
-        state = plain(state)
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         check_batches(state=state.translation.shape[:-1], twist=twist.shape[:-1])
@@ -237,6 +236,7 @@ def predict_pose(
     ``F = blkdiag(exp(w dt), I)`` and ``G = blkdiag(Jl(w dt), I)``: the error is global, and the
     noise, of `variance` (6,) after 1 s, is on the angular velocity.
     """
+    rotation, translation, covariance = plain(PoseState(rotation, translation, covariance))
     dt = np.asarray(dt)[..., None]
     turn = twist[..., :3] * dt
     F, G = (np.broadcast_to(np.eye(6), (*turn.shape[:-1], 6, 6)).copy() for _ in range(2))
