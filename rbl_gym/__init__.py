@@ -68,8 +68,8 @@ def _register_environments() -> None:
             "rbl_gym.envs.tracking_vector:TrackingVectorEnv",
         ),
         "RBL/AnchorPlacement-v0": (
-            "rbl_gym.envs.placement:AnchorPlacementEnv",
-            "rbl_gym.envs.placement:AnchorPlacementVectorEnv",
+            "rbl_gym.wrappers.filter_reward:anchor_placement",
+            "rbl_gym.wrappers.filter_reward:anchor_placement_vector",
         ),
         "RBL/PlanarNetwork-v0": (
             "rbl_gym.envs.network:PlanarNetworkEnv",

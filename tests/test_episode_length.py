@@ -16,6 +16,7 @@ LENGTHS = [
     ("AnchorPlacement", {}, 4),
     ("AnchorPlacement", {"mode": "one-shot"}, 1),
     ("AnchorPlacement", {"scene": "uwb_room", "mode": "mounts", "n_anchors": 7}, 7),
+    ("AnchorPlacement", {"scene": "drone_yard", "reward": "filter", "filter": "uc-kf"}, 6),
     ("PlanarNetwork", {}, 50),
     ("PlanarNetwork", {"n_nodes": 4, "steps": 60}, 60),
     ("MobileAnchors", {}, 100),

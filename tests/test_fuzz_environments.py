@@ -23,7 +23,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     "Tracking": {"scene": SHORT, "reward": "bound"},
     "AnchorPlacement": {
         "scene": SHORT, "mode": "sequential", "racks": 1, "n_anchors": 4, "mirror": True,
-        "sight": True,
+        "sight": True, "reward": "filter", "filter": "iekf", "options": {"robust": True},
     },
     "MobileAnchors": {
         "difficulty": "easy", "scene": "auv_craft", "sort_craft": True, "filter": "iekf",

@@ -258,6 +258,11 @@ class AnchorPlacementEnv(ScalarEnv):
             sight=sight,
         )  # fmt: skip
 
+    @property
+    def task(self) -> placement.PlacementTask:
+        """The family of problems."""
+        return self._batch.task
+
 
 def check_sight(sight: bool, task: placement.PlacementTask) -> bool:
     """Whether the sight of the mount points is observed: only where racks can block it."""

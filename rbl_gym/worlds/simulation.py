@@ -259,11 +259,13 @@ def measure(
 ) -> ranging.Measurement:
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
 
-    `at` is of an episode of the `scene`; `quality` (`link_quality`): where known already.
+    `at` is of an episode of the `scene`; `quality` (`link_quality`): where known already, or of
+    other obstacles than the scene's.
     """
     normals = at.normals
-    if scene.obstacles:
-        quality = link_quality(scene, at, anchors) if quality is None else quality
+    if quality is None and scene.obstacles:
+        quality = link_quality(scene, at, anchors)
+    if quality is not None:
         normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
     taken = ranging.sample(at.rotation, at.translation, scene.body, anchors, normals, scene.noise)
     ranges, links, nlos = ranging.lose_links(*taken, scene.links, at.uniforms)
