@@ -17,12 +17,8 @@ from rbl_gym.envs.placement import AnchorPlacementEnv
 from rbl_gym.measurements.ranging import LinkNoise
 from rbl_gym.placement import Context
 from rbl_gym.wrappers import FilterReward, VectorFilterReward
-from rbl_gym.wrappers.filter_reward import (
-    anchor_placement,
-    anchor_placement_vector,
-    track_error,
-    tracks,
-)
+from rbl_gym.wrappers.filter_reward import anchor_placement, anchor_placement_vector
+from rbl_gym.wrappers.filter_tracks import track_error, tracks
 from tests.helpers import assert_same
 from tests.side_by_side import (
     assert_masks_alike,

@@ -214,7 +214,8 @@ class AnchorPlacementEnv(ScalarEnv):
 
     ## Reward
     ``-log score`` with the last anchor, 0 before. ``"mounts"``: the drop of the log score with
-    every anchor, from that of 3 m.
+    every anchor, from that of 3 m. ``gym.make(..., reward="filter")`` pays what a filter reaches
+    instead (`rbl_gym.wrappers.FilterReward`).
 
     ## Episode end
     Terminates with the last anchor; `env.spec.max_episode_steps` says how many steps that is. (In
@@ -235,6 +236,7 @@ class AnchorPlacementEnv(ScalarEnv):
 
     env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", racks=2, sight=True)
     env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", mode="mounts", n_anchors=4)
+    env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", reward="filter", filter="iekf")
     ```
 
     ## Version history
