@@ -31,7 +31,7 @@ class Standstill:
     def predict(self, state, twist, dt):
         return state
 
-    def update(self, state, ranges, anchors, links=None):
+    def update(self, state, ranges, anchors, links=None, noise=None):
         return state._replace(translation=state.translation + self.shift)
 
     def belief(self, state):

@@ -167,8 +167,8 @@ def test_dependent_cycles_of_consistent_branches_give_what_a_basis_gives():
     y = 0.1 * rng.standard_normal((5, 6))
     basis = cycle_matrix(K4, 4)
     want = cycle_projection(basis, y)
-    for C in (cycle_matrix(K4, 4, "all"), sp.vstack([basis, basis[:1], -basis[1:]])):
-        np.testing.assert_allclose(cycle_projection(sp.csr_matrix(C), y), want, atol=1e-12)
+    for C in (cycle_matrix(K4, 4, "all"), sp.csr_matrix(sp.vstack([basis, basis[:1], -basis[1:]]))):
+        np.testing.assert_allclose(cycle_projection(C, y), want, atol=1e-12)
         np.testing.assert_allclose(cycle_consensus(K4, y[0], 4, C), want[0], atol=1e-10)
     # The eigenvalues that are not zero are all alike: one step.
     assert consensus.eigenvalues(cycle_matrix(K4, 4, "all")) == pytest.approx((8, 8))
@@ -183,8 +183,9 @@ def test_a_random_order_that_cannot_come_to_rest_ends():
         y = proj(rng.normal(0, 0.9, 6))
         if not cycle_iteration(K4, y, 4, C).consistent:
             break
-    for settings in ({"order": "asynchronous"}, {"loss": 0.3}):
-        run = cycle_iteration(K4, y, 4, C, rng=np.random.default_rng(1), **settings)
+    for order, loss in (("asynchronous", 0.0), ("synchronous", 0.3)):
+        rng = np.random.default_rng(1)
+        run = cycle_iteration(K4, y, 4, C, rng=rng, order=order, loss=loss)
         assert run.converged == run.consistent
         assert run.steps < 5000
 
