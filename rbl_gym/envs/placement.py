@@ -20,6 +20,8 @@ from rbl_gym.rendering import placement as rendering
 
 # Signs by which a problem may be mirrored: neither, x, y, both.
 _MIRRORS = ((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1))
+# The axes that may be mirrored.
+_LEVEL = np.array([1.0, 1.0, 0.0])
 MODES = ("sequential", "one-shot", "mounts")
 # Score from which the shaped reward of the mounts counts, metres.
 _EMPTY_SCORE_M = 3.0
@@ -127,12 +129,17 @@ class AnchorPlacementVectorEnv(BatchEnv):
             return self._mount(actions, rows, step, complete), complete
         # One-shot: all anchors of a world; else the next one.
         new = (rows,) if self.mode == "one-shot" else (rows, step)
-        self._actions[new] = np.clip(actions[rows], -1, 1).reshape(self._actions[new].shape)
-        signs = self._signs[rows, None] if self.mode == "one-shot" else self._signs[rows]
-        self._anchors[new] = self.task.scene.anchor_region.place(signs * self._actions[new])
+        placed = np.minimum(np.maximum(actions[rows], -1.0), 1.0)
+        signs = self._signs[rows]
+        if self.mode == "one-shot":
+            placed, signs = placed.reshape((len(rows), -1, 3)), signs[:, None]
+        self._actions[new] = placed
+        self._anchors[new] = self.task.scene.anchor_region.place(signs * placed)
         reward = np.zeros(self.num_envs)
         if complete.any():
-            problems = Context(*(field[complete] for field in self._contexts))
+            problems = self._contexts
+            if not complete.all():
+                problems = Context(*(field[complete] for field in problems))
             self._score_m[complete] = placement.score(self.task, problems, self._anchors[complete])
             reward[complete] = -np.log(self._score_m[complete])
         return reward, complete
@@ -294,23 +301,26 @@ def is_symmetric(task: placement.PlacementTask) -> bool:
 
 
 def _centre(region: Region) -> FloatArray:
-    return np.mean(region.bounds(), axis=0)
+    low, high = region.bounds()
+    return 0.5 * (low + high)
 
 
 def signs_of(task: placement.PlacementTask, context: Context) -> FloatArray:
     """Signs (..., 3) of the axes that bring the region's centre towards +x and +y."""
     off = context.centre - _centre(task.scene.volume)
-    return np.where((off < 0) & np.array([True, True, False]), -1.0, 1.0)
+    return np.where((off < 0) & (_LEVEL > 0), -1.0, 1.0)
 
 
 def mirrored_context(task: placement.PlacementTask, context: Context, signs: FloatArray) -> Context:
     """The problem mirrored by signs (..., 3), its racks in the order of falling x."""
-    middle = _centre(task.scene.anchor_region) * [1, 1, 0]
-    racks = context.racks.copy()
+    middle = _centre(task.scene.anchor_region) * _LEVEL
+    centre, racks = middle + signs * (context.centre - middle), context.racks.copy()
+    if not racks.shape[-2]:
+        return Context(centre, context.half, racks)
     racks[..., :3] = middle + signs[..., None, :] * (racks[..., :3] - middle)
     order = np.argsort(-racks[..., 0], axis=-1)
     racks = np.take_along_axis(racks, order[..., None], axis=-2)
-    return Context(middle + signs * (context.centre - middle), context.half, racks)
+    return Context(centre, context.half, racks)
 
 
 def mirrored_mounts(task: placement.PlacementTask, mounts: FloatArray) -> np.ndarray:
@@ -325,9 +335,11 @@ def context_features(task: placement.PlacementTask, context: Context) -> FloatAr
     low, high = task.scene.volume.bounds()
     half = np.maximum(0.5 * (high - low), 1e-9)
     region = [(context.centre - 0.5 * (low + high)) / half, 2 * context.half / half - 1]
-    floor, ceiling = task.scene.anchor_region.bounds()
-    room = 0.5 * (ceiling - floor)
     drawn = context.racks[..., len(task.scene.obstacles) :, :]
-    racks = np.concatenate([(drawn[..., :3] - floor) / room - 1, drawn[..., 3:] / room], axis=-1)
-    racks = racks.reshape((*racks.shape[:-2], 6 * task.racks))
-    return np.clip(np.concatenate([*region, racks], axis=-1), -1, 1)
+    if drawn.shape[-2]:
+        floor, ceiling = task.scene.anchor_region.bounds()
+        room = 0.5 * (ceiling - floor)
+        racks = [(drawn[..., :3] - floor) / room - 1, drawn[..., 3:] / room]
+        racks = np.concatenate(racks, axis=-1)
+        region.append(racks.reshape((*racks.shape[:-2], 6 * task.racks)))
+    return np.minimum(np.maximum(np.concatenate(region, axis=-1), -1.0), 1.0)

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from rbl_gym import rendering
 from rbl_gym.envs.batch import BatchEnv, Observation, StatedLength, check_actions, check_options
 
-# The mask of a world that moves, and is the only one.
-_ALONE = np.ones(1, dtype=np.bool_)
+# The index of the only world, and the mask of it moving.
+_FIRST, _ALONE = np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.bool_)
 
 
 class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -57,9 +57,13 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
         """Start an episode; `options` must be empty."""
         check_options(options)
         super().reset(seed=seed)
-        self._batch._generators = [self.np_random]
-        observation, info = self._batch.reset()
-        return _first(observation), _scalars(info)
+        batch = self._batch
+        batch._generators = [self.np_random]
+        batch._epochs[0], batch._done[0] = 0, False
+        start = batch._restart(_FIRST, batch._generators) or {}
+        batch._shoot()
+        info = {**_scalars(batch._inform()), **_scalars(start)}
+        return _first(batch._observe()), info
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step."""

@@ -63,8 +63,8 @@ class Box:
         _check_corners(self, flat=True)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner."""
-        return np.array(self.low), np.array(self.high)
+        """Lower and upper corner, not to be written to."""
+        return self._corners
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
         """Uniform in the box."""
@@ -79,7 +79,7 @@ class Box:
 
     @functools.cached_property
     def _corners(self) -> tuple[FloatArray, FloatArray]:
-        return self.bounds()
+        return _fixed(self.low), _fixed(self.high)
 
     def place(self, action: FloatArray) -> FloatArray:
         """The box is [-1, 1]^3."""
@@ -101,8 +101,12 @@ class Walls:
         _check_corners(self, flat=False)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner of the room."""
-        return np.array(self.low), np.array(self.high)
+        """Lower and upper corner of the room, not to be written to."""
+        return self._corners
+
+    @functools.cached_property
+    def _corners(self) -> tuple[FloatArray, FloatArray]:
+        return _fixed(self.low), _fixed(self.high)
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
         """Uniform by area; the first uniform chooses the surface and its first coordinate."""
@@ -207,9 +211,15 @@ class Shell:
 REGIONS = {"box": Box, "walls": Walls, "shell": Shell}
 
 
+def _fixed(corner: Triple) -> FloatArray:
+    array = np.array(corner)
+    array.flags.writeable = False
+    return array
+
+
 def _cut(action: FloatArray) -> FloatArray:
     """The action in [-1, 1]^3, in full precision."""
-    return np.clip(action, -1, 1, dtype=np.float64)
+    return np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
 
 
 def _scaled(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:

@@ -122,8 +122,10 @@ class RangeNoise:
         self, ranges: FloatArray, links: BoolArray | None = None
     ) -> FloatArray:
         """Variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
-        r = self._scale(ranges, links)
-        return 4 * r**2 * (self.floor_m**2 + (self.proportional * r) ** 2)
+        square = self._scale(ranges, links) ** 2
+        if self.proportional == 0:
+            return 4 * self.floor_m**2 * square
+        return 4 * square * (self.floor_m**2 + self.proportional**2 * square)
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
         """Ranges with noise of this law, never below zero."""
