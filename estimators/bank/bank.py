@@ -262,6 +262,8 @@ class IteratedEkfBank:
         nis = state.nis.copy()
         nis[rows] = state.links[rows]
         state = state._replace(nis=nis)
+        if not len(trial):
+            return state
         scored = self._scored(before, part.take(trial), (rotation, translation))
         # Of anchors so far apart that rounding hides what they tell there may be none.
         found = np.isfinite(scored.cost)
