@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, TypeVar
 
 import numpy as np
@@ -81,6 +82,14 @@ def is_one_epoch(ranges: Any, anchors: Any, tags: FloatArray) -> bool:
         and ranges.shape == (len(anchors), len(tags))
         and ranges.size > 0
     )
+
+
+@functools.lru_cache(64)
+def all_links(n_anchors: int, n_tags: int) -> FloatArray:
+    """Ones (M, N), not to be written to."""
+    ones = np.ones((n_anchors, n_tags))
+    ones.flags.writeable = False
+    return ones
 
 
 def check_batches(**batches: tuple[int, ...]) -> None:

@@ -86,6 +86,13 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
         If `value` is not numeric, has other trailing axes, is empty, or holds NaN, inf, or
         what is as large as `HUGE`.
     """
+    if (
+        type(value) is np.ndarray
+        and value.dtype is _FLOAT64
+        and value.shape == shape
+        and np.vdot(value, value) < HUGE
+    ):
+        return value
     return check_finite(name, check_shape(name, value, shape))
 
 
@@ -147,6 +154,8 @@ def are_finite(array: FloatArray, trailing: int) -> BoolArray:
 
 def check_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
     """`value` as a finite float in ``[low, high]``, or a ValueError that names it."""
+    if type(value) is float and low <= value <= high and -HUGE < value < HUGE:
+        return value
     try:
         # Whether an array of one number is a number, NumPy's versions do not agree.
         if isinstance(value, (str, bytes)) or getattr(value, "ndim", 0):

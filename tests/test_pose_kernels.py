@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rbl_gym import bounds, estimators, kernels, motion
 from rbl_gym.estimators.costs import range_cost
 from rbl_gym.estimators.costs.map_problem import PoseState, minimize_ranges, positive_inverse
-from rbl_gym.estimators.iekf.manifold import predict_pose, update_pose
+from rbl_gym.estimators.iekf.manifold import WEIGHTS, predict_pose, update_pose
 from rbl_gym.estimators.locating.maximum_likelihood import most_likely_pose, points_start
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import bodies, rotations
@@ -87,9 +87,35 @@ def test_prediction(seed, turn, dt):
 @given(st.integers(0, 999), shapes, geometries, st.booleans(), st.sampled_from([1, 2, 4]))
 def test_update(seed, shape, geometry, robust, iterations):
     prior, *data = epoch(seed, *shape, geometry, wrong=0.1 if robust else 0.0)
-    args = *prior, *data, *prior[:2], iterations, robust
+    ranges, weights, *places = data
+    args = *prior, ranges, weights, WEIGHTS, *places, *prior[:2], iterations, robust
     with np.errstate(all="ignore"):
         assert_near(update_pose.kernel(*args), update_pose.textbook(*args))
+
+
+@needs_kernels
+@pytest.mark.parametrize(
+    "law",
+    [
+        NOISE,
+        ranging.RangeNoise(0.0, 0.01, 1),
+        ranging.RangeNoise(0.1),
+        ranging.SquaredRangeNoise(0.05),
+    ],
+)
+def test_update_by_the_numbers_of_a_law(law):
+    prior, ranges, _, *places = epoch(3, 4, 3, lost=0.0)
+    ranges[1, 2, 1] = -1.0
+    args = *prior, ranges, np.ones((4, 3)), law.numbers, *places, *prior[:2], 3, False
+    with np.errstate(all="ignore"):
+        got, want = update_pose.kernel(*args), update_pose.textbook(*args)
+        weights = 1 / law.variance(ranges) + np.zeros_like(ranges)
+        told = update_pose.kernel(*args[:4], weights, WEIGHTS, *args[6:])
+    assert np.isnan(got[2][1]).all()
+    for a, b in zip(got[:3], want[:3], strict=True):
+        assert_near([a[[0, 2]]], [b[[0, 2]]])
+    for a, b in zip(got, told, strict=True):
+        assert_near([a[[0, 2]]], [b[[0, 2]]], 1e-12)
 
 
 @needs_kernels
@@ -142,7 +168,7 @@ def test_what_is_not_positive_definite_is_nan_in_both():
     P = prior[2].copy()
     P[1] = 0.01 * np.diag([1.0, 1, -1, 1, 1, 1])
     P[2, 0, 0] = np.nan
-    args = *prior[:2], P, *data, *prior[:2], 2, False
+    args = *prior[:2], P, *data[:2], WEIGHTS, *data[2:], *prior[:2], 2, False
     for form in (update_pose.kernel, update_pose.textbook):
         with np.errstate(all="ignore"):
             got = form(*args)[2]

@@ -31,7 +31,7 @@ from rbl_gym.estimators.bank.hypotheses import (
 )
 from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief, register
-from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state, update_pose
+from rbl_gym.estimators.iekf.manifold import WEIGHTS, IteratedEkf, as_state, update_pose
 from rbl_gym.estimators.inputs import check_batches, plain, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
@@ -213,7 +213,17 @@ class IteratedEkfBank:
         """The update of trials (B,), with its cost; NaN where it has none."""
         start = start or self._filter.start(prior, *epoch)
         return _Scored(
-            *update_pose(*prior, *epoch, self.tags, *start, self.iterations, self.robust)
+            *update_pose(
+                *prior,
+                epoch.ranges,
+                epoch.weights,
+                WEIGHTS,
+                epoch.anchors,
+                self.tags,
+                *start,
+                self.iterations,
+                self.robust,
+            )
         )
 
     def _weigh_rivals(

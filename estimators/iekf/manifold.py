@@ -38,6 +38,7 @@ from rbl_gym.estimators.iekf.vague_start import (
     settles,
 )
 from rbl_gym.estimators.inputs import (
+    all_links,
     check_batches,
     check_covariance,
     check_epoch,
@@ -47,9 +48,12 @@ from rbl_gym.estimators.inputs import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
+from rbl_gym.measurements.noise_laws import law_of, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
+# The law of `update_pose` whose shares are weights.
+WEIGHTS = np.array([2.0, 0.0, 0.0, -1.0])
 # Behind the doors: what comes to these was checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
@@ -115,7 +119,8 @@ class IteratedEkf:
         """State after `dt` seconds of the twist (..., 6), ``P <- F P F^T + Q``."""
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
-        check_batches(state=state.translation.shape[:-1], twist=twist.shape[:-1])
+        if twist.ndim > 1:
+            check_batches(state=state.translation.shape[:-1], twist=twist.shape[:-1])
         return PoseState(*predict_pose(*state, twist, dt, self._variance))
 
     def update(
@@ -151,7 +156,15 @@ class IteratedEkf:
         start = self.start(state, ranges, weights, anchors)
         return as_state(
             *update_pose(
-                *state, ranges, weights, anchors, self.tags, *start, self.iterations, self.robust
+                *state,
+                ranges,
+                weights,
+                WEIGHTS,
+                anchors,
+                self.tags,
+                *start,
+                self.iterations,
+                self.robust,
             )[:3]
         )
 
@@ -160,22 +173,18 @@ class IteratedEkf:
     ) -> PoseState | None:
         """The update of one body by an epoch with nothing special about it, in few calls.
 
-        None where there is: then the long way says what, or does it. Most values are looked at
+        None where there is: then the long way says what, or does it. The values are looked at
         by `update_pose`.
         """
         P = state.covariance
         if not is_one_epoch(ranges, anchors, self.tags) or P.ndim != 2:
             return None
-        # An infinite range would have an infinite variance, and no weight.
-        if not np.vdot(ranges, ranges) < HUGE:  # pyright: ignore[reportArgumentType]
+        numbers = numbers_of(self.noise, len(self.tags))
+        if numbers is None or P[0, 0] + P[1, 1] + P[2, 2] > VAGUE_ROTATION_RAD**2:
             return None
-        variance = self.noise.variance(ranges)
-        if not variance.min() > 0 or P[0, 0] + P[1, 1] + P[2, 2] > VAGUE_ROTATION_RAD**2:
-            return None
-        weights = np.divide(1.0, variance, out=np.empty_like(ranges))
         rotation, translation, P, _ = update_pose(
-            *state, ranges, weights, anchors, self.tags, state.rotation, state.translation,
-            self.iterations, self.robust,
+            *state, ranges, all_links(*ranges.shape), numbers, anchors, self.tags,
+            state.rotation, state.translation, self.iterations, self.robust,
         )  # fmt: skip
         if not math.isfinite(np.vdot(P, P)):
             return None
@@ -255,7 +264,8 @@ def update_pose(
     translation: FloatArray,
     covariance: FloatArray,
     ranges: FloatArray,
-    weights: FloatArray,
+    shares: FloatArray,
+    law: FloatArray,
     anchors: FloatArray,
     tags: FloatArray,
     start_rotation: FloatArray,
@@ -269,8 +279,11 @@ def update_pose(
     ----------
     rotation, translation, covariance
         The prior.
-    ranges, weights, anchors, tags
+    ranges, anchors, tags
         As of `RangeCost`.
+    shares, law
+        The weights (..., M, N) and `WEIGHTS`; or ones and the numbers (4,) of a noise law
+        (`noise_laws.numbers_of`), where all links were measured.
     start_rotation, start_translation
         Where Gauss-Newton starts.
     iterations
@@ -284,6 +297,7 @@ def update_pose(
     Rotation, translation, covariance, cost (...). The covariance is NaN where a matrix is not
     positive definite, a range that counts not positive, or anything not finite.
     """
+    weights = shares if law[0] == WEIGHTS[0] else shares / law_of(law).variance(ranges)
     prior = plain(PoseState(rotation, translation, covariance))
     data = RangeCost(ranges, weights, anchors, tags, SQUARES)
     problem = map_problem(prior, data)
@@ -294,7 +308,7 @@ def update_pose(
     else:
         found = minimize_pose(problem, start_rotation, start_translation, iterations)
         cost = found.at.cost
-    sound = (weights == 0) | ((ranges > 0) & (ranges < HUGE) & np.isfinite(weights))
+    sound = (shares == 0) | ((ranges > 0) & (ranges < HUGE) & (weights > 0) & np.isfinite(weights))
     sound = sound.all(axis=(-2, -1)) & (np.abs(anchors) < HUGE).all(axis=(-2, -1))
     covariance = np.where(sound[..., None, None], positive_inverse(found.at.hessian), np.nan)
     pose = PoseState(found.rotation, found.translation, covariance)

@@ -13,6 +13,7 @@ import numpy as np
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
+from rbl_gym.kernels.noise_laws import reference_of
 from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
 from rbl_gym.kernels.range_cost import loss_of, squared_residuals
 
@@ -69,15 +70,33 @@ def invert(A: Any, L: Any, out: Any) -> bool:
 
 
 @helper
-def is_sound(ranges: Any, weights: Any, anchors: Any) -> bool:
-    """Whether ranges that count are positive and all numbers finite."""
+def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, weights: Any) -> bool:
+    """Weights of an epoch: shares over variances; False where a number is none that can be.
+
+    `shares` are 0 where nothing was measured. `law` has the numbers of `noise_laws`, of an epoch
+    without lost links; or it is of the kind 2, where the shares are the weights.
+    """
     for m in range(anchors.shape[0]):
         for i in range(3):
             if not abs(anchors[m, i]) < HUGE:
                 return False
-        for n in range(weights.shape[1]):
-            weight = weights[m, n]
-            if not 0 <= weight < math.inf or (weight > 0 and not 0 < ranges[m, n] < HUGE):
+        for n in range(shares.shape[1]):
+            weights[m, n] = 0.0
+            if shares[m, n] == 0:
+                continue
+            square = ranges[m, n] * ranges[m, n]
+            if not (ranges[m, n] > 0 and square < HUGE * HUGE):
+                return False
+            variance = 1.0
+            if law[0] < 2:
+                reference = ranges[m, reference_of(law, n)]
+                reference *= reference
+                if law[0] == 0:
+                    variance = law[1] * law[1] + law[2] * law[2] * reference
+                else:
+                    variance = law[1] * law[1] * reference / (4 * square)
+            weights[m, n] = shares[m, n] / variance
+            if not 0 < weights[m, n] < math.inf:
                 return False
     return True
 
@@ -222,11 +241,26 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
 
 
 @gufunc(
-    "(d,d),(d),(p,p),(m,n),(m,n),(m,d),(n,d),(d,d),(d),(),()->(d,d),(d),(p,p),()",
-    "fffffffffibffff",
+    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(),()->(d,d),(d),(p,p),()",
+    "ffffffffffibffff",
 )
 def update(
-    Q0, t0, P0, ranges, weights, anchors, tags, start_Q, start_t, iterations, robust, Q, t, P, cost
+    Q0,
+    t0,
+    P0,
+    ranges,
+    shares,
+    law,
+    anchors,
+    tags,
+    start_Q,
+    start_t,
+    iterations,
+    robust,
+    Q,
+    t,
+    P,
+    cost,
 ):
     """The most likely pose of an epoch near a start, its covariance, and the cost there.
 
@@ -237,10 +271,12 @@ def update(
     room = room_to_solve()
     H, information, loss, L = room[1], room[2], room[3], room[4]
     loss[0] = loss[1] = loss[2] = math.inf
+    weights = np.empty(shares.shape)
     kept, tolerance = weights, 1e-6
     squared = kept
     links = 0
-    if not (is_sound(ranges, weights, anchors) and invert(P0, L, information)):
+    sound = weigh(ranges, shares, law, anchors, weights)
+    if not (sound and invert(P0, L, information)):
         copy_pose(Q0, t0, Q, t)
         fill(math.nan, P)
         cost[0] = math.nan
