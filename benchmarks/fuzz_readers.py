@@ -20,8 +20,8 @@ from pathlib import Path
 INSTRUMENTED = [
     "rbl_gym.recordings.reading", "rbl_gym.placement.scene_files", "rbl_gym.networks.g2o",
     "rbl_gym.studies.learning.policies",
-    "rbl_gym.studies.bench.records", "rbl_gym.app.bench_command", "csv", "json.decoder", "tomllib",
-    "tomllib._parser", "numpy.lib.format", "numpy.lib._format_impl", "zipfile",
+    "rbl_gym.studies.bench.records", "rbl_gym.studies.bench.spec_files",
+    "csv", "json.decoder", "tomllib", "tomllib._parser", "numpy.lib.format", "numpy.lib._format_impl", "zipfile",
 ]  # fmt: skip
 
 

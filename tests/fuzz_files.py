@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.app import bench_command
 from rbl_gym.networks.g2o import read_graph
 from rbl_gym.placement.scene_files import problem
 from rbl_gym.recordings import read_recording
-from rbl_gym.studies.bench import records
+from rbl_gym.studies.bench import records, spec_files
 from rbl_gym.studies.learning import policies
 
 
@@ -132,7 +131,7 @@ READERS = {
     ),
     "policy": Reader("policy.npz", policies.load, (_policy(), _policy_packed()), NUMBERS),
     "bench-spec": Reader(
-        "spec.json", bench_command._from_file,
+        "spec.json", spec_files.read_spec,
         (b'{"name": "uwb_room", "steps": 9}', b'{"ranges": "r.csv", "anchors": "a.csv"}'),
         NUMBERS + JSON,
     ),

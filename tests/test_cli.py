@@ -297,7 +297,7 @@ def test_static_runs_of_a_real_recording(every, tmp_path):
             LIAS / "calibration_8_14.csv",
         )
         found = replay.track_errors(
-            recording, replay.replay_recording(recording, settings), settings
+            recording, replay.track_recording(recording, settings), settings
         )
         assert found is not None
         squares.append(np.mean(found.position[found.known] ** 2))

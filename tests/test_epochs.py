@@ -11,9 +11,12 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import monte_carlo
 from rbl_gym.studies.epochs import (
+    AxisErrors,
     PoseErrors,
     Reading,
     Step,
+    axis_errors,
+    nees_interval,
     nis,
     pose_errors,
     stack_beliefs,
@@ -108,6 +111,35 @@ def test_errors_of_beliefs_by_hand_and_of_impossible_ones():
     np.testing.assert_allclose(found.tags_m, np.sqrt((moved**2).sum(-1).mean(-1)), rtol=1e-12)
     expected = (turn[:2] ** 2).sum(-1) / 0.1 + (shift[:2] ** 2).sum(-1) / 0.2
     np.testing.assert_allclose(found.nees, [*expected, np.inf, np.inf], rtol=1e-9)
+
+
+def test_errors_along_a_track_where_truth_is_known():
+    rng = np.random.default_rng(5)
+    _, _, rotation, translation = random_world(rng, 4, 4)
+    Q, t = np.tile(rotation, (6, 1, 1)), np.tile(translation, (6, 1))
+    w, v = 0.1 * rng.standard_normal((2, 6, 3))
+    P = np.tile(np.diag([0.01, 0.04, 0.09, 1.0, 4.0, 9.0]), (6, 1, 1))
+    belief = PoseBelief(rotations.exp(w) @ Q, t + v, P, Q)
+    known = np.arange(6) != 3
+    whole = axis_errors(belief, Q, t)
+    flat = axis_errors(belief, Q, t, known, planar=True)
+    assert isinstance(flat, AxisErrors)
+    np.testing.assert_allclose(whole.position_m, np.linalg.norm(v, axis=1))
+    np.testing.assert_allclose(whole.rotation_deg, np.rad2deg(np.linalg.norm(w, axis=1)))
+    np.testing.assert_allclose(whole.rotation_std_deg, np.rad2deg(np.sqrt(0.14)))
+    np.testing.assert_allclose(flat.position_std_m, np.sqrt(5))
+    np.testing.assert_allclose(flat.rotation_deg[known], np.rad2deg(np.abs(w[known, 2])))
+    nees = w[:, 2] ** 2 / 0.09 + v[:, 0] ** 2 + v[:, 1] ** 2 / 4
+    np.testing.assert_allclose(flat.nees, np.where(known, nees, np.nan))
+
+
+@pytest.mark.parametrize(("count", "dof"), [(1, 6), (1, 3), (50, 6)])
+def test_the_interval_of_the_nees_holds_what_honest_beliefs_have(count, dof):
+    low, high = nees_interval(count, dof)
+    drawn = np.random.default_rng(6).chisquare(dof, (20_000, count)).mean(axis=1)
+    # A share of 0.975 of 20,000 is known to 0.0011: four standard deviations.
+    assert np.mean(drawn < high) == pytest.approx(0.975, abs=0.0045)
+    assert np.mean(drawn > low) == pytest.approx(0.975, abs=0.0045)
 
 
 def test_nis_by_the_full_innovation_covariance():

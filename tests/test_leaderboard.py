@@ -487,7 +487,7 @@ def test_a_recording_is_a_scene(tmp_path, recording, capsys):
     settings = replay.Settings(range_std_m=0.03, walk_m=0.5, walk_deg=25, robust=False)
     files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags", "truth")}
     log = read_recording(**files)
-    track = replay.replay_recording(log, settings)
+    track = replay.track_recording(log, settings)
     figures = replay.track_figures(log, track, replay.track_errors(log, track, settings), settings)
     # The stretches leave out what the last of 41 epochs does not fill.
     for part, name in (("position_m", "position_rmse_m"), ("rotation_deg", "rotation_rmse_deg")):

@@ -219,18 +219,19 @@ def test_errors_of_a_story_are_those_that_were_put_in():
     rng = np.random.default_rng(0)
     w, v = 0.1 * rng.normal(size=(2, 7, 3))
     told = story()
-    sizes, bands, nees = track_html.errors_of(told, told.beliefs["f"])
+    found = track_html.errors_of(told, told.beliefs["f"])
     known = np.arange(7) != 2
-    assert np.isnan(sizes[:, 2]).all()
-    assert np.isnan(nees[2])
-    np.testing.assert_allclose(sizes[0][known], np.linalg.norm(v, axis=1)[known])
-    np.testing.assert_allclose(sizes[1][known], np.rad2deg(np.linalg.norm(w, axis=1))[known])
-    np.testing.assert_allclose(bands[0], 3 * np.sqrt(14))
+    for values in (found.position_m, found.rotation_deg, found.nees):
+        assert np.isnan(values[2])
+    np.testing.assert_allclose(found.position_m[known], np.linalg.norm(v, axis=1)[known])
+    degrees = np.rad2deg(np.linalg.norm(w, axis=1))
+    np.testing.assert_allclose(found.rotation_deg[known], degrees[known])
+    np.testing.assert_allclose(found.position_std_m, np.sqrt(14))
     expected = ((w / [0.1, 0.2, 0.3]) ** 2 + (v / [1, 2, 3]) ** 2).sum(axis=1)
-    np.testing.assert_allclose(nees[known], expected[known])
+    np.testing.assert_allclose(found.nees[known], expected[known])
     flat = track_html.errors_of(story("xy"), told.beliefs["f"])
-    np.testing.assert_allclose(flat[0][0][known], np.linalg.norm(v[:, :2], axis=1)[known])
-    np.testing.assert_allclose(flat[1][1], 3 * np.rad2deg(0.3))
+    np.testing.assert_allclose(flat.position_m[known], np.linalg.norm(v[:, :2], axis=1)[known])
+    np.testing.assert_allclose(flat.rotation_std_deg, np.rad2deg(0.3))
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -16,7 +16,7 @@ from rbl_gym.networks import rigidity
 from rbl_gym.placement import scene_files
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
-from rbl_gym.studies.bench import worlds
+from rbl_gym.studies.bench import spec_files, worlds
 from rbl_gym.studies.placing import design
 from rbl_gym.worlds import scenes
 
@@ -211,7 +211,7 @@ def test_benchmarks():
     with pytest.raises(Exception, match="must be different names with commas, got 'kf,,iekf'"):
         bench_command._names("kf,,iekf")
     with pytest.raises(ValueError, match="--scenes: two are named 'hall': rename a file"):
-        bench_command._specs(["hall", "hall"])
+        spec_files.scene_specs(["hall", "hall"])
 
 
 def test_rooms_full_of_obstacles():

@@ -42,7 +42,7 @@ def record(anchors, tags, seed=0, epochs=25, noise_m=0.03, start=(1.5, 1.2, 0.8)
 
 def outcome(recording, **options):
     settings = replay.Settings(**{**OPTIONS, **options})
-    track = replay.replay_recording(recording, settings)
+    track = replay.track_recording(recording, settings)
     found = replay.track_errors(recording, track, settings)
     return track, replay.track_figures(recording, track, found, settings)
 
@@ -138,7 +138,7 @@ def test_one_range_at_a_time():
 def test_a_mirrored_planar_track_is_held_by_its_height():
     recording = record(CEILING, FLAT)
     assert (
-        replay.replay_recording(recording, replay.Settings(planar=True, height_offset_m=1.2)).other
+        replay.track_recording(recording, replay.Settings(planar=True, height_offset_m=1.2)).other
         is None
     )
 
@@ -153,7 +153,7 @@ def test_map_coordinates_give_the_track_of_local_ones():
     )
     for name in ("iekf", "iekf-bank"):
         tracks = [
-            replay.replay_recording(
+            replay.track_recording(
                 recording, replay.Settings(**{**OPTIONS, "filter": name, "below_anchors": True})
             )
             for recording in (near, far)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -67,14 +65,14 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from rbl_gym.studies.bench import leaderboard
+    from rbl_gym.studies.bench import leaderboard, spec_files
     from rbl_gym.studies.bench import records as bench_files
     from rbl_gym.worlds import scenes
 
     check_html(options)
     workers = _workers(options)
     tasks = leaderboard.tasks(
-        _specs(options.scenes or list(scenes.SCENES)),
+        spec_files.scene_specs(options.scenes or list(scenes.SCENES)),
         options.conditions or list(leaderboard.CONDITIONS),
         options.filters or leaderboard.default_filters(),
         options.trials,
@@ -126,41 +124,3 @@ def _names(text: str) -> list[str]:
     if "" in names or len(set(names)) < len(names):
         raise argparse.ArgumentTypeError(f"must be different names with commas, got {text!r}")
     return names
-
-
-def _specs(names: list[str]) -> dict[str, Any]:
-    """Scenes by label: names, changes of scenes and recordings from files that can be read."""
-    from rbl_gym.studies.bench import leaderboard
-
-    specs: dict[str, Any] = {}
-    for name in names:
-        path = Path(name)
-        label = path.stem if path.suffix in (".toml", ".json") else name
-        if label in specs:
-            raise ValueError(f"--scenes: two are named {label!r}: rename a file")
-        specs[label] = name if label == name else _from_file(path)
-        if label != name:
-            try:
-                leaderboard.digest_of(specs[label])
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"{path}: {error}") from error
-    return specs
-
-
-def _from_file(path: Path) -> dict[str, Any]:
-    """A mapping for `scenes.get`, or one of a recording, its files found beside this one."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        spec = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: {error}") from error
-    if not isinstance(spec, dict) or ("name" in spec) == ("ranges" in spec):
-        raise ValueError(f"{path}: must have the name of a scene, or the files of a recording")
-    from rbl_gym.studies.bench.recordings import FILES
-
-    for key in FILES if "ranges" in spec else ():
-        if not isinstance(spec.get(key, ""), str):
-            raise ValueError(f"{path}: {key} must be the name of a file, got {spec[key]!r:.80}")
-        if key in spec:
-            spec[key] = str(path.parent / spec[key])
-    return spec

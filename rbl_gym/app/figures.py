@@ -10,13 +10,12 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
-from scipy.stats import chi2
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.geometry.rotations import error as rotation_error
 from rbl_gym.recordings.reading import Recording
+from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example
-from rbl_gym.studies.replay import Track, TrackErrors
+from rbl_gym.studies.replay import Replayed
 
 COLOURS = {
     "KF": "#d1495b",
@@ -88,7 +87,7 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
             ax.plot(steps, estimated, "x", color="0.25", ms=5, label="estimated by KF")
             ax.plot(steps, result["bound"][key], "k.", ms=5, label="posterior CRB")
         if key == "nees":
-            low, high = chi2.ppf([0.025, 0.975], 6 * result["trials"]) / result["trials"]
+            low, high = nees_interval(result["trials"])
             ax.axhspan(low, high, color="0.85", zorder=0)
             title = "grey: 95 % of an honest filter, "
         else:
@@ -113,10 +112,9 @@ def _trajectory(axes: Any, example: Example) -> None:
     truth = episode.translation[0]
     axes.plot(*truth[:, :2].T, color="0.6", lw=1, zorder=1)
     axes.plot(*truth[:, :2].T, "k.", ms=4, label="true position", zorder=4)
-    for name, beliefs in example.beliefs.items():
-        for k, belief in enumerate(beliefs):
-            error = belief.translation[0, :2] - truth[k, :2]
-            ring = ellipse(belief.covariance[0, 3:5, 3:5]) + error
+    for name, belief in example.beliefs.items():
+        for k, error in enumerate(example.errors[name]):
+            ring = ellipse(belief.covariance[k, 3:5, 3:5]) + error[3:5]
             places = truth[k, :2] + _MAGNIFY * ring
             axes.plot(*places.T, color=COLOURS[name], lw=1.2, label=name if k == 0 else None)
     heading = episode.rotation[0][:, :2, 0]
@@ -147,13 +145,9 @@ def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
 def _errors(axes: Any, example: Example) -> None:
     """The same trial's rotation error about one axis inside its 3-sigma band."""
     steps = np.arange(1, len(example.trials.measurements) + 1)
-    for name, beliefs in example.beliefs.items():
-        errors, bands = [], []
-        for k, belief in enumerate(beliefs):
-            error = rotation_error(belief.rotation[0], example.trials.episode.rotation[0, k])
-            errors.append(np.rad2deg(error[2]))
-            bands.append(3 * np.rad2deg(np.sqrt(belief.covariance[0, 2, 2])))
-        band = np.array(bands)
+    for name, belief in example.beliefs.items():
+        errors = np.rad2deg(example.errors[name][:, 2])
+        band = 3 * np.rad2deg(np.sqrt(belief.covariance[:, 2, 2]))
         axes.fill_between(steps, -band, band, color=COLOURS[name], alpha=0.15, lw=0)
         axes.plot(steps, errors, color=COLOURS[name], lw=1.5, label=name)
     axes.axhline(0, color="0.5", lw=0.6)
@@ -231,8 +225,9 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
 
 
 @styled
-def replay(recording: Recording, track: Track, found: TrackErrors | None) -> Figure:
+def replay(recording: Recording, replayed: Replayed) -> Figure:
     """The track from above with the anchors, and, where truth exists, the errors over time."""
+    track, found = replayed.track, replayed.errors
     figure = new_figure(12, 5.2 if found is not None else 6)
     grid = figure.add_gridspec(
         2, 2 if found is not None else 1, width_ratios=[1, 1.2] if found is not None else [1]

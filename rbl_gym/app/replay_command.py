@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from typing import Any
 
 from rbl_gym.app.terminal import (
@@ -155,27 +154,21 @@ def _replay(options: argparse.Namespace) -> int:
         options.ranges, options.anchors, options.tags, options.truth, options.calibration
     )
     # What is wrong is said before the work begins.
-    offset = replay.height_offset(recording, settings)
-    settings = dataclasses.replace(settings, height_offset_m=offset)
-    replay.recording_filter(recording, settings)
-    if recording.truth is not None:
-        replay.check_overlap(recording.truth, recording.times, settings.truth_gap_s)
+    replay.check_replay(recording, settings)
     with progress("replay", len(recording.times)) as advance:
-        track = replay.replay_recording(recording, settings, advance)
-    found = replay.track_errors(recording, track, settings)
-    result = replay.track_figures(recording, track, found, settings)
+        replayed = replay.replay_recording(recording, settings, advance)
     if options.plot:
         from rbl_gym.app import figures
 
-        figures.save(figures.replay(recording, track, found), options.plot)
+        figures.save(figures.replay(recording, replayed), options.plot)
     if options.html:
         from rbl_gym.app import page, track_pages
 
-        page.write(track_pages.replay(recording, track, result, settings), options.html)
-    if write_json(result, options.json):
+        page.write(track_pages.replay(recording, replayed), options.html)
+    if write_json(replayed.figures, options.json):
         from rbl_gym.app import reports
 
-        reports.print_replay(result)
+        reports.print_replay(replayed.figures)
         print_files(picture=options.plot, page=options.html)
     return 0
 

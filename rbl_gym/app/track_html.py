@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
-from scipy.stats import chi2
 
-from rbl_gym import metrics
 from rbl_gym.app import page, solids
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators import PoseBelief
 from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import (
     ANCHOR,
@@ -24,10 +23,11 @@ from rbl_gym.rendering.drawing import (
     gapped,
     round_number,
 )
+from rbl_gym.studies.epochs import AxisErrors, axis_errors, nees_interval
 
 # Moments of the slider, and epochs of the curves; longer tracks are thinned out.
 _MOMENTS, _POINTS = 120, 1500
-_DIRECTIONS = {"xy": [2, 3, 4], "xyz": list(range(6))}
+_FREEDOM = {"xy": 3, "xyz": 6}
 
 
 class Beliefs(NamedTuple):
@@ -152,34 +152,26 @@ def _add_still(shown: go.Figure, story: Story) -> None:
                         row=1, col=1)  # fmt: skip
 
 
-def errors_of(story: Story, belief: Beliefs) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Errors (2, K) of position and rotation, three sigma (2, K), NEES (K,); NaN without truth."""
+def errors_of(story: Story, belief: Beliefs) -> AxisErrors:
+    """Errors of a track, with the standard deviations that it claims."""
     assert story.truth is not None
-    rotation, translation, known = story.truth
-    error = metrics.pose_error(belief.rotation, belief.translation, rotation, translation)
-    axes = _DIRECTIONS[story.axes]
-    turn = [axis for axis in axes if axis < 3]
-    move = [axis for axis in axes if axis >= 3]
-    variance = np.diagonal(belief.covariance, axis1=-2, axis2=-1)
-    size = np.array([np.linalg.norm(error[:, move], axis=-1),
-                     np.rad2deg(np.linalg.norm(error[:, turn], axis=-1))])  # fmt: skip
-    band = 3 * np.array([np.sqrt(variance[:, move].sum(axis=-1)),
-                         np.rad2deg(np.sqrt(variance[:, turn].sum(axis=-1)))])  # fmt: skip
-    nees = metrics.nees(error[:, axes], belief.covariance[:, axes][:, :, axes])
-    size[:, ~known] = nees[~known] = np.nan
-    return size, band, nees
+    found = PoseBelief(belief.rotation, belief.translation, belief.covariance, belief.rotation)
+    return axis_errors(found, *story.truth, planar=story.axes == "xy")
 
 
 def _add_curves(shown: go.Figure, story: Story) -> None:
     points = _thinned(len(story.times), _POINTS)
     times = solids.numbers(story.times[points], 6)
-    freedom = len(_DIRECTIONS[story.axes])
-    low, high = chi2.ppf([0.025, 0.975], freedom)
+    freedom = _FREEDOM[story.axes]
+    low, high = nees_interval(dof=freedom)
     for name, belief in story.beliefs.items():
-        sizes, bands, nees = errors_of(story, belief)
-        for column, size, band in zip((1, 3), sizes, bands, strict=True):
+        found = errors_of(story, belief)
+        for column, size, std in (
+            (1, found.position_m, found.position_std_m),
+            (3, found.rotation_deg, found.rotation_std_deg),
+        ):
             shown.add_trace(
-                go.Scatter(x=times, y=solids.numbers(band[points]), mode="lines", fill="tozeroy",
+                go.Scatter(x=times, y=solids.numbers(3 * std[points]), mode="lines", fill="tozeroy",
                            fillcolor=_faint(belief.colour), line={"width": 0}, name="3 sigma",
                            legendgroup=name, showlegend=False, hoverinfo="skip"),
                 row=2, col=column,
@@ -191,7 +183,7 @@ def _add_curves(shown: go.Figure, story: Story) -> None:
                 row=2, col=column,
             )  # fmt: skip
         shown.add_trace(
-            go.Scatter(x=times, y=solids.numbers(nees[points]), mode="lines", name=name,
+            go.Scatter(x=times, y=solids.numbers(found.nees[points]), mode="lines", name=name,
                        legendgroup=name, showlegend=False,
                        line={"color": belief.colour, "width": 1.5}),
             row=2, col=5,
@@ -207,12 +199,16 @@ def _tops(story: Story) -> list[tuple[float, float]]:
     """Limits of the three charts; what the first epochs do from far off is cut."""
     found = [errors_of(story, belief) for belief in story.beliefs.values()]
     limits = []
-    for row in range(2):
-        values = [np.maximum(np.nan_to_num(sizes[row]), bands[row]) for sizes, bands, _ in found]
+    pairs = (
+        [(errors.position_m, errors.position_std_m) for errors in found],
+        [(errors.rotation_deg, errors.rotation_std_deg) for errors in found],
+    )
+    for pair in pairs:
+        values = [np.maximum(np.nan_to_num(size), 3 * std) for size, std in pair]
         limits.append((0.0, 1.15 * float(np.quantile(np.concatenate(values), 0.98))))
-    nees = np.concatenate([values[np.isfinite(values)] for *_, values in found])
-    freedom = len(_DIRECTIONS[story.axes])
-    low, high = chi2.ppf([0.025, 0.975], freedom)
+    nees = np.concatenate([errors.nees[np.isfinite(errors.nees)] for errors in found])
+    freedom = _FREEDOM[story.axes]
+    low, high = nees_interval(dof=freedom)
     low, high = min(low, np.quantile(nees, 0.01)), max(high, np.quantile(nees, 0.995))
     return [*limits, (0.7 * max(float(low), 1e-3), 1.5 * float(high))]
 

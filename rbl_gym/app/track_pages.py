@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
-from scipy.stats import chi2
 
 from rbl_gym.app import page, track_html
 from rbl_gym.app.figures import COLOURS
 from rbl_gym.app.reports import CAMSAP_COLUMNS
 from rbl_gym.app.track_html import Beliefs, Story
 from rbl_gym.recordings.reading import Recording
+from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example
-from rbl_gym.studies.replay import Settings, Track, origin_of, truth_of
+from rbl_gym.studies.replay import Replayed, origin_of, truth_of
 
 _LEGEND = (
     "Drag to turn, wheel to zoom; play, or move the slider. Shaded: three sigma of the belief "
@@ -28,14 +28,8 @@ def demo(result: dict[str, Any], example: Example) -> str:
     """The tracking paper's experiment: one trial to look at, and all of them in figures."""
     scene, episode = example.trials.scene, example.trials.episode
     beliefs = {
-        name: Beliefs(
-            np.array([belief.rotation[0] for belief in steps]),
-            np.array([belief.translation[0] for belief in steps]),
-            np.array([belief.covariance[0] for belief in steps]),
-            COLOURS[name],
-        )
-        for name, steps in example.beliefs.items()
-    }  # fmt: skip
+        name: Beliefs(*belief[:3], COLOURS[name]) for name, belief in example.beliefs.items()
+    }
     count = episode.rotation.shape[1]
     story = Story(
         scene.dt * np.arange(1, count + 1), episode.anchors[0],
@@ -73,7 +67,7 @@ def _curves(result: dict[str, Any]) -> go.Figure:
     shown = make_subplots(2, 2, subplot_titles=[title for _, title in charts],
                           horizontal_spacing=0.08, vertical_spacing=0.13)  # fmt: skip
     trials = result["trials"]
-    low, high = chi2.ppf([0.025, 0.975], 6 * trials) / trials
+    low, high = nees_interval(trials)
     steps = list(range(1, len(result["bound"]["rotation_rmse"]) + 1))
     for k, (key, _) in enumerate(charts):
         row, column = divmod(k, 2)
@@ -107,8 +101,9 @@ def _curves(result: dict[str, Any]) -> go.Figure:
     return shown
 
 
-def replay(recording: Recording, track: Track, result: dict[str, Any], settings: Settings) -> str:
+def replay(recording: Recording, replayed: Replayed) -> str:
     """A recording: the track, its errors where truth exists, the figures of the run."""
+    settings, track, result = replayed.settings, replayed.track, replayed.figures
     truth = truth_of(recording, track, settings)
     times = track.times - track.times[0]
     # Pictures in 3-D have seven digits, those of a map need more.

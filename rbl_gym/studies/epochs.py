@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import special
 
 from rbl_gym import metrics
 from rbl_gym.bounds.pose import range_jacobian
@@ -20,9 +21,12 @@ from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.measurements.ranging import NoiseLaw
 
 __all__ = [
+    "AxisErrors",
     "PoseErrors",
     "Reading",
     "Step",
+    "axis_errors",
+    "nees_interval",
     "nis",
     "pose_errors",
     "stack_beliefs",
@@ -173,6 +177,79 @@ def pose_errors(
         safe = np.where(singular[..., None, None], np.eye(6), belief.covariance)
         nees = metrics.nees(error, safe)
     return PoseErrors(error, tags_m, np.where(singular | ~(nees >= 0), np.inf, nees))
+
+
+class AxisErrors(NamedTuple):
+    """Errors of K beliefs in position and rotation, (K,) each; NaN where truth is not known.
+
+    Attributes
+    ----------
+    position_m, rotation_deg
+        Lengths of the errors.
+    position_std_m, rotation_std_deg
+        Standard deviations that the beliefs claim, of all axes together.
+    nees
+        Of the same axes.
+    """
+
+    position_m: FloatArray
+    rotation_deg: FloatArray
+    position_std_m: FloatArray
+    rotation_std_deg: FloatArray
+    nees: FloatArray
+
+
+def axis_errors(
+    belief: PoseBelief,
+    rotation: FloatArray,
+    translation: FloatArray,
+    known: BoolArray | None = None,
+    planar: bool = False,
+) -> AxisErrors:
+    """Errors and claimed standard deviations of beliefs along a track, for curves over time.
+
+    Parameters
+    ----------
+    belief
+        Arrays (K, ...).
+    rotation, translation
+        The truth (K, 3, 3), (K, 3).
+    known
+        Epochs (K,) that have truth; None: all.
+    planar
+        Judge yaw and the position in x and y only.
+    """
+    turn, move = ([2], [3, 4]) if planar else ([0, 1, 2], [3, 4, 5])
+    axes = turn + move
+    error = metrics.pose_error(belief.rotation, belief.translation, rotation, translation)
+    nees = metrics.nees(error[:, axes], belief.covariance[:, axes][:, :, axes])
+    missing = np.zeros(len(error), dtype=np.bool_) if known is None else ~known
+    error[missing] = nees[missing] = np.nan
+    std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
+    return AxisErrors(
+        np.linalg.norm(error[:, move], axis=-1),
+        np.rad2deg(np.linalg.norm(error[:, turn], axis=-1)),
+        np.linalg.norm(std[:, move], axis=-1),
+        np.rad2deg(np.linalg.norm(std[:, turn], axis=-1)),
+        nees,
+    )
+
+
+def nees_interval(count: int = 1, dof: int = 6, level: float = 0.95) -> tuple[float, float]:
+    """Ends of the interval that holds the mean NEES of honest beliefs with this probability.
+
+    Parameters
+    ----------
+    count
+        Independent beliefs that the mean is over.
+    dof
+        Degrees of freedom of each.
+    level
+        Probability; half of the rest lies below, half above.
+    """
+    tail = 0.5 * (1 - level)
+    low, high = (special.chdtri(dof * count, p) / count for p in (1 - tail, tail))
+    return float(low), float(high)
 
 
 def nis(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import special
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.studies.epochs import nees_interval
 
 PARTS = ("position_m", "rotation_deg", "tags_m")
 # A trial is lost where its tags end off by more than this many bounds, and by more than the
@@ -102,9 +102,7 @@ def consistency(nees: FloatArray, dof: int) -> dict[str, Any]:
     own average lies in the interval.
     """
     nees = _finite_or_inf(nees)
-    freedom = dof * nees.shape[1]
-    tail = 0.5 * (1 - LEVEL)
-    low, high = (special.chdtri(freedom, p) / freedom for p in (1 - tail, tail))
+    low, high = (end / dof for end in nees_interval(nees.shape[1], dof, LEVEL))
     anees = nees.mean() / dof
     verdict = "optimistic" if anees > high else "pessimistic" if anees < low else "consistent"
     per_epoch = nees.mean(axis=1) / dof

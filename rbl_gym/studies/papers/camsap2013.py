@@ -12,9 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbl_gym import metrics
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.studies import monte_carlo
+from rbl_gym.studies.epochs import stack_beliefs
 from rbl_gym.studies.monte_carlo import SimulatedTrials, Trace, rms
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
@@ -42,10 +44,21 @@ _SIGMAS = 4.0
 
 
 class Example(NamedTuple):
-    """One trial, and the beliefs of some filters, one per step."""
+    """One trial of K steps, and what some filters make of it, by their labels.
+
+    Attributes
+    ----------
+    trials
+        The trial, a batch of one.
+    beliefs
+        Arrays (K, ...).
+    errors
+        Pose errors (K, 6) of the beliefs.
+    """
 
     trials: SimulatedTrials
-    beliefs: dict[str, list[PoseBelief]]
+    beliefs: dict[str, PoseBelief]
+    errors: dict[str, FloatArray]
 
 
 class Claim(NamedTuple):
@@ -274,9 +287,13 @@ def _range_of(ratio: FloatArray) -> str:
 def example(seed: int) -> Example:
     """One trial, for the picture."""
     trial = monte_carlo.simulate_trials(paper_scene(), 1, np.random.default_rng([seed, 1]))
-    beliefs = {}
+    truth = trial.episode.rotation[0], trial.episode.translation[0]
+    found = Example(trial, {}, {})
     for label in ("KF", "iterated EKF"):
         name, options = FILTERS[label]
         filter = monte_carlo.scene_filter(trial.scene, name, options)
-        beliefs[label] = [step.belief for step in monte_carlo.trial_steps(trial, filter)]
-    return Example(trial, beliefs)
+        steps = monte_carlo.trial_steps(trial, filter)
+        belief = PoseBelief(*(part[:, 0] for part in stack_beliefs(s.belief for s in steps)))
+        found.beliefs[label] = belief
+        found.errors[label] = metrics.pose_error(*belief[:2], *truth)
+    return found

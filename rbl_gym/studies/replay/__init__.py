@@ -9,24 +9,27 @@ from rbl_gym.studies.replay.settings import (
     origin_of,
     volume_of,
 )
+from rbl_gym.studies.replay.study import Replayed, check_replay, replay_recording
 from rbl_gym.studies.replay.tracking import (
     Track,
     named_filter,
     range_std_of,
     recording_filter,
     recording_steps,
-    replay_recording,
     track_of,
+    track_recording,
 )
 from rbl_gym.studies.replay.truth import check_overlap
 
 __all__ = [
     "DEFAULT_RANGE_STD_M",
     "Mirror",
+    "Replayed",
     "Settings",
     "Track",
     "TrackErrors",
     "check_overlap",
+    "check_replay",
     "covering",
     "height_offset",
     "named_filter",
@@ -39,6 +42,7 @@ __all__ = [
     "track_errors",
     "track_figures",
     "track_of",
+    "track_recording",
     "truth_of",
     "volume_of",
 ]

@@ -46,7 +46,7 @@ class Track(NamedTuple):
     other: Mirror | None = None
 
 
-def replay_recording(
+def track_recording(
     recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
 ) -> Track:
     """Filter a recording causally, epoch by epoch; `advance` is called after each.

@@ -1,0 +1,78 @@
+"""`rbl-gym replay` as a function: a recording, its track, its errors, its figures."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rbl_gym.recordings.reading import Recording
+from rbl_gym.studies.replay.figures import TrackErrors, track_errors, track_figures
+from rbl_gym.studies.replay.settings import Settings, height_offset
+from rbl_gym.studies.replay.tracking import Track, recording_filter, track_recording
+from rbl_gym.studies.replay.truth import check_overlap
+
+__all__ = ["Replayed", "check_replay", "replay_recording"]
+
+
+class Replayed(NamedTuple):
+    """A recording as a filter saw it.
+
+    Attributes
+    ----------
+    settings
+        As they were used.
+    track
+        Beliefs after every epoch.
+    errors
+        Against the recording's truth; None without one.
+    figures
+        Plain numbers: what `rbl-gym replay --json` writes.
+    """
+
+    settings: Settings
+    track: Track
+    errors: TrackErrors | None
+    figures: dict[str, Any]
+
+
+def check_replay(recording: Recording, settings: Settings) -> Settings:
+    """The settings with what the recording says of them, checked before any work is done.
+
+    Raises
+    ------
+    ValueError
+        On a filter or option that is not known, a height that must be told, or truth that does
+        not overlap the ranges.
+    """
+    offset = height_offset(recording, settings)
+    settings = dataclasses.replace(settings, height_offset_m=offset)
+    recording_filter(recording, settings)
+    if recording.truth is not None:
+        check_overlap(recording.truth, recording.times, settings.truth_gap_s)
+    return settings
+
+
+def replay_recording(
+    recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
+) -> Replayed:
+    """Track a recorded body, causally, and judge the track by the truth where there is one.
+
+    Parameters
+    ----------
+    recording
+        Of `rbl_gym.recordings.read_recording`, or made of arrays.
+    settings
+        How it is filtered.
+    advance
+        Called after every epoch.
+
+    Raises
+    ------
+    ValueError
+        As `check_replay`.
+    """
+    settings = check_replay(recording, settings)
+    track = track_recording(recording, settings, advance)
+    errors = track_errors(recording, track, settings)
+    return Replayed(settings, track, errors, track_figures(recording, track, errors, settings))
