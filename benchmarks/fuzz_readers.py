@@ -21,7 +21,8 @@ INSTRUMENTED = [
     "rbl_gym.recordings.reading", "rbl_gym.placement.scene_files", "rbl_gym.networks.g2o",
     "rbl_gym.studies.learning.policies",
     "rbl_gym.studies.bench.records", "rbl_gym.studies.bench.spec_files",
-    "csv", "json.decoder", "tomllib", "tomllib._parser", "numpy.lib.format", "numpy.lib._format_impl", "zipfile",
+    "csv", "json.decoder", "tomllib", "tomllib._parser",
+    "numpy.lib.format", "numpy.lib._format_impl", "zipfile",
 ]  # fmt: skip
 
 

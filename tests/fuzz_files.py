@@ -135,7 +135,7 @@ READERS = {
         (b'{"name": "uwb_room", "steps": 9}', b'{"ranges": "r.csv", "anchors": "a.csv"}'),
         NUMBERS + JSON,
     ),
-    "bench-lines": Reader("bench.jsonl", records.read, (_lines,), NUMBERS + JSON),
+    "bench-lines": Reader("bench.jsonl", records.read_records, (_lines,), NUMBERS + JSON),
     "bench-timings": Reader(
         "bench.timings.jsonl",
         lambda path: records.read_timings(path.with_name("bench.jsonl")), (_times,),

@@ -100,7 +100,7 @@ def _rerun(options: argparse.Namespace) -> int:
 
     workers = _workers(options)
     path = Path(options.file)
-    records = bench_files.read(path)
+    records = bench_files.read_records(path)
     if not records:
         raise ValueError(f"{path} holds no record of rbl-gym bench")
     with progress("rerun", len(records)) as advance:

@@ -124,21 +124,17 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 def _transfer(options: argparse.Namespace) -> int:
     require("cmaes", "placement")
-    from rbl_gym.studies.learning import evaluation, transfer
+    from rbl_gym.studies.learning import transfer
 
     task = rl_task(options.task)
     loaded = _policies(options.policy)
-    filters = transfer.tracking_filters(task)
-    references = _references(options, transfer.transfer_references(task))
-    units = (len(filters) + 1) * (len(references) + len(loaded))
+    names = _references(options, transfer.transfer_references(task))
+    units = transfer.transfer_work_units(task, names, len(loaded))
     with progress(options.task, units) as advance:
-        problem, contexts, layouts = evaluation.layouts_of(
-            task, loaded, references, options.worlds, options.seed, advance
+        result = transfer.transfer_layouts(
+            task, loaded, names, options.worlds, options.repeats, options.seed, advance
         )
-        result = transfer.track_layouts(
-            problem, contexts, layouts, filters, options.repeats, options.seed, advance
-        )
-    result |= {"task": options.task, "worlds": options.worlds, "seed": options.seed}
+    result["task"] = options.task
     if write_json(result, options.json):
         from rbl_gym.app import reports
 

@@ -14,6 +14,11 @@ from rbl_gym.studies.monte_carlo import SimulatedTrials
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
+__all__ = [
+    "compare_hard_conditions",
+    "work_units",
+]
+
 LINK_SCENES = ("uwb_room", "drone_yard")
 CONDITIONS: dict[str, dict[str, float]] = {
     "all links": {},

@@ -16,6 +16,19 @@ from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import check_takes_obstacles
 
+__all__ = [
+    "SimulatedTrials",
+    "Trace",
+    "bound_of",
+    "measure_episode",
+    "rms",
+    "scene_filter",
+    "simulate_trials",
+    "told_readings",
+    "track_trials",
+    "trial_steps",
+]
+
 
 class SimulatedTrials(NamedTuple):
     """A batch of episodes with their measurements and their posterior Cramer-Rao bound.

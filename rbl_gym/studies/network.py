@@ -18,6 +18,12 @@ from rbl_gym.networks import g2o, graphs
 from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.g2o import PoseGraph
 
+__all__ = [
+    "Solved",
+    "edge_weights",
+    "solve_network",
+]
+
 WEIGHTS = ("information", "unit")
 _WORST = 5  # edges that are listed
 

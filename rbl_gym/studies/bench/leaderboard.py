@@ -30,6 +30,16 @@ from rbl_gym.studies.bench import figures, recordings, stages, worlds
 from rbl_gym.studies.bench.worlds import CONDITIONS
 from rbl_gym.worlds import scenes
 
+__all__ = [
+    "CONDITIONS",
+    "Task",
+    "default_filters",
+    "parse_filter",
+    "run_task",
+    "summary",
+    "tasks",
+]
+
 # Options with which a filter of ours stands in the table besides its plain self.
 VARIANTS = ("iekf/robust=true",)
 # Made for what no scene has: a start that nobody knows, biased links, no odometry. They take long.
@@ -79,7 +89,18 @@ def tasks(
     trials: int,
     seed: int,
 ) -> list[Task]:
-    """One task for every scene and condition; scenes by the label they have in the table.
+    """One task for every scene and condition.
+
+    Parameters
+    ----------
+    specs
+        Scenes (of `scenes.get`) and recordings by the label they have in the table.
+    conditions
+        Of `CONDITIONS`.
+    filters
+        Names, with options as `parse_filter` reads them.
+    trials, seed
+        Of the simulated scenes, and of all randomness.
 
     Raises
     ------

@@ -16,6 +16,13 @@ from rbl_gym.studies import backends
 from rbl_gym.studies.bench import leaderboard
 from rbl_gym.studies.bench.leaderboard import Task
 
+__all__ = [
+    "read_records",
+    "read_timings",
+    "rerun",
+    "run_tasks",
+]
+
 Records = list[dict[str, Any]]
 # What all records of one file have in common.
 _COMMON = ("trials", "seed", "versions")
@@ -65,7 +72,11 @@ def run_tasks(
         for file in (path, timings_path(path)):
             file.unlink(missing_ok=True)
     wanted = [key for task in tasks for key in leaderboard.keys_of(task).values()]
-    found = {leaderboard.key_of(record): record for record in read(path)} if path.exists() else {}
+    found = (
+        {leaderboard.key_of(record): record for record in read_records(path)}
+        if path.exists()
+        else {}
+    )
     _check_same_run(path, list(found.values()), tasks)
     # A line that a kill cut in half must not run into the next.
     _write(path, list(found.values()))
@@ -109,7 +120,7 @@ def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None
                 )
 
 
-def read(path: Path) -> Records:
+def read_records(path: Path) -> Records:
     """Records of a file; a last line that was cut off is left out.
 
     Raises
@@ -226,6 +237,15 @@ def rerun(
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
     """Run again what made some records, and say what came out differently.
+
+    Parameters
+    ----------
+    records
+        Of `read_records`.
+    jobs, backend, address
+        See `backends.each`.
+    advance
+        Called with the number of records that are done, as they come.
 
     Returns
     -------

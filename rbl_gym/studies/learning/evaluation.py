@@ -22,6 +22,14 @@ from rbl_gym.studies.learning.policies import Policy, check_fit
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 from rbl_gym.wrappers import controllers
 
+__all__ = [
+    "evaluate",
+    "held_out_returns",
+    "layouts_of",
+    "references",
+    "work_units",
+]
+
 # The reference that is one layout for all contexts, and the contexts it is optimised over.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
 # The search that counts as 1.
@@ -104,6 +112,13 @@ def held_out_returns(task: RlTask, policy: Policy, worlds: int, seed: int) -> di
     """Returns of the policy as it is saved, and of random actions, in the worlds of `evaluate`.
 
     A training's own returns are those of actions drawn about the policy's, in other worlds.
+
+    Parameters
+    ----------
+    task, policy
+        What is played, and by whom.
+    worlds, seed
+        How many, and which.
     """
     check_fit(policy, str(policy.meta.get("task")), task.make(1))
 

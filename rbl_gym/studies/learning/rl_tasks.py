@@ -9,6 +9,12 @@ import gymnasium as gym
 
 from rbl_gym.checks import check_one_of
 
+__all__ = [
+    "TASKS",
+    "RlTask",
+    "rl_task",
+]
+
 # Worlds of a training, or of an evaluation, have the seeds from SEED_STRIDE times its own seed on;
 # those of evaluations begin beyond all of trainings.
 SEED_STRIDE = 1_000_000

@@ -12,6 +12,10 @@ import numpy as np
 from rbl_gym.studies.learning.policies import Policy, kind_and_outputs
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 
+__all__ = [
+    "train",
+]
+
 
 def train(
     name: str, task: RlTask, steps: int, seed: int, advance: Callable[[int], None]

@@ -21,8 +21,18 @@ from rbl_gym.placement import search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.learning import evaluation
+from rbl_gym.studies.learning.policies import Policy
 from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.worlds.scene import Scene
+
+__all__ = [
+    "FILTERS",
+    "track_layouts",
+    "tracking_filters",
+    "transfer_layouts",
+    "transfer_references",
+    "transfer_work_units",
+]
 
 # Steps of an episode, of which the first are the filter's settling; way-points of an episode.
 _STEPS, _SETTLING, _POINTS = 40, 10, 12
@@ -59,6 +69,45 @@ class Bodies(NamedTuple):
     prior: tuple[FloatArray, FloatArray]
 
 
+def transfer_layouts(
+    task: RlTask,
+    policies: dict[str, Policy],
+    names: list[str],
+    worlds: int,
+    repeats: int,
+    seed: int,
+    advance: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """Let policies and references place anchors in held-out worlds, and track bodies among them.
+
+    Parameters
+    ----------
+    task
+        A placement task.
+    policies
+        By the label they are to have.
+    names
+        Of `evaluation.references`.
+    worlds, repeats, seed
+        Held-out worlds, bodies in each, and which.
+    advance
+        Called `transfer_work_units` times.
+
+    Returns
+    -------
+    See `track_layouts`; with `worlds` and `seed`.
+    """
+    problem, contexts, layouts = evaluation.layouts_of(task, policies, names, worlds, seed, advance)
+    filters = tracking_filters(task)
+    found = track_layouts(problem, contexts, layouts, filters, repeats, seed, advance)
+    return found | {"worlds": worlds, "seed": seed}
+
+
+def transfer_work_units(task: RlTask, names: list[str], n_policies: int) -> int:
+    """How often `transfer_layouts` calls `advance`."""
+    return (len(tracking_filters(task)) + 1) * (len(names) + n_policies)
+
+
 def track_layouts(
     task: PlacementTask,
     contexts: Context,
@@ -66,12 +115,28 @@ def track_layouts(
     filters: list[str],
     repeats: int,
     seed: int,
-    advance: Callable[[], None],
+    advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
-    """Scores and filter errors of layouts (C, M, 3) or (C, L, M, 3) of contexts (C,).
+    """Scores and filter errors of layouts; every layout meets the same bodies.
 
-    Every layout meets the same bodies. Returns, for each filter and label, the mean logarithms of
-    score and error, and their correlation over the layouts (None of fewer than three).
+    Parameters
+    ----------
+    task, contexts
+        The problem, and the C worlds of the layouts.
+    layouts
+        By label: anchors (C, M, 3), or L layouts of each world (C, L, M, 3).
+    filters
+        Of `FILTERS`.
+    repeats, seed
+        Bodies in each world, and which.
+    advance
+        Called after every filter and label.
+
+    Returns
+    -------
+    A dict: ``filters[name][label]`` has the exponentials of the mean logarithms of score
+    (`score_m`) and error (`tag_rmse_m`), and the correlation of these logarithms over the
+    layouts (None of fewer than three).
     """
     bodies = _bodies(task, contexts, repeats, np.random.default_rng([seed, 2]))
     scores = {

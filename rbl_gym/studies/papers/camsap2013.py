@@ -21,6 +21,16 @@ from rbl_gym.studies.monte_carlo import SimulatedTrials, Trace, rms
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
+__all__ = [
+    "FILTERS",
+    "Claim",
+    "Example",
+    "example",
+    "paper_scene",
+    "tracking_experiment",
+    "work_units",
+]
+
 Filters = Mapping[str, tuple[str, dict[str, Any]]]
 
 FILTERS: Filters = {

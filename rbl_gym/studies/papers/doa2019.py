@@ -24,6 +24,11 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import bearing
 from rbl_gym.studies.monte_carlo import rms
 
+__all__ = [
+    "doa_experiment",
+    "work_units",
+]
+
 METHODS = {"NIA + UQ": "nia", "ML": "ml", "PSO": "pso", "PSA": "psa"}
 SIGMAS_DEG = (0.01, 0.1, 1.0)
 SETTINGS = ("R = I", "random R")

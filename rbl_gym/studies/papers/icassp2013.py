@@ -18,6 +18,14 @@ from rbl_gym.measurements import ranging
 from rbl_gym.studies.monte_carlo import rms
 from rbl_gym.worlds import scenes
 
+__all__ = [
+    "METHODS",
+    "Setting",
+    "static_experiment",
+    "static_settings",
+    "work_units",
+]
+
 METHODS = {
     "LS": "ls",
     "LS-projected": "ls-projected",

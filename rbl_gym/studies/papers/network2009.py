@@ -28,6 +28,12 @@ from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.sensing import check_positions, proj, unit_disk_edges
 from rbl_gym.studies.papers import network_growth
 
+__all__ = [
+    "network_experiment",
+    "read_points",
+    "work_units",
+]
+
 # Node 0, the reference, is the one at the bottom left, as in Fig. 6.
 PLACES = np.array([[0.07, 0.13], [0.13, 0.50], [0.60, 0.03], [0.37, 0.51], [0.14, 0.79],
                    [0.66, 0.28], [0.15, 0.93], [0.67, 0.51], [0.82, 0.55],

@@ -18,6 +18,13 @@ from rbl_gym.studies.papers import camsap2013, icassp2013
 from rbl_gym.studies.papers.icassp2013 import Setting
 from rbl_gym.worlds.scene import Scene, as_tuples
 
+__all__ = [
+    "slides_experiment",
+    "slides_scene",
+    "slides_settings",
+    "work_units",
+]
+
 TAGS = bodies.centred([[0, 0, 0], [5, 0, 0], [5, 4, 0], [0, 4, 0], [2.5, 2, 5]])
 # Four alternate corners of a cube, the best that four can do.
 ANCHORS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1.0]])

@@ -11,6 +11,16 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.placement import scene_files
 from rbl_gym.placement.scene_files import Problem
 
+__all__ = [
+    "Accuracy",
+    "Map",
+    "accuracy",
+    "accuracy_map",
+    "free_grid",
+    "free_sample",
+    "level_maps",
+]
+
 # Turns of the body over which the accuracy at a place is averaged.
 _TURNS = 8
 # Places over which the accuracy is averaged; those along the axes where the worst is sought,

@@ -14,6 +14,12 @@ from rbl_gym.measurements import ranging
 from rbl_gym.placement.scene_files import Problem
 from rbl_gym.studies.epochs import Reading, track_epochs
 
+__all__ = [
+    "DrawnBodies",
+    "check_layout",
+    "draw_bodies",
+]
+
 # A consistent belief is this far from the truth once in a million: such a pose is lost, for
 # instance the mirror image behind a plane of anchors.
 _LOST_NEES = float(special.chdtri(6, 1e-6))

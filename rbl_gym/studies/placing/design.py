@@ -18,6 +18,16 @@ from rbl_gym.studies.monte_carlo import rms
 from rbl_gym.studies.placing import check
 from rbl_gym.studies.placing.accuracy import accuracy, free_grid, free_sample
 
+__all__ = [
+    "Design",
+    "Placed",
+    "comparison",
+    "design_layout",
+    "place_anchors",
+    "prediction",
+    "work_units",
+]
+
 # Poses over which layouts are scored while searching: racks make the score rough.
 _N_POSES, _N_POSES_OBSTACLES = 64, 160
 # Poses over which the criteria of the result are averaged.

@@ -24,6 +24,13 @@ from rbl_gym.studies.replay.truth import (
     stamp_hints,
 )
 
+__all__ = [
+    "TrackErrors",
+    "track_errors",
+    "track_figures",
+    "truth_of",
+]
+
 # The mirror pose is the one meant where its mean square error is below this share of the track's.
 _NEARER = 0.25
 

@@ -11,6 +11,14 @@ from rbl_gym.checks import FloatArray, check_number
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.recordings.reading import Recording
 
+__all__ = [
+    "DEFAULT_RANGE_STD_M",
+    "Settings",
+    "height_offset",
+    "origin_of",
+    "volume_of",
+]
+
 # Coordinates beyond this are those of a map.
 _MAP_M = 1e4
 # Heights of anchors within this much are one plane.

@@ -27,6 +27,16 @@ from rbl_gym.studies.replay.settings import (
     volume_of,
 )
 
+__all__ = [
+    "Track",
+    "named_filter",
+    "range_std_of",
+    "recording_filter",
+    "recording_steps",
+    "track_of",
+    "track_recording",
+]
+
 # What the planar constraint leaves to height (m), roll and pitch (rad).
 _PLANAR_STD = 1e-3
 # How much wider than the belief its mirror image starts.
