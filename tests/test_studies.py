@@ -50,6 +50,8 @@ def test_demo(capsys, tmp_path):
 
 def test_an_example_has_the_errors_of_its_beliefs():
     found = camsap2013.example(1)
+    assert isinstance(found, camsap2013.Example)
+    assert found.trials.scene == camsap2013.paper_scene()
     assert list(found.beliefs) == list(found.errors) == ["KF", "iterated EKF"]
     truth = found.trials.episode.translation[0]
     for name, belief in found.beliefs.items():
@@ -84,6 +86,10 @@ def test_replay_in_one_call_is_the_four():
     errors = replay.track_errors(recording, track, settings)
     assert isinstance(errors, replay.TrackErrors)
     assert found.figures == replay.track_figures(recording, track, errors, found.settings)
+    np.testing.assert_array_equal(replay.origin_of(recording), np.zeros(3))
+    checked = replay.check_replay(recording, settings)
+    assert checked.height_offset_m == replay.height_offset(recording, settings)
+    assert checked == found.settings
     # The filter by its name, with options of its own.
     filter = replay.named_filter(recording, settings, "iekf", {"robust": True})
     *_, last = replay.recording_steps(recording, settings, filter)
@@ -100,7 +106,10 @@ def test_place(capsys, monkeypatch):
     placed = design.place_anchors(problem, range(4, 5), 0, 20)
     arguments = "--scene", "uwb_room", "--anchors", "4", "--trials", "20"
     assert placed.result == printed(capsys, "place", *arguments)
+    assert isinstance(placed, design.Placed)
     assert isinstance(placed.design, design.Design)
+    maps = accuracy.level_maps(problem, placed.design.anchors)
+    assert all(isinstance(level, accuracy.Map) for level in maps)
     again = check.check_layout(problem, placed.design.anchors, 20, 0)
     assert again == placed.result["check"]
     drawn = check.draw_bodies(problem, placed.design.anchors, 5, np.random.default_rng(0))
@@ -149,7 +158,9 @@ def test_the_papers_experiments():
     angles = doa2019.doa_experiment(2, 0)
     assert list(angles["settings"]) == ["R = I", "random R"]
     both = slides2013.slides_experiment(2, 0)
+    assert list(both["settings"]) == list(slides2013.slides_settings())
     assert list(both["dynamic"]["filters"]) == list(slides2013.FILTERS)
+    assert len(slides2013.slides_scene().tags) == 5
     rows = network_growth.three_in_space(300, np.random.default_rng(0))
     # 600 turns of three axes each: 4 sigma of a root mean square is 7 %, and 3 % of second order.
     assert all(row["ratio"] == pytest.approx(1, abs=0.1) for row in rows)

@@ -20,7 +20,6 @@ from rbl_gym.networks.g2o import PoseGraph
 
 __all__ = [
     "Solved",
-    "edge_weights",
     "solve_network",
 ]
 

@@ -62,7 +62,7 @@ def evaluate(
     names: list[str],
     worlds: int,
     seed: int,
-    advance: Callable[[], None],
+    advance: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Losses of policies and references on the same `worlds` held-out worlds.
 
@@ -265,11 +265,25 @@ def layouts_of(
     names: list[str],
     worlds: int,
     seed: int,
-    advance: Callable[[], None],
+    advance: Callable[[], None] = lambda: None,
 ) -> tuple[PlacementTask, Context, dict[str, FloatArray]]:
-    """The problem, held-out contexts, and layouts (C, M, 3) of references and policies.
+    """Layouts of references and policies in held-out contexts.
 
-    The random ones are (C, 8, M, 3).
+    Parameters
+    ----------
+    task
+        A placement task.
+    policies, names
+        Policies by label, and names of `references`.
+    worlds, seed
+        How many contexts, and which.
+    advance
+        Called after each reference and policy.
+
+    Returns
+    -------
+    The problem, its contexts, and the layouts (C, M, 3) by label; the random ones are
+    (C, 8, M, 3).
     """
     env, _, _ = _held_out(task, worlds, seed)
     found = _of_all(

@@ -18,9 +18,22 @@ __all__ = [
 
 
 def train(
-    name: str, task: RlTask, steps: int, seed: int, advance: Callable[[int], None]
+    name: str,
+    task: RlTask,
+    steps: int,
+    seed: int,
+    advance: Callable[[int], None] = lambda steps: None,
 ) -> tuple[Policy, dict[str, Any]]:
-    """Train, and say how it went.
+    """Train a policy by PPO, and say how it went.
+
+    Parameters
+    ----------
+    name, task
+        What is learned, and the name that the policy's file gives it.
+    steps, seed
+        Environment steps, and the seed of worlds, networks and actions.
+    advance
+        Called after every rollout, with its environment steps.
 
     Returns
     -------

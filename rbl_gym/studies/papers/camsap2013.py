@@ -98,6 +98,10 @@ def tracking_experiment(
 
     Parameters
     ----------
+    trials, seed
+        How many, and of which random numbers.
+    advance
+        Called after every epoch of every filter.
     trade
         Also run ET-KF over `THRESHOLDS`: its error against how often it projects.
     world

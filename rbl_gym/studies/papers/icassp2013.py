@@ -85,6 +85,17 @@ def static_experiment(
 ) -> dict[str, Any]:
     """Every method at every reference range of every setting, with the bounds.
 
+    Parameters
+    ----------
+    name
+        What the result calls itself.
+    settings
+        By label: `static_settings`, or others.
+    trials, seed
+        Of each setting and reference range, and of which random numbers.
+    advance
+        Called after every reference range of every setting.
+
     Returns
     -------
     A dict of plain numbers: ``settings[label]`` has ``reference_range_db``, ``bound`` (raw

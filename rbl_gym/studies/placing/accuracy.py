@@ -16,7 +16,6 @@ __all__ = [
     "Map",
     "accuracy",
     "accuracy_map",
-    "free_grid",
     "free_sample",
     "level_maps",
 ]
@@ -95,7 +94,17 @@ class Map(NamedTuple):
 
 
 def accuracy_map(problem: Problem, anchors: FloatArray, up: int = 1, share: float = 0.5) -> Map:
-    """The map over x and y (`up` 1) or x and z (2), at a share of the third axis's extent."""
+    """Accuracy on a plane of the work region.
+
+    Parameters
+    ----------
+    problem, anchors
+        What is placed, and where (M, 3).
+    up
+        1: over x and y; 2: over x and z.
+    share
+        Where the plane cuts the third axis: 0 is the region's lower side, 1 its upper one.
+    """
     low, high = problem.corners()
     third = 3 - up
     at = float(low[third] + share * (high - low)[third])

@@ -60,6 +60,13 @@ def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) 
     - ``iterated EKF, not told``: takes all links for clear, with Huber's loss; only where there
       are obstacles.
     - ``locate, from nothing``: maximum likelihood without a prior; told as well.
+
+    Parameters
+    ----------
+    problem, anchors
+        What is placed, and where (M, 3).
+    trials, seed
+        Bodies at random poses, and of which random numbers.
     """
     drawn = draw_bodies(problem, anchors, trials, np.random.default_rng([seed, 1]))
     scene = problem.task.scene

@@ -21,7 +21,6 @@ from rbl_gym.studies.placing.accuracy import accuracy, free_grid, free_sample
 __all__ = [
     "Design",
     "Placed",
-    "comparison",
     "design_layout",
     "place_anchors",
     "prediction",

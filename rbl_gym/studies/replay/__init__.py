@@ -16,7 +16,6 @@ from rbl_gym.studies.replay.tracking import (
     range_std_of,
     recording_filter,
     recording_steps,
-    track_of,
     track_recording,
 )
 from rbl_gym.studies.replay.truth import check_overlap
@@ -41,7 +40,6 @@ __all__ = [
     "replay_recording",
     "track_errors",
     "track_figures",
-    "track_of",
     "track_recording",
     "truth_of",
     "volume_of",

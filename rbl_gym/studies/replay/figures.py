@@ -102,7 +102,15 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
 def track_figures(
     recording: Recording, track: Track, found: TrackErrors | None, settings: Settings
 ) -> dict[str, Any]:
-    """The figures of a run as plain numbers; those of errors are absent without truth."""
+    """The figures of a run as plain numbers.
+
+    Parameters
+    ----------
+    recording, track, settings
+        What was filtered, what came out, and how.
+    found
+        Of `track_errors`; None: figures of errors are absent.
+    """
     result: dict[str, Any] = {
         "settings": {
             **dataclasses.asdict(settings),

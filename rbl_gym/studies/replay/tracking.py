@@ -33,7 +33,6 @@ __all__ = [
     "range_std_of",
     "recording_filter",
     "recording_steps",
-    "track_of",
     "track_recording",
 ]
 
@@ -67,7 +66,7 @@ def track_recording(
     for step in recording_steps(recording, settings, recording_filter(recording, settings)):
         beliefs.append(step.belief)
         advance()
-    track = track_of(recording, beliefs)
+    track = Track(recording.times, *stack_beliefs(beliefs)[:3])
     if settings.planar:
         # Height, roll and pitch are held: they tell the sides apart.
         return track
@@ -138,11 +137,6 @@ def range_std_of(recording: Recording, settings: Settings) -> float | str:
     return "recorded" if has_own_std(recording, settings) else DEFAULT_RANGE_STD_M
 
 
-def track_of(recording: Recording, beliefs: list[estimators.PoseBelief]) -> Track:
-    """Beliefs after every epoch as arrays."""
-    return Track(recording.times, *stack_beliefs(beliefs)[:3])
-
-
 def recording_filter(recording: Recording, settings: Settings) -> estimators.Filter:
     """The named filter with the recording's tags, a random walk and the range noise."""
     return named_filter(recording, settings, settings.filter, _options(settings))
@@ -151,7 +145,14 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
 def named_filter(
     recording: Recording, settings: Settings, name: str, options: dict[str, Any]
 ) -> estimators.Filter:
-    """`recording_filter` for any filter and options of its own.
+    """A filter with a recording's tags, a random walk and the range noise.
+
+    Parameters
+    ----------
+    recording, settings
+        What is filtered, and how.
+    name, options
+        Of the filter, in place of the settings' own.
 
     Raises
     ------
