@@ -87,6 +87,7 @@ def test_replay_in_one_call_is_the_four():
     assert isinstance(errors, replay.TrackErrors)
     assert found.figures == replay.track_figures(recording, track, errors, found.settings)
     np.testing.assert_array_equal(replay.origin_of(recording), np.zeros(3))
+    assert replay.volume_of(recording, settings) is None
     checked = replay.check_replay(recording, settings)
     assert checked.height_offset_m == replay.height_offset(recording, settings)
     assert checked == found.settings
@@ -119,6 +120,7 @@ def test_place(capsys, monkeypatch):
     assert isinstance(found, accuracy.Accuracy)
     rms = float(monte_carlo.rms(found.score))
     assert rms == placed.result["predicted"]["score_m"]["rms"]
+    assert design.prediction(problem, placed.design.anchors) == placed.result["predicted"]
 
 
 @needs("cmaes")

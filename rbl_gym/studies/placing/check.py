@@ -102,7 +102,15 @@ def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) 
 def draw_bodies(
     problem: Problem, anchors: FloatArray, trials: int, rng: np.random.Generator
 ) -> DrawnBodies:
-    """Bodies uniform over the free part of the region, turned anyhow, and one epoch of ranges."""
+    """Bodies uniform over the free part of the region, turned anyhow, and one epoch of ranges.
+
+    Parameters
+    ----------
+    problem, anchors
+        What is placed, and where (M, 3).
+    trials, rng
+        How many bodies, and their random numbers.
+    """
     task = problem.task
     scene = task.scene
     translation = _free_places(problem, trials, rng)
