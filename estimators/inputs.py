@@ -72,14 +72,19 @@ def check_epoch(
     return ranges, anchors, mask
 
 
-def is_one_epoch(ranges: Any, anchors: Any, tags: FloatArray) -> bool:
-    """Whether these are arrays (M, N) and (M, 3) of float64 for tags (N, 3), values aside."""
+def is_plain_epoch(ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int, ...]) -> bool:
+    """Whether these are arrays of float64 for the tags of one body, of trials (*batch) each.
+
+    Ranges (*batch, M, N), anchors (*batch, M, 3), tags (N, 3); their values are not looked at.
+    """
     return (
         type(ranges) is type(anchors) is np.ndarray
         and ranges.dtype is anchors.dtype is _FLOAT64
-        and anchors.ndim == tags.ndim == 2
-        and anchors.shape[1] == 3
-        and ranges.shape == (len(anchors), len(tags))
+        and anchors.ndim == len(batch) + 2
+        and tags.ndim == 2
+        and anchors.shape[-1] == 3
+        and anchors.shape[:-2] == batch
+        and ranges.shape == (*batch, anchors.shape[-2], len(tags))
         and ranges.size > 0
     )
 

@@ -43,7 +43,7 @@ from rbl_gym.estimators.inputs import (
     check_covariance,
     check_epoch,
     epoch_variance,
-    is_one_epoch,
+    is_plain_epoch,
     plain,
 )
 from rbl_gym.geometry import rotations
@@ -145,7 +145,7 @@ class IteratedEkf:
             On wrong shapes, NaN, ranges that are not positive.
         """
         if links is None and noise is None:
-            found = self._update_one(state, ranges, anchors)
+            found = self._update_plain(state, ranges, anchors)
             if found is not None:
                 return found
         state = plain(state)
@@ -168,22 +168,23 @@ class IteratedEkf:
             )[:3]
         )
 
-    def _update_one(
+    def _update_plain(
         self, state: PoseState, ranges: ArrayLike, anchors: ArrayLike
     ) -> PoseState | None:
-        """The update of one body by an epoch with nothing special about it, in few calls.
+        """The update by an epoch with nothing special about it, in few calls.
 
         None where there is: then the long way says what, or does it. The values are looked at
         by `update_pose`.
         """
         P = state.covariance
-        if not is_one_epoch(ranges, anchors, self.tags) or P.ndim != 2:
+        if not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
             return None
         numbers = numbers_of(self.noise, len(self.tags))
-        if numbers is None or P[0, 0] + P[1, 1] + P[2, 2] > VAGUE_ROTATION_RAD**2:
+        wide = P[..., 0, 0] + P[..., 1, 1] + P[..., 2, 2] > VAGUE_ROTATION_RAD**2
+        if numbers is None or (wide if P.ndim == 2 else wide.any()):
             return None
         rotation, translation, P, _ = update_pose(
-            *state, ranges, all_links(*ranges.shape), numbers, anchors, self.tags,
+            *state, ranges, all_links(*ranges.shape[-2:]), numbers, anchors, self.tags,
             state.rotation, state.translation, self.iterations, self.robust,
         )  # fmt: skip
         if not math.isfinite(np.vdot(P, P)):
