@@ -9,7 +9,6 @@ import pytest
 from rbl_gym import bounds, estimators, motion, placement
 from rbl_gym.app import bench_command
 from rbl_gym.bounds import links as link_bounds
-from rbl_gym.bounds import posterior
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import ranging
 from rbl_gym.networks import rigidity
@@ -18,7 +17,7 @@ from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.bench import spec_files, worlds
 from rbl_gym.studies.placing import design
-from rbl_gym.worlds import scenes
+from rbl_gym.worlds import scene_bounds, scenes, simulation
 
 TAGS = bodies.pyramid()
 ANCHORS = np.array([[0, 0, 0], [9, 0, 1], [0, 9, 2], [9, 9, 3.0]])
@@ -148,8 +147,12 @@ def test_lost_links_out_of_reach_are_drawn_as_lost():
 
 
 def test_the_bound_of_a_scene_whose_prior_is_not_positive():
+    scene = scenes.SCENES["uwb_room"]
+    episode = simulation.draw_episode(scene, np.random.default_rng(0))
+    at = simulation.epoch_of(episode, 0)
+    links = np.zeros((len(episode.anchors), len(scene.tags)), bool)
     with pytest.raises(ValueError, match="information about the pose is singular or not finite"):
-        posterior.update(-np.eye(6), np.eye(6))
+        scene_bounds.posterior_step(scene, at, episode.anchors, links, None, -np.eye(6))
 
 
 def test_ranges_are_simulated_by_generators_and_link_models():
