@@ -111,11 +111,9 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
 def select(observation: dict[str, np.ndarray], chosen: BoolArray) -> dict[str, np.ndarray]:
     """An observation with the links (..., M, N) of the chosen anchors (..., M) alone."""
     each = chosen[..., None]
-    selected = {
-        **observation,
-        "ranges": observation["ranges"] * each,
-        "links": observation["links"] * each,
-    }
+    selected = observation.copy()
+    selected["ranges"] = observation["ranges"] * each
+    selected["links"] = observation["links"] * each
     if "quality" in observation:
         selected["quality"] = np.where(chosen, observation["quality"], 1.0)
     return selected

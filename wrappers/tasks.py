@@ -19,6 +19,7 @@ from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.wrappers import views
 from rbl_gym.wrappers.compositions import TaskEnv, VectorTaskEnv
 from rbl_gym.wrappers.estimate import EstimatePose, check_options_of
 from rbl_gym.wrappers.select_anchors import SelectAnchors, VectorSelectAnchors
@@ -47,30 +48,17 @@ def _options(filter: Any, options: Mapping[str, Any] | None) -> dict[str, Any]:
     return {**usual, **check_options_of(options)}
 
 
-class _View:
-    """The part of a flat observation that both tasks have, of arrays with any leading axes."""
+class _Usual:
+    """What is usual in a scene: variances of the prior, speed."""
 
     def __init__(self, scene: Scene) -> None:
+        self.variance = np.diagonal(scene.prior_covariance).copy()
         self.speed = max(scene.speed_m_s, float(np.abs(scene.twist[3:]).max()), 1e-3)
-        self.prior_variance = np.diagonal(scene.prior_covariance).copy()
-
-    def write(self, flat: FloatArray, observation: Mapping[str, np.ndarray]) -> None:
-        """Log standard deviations and two columns of the rotation into flat (..., 12)."""
-        covariance = observation["belief_covariance"]
-        variance = covariance.reshape(*covariance.shape[:-2], 36)[..., ::7]
-        # Less that of their usual size.
-        flat[..., :6] = 0.5 * np.log(np.maximum(variance, 1e-24) / self.prior_variance) + 1.0
-        rotation = observation["belief_rotation"]
-        flat[..., 6:9], flat[..., 9:12] = rotation[..., 0], rotation[..., 1]
 
 
 def _worlds(batch: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-    """Indices that stand before those (B, M) of each world's craft."""
+    """Indices that stand before those (B, M) of each world's anchors."""
     return tuple(np.arange(n)[:, None] for n in batch)
-
-
-def _cut(flat: FloatArray) -> np.ndarray:
-    return np.minimum(np.maximum(flat, -_LIMIT), _LIMIT).astype(np.float32)
 
 
 # --- surface craft and a diving vehicle -------------------------------------------------------
@@ -80,8 +68,9 @@ class _MobileAnchors:
     """Craft in the order of the observation: what scalar and vector forms share."""
 
     scene: Scene
-    # The last observation that was sorted, and its order.
-    _sorted: tuple[Any, np.ndarray] | None = None
+    seen: Any
+    # Numbers (..., M) of the craft in the order of the last observation.
+    order: np.ndarray
 
     def _configure(self, difficulty: str, scene: Any, sort_craft: bool) -> None:
         level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
@@ -91,29 +80,15 @@ class _MobileAnchors:
         if not isinstance(sort_craft, bool):
             raise ValueError(f"sort_craft must be True or False, got {sort_craft!r}")
         self.sort_craft = sort_craft
-        self._view = _View(self.scene)
+        self._limits = np.full(15 + 3 * self.scene.n_anchors, _LIMIT)
+        self._usual = _Usual(self.scene)
 
     def _spaces(self) -> tuple[spaces.Box, spaces.Box]:
         m = self.scene.n_anchors
         return (
-            spaces.Box(-_LIMIT, _LIMIT, (15 + 3 * m,), np.float32),
+            spaces.Box(-_LIMIT, _LIMIT, self._limits.shape, np.float32),
             spaces.Box(-1.0, 1.0, (2 * m,), np.float32),
         )
-
-    @property
-    def order(self) -> np.ndarray:
-        """Numbers (..., M) of the craft in the order of the observation."""
-        return self._order(self._told())  # pyright: ignore[reportAttributeAccessIssue]
-
-    def _order(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        """By bearing from the estimate, so that equal situations look equal."""
-        if self._sorted is None or self._sorted[0] is not observation:
-            gap = observation["anchors"] - observation["belief_translation"][..., None, :]
-            order = np.argsort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1)
-            if not self.sort_craft:
-                order[...] = np.arange(order.shape[-1])
-            self._sorted = observation, order
-        return self._sorted[1]
 
     def _velocities(self, level: FloatArray) -> FloatArray:
         """Actions of the world (..., 3 M) of level velocities (..., 2 M) in order."""
@@ -124,18 +99,14 @@ class _MobileAnchors:
         return velocity.reshape(*batch, 3 * m)
 
     def _show(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        estimate, anchors = observation["belief_translation"], observation["anchors"]
-        batch, m = anchors.shape[:-2], anchors.shape[-2]
-        flat = np.empty((*batch, 15 + 3 * m))
-        flat[..., 0] = estimate[..., 2] / 50
-        flat[..., 1:3] = observation["twist"][..., 3:5] / self._view.speed
-        self._view.write(flat[..., 3:15], observation)
-        gap = anchors[..., :2] - estimate[..., None, :2]
-        gap = gap[(*_worlds(batch), self._order(observation))] / 100
-        flat[..., 15 : 15 + 2 * m] = gap.reshape(*batch, 2 * m)
-        square = gap[..., 0] ** 2 + gap[..., 1] ** 2 + (estimate[..., 2:] / 100) ** 2
-        flat[..., 15 + 2 * m :] = 0.5 * np.log(np.maximum(square, 1e-16))
-        return _cut(flat)
+        order, flat = views.mobile_anchors(
+            observation["belief_translation"], observation["belief_rotation"],
+            observation["belief_covariance"], observation["twist"], observation["anchors"],
+            self._usual.variance, self._usual.speed, self.sort_craft, self._limits,
+        )  # fmt: skip
+        if observation is self.seen:
+            self.order = order
+        return flat.astype(np.float32)
 
 
 class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
@@ -245,7 +216,8 @@ class _AnchorSelection:
         self.mode = check_one_of("mode", mode, SELECTIONS)
         self.k = check_count("k", k, most=self.scene.n_anchors)
         self.price = check_number("price", price, low=0.0)
-        self._view = _View(self.scene)
+        self._limits = np.full(18, _LIMIT)
+        self._usual = _Usual(self.scene)
         low, high = self.scene.volume.bounds()
         self._centre = 0.5 * (low + high)
         # In a volume without height, deviations count by what the prior leaves open.
@@ -266,18 +238,19 @@ class _AnchorSelection:
             return action
         best = np.argsort(-action, axis=-1, kind="stable")[..., : self.k]
         chosen = np.zeros(action.shape, dtype=np.int8)
-        np.put_along_axis(chosen, best, 1, axis=-1)
+        chosen[(*_worlds(action.shape[:-1]), best)] = 1
         return chosen
 
     def _price(self, info: dict[str, Any]) -> Any:
         return self.price * info["chosen"].sum(axis=-1) if self.mode == "priced" else 0.0
 
     def _show(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        flat = np.empty((*observation["twist"].shape[:-1], 18))
-        flat[..., :3] = (observation["belief_translation"] - self._centre) / self._half
-        flat[..., 3:6] = observation["twist"][..., 3:] / self._view.speed
-        self._view.write(flat[..., 6:], observation)
-        return _cut(flat)
+        flat = views.anchor_selection(
+            observation["belief_translation"], observation["belief_rotation"],
+            observation["belief_covariance"], observation["twist"], self._usual.variance,
+            self._usual.speed, self._centre, self._half, self._limits,
+        )  # fmt: skip
+        return flat.astype(np.float32)
 
 
 class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
