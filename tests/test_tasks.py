@@ -437,6 +437,7 @@ def test_craft_numbers_change_nothing_when_sorted(sort):
     moved = env.anchors
     env.reset(seed=3)
     env.seen = other
+    env._show(other)
     renumbered = env._velocities(actions).reshape(8, 4, 3)
     env.seen = seen
     # The same craft get the same commands, whatever their numbers.
