@@ -71,7 +71,7 @@ def drawn(sensor: ut.TwistSensor | None, options: argparse.Namespace) -> dict[st
     trials, P = options.trials, SCENE.prior_covariance
     rotation = rotations.random(rng, (trials,))
     start = rng.uniform(*SCENE.volume.bounds(), (trials, 3))
-    path = ut.simulate(rotation, start, LAW, SCENE.process, SCENE.dt, options.steps, rng)
+    path = ut.simulate_wandering(rotation, start, LAW, SCENE.process, SCENE.dt, options.steps, rng)
     of_sensor: dict[str, Any] = {}
     if sensor is not None:
         of_sensor = {

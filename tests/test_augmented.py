@@ -126,7 +126,7 @@ def test_unknown_twist_in_the_drone_yard_reaches_the_bound_and_is_consistent(sen
     low, high = scene.volume.bounds()
     rotation = rotations.random(rng, (trials,))
     start = rng.uniform(low, high, (trials, 3))
-    path = ut.simulate(rotation, start, law, scene.process, scene.dt, steps, rng)
+    path = ut.simulate_wandering(rotation, start, law, scene.process, scene.dt, steps, rng)
     tags, anchors = np.asarray(scene.tags), np.asarray(scene.anchors)
     filter = iekf_cv(
         tags, scene.noise, scene.process, turn_rate_rad_s=law.turn_rate_rad_s,
@@ -196,7 +196,9 @@ def biased_recording(rng, trials, steps, law):
     heading[..., 2] = phase + np.pi / 2
     rotation = rotations.exp(heading)
     translation = np.stack([2 * np.cos(phase), 2 * np.sin(phase), 0 * phase], axis=-1)
-    biases = link_bias.simulate(law, times, 24, rng, (trials,)).reshape((trials, steps, 8, 3))
+    biases = link_bias.simulate_biases(law, times, 24, rng, (trials,)).reshape(
+        (trials, steps, 8, 3)
+    )
     noise = ranging.RangeNoise(0.03)
     ranges = simulate(rng, anchors, tags, rotation, translation, noise) + biases
     twist = np.array([0, 0, 0.2, 0, 0, 0])
@@ -279,12 +281,12 @@ def test_biases_are_forgotten_as_their_law_says(twist):
 def test_biases_that_cannot_be_drawn(changes, message):
     good = {"law": LinkBias(), "times": [0.0, 1.0], "links": 3, "rng": np.random.default_rng(0)}
     with pytest.raises(ValueError, match=message):
-        link_bias.simulate(**{**good, **changes})
+        link_bias.simulate_biases(**{**good, **changes})
 
 
 def test_drawn_biases_have_their_laws_moments():
     law = LinkBias(0.05, 2.0, 0.1)
-    drawn = link_bias.simulate(law, [0.0, 1.0, 1.0], 3, np.random.default_rng(7), (20_000,))
+    drawn = link_bias.simulate_biases(law, [0.0, 1.0, 1.0], 3, np.random.default_rng(7), (20_000,))
     np.testing.assert_array_equal(drawn[:, 2], drawn[:, 1])
     for k in (0, 1):
         got = drawn[:, k].T @ drawn[:, k] / 20_000
@@ -366,6 +368,6 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="time_s must be a finite number"):
         iekf_bias(tags, NOISE, PROCESS, bias_time_s=0)
     with pytest.raises(ValueError, match="times must be"):
-        link_bias.simulate(LinkBias(), [1.0, 0.0], 3, rng)
+        link_bias.simulate_biases(LinkBias(), [1.0, 0.0], 3, rng)
     with pytest.raises(ValueError, match="has no option 'bias_std_m'"):
         estimators.make("iekf-cv", tags=tags, noise=NOISE, process=PROCESS, bias_std_m=1)

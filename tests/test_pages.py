@@ -83,7 +83,7 @@ def result() -> dict:
 
 @pytest.fixture(scope="module")
 def demo(result) -> str:
-    return track_pages.demo(result, camsap2013.example(1))
+    return track_pages.demo_page(result, camsap2013.example(1))
 
 
 HEADINGS = ["filter", "scene", "ratio", "flips", "verdict"]
@@ -191,7 +191,7 @@ def test_logarithmic_axes_are_labelled_with_whole_numbers(result):
 
 
 def test_a_page_needs_no_network_and_is_the_same_for_the_same_result(demo):
-    again = track_pages.demo(camsap2013.tracking_experiment(5, 1), camsap2013.example(1))
+    again = track_pages.demo_page(camsap2013.tracking_experiment(5, 1), camsap2013.example(1))
     # Only the times of the processor differ.
     table = r"<td data-value=\"[\d.]+\">[\d.]+</td></tr>"
     assert re.sub(table, "", demo) == re.sub(table, "", again)
@@ -236,7 +236,7 @@ def test_errors_of_a_story_are_those_that_were_put_in():
 
 @pytest.mark.parametrize("known", [True, False])
 def test_every_moment_changes_the_same_traces(known):
-    shown = track_html.figure(story(known=known))
+    shown = track_html.track_figure(story(known=known))
     kinds = [type(trace) for trace in shown.data]
     assert len(shown.frames) == 7
     for frame in shown.frames:
@@ -245,7 +245,7 @@ def test_every_moment_changes_the_same_traces(known):
 
 
 def test_scenes_have_equal_scales():
-    scene = track_html.figure(story()).layout.scene
+    scene = track_html.track_figure(story()).layout.scene
     spans = [np.ptp(getattr(scene, f"{name}axis").range) for name in "xyz"]
     ratios = [getattr(scene.aspectratio, name) for name in "xyz"]
     np.testing.assert_allclose(np.divide(spans, ratios), spans[0] / ratios[0])

@@ -68,14 +68,14 @@ def test_every_kind_of_legal_space(scene):
     problem = scene_files.problem(scene, 4)
     found = place.design_layout(problem, 0)
     assert placement.is_legal(problem.task, found.anchors, 1e-3).all()
-    assert place_figures.figure(place.place_anchors(problem, range(4, 5), 0, 20)) is not None
+    assert place_figures.place_figure(place.place_anchors(problem, range(4, 5), 0, 20)) is not None
 
 
 def test_a_plane_and_a_line_are_regions_too():
     for high in ([7, 5, 1], [7, 1, 1]):
         problem = scene_files.problem("uwb_room", 4, ([1, 1, 1], high))
         found = place.place_anchors(problem, range(4, 5), 0, 20)
-        assert place_figures.figure(found) is not None
+        assert place_figures.place_figure(found) is not None
         assert found.result["predicted"]["position_m"]["worst"] < 1
 
 
@@ -241,7 +241,7 @@ def test_the_figures_have_these_names(placed):
 
 def test_the_page_needs_no_network_and_is_the_same_for_the_same_result(placed, tmp_path):
     for name in ("a.html", "b.html"):
-        place_html.write(placed, str(tmp_path / name))
+        place_html.write_place(placed, str(tmp_path / name))
     page = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert page == (tmp_path / "b.html").read_text(encoding="utf-8")
     assert not re.search(r"<(script|link|img)[^>]*(src|href)\s*=", page[:5000])
@@ -255,7 +255,7 @@ def test_the_page_needs_no_network_and_is_the_same_for_the_same_result(placed, t
 
 def test_the_picture_is_the_same_for_the_same_result(placed, tmp_path):
     for name in ("a.png", "b.png"):
-        place_figures.figure(placed).savefig(tmp_path / name, dpi=60)
+        place_figures.place_figure(placed).savefig(tmp_path / name, dpi=60)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 

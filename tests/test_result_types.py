@@ -26,7 +26,7 @@ def graph_file(folder):
 
 def wandering():
     law, process = unknown_twist.WanderingTwist(), motion.ProcessNoise()
-    return unknown_twist.simulate(
+    return unknown_twist.simulate_wandering(
         np.eye(3), np.zeros(3), law, process, 0.1, 3, np.random.default_rng(0)
     )
 

@@ -87,7 +87,7 @@ def test_bound_by_brute_force_is_the_last_block_of_the_whole_trajectorys_informa
     rng = np.random.default_rng(3)
     anchors, tags, rotation, translation = random_world(rng, 5, 4)
     steps, dt = 4, 0.3
-    path = ut.simulate(rotation, translation, LAW, PROCESS, dt, steps, rng)
+    path = ut.simulate_wandering(rotation, translation, LAW, PROCESS, dt, steps, rng)
     links = rng.random((steps + 1, 5, 4)) > 0.2
     prior = np.diag([0.1, 0.2, 0.1, 1.0, 0.5, 2.0, *LAW.prior_std() ** 2])
     whole = np.zeros((12 * (steps + 1),) * 2)
@@ -159,7 +159,7 @@ def test_drawn_trajectories_have_the_laws_moments():
     at = np.broadcast_to(np.eye(3), (trials, 3, 3))
     law = ut.WanderingTwist(0.02, 2.0, 0.05, 0.7)
     still = motion.ProcessNoise(0.01, 0.1)
-    path = ut.simulate(at, np.zeros(3), law, still, dt, 2, rng)
+    path = ut.simulate_wandering(at, np.zeros(3), law, still, dt, 2, rng)
     twists = path.twists
     turn = rotations.error(path.rotation[:, 2], path.rotation[:, 1])
     moves = np.concatenate([turn, path.translation[:, 2] - path.translation[:, 1]], axis=-1)
@@ -185,19 +185,19 @@ def test_drawn_trajectories_have_the_laws_moments():
         (lambda: ut.TwistSensor(gyro_std_rad_s=0), "gyro_std_rad_s must be a finite number"),
         (lambda: ut.TwistSensor(frame="moon"), "frame must be one of"),
         (
-            lambda: ut.simulate(
+            lambda: ut.simulate_wandering(
                 np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 0, np.random.default_rng(0)
             ),
             "steps must be a positive int",
         ),
         (
-            lambda: ut.simulate(
+            lambda: ut.simulate_wandering(
                 np.eye(3), np.zeros(3), PROCESS, PROCESS, 0.1, 1, np.random.default_rng(0)  # pyright: ignore[reportArgumentType]
             ),
             "law must be a WanderingTwist, got ProcessNoise",
         ),
         (
-            lambda: ut.simulate(np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 1, 0),  # pyright: ignore[reportArgumentType]
+            lambda: ut.simulate_wandering(np.eye(3), np.zeros(3), LAW, PROCESS, 0.1, 1, 0),  # pyright: ignore[reportArgumentType]
             "rng must be a numpy.random.Generator, got 0",
         ),
         (

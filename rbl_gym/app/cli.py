@@ -146,11 +146,11 @@ def _demo(options: argparse.Namespace) -> int:
     from rbl_gym.app import figures, reports
 
     example = camsap2013.example(options.seed)
-    figures.save(figures.camsap2013(result, example), options.plot)
+    figures.save_figure(figures.camsap2013_figure(result, example), options.plot)
     if options.html:
         from rbl_gym.app import page, track_pages
 
-        page.write(track_pages.demo(result, example), options.html)
+        page.write(track_pages.demo_page(result, example), options.html)
     if write_json(result, options.json):
         reports.print_camsap2013(result)
         print_files(picture=options.plot, page=options.html)
@@ -170,7 +170,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     from rbl_gym.app import figures
 
     plot = options.plot or f"out/{options.experiment}.png"
-    figures.save(experiment.figure(result, options.seed), plot)
+    figures.save_figure(experiment.figure(result, options.seed), plot)
     if options.csv:
         papers.write_csv(result, options.csv)
     if write_json(result, options.json):
@@ -186,7 +186,7 @@ def _network(options: argparse.Namespace) -> int:
     if options.plot:
         from rbl_gym.app import figures, network_figures
 
-        figures.save(network_figures.network_figure(solved), options.plot)
+        figures.save_figure(network_figures.network_figure(solved), options.plot)
     if write_json(solved.result, options.json):
         from rbl_gym.app import network_figures
 
@@ -212,11 +212,11 @@ def _place(options: argparse.Namespace) -> int:
     if options.plot:
         from rbl_gym.app import figures, place_figures
 
-        figures.save(place_figures.figure(placed), options.plot)
+        figures.save_figure(place_figures.place_figure(placed), options.plot)
     if options.html:
         from rbl_gym.app import place_html
 
-        place_html.write(placed, options.html)
+        place_html.write_place(placed, options.html)
     if write_json(placed.result, options.json):
         from rbl_gym.app import place_report
 

@@ -49,14 +49,14 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 @styled
-def save(figure: Figure, path: str) -> None:
+def save_figure(figure: Figure, path: str) -> None:
     """Write a figure, making its folder."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
 
 
 @styled
-def camsap2013(result: dict[str, Any], example: Example) -> Figure:
+def camsap2013_figure(result: dict[str, Any], example: Example) -> Figure:
     """Figs 2 and 3 of the tracking paper, NEES, and one trial or ET-KF's trade beside them."""
     figure = new_figure(14, 7.2)
     axes = figure.subplots(2, 3, width_ratios=[1.05, 1, 1])
@@ -159,7 +159,7 @@ def _errors(axes: Any, example: Example) -> None:
 
 
 @styled
-def static(result: dict[str, Any]) -> Figure:
+def static_figure(result: dict[str, Any]) -> Figure:
     """Figs 2 and 3 of the static paper over the reference range, a column for every setting."""
     settings = result["settings"]
     figure = new_figure(3.4 * len(settings) + 1.2, 6.6)
@@ -170,7 +170,7 @@ def static(result: dict[str, Any]) -> Figure:
 
 
 @styled
-def slides2013(result: dict[str, Any]) -> Figure:
+def slides2013_figure(result: dict[str, Any]) -> Figure:
     """The static part in the first columns, the dynamic part in the last two."""
     settings = result["settings"]
     count = len(settings)
@@ -225,7 +225,7 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
 
 
 @styled
-def replay(recording: Recording, replayed: Replayed) -> Figure:
+def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     """The track from above with the anchors, and, where truth exists, the errors over time."""
     track, found = replayed.track, replayed.errors
     figure = new_figure(12, 5.2 if found is not None else 6)

@@ -40,7 +40,7 @@ def _drawn(module: str, name: str) -> Callable[[dict[str, Any], int], Any]:
 
 
 def _camsap2013_figure(result: dict[str, Any], seed: int) -> Any:
-    return _late("figures", "camsap2013")(result, camsap2013.example(seed))
+    return _late("figures", "camsap2013_figure")(result, camsap2013.example(seed))
 
 
 def experiments() -> dict[str, Experiment]:
@@ -75,14 +75,14 @@ def experiments() -> dict[str, Experiment]:
             lambda *arguments: icassp2013.static_experiment(
                 "icassp2013", icassp2013.static_settings(), *arguments
             ),
-            _drawn("figures", "static"),
+            _drawn("figures", "static_figure"),
             _late("reports", "print_static"),
         ),
         "slides2013": Experiment(
             "5 tags on a rectangular pyramid, 4 anchors: static, and the tracking experiment",
             slides2013.work_units(),
             slides2013.slides_experiment,
-            _drawn("figures", "slides2013"),
+            _drawn("figures", "slides2013_figure"),
             _late("reports", "print_slides2013"),
         ),
         "network2009": Experiment(

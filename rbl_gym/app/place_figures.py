@@ -26,7 +26,7 @@ _SIDE: Plane = (0, 2)
 
 
 @matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10})
-def figure(placed: Placed) -> Figure:
+def place_figure(placed: Placed) -> Figure:
     """Maps of position and orientation, a side view, the usual layouts or the number's curve."""
     problem, anchors = placed.problem, placed.design.anchors
     low, high = problem.corners()

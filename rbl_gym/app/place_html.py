@@ -17,19 +17,19 @@ from rbl_gym.studies.placing.accuracy import Map, level_maps
 from rbl_gym.studies.placing.design import Placed
 
 
-def write(placed: Placed, path: str) -> None:
+def write_place(placed: Placed, path: str) -> None:
     """Write the page, making its folder."""
     result = placed.result
     title = f"{result['scene']}: {result['n_anchors']} anchors"
     parts = [
-        page.plot(scene(placed), "scene"),
+        page.plot(place_scene(placed), "scene"),
         *(page.table(*rows) for rows in tables(result)),
         *(page.note(text) for text in notes(result)),
     ]
     page.write(page.document(title, parts), path)
 
 
-def scene(placed: Placed) -> go.Figure:
+def place_scene(placed: Placed) -> go.Figure:
     """Anchors, obstacles, region and map; a slider for its height, buttons for what it shows."""
     problem, anchors = placed.problem, placed.design.anchors
     maps = level_maps(problem, anchors)

@@ -160,11 +160,11 @@ def _replay(options: argparse.Namespace) -> int:
     if options.plot:
         from rbl_gym.app import figures
 
-        figures.save(figures.replay(recording, replayed), options.plot)
+        figures.save_figure(figures.replay_figure(recording, replayed), options.plot)
     if options.html:
         from rbl_gym.app import page, track_pages
 
-        page.write(track_pages.replay(recording, replayed), options.html)
+        page.write(track_pages.replay_page(recording, replayed), options.html)
     if write_json(replayed.figures, options.json):
         from rbl_gym.app import reports
 

@@ -67,7 +67,7 @@ class Story(NamedTuple):
     axes: str = "xyz"
 
 
-def figure(story: Story) -> go.Figure:
+def track_figure(story: Story) -> go.Figure:
     """Space, the body close up, and where truth is known the errors and the NEES; a slider."""
     rows = 2 if story.truth is not None else 1
     wide = {"type": "scene", "colspan": 3}

@@ -24,7 +24,7 @@ _LEGEND = (
 )
 
 
-def demo(result: dict[str, Any], example: Example) -> str:
+def demo_page(result: dict[str, Any], example: Example) -> str:
     """The tracking paper's experiment: one trial to look at, and all of them in figures."""
     scene, episode = example.trials.scene, example.trials.episode
     beliefs = {
@@ -46,7 +46,7 @@ def demo(result: dict[str, Any], example: Example) -> str:
     assumed = ", ".join(result["assumed"])
     parts = [
         page.note(f"One trial. {_LEGEND}"),
-        page.plot(track_html.figure(story), "track"),
+        page.plot(track_html.track_figure(story), "track"),
         "<h2>All trials</h2>",
         page.plot(_curves(result), "curves", first=False),
         page.note("Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward "
@@ -101,7 +101,7 @@ def _curves(result: dict[str, Any]) -> go.Figure:
     return shown
 
 
-def replay(recording: Recording, replayed: Replayed) -> str:
+def replay_page(recording: Recording, replayed: Replayed) -> str:
     """A recording: the track, its errors where truth exists, the figures of the run."""
     settings, track, result = replayed.settings, replayed.track, replayed.figures
     truth = truth_of(recording, track, settings)
@@ -120,7 +120,7 @@ def replay(recording: Recording, replayed: Replayed) -> str:
     if origin.any():
         shift = ", ".join(f"{x:.0f}" for x in origin)
         parts.append(page.note(f"Coordinates are relative to ({shift}) m."))
-    parts.append(page.plot(track_html.figure(story), "track"))
+    parts.append(page.plot(track_html.track_figure(story), "track"))
     if truth is not None:
         rows = [
             [f"{name} {result['position_axes']} (m)" if unit == "m" else f"{name} (deg)",

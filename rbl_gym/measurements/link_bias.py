@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_count, check_generator, check_number
 
-__all__ = ["LinkBias", "simulate"]
+__all__ = ["LinkBias", "simulate_biases"]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class LinkBias:
         return 1.0 if self.time_s is None else math.exp(-dt / self.time_s)
 
 
-def simulate(
+def simulate_biases(
     law: LinkBias,
     times: ArrayLike,
     links: int,

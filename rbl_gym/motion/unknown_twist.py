@@ -33,7 +33,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.motion.kinematics import ProcessNoise, check_process, six
 
 __all__ = [
-    "FRAMES", "TwistSensor", "WanderingPath", "WanderingTwist", "simulate",
+    "FRAMES", "TwistSensor", "WanderingPath", "WanderingTwist", "simulate_wandering",
 ]  # fmt: skip
 
 FRAMES = ("world", "body")
@@ -142,7 +142,7 @@ class WanderingPath(NamedTuple):
     twists: FloatArray  # (..., T + 1, 6)
 
 
-def simulate(
+def simulate_wandering(
     rotation: ArrayLike,
     translation: ArrayLike,
     law: WanderingTwist,

@@ -36,10 +36,10 @@ from rbl_gym.testing.worlds import (
     check_refuses_nan,
     check_same,
     check_shapes,
+    draw_epochs,
     moved,
     moved_world,
     require,
-    simulate,
     take,
     trial,
 )
@@ -127,18 +127,18 @@ def _filter_interface(make_filter: Any, rng: np.random.Generator) -> None:
 
 def _filter_shapes(make_filter: Any, rng: np.random.Generator) -> None:
     for batch in ((), (3,), (2, 2)):
-        epochs = simulate(rng, batch, 2)
+        epochs = draw_epochs(rng, batch, 2)
         belief = _beliefs(_made(make_filter), epochs)[-1]
         check_shapes("belief", belief, batch, ("rotation", "translation", "covariance", "matrix"))
 
 
 def _filter_pose(make_filter: Any, rng: np.random.Generator) -> None:
-    for belief in _beliefs(_made(make_filter), simulate(rng, (8,), 4)):
+    for belief in _beliefs(_made(make_filter), draw_epochs(rng, (8,), 4)):
         check_pose("belief", belief)
 
 
 def _filter_batching(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), simulate(rng, (4,), 3)
+    filter, epochs = _made(make_filter), draw_epochs(rng, (4,), 3)
     together = _beliefs(filter, epochs)[-1]
     for index in range(4):
         alone = _beliefs(filter, trial(epochs, index))[-1]
@@ -152,7 +152,7 @@ def _filter_batching(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_purity(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), simulate(rng, (3,), 2)
+    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 2)
     anchors, links = ANCHORS, np.ones(epochs.ranges.shape[1:], dtype=np.bool_)
     links[..., 0, 0] = False
     prior = tuple(array.copy() for array in epochs.prior)
@@ -163,7 +163,7 @@ def _filter_purity(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_determinism(make_filter: Any, rng: np.random.Generator) -> None:
-    epochs = simulate(rng, (3,), 3)
+    epochs = draw_epochs(rng, (3,), 3)
     filter = _made(make_filter)
     first = _beliefs(filter, epochs)[-1]
     for label, other in (("a second run", filter), ("a filter made alike", _made(make_filter))):
@@ -171,7 +171,7 @@ def _filter_determinism(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_pickling(make_filter: Any, rng: np.random.Generator) -> None:
-    epochs = simulate(rng, (3,), 2)
+    epochs = draw_epochs(rng, (3,), 2)
     filter = _made(make_filter)
     state = call("initial", filter.initial, *epochs.prior)
     copies = []
@@ -187,7 +187,7 @@ def _filter_pickling(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), simulate(rng, (3,), 3)
+    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 3)
     turn, shift = moved_world(rng)
     both = np.kron(np.eye(2), turn)
     rotation, translation, covariance = epochs.prior
@@ -201,7 +201,7 @@ def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), simulate(rng, (3,), 1)
+    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 1)
     anchors, ranges = ANCHORS, epochs.ranges[0]
     state = call("initial", filter.initial, *epochs.prior)
 
@@ -216,7 +216,7 @@ def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), simulate(rng, (3,), 2)
+    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 2)
     links = np.ones(epochs.ranges.shape[1:], dtype=np.bool_)
     links[..., 1, 0] = False
     state = call("initial", filter.initial, *epochs.prior)
@@ -243,7 +243,7 @@ def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), simulate(rng, (3,), 1)
+    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 1)
     state = call("initial", filter.initial, *epochs.prior)
     calls = {
         "initial": (filter.initial, ("rotation", "translation", "covariance"), epochs.prior),
@@ -260,7 +260,7 @@ def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
-    epochs = simulate(rng, (_TRIALS,), _EPOCHS)
+    epochs = draw_epochs(rng, (_TRIALS,), _EPOCHS)
     beliefs = _beliefs(_made(make_filter), epochs)
     check_nees(beliefs, epochs.rotation, epochs.translation)
     last = (epochs.rotation[-1], epochs.translation[-1], TAGS)
@@ -297,16 +297,16 @@ def _beliefs(filter: Any, epochs: Epochs, anchors: FloatArray | None = None) -> 
 
 def _locator_shapes(locate: Any, rng: np.random.Generator) -> None:
     for batch in ((), (3,), (2, 2)):
-        found = _located(locate, simulate(rng, batch, 1).ranges[0])
+        found = _located(locate, draw_epochs(rng, batch, 1).ranges[0])
         check_shapes("estimate", found, batch, ("rotation", "translation", "covariance"))
 
 
 def _locator_pose(locate: Any, rng: np.random.Generator) -> None:
-    check_pose("estimate", _located(locate, simulate(rng, (8,), 1).ranges[0]))
+    check_pose("estimate", _located(locate, draw_epochs(rng, (8,), 1).ranges[0]))
 
 
 def _locator_batching(locate: Any, rng: np.random.Generator) -> None:
-    ranges = simulate(rng, (4,), 1).ranges[0]
+    ranges = draw_epochs(rng, (4,), 1).ranges[0]
     together = _located(locate, ranges)
     for index in range(4):
         check_same(
@@ -316,20 +316,20 @@ def _locator_batching(locate: Any, rng: np.random.Generator) -> None:
 
 
 def _locator_purity(locate: Any, rng: np.random.Generator) -> None:
-    ranges = simulate(rng, (3,), 1).ranges[0]
+    ranges = draw_epochs(rng, (3,), 1).ranges[0]
     links = np.ones(ranges.shape, dtype=np.bool_)
     links[..., 0, 0] = False
     check_pure("locate", locate, ranges.copy(), ANCHORS, TAGS, NOISE, links=links)
 
 
 def _locator_determinism(locate: Any, rng: np.random.Generator) -> None:
-    ranges = simulate(rng, (3,), 1).ranges[0]
+    ranges = draw_epochs(rng, (3,), 1).ranges[0]
     first, second = _located(locate, ranges), _located(locate, ranges)
     check_same("a second call must give the same bytes", first, second, 0.0)
 
 
 def _locator_invariance(locate: Any, rng: np.random.Generator) -> None:
-    ranges = simulate(rng, (3,), 1).ranges[0]
+    ranges = draw_epochs(rng, (3,), 1).ranges[0]
     turn, shift = moved_world(rng)
     expected = moved(_located(locate, ranges), turn, shift)
     found = _located(locate, ranges, ANCHORS @ turn.T + shift)
@@ -337,7 +337,7 @@ def _locator_invariance(locate: Any, rng: np.random.Generator) -> None:
 
 
 def _locator_links(locate: Any, rng: np.random.Generator) -> None:
-    ranges = simulate(rng, (3,), 1).ranges[0]
+    ranges = draw_epochs(rng, (3,), 1).ranges[0]
     check_links(lambda ranges, anchors, links: _located(locate, ranges, anchors, links), ranges)
 
 
@@ -346,12 +346,12 @@ def _locator_nan(locate: Any, rng: np.random.Generator) -> None:
         "locate",
         lambda ranges, anchors, tags: locate(ranges, anchors, tags, NOISE),
         ("ranges", "anchors", "tags"),
-        (simulate(rng, (3,), 1).ranges[0], ANCHORS, TAGS),
+        (draw_epochs(rng, (3,), 1).ranges[0], ANCHORS, TAGS),
     )
 
 
 def _locator_nees(locate: Any, rng: np.random.Generator) -> None:
-    epochs = simulate(rng, (4 * _TRIALS,), 1)
+    epochs = draw_epochs(rng, (4 * _TRIALS,), 1)
     check_nees([_located(locate, epochs.ranges[0])], epochs.rotation, epochs.translation)
 
 

@@ -37,7 +37,7 @@ class Epochs(NamedTuple):
     prior: tuple[FloatArray, FloatArray, FloatArray]
 
 
-def simulate(rng: np.random.Generator, batch: tuple[int, ...], count: int) -> Epochs:
+def draw_epochs(rng: np.random.Generator, batch: tuple[int, ...], count: int) -> Epochs:
     """Bodies that drift and turn among `ANCHORS`, their ranges, and a prior drawn around them."""
     twists = np.zeros((*batch, count, 6))
     twists[..., 1:, :] = 0.5 * rng.standard_normal((*batch, 1, 6))
