@@ -54,6 +54,14 @@ def check_epoch(
     ValueError
         On shapes that do not fit, NaN or inf behind a True link, a range that is not positive.
     """
+    if (
+        links is None
+        and is_one_epoch(ranges, anchors, tags)
+        and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportArgumentType]
+        and are_positive(ranges)  # pyright: ignore[reportArgumentType]
+    ):
+        # The quick way of one body; what is wrong goes the long one, which names it.
+        return ranges, anchors, None  # pyright: ignore[reportReturnType]
     anchors = check_array("anchors", anchors, ("M", 3))
     shape = (anchors.shape[-2], tags.shape[-2])
     mask = check_links(links, shape)

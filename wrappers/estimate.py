@@ -193,9 +193,9 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
     """
     if "angles" in observation:
         return filter.update(state, observation["angles"], observation["station"])
-    ranges, anchors, links = (observation[key] for key in ("ranges", "anchors", "links"))
+    ranges, anchors, links = observation["ranges"], observation["anchors"], observation["links"]
     if "quality" not in observation:
-        return filter.update(state, ranges, anchors, links)
+        return filter.update(state, ranges, anchors, None if links.all() else links)
     seen = links.astype(np.bool_, copy=False)
     law = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
     return filter.update(state, ranges, anchors, links, noise=law)

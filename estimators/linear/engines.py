@@ -5,8 +5,8 @@ A test holds both to each other on the same trials.
 
 from __future__ import annotations
 
-import copy
 import functools
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from rbl_gym.kernels import compiled
 
 # Behind the door: what comes to it was checked.
 _EXP = kernel(rotations.exp)
+_EYE = np.eye(12)
 
 
 class Prediction(NamedTuple):
@@ -129,10 +130,10 @@ def update_mean(
 
 def transition(step: FloatArray) -> FloatArray:
     """F (..., 12, 12) of a rotation: ``blkdiag(step, step, step, I)``."""
-    F = np.zeros((*step.shape[:-2], 12, 12))
-    for k in range(3):
-        F[..., 3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = step
-    F[..., 9:, 9:] = np.eye(3)
+    F = np.empty((*step.shape[:-2], 12, 12))
+    F[...] = _EYE
+    for k in (0, 3, 6):
+        F[..., k : k + 3, k : k + 3] = step
     return F
 
 
@@ -160,7 +161,7 @@ class FilterPy:
     ) -> tuple[FloatArray, FloatArray]:
         """As `Batched.predict`."""
         kf = cls._filter(mean, P)
-        kf.F, kf.Q = transition(_EXP(motion.turn)), np.diag(motion.noise)
+        kf.F, kf.Q = transition(_EXP(motion.turn)), motion.noise * _EYE
         kf.predict(u=motion.shift[:, None])
         return cls._result(kf)
 
@@ -175,8 +176,10 @@ class FilterPy:
 
     @staticmethod
     def _filter(mean: FloatArray, P: FloatArray) -> Any:
-        kf = copy.copy(_kalman_filter())
-        # It never writes into its arrays; a shallow copy shares those that stay the same.
+        ready = _kalman_filter()
+        kf = object.__new__(type(ready))
+        # It never writes into its arrays: a shallow copy shares those that stay the same.
+        kf.__dict__.update(ready.__dict__)
         kf.x, kf.P = mean[:, None].copy(), P.copy()
         return kf
 
@@ -185,7 +188,7 @@ class FilterPy:
         mean, P = np.asarray(kf.x), np.asarray(kf.P)
         if mean.shape != (12, 1) or P.shape != (12, 12):
             raise RuntimeError(f"filterpy returned shapes {mean.shape} and {P.shape}")
-        if not (np.isfinite(mean).all() and np.isfinite(P).all()):
+        if not math.isfinite(np.vdot(mean, mean) + np.vdot(P, P)):
             raise ValueError("the filter's state is no longer finite")
         return mean[:, 0].copy(), symmetric(P)
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of, kernel
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
@@ -41,8 +41,8 @@ from rbl_gym.kernels import compiled
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
-# Behind the door: what is not determined is NaN.
-_HAT = kernel(rotations.hat)
+# How large the rotation and the covariance of a belief are, to kernels.
+_SIZES = np.eye(3), np.zeros(6)
 
 
 class KalmanState(NamedTuple):
@@ -187,7 +187,8 @@ class KalmanFamily:
                 self.tags.shape[-2],
             ):
                 raise ValueError(f"weights must fit {ranges.shape[-2:]} links, got {weights.shape}")
-        check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
+        if state.mean.ndim > 1 or ranges.ndim > 2:
+            check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
         if mask is not None:
             weights = np.where(mask, weights, 0.0)
         epoch = Epoch(ranges, anchors, self.tags, weights)
@@ -210,7 +211,7 @@ class KalmanFamily:
         """
         state = plain(state)
         form = constrained_belief if self.constraint == "newton" else projected_belief
-        rotation, covariance = form(state.mean, state.covariance, np.eye(3), np.zeros(6))
+        rotation, covariance = form(state.mean, state.covariance, *_SIZES)
         translation = state.mean[..., 9:].copy()
         if self.constraint in ("newton", "always"):
             return PoseBelief(rotation, translation, covariance, rotation)
