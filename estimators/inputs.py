@@ -56,7 +56,7 @@ def check_epoch(
     """
     if (
         links is None
-        and is_one_epoch(ranges, anchors, tags)
+        and is_plain_epoch(ranges, anchors, tags, ())
         and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportArgumentType]
         and are_positive(ranges)  # pyright: ignore[reportArgumentType]
     ):
@@ -173,7 +173,10 @@ def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
 
 def plain(state: State) -> State:
     """A state with its arrays in C order: results must not depend on how they lie in memory."""
-    return type(state)(*(np.asarray(field, order="C") for field in state))
+    for field in state:
+        if type(field) is not np.ndarray or not field.flags.c_contiguous:
+            return type(state)(*(np.asarray(field, order="C") for field in state))
+    return state
 
 
 def law_of(noise: NoiseLaw | None, own: NoiseLaw) -> NoiseLaw:

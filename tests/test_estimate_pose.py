@@ -104,8 +104,9 @@ def test_wrapped_rollout_equals_driving_the_filter_by_hand(name, filter, options
         e = np.concatenate([w, belief.translation - info["translation"]])
         for reward, steps in runs.items():
             got, told = steps[k][0], steps[k][-1]
+            # The wrapper says None where all links measured, which may turn the last bits.
             for key, want in zip(BELIEF, belief[:3], strict=True):
-                np.testing.assert_array_equal(got[key], want)
+                np.testing.assert_allclose(got[key], want, rtol=1e-9, atol=1e-9)
             for key, want in seen.items():
                 np.testing.assert_array_equal(got[key], want)
             assert told["score_m"] == pytest.approx(b, rel=1e-9)

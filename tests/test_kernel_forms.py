@@ -266,11 +266,10 @@ every_weight = pytest.mark.parametrize("weights", ["common", "of each link", "lo
 @every_batch
 def test_linear_prediction(batch):
     rng, linear = np.random.default_rng(5), Linear(batch, 4, 5, "common")
-    turn, shift = rng.standard_normal((2, *batch, 3))
-    for turn_of_all in (turn, np.zeros(3), np.array([0.0, 3.0, 0.1])):
-        assert_equal_forms(engines.predict_mean, linear.mean, turn_of_all, shift)
+    for twist in (rng.standard_normal((*batch, 6)), np.zeros(6), np.array([0, 9.0, 0, 1, 2, 3])):
+        assert_equal_forms(engines.predict_mean, linear.mean, twist, 0.3)
         for P in (linear.P, np.eye(12)):
-            assert_equal_forms(engines.predict_covariance, P, turn_of_all, rng.random(12))
+            assert_equal_forms(engines.predict_covariance, P, twist, 0.3, rng.random(12))
 
 
 @every_batch

@@ -27,22 +27,20 @@ _EXP = kernel(rotations.exp)
 _EYE = np.eye(12)
 
 
-class Prediction(NamedTuple):
-    """What a step of time does: ``Q <- exp(turn) Q + noise``, ``t <- t + shift + noise``.
+class Motion(NamedTuple):
+    """What a step of time does: ``Q <- exp(w dt) Q + noise``, ``t <- t + v dt + noise``.
 
     Attributes
     ----------
-    turn
-        Rotation vector (..., 3), radians.
-    shift
-        (..., 3), metres.
-    noise
-        Variances (12,) that are added, one for all entries of Q.
+    twist, dt
+        Known twist (w, v) (..., 6), and seconds.
+    rate
+        Variances (12,) that are added in 1 s, one for all entries of Q.
     """
 
-    turn: FloatArray
-    shift: FloatArray
-    noise: FloatArray
+    twist: FloatArray
+    dt: float
+    rate: FloatArray
 
 
 class Epoch(NamedTuple):
@@ -71,12 +69,10 @@ class Batched:
     """Any leading axes, by broadcasting: a covariance (12, 12) belongs to all trials."""
 
     @staticmethod
-    def predict(
-        mean: FloatArray, P: FloatArray, motion: Prediction
-    ) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance after ``x <- F x + [0; shift]``, ``P <- F P F^T + Q``."""
-        turn, shift, noise = motion
-        return predict_mean(mean, turn, shift), predict_covariance(P, turn, noise)
+    def predict(mean: FloatArray, P: FloatArray, motion: Motion) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance after ``x <- F x + [0; v dt]``, ``P <- F P F^T + Q``."""
+        twist, dt, rate = motion
+        return predict_mean(mean, twist, dt), predict_covariance(P, twist, dt, rate)
 
     @staticmethod
     def update(mean: FloatArray, P: FloatArray, epoch: Epoch) -> tuple[FloatArray, FloatArray]:
@@ -86,18 +82,18 @@ class Batched:
 
 
 @compiled("linear_filter:predict_mean")
-def predict_mean(mean: FloatArray, turn: FloatArray, shift: FloatArray) -> FloatArray:
-    """``F x + [0; shift]`` (..., 12), ``F = blkdiag(R, R, R, I)``, ``R = exp(turn)``."""
-    mean = (transition(_EXP(turn)) @ mean[..., None])[..., 0]
-    mean[..., 9:] += shift
+def predict_mean(mean: FloatArray, twist: FloatArray, dt: float) -> FloatArray:
+    """``F x + [0; v dt]`` (..., 12), ``F = blkdiag(R, R, R, I)``, ``R = exp(w dt)``."""
+    mean = (transition(_EXP(twist[..., :3] * dt)) @ mean[..., None])[..., 0]
+    mean[..., 9:] += twist[..., 3:] * dt
     return mean
 
 
 @compiled("linear_filter:predict_covariance")
-def predict_covariance(P: FloatArray, turn: FloatArray, noise: FloatArray) -> FloatArray:
-    """``F P F^T + diag(noise)`` (..., 12, 12), F as of `predict_mean`."""
-    F = transition(_EXP(turn))
-    return symmetric(F @ P @ np.swapaxes(F, -1, -2)) + noise[..., None] * np.eye(12)
+def predict_covariance(P: FloatArray, twist: FloatArray, dt: float, rate: FloatArray) -> FloatArray:
+    """``F P F^T + dt diag(rate)`` (..., 12, 12), F as of `predict_mean`."""
+    F = transition(_EXP(twist[..., :3] * dt))
+    return symmetric(F @ P @ np.swapaxes(F, -1, -2)) + dt * rate[..., None] * _EYE
 
 
 @compiled("linear_filter:update_covariance")
@@ -157,12 +153,13 @@ class FilterPy:
 
     @classmethod
     def predict(
-        cls, mean: FloatArray, P: FloatArray, motion: Prediction
+        cls, mean: FloatArray, P: FloatArray, motion: Motion
     ) -> tuple[FloatArray, FloatArray]:
         """As `Batched.predict`."""
         kf = cls._filter(mean, P)
-        kf.F, kf.Q = transition(_EXP(motion.turn)), motion.noise * _EYE
-        kf.predict(u=motion.shift[:, None])
+        twist, dt, rate = motion
+        kf.F, kf.Q = transition(_EXP(twist[:3] * dt)), dt * rate * _EYE
+        kf.predict(u=twist[3:, None] * dt)
         return cls._result(kf)
 
     @classmethod

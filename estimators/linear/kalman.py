@@ -27,7 +27,7 @@ from rbl_gym.estimators.inputs import (
     epoch_variance,
     plain,
 )
-from rbl_gym.estimators.linear.engines import ENGINES, Epoch, Prediction, engine_for
+from rbl_gym.estimators.linear.engines import ENGINES, Epoch, Motion, engine_for
 from rbl_gym.estimators.linear.least_squares import unvec, vec
 from rbl_gym.estimators.linear.squared_range import geometric_rank
 from rbl_gym.estimators.linear.unitary import (
@@ -148,11 +148,8 @@ class KalmanFamily:
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
         engine = engine_for(self.engine, state=state.mean.shape[:-1], twist=twist.shape[:-1])
-        mean, covariance = engine.predict(
-            state.mean,
-            state.covariance,
-            Prediction(twist[..., :3] * dt, twist[..., 3:] * dt, dt * self._variance_rate),
-        )
+        motion = Motion(twist, dt, self._variance_rate)
+        mean, covariance = engine.predict(state.mean, state.covariance, motion)
         return KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
 
     def update(

@@ -19,25 +19,25 @@ _STATES = 12
 _cholesky, _, _invert_factored = of_size(_STATES)
 
 
-@gufunc("(p),(d),(d)->(p)")
-def predict_mean(mean: Any, turn: Any, shift: Any, new_mean: Any) -> None:
-    """``x <- F x + [0; shift]``, F = blkdiag(R, R, R, I), R the rotation of the vector `turn`."""
+@gufunc("(p),(s),()->(p)")
+def predict_mean(mean: Any, twist: Any, dt: float, new_mean: Any) -> None:
+    """``x <- F x + [0; v dt]``, F = blkdiag(R, R, R, I), ``R = exp(w dt)`` of the twist (w, v)."""
     R = np.empty((3, 3))
-    rotations.exp(turn[0], turn[1], turn[2], R)
+    rotations.exp(dt * twist[0], dt * twist[1], dt * twist[2], R)
     for i in range(3):
         for k in range(3):
             new_mean[3 * k + i] = (
                 R[i, 0] * mean[3 * k] + R[i, 1] * mean[3 * k + 1] + R[i, 2] * mean[3 * k + 2]
             )
-        new_mean[9 + i] = mean[9 + i] + shift[i]
+        new_mean[9 + i] = mean[9 + i] + dt * twist[3 + i]
 
 
-@gufunc("(p,p),(d),(p)->(p,p)")
-def predict_covariance(P: Any, turn: Any, noise: Any, new_P: Any) -> None:
-    """``P <- F P F^T + diag(noise)``, F as of `predict_mean`."""
+@gufunc("(p,p),(s),(),(p)->(p,p)")
+def predict_covariance(P: Any, twist: Any, dt: float, rate: Any, new_P: Any) -> None:
+    """``P <- F P F^T + dt diag(rate)``, F as of `predict_mean`."""
     work = np.empty((2, 3, 3))
     R, half = work[0], work[1]
-    rotations.exp(turn[0], turn[1], turn[2], R)
+    rotations.exp(dt * twist[0], dt * twist[1], dt * twist[2], R)
     for k in range(4):
         for m in range(k + 1):
             row, column = 3 * k, 3 * m
@@ -61,7 +61,7 @@ def predict_covariance(P: Any, turn: Any, noise: Any, new_P: Any) -> None:
                         new_P[row + i, column + j] = value
                         new_P[column + j, row + i] = value
     for i in range(_STATES):
-        new_P[i, i] += noise[i]
+        new_P[i, i] += dt * rate[i]
 
 
 @helper
