@@ -18,6 +18,7 @@ from rbl_gym.checks import (
     check_shape,
 )
 from rbl_gym.measurements.ranging import NoiseLaw
+from rbl_gym.motion.kinematics import ProcessNoise
 
 State = TypeVar("State", bound=tuple[Any, ...])
 _FLOAT64 = np.dtype(np.float64)
@@ -207,3 +208,13 @@ def matrix_rank(rows: FloatArray) -> np.ndarray:
     """Rank (...) of matrices (..., m, n): singular values above 1e-9 of the largest."""
     values = np.linalg.svd(rows, compute_uv=False)
     return (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1)
+
+
+def check_one_process(process: ProcessNoise) -> ProcessNoise:
+    """The noise of a motion, or a ValueError where each trial has its own."""
+    if np.ndim(process.std()) > 1:
+        raise ValueError(
+            f"process must be that of all trials, as only 'iekf' takes leading axes, got "
+            f"{process.std().shape[:-1]}"
+        )
+    return process

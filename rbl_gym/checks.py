@@ -169,15 +169,34 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
     return number
 
 
-def check_axes(name: str, value: ArrayLike) -> Axes:
-    """A standard deviation, or one for each of the world's axes; or a ValueError."""
+def check_axes(name: str, value: ArrayLike, leading: bool = False) -> Any:
+    """A standard deviation, or one for each of the world's axes; or a ValueError.
+
+    `leading`: whether it may be (..., 3), of each trial its own.
+    """
     array = check_array(name, value, ())
-    if array.shape not in ((), (3,)):
-        raise ValueError(f"{name} must be one number or three, got shape {array.shape}")
+    if array.shape not in ((), (3,)) and not (leading and array.ndim > 1 and array.shape[-1] == 3):
+        more = ", or (..., 3) with leading axes" if leading else ""
+        raise ValueError(f"{name} must be one number or three{more}, got shape {array.shape}")
     if (array < 0).any():
-        raise ValueError(f"{name} must not be negative, got {array.tolist()}")
+        raise ValueError(f"{name} must not be negative, got {array.min()}")
     # Lists come out of JSON; tuples keep the configuration hashable.
-    return float(array) if array.ndim == 0 else tuple(array.tolist())
+    return as_tuples(array)
+
+
+def as_tuples(value: FloatArray) -> Any:
+    """An array as nested tuples of floats: configuration that hashes and compares."""
+    return tuple(as_tuples(row) for row in value) if value.ndim else float(value)
+
+
+def check_duration(name: str, value: ArrayLike) -> Any:
+    """Seconds that are not negative, a float or an array (...) of trials; or a ValueError."""
+    if not getattr(value, "ndim", 0) and not isinstance(value, list | tuple):
+        return check_number(name, value, low=0.0)
+    array = check_array(name, value, ())
+    if (array < 0).any():
+        raise ValueError(f"{name} must not be negative, got {array.min()}")
+    return array
 
 
 def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:

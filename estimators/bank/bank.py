@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.bank.hypotheses import (
     SAME,
     BankState,
@@ -32,7 +32,7 @@ from rbl_gym.estimators.bank.hypotheses import (
 from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import WEIGHTS, IteratedEkf, as_state, update_pose
-from rbl_gym.estimators.inputs import check_batches, plain, spanned_dimensions
+from rbl_gym.estimators.inputs import check_batches, check_one_process, plain, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
 from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
@@ -85,6 +85,7 @@ class IteratedEkfBank:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tags", self._filter.tags)
+        check_one_process(self.process)
         if self.tags.ndim != 2:
             raise ValueError(f"tags must have shape (N, 3), got {self.tags.shape}")
         if self.volume is not None:
@@ -114,7 +115,7 @@ class IteratedEkfBank:
     def predict(self, state: BankState, twist: ArrayLike, dt: float) -> BankState:
         """State after `dt` seconds of the twist (..., 6), of all hypotheses."""
         state = plain(state)
-        twist = check_array("twist", twist, (6,))
+        twist, dt = check_array("twist", twist, (6,)), check_number("dt", dt, low=0.0)
         leader = self._filter.predict(leader_of(state), twist, dt)
         batch = leader.translation.shape[:-1]
         state = flat(state._replace(**leader._asdict()), batch)

@@ -23,7 +23,13 @@ from rbl_gym.estimators.costs.bias_cost import AugmentedState
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
-from rbl_gym.estimators.inputs import check_batches, check_epoch, epoch_variance, plain
+from rbl_gym.estimators.inputs import (
+    check_batches,
+    check_epoch,
+    check_one_process,
+    epoch_variance,
+    plain,
+)
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
@@ -56,6 +62,9 @@ class AugmentedEkf:
     twist: WanderingTwist | None = None
     sensor: TwistSensor | None = None
     biases: tuple[LinkBias, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_one_process(self.pose.process)
 
     @property
     def _n_twist(self) -> int:

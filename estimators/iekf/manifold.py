@@ -21,7 +21,7 @@ from rbl_gym.checks import (
     FloatArray,
     check_array,
     check_count,
-    check_number,
+    check_duration,
     kernel,
 )
 from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
@@ -69,7 +69,7 @@ class IteratedEkf:
     noise
         Law of the ranges; variances are taken at the measured ranges.
     process
-        Noise of the motion.
+        Noise of the motion; with leading axes each trial has its own.
     iterations
         Gauss-Newton iterations of an update; one alone is overconfident at high turn noise.
     robust
@@ -90,7 +90,7 @@ class IteratedEkf:
 
     @functools.cached_property
     def _variance(self) -> FloatArray:
-        """Variances (6,) of the motion's noise after 1 s."""
+        """Variances (..., 6) of the motion's noise after 1 s."""
         return self.process.std() ** 2
 
     def initial(
@@ -115,12 +115,14 @@ class IteratedEkf:
             np.broadcast_to(covariance, (*batch, 6, 6)).copy(),
         )
 
-    def predict(self, state: PoseState, twist: ArrayLike, dt: float) -> PoseState:
-        """State after `dt` seconds of the twist (..., 6), ``P <- F P F^T + Q``."""
+    def predict(self, state: PoseState, twist: ArrayLike, dt: ArrayLike) -> PoseState:
+        """State after `dt` seconds (...) of the twist (..., 6), ``P <- F P F^T + Q``."""
         twist = check_array("twist", twist, (6,))
-        dt = check_number("dt", dt, low=0.0)
-        if twist.ndim > 1:
-            check_batches(state=state.translation.shape[:-1], twist=twist.shape[:-1])
+        dt = check_duration("dt", dt)
+        if twist.ndim > 1 or np.ndim(dt) or self._variance.ndim > 1:
+            batches = {"twist": twist.shape[:-1], "dt": np.shape(dt)}
+            batches["process"] = self._variance.shape[:-1]
+            check_batches(state=state.translation.shape[:-1], **batches)
         return PoseState(*predict_pose(*state, twist, dt, self._variance))
 
     def update(

@@ -24,6 +24,7 @@ from rbl_gym.estimators.inputs import (
     check_batches,
     check_covariance,
     check_epoch,
+    check_one_process,
     epoch_variance,
     plain,
 )
@@ -109,6 +110,7 @@ class KalmanFamily:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
+        check_one_process(self.process)
         check_one_of("constraint", self.constraint, list(_CONSTRAINTS))
         check_one_of("engine", self.engine, list(ENGINES))
         check_number("sigma_q_scale", self.sigma_q_scale, low=0.0)

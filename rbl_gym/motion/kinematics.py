@@ -38,8 +38,10 @@ _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
 def six(rotation: Axes, translation: Axes) -> FloatArray:
-    """Six numbers (6,): those of the rotation's axes, then those of the translation's."""
-    return np.concatenate([np.broadcast_to(rotation, 3), np.broadcast_to(translation, 3)])
+    """Six numbers (..., 6): those of the rotation's axes, then those of the translation's."""
+    parts = [np.asarray(part, dtype=np.float64) for part in (rotation, translation)]
+    batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*batch, 3)) for part in parts], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,13 @@ class ProcessNoise:
     Parameters
     ----------
     rotation_rad, translation_m
-        A float, or three of them for the world's axes (a planar body has zeros among them).
+        A float, or three of them for the world's axes (a planar body has zeros among them), or
+        (..., 3) with leading axes: each trial has its own (`IteratedEkf` takes such).
 
     Raises
     ------
     ValueError
-        If a value is negative or not finite, or there are neither 1 nor 3.
+        If a value is negative or not finite, or there are neither 1 nor 3 of a trial.
     """
 
     rotation_rad: Axes = 0.0
@@ -62,10 +65,17 @@ class ProcessNoise:
 
     def __post_init__(self) -> None:
         for name in ("rotation_rad", "translation_m"):
-            object.__setattr__(self, name, check_axes(name, getattr(self, name)))
+            object.__setattr__(self, name, check_axes(name, getattr(self, name), leading=True))
+        shapes = np.shape(self.rotation_rad), np.shape(self.translation_m)
+        try:
+            np.broadcast_shapes(*shapes)
+        except ValueError as error:
+            raise ValueError(
+                f"rotation_rad and translation_m must broadcast, got shapes {shapes}"
+            ) from error
 
     def std(self) -> FloatArray:
-        """The six standard deviations after 1 s: rotation (rad), then translation (m)."""
+        """The standard deviations (..., 6) after 1 s: rotation (rad), then translation (m)."""
         return self._std.copy()
 
     def covariance(self, twist: FloatArray, dt: ArrayLike) -> FloatArray:
@@ -77,7 +87,8 @@ class ProcessNoise:
         dt = np.asarray(dt, dtype=np.float64)[..., None]
         jacobian = _LEFT_JACOBIAN(twist[..., :3] * dt)
         variance = dt * self._variance
-        covariance = np.zeros((*jacobian.shape[:-2], 6, 6))
+        batch = np.broadcast_shapes(jacobian.shape[:-2], variance.shape[:-1])
+        covariance = np.zeros((*batch, 6, 6))
         covariance[..., :3, :3] = (jacobian * variance[..., None, :3]) @ np.swapaxes(
             jacobian, -1, -2
         )

@@ -5,11 +5,17 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_array, check_count, check_number, check_one_of
+from rbl_gym.checks import (
+    FloatArray,
+    as_tuples,
+    check_array,
+    check_count,
+    check_number,
+    check_one_of,
+)
 from rbl_gym.geometry import rotations
 from rbl_gym.geometry.obstacles import Obstacles, check_obstacles
 from rbl_gym.geometry.regions import REGIONS, Box, Region
@@ -108,6 +114,9 @@ class Scene:
             if not isinstance(getattr(self, name), kinds):
                 raise ValueError(f"{name} must be {_names(kinds)}, got {getattr(self, name)!r:.80}")
         check_number("dt", self.dt, low=1e-9)
+        if self.process.std().ndim > 1:
+            shape = self.process.std().shape[:-1]
+            raise ValueError(f"process must be that of all worlds, got leading axes {shape}")
         for name in ("initial_rotation_rad", "initial_translation_m"):
             check_number(name, getattr(self, name), low=1e-9)
         for name in ("anchor_speed_m_s", "speed_m_s", "spin_rad_s"):
@@ -201,8 +210,3 @@ class Scene:
 
 def _names(kinds: tuple[type, ...]) -> str:
     return " or ".join(kind.__name__ for kind in kinds)
-
-
-def as_tuples(value: FloatArray) -> Any:
-    """An array as nested tuples of floats: configuration that hashes and compares."""
-    return tuple(as_tuples(row) for row in value) if value.ndim else float(value)

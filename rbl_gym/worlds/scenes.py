@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import check_array, check_one_of
+from rbl_gym.checks import as_tuples, check_array, check_one_of
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import RangeNoise, SquaredRangeNoise
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.worlds import overrides
-from rbl_gym.worlds.scene import Scene, as_tuples
+from rbl_gym.worlds.scene import Scene
 
 __all__ = ["SCENES", "get"]
 

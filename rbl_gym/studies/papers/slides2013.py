@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.checks import as_tuples
 from rbl_gym.geometry import bodies
 from rbl_gym.studies.papers import camsap2013, icassp2013
 from rbl_gym.studies.papers.icassp2013 import Setting
-from rbl_gym.worlds.scene import Scene, as_tuples
+from rbl_gym.worlds.scene import Scene
 
 __all__ = [
     "slides_experiment",
