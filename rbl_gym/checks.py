@@ -176,10 +176,9 @@ def check_axes(name: str, value: ArrayLike, leading: bool = False) -> Any:
     """
     array = check_array(name, value, ())
     if array.shape not in ((), (3,)) and not (leading and array.ndim > 1 and array.shape[-1] == 3):
-        more = ", or (..., 3) with leading axes" if leading else ""
-        raise ValueError(f"{name} must be one number or three{more}, got shape {array.shape}")
+        raise ValueError(f"{name} must be one number or three, got shape {array.shape}")
     if (array < 0).any():
-        raise ValueError(f"{name} must not be negative, got {array.min()}")
+        raise ValueError(f"{name} must not be negative, got {array.tolist()!s:.80}")
     # Lists come out of JSON; tuples keep the configuration hashable.
     return as_tuples(array)
 
