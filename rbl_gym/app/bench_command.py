@@ -28,16 +28,28 @@ def add_bench(commands: Any) -> None:
         "same noise for all: accuracy beside the bound, honesty, failures, time. A run that was "
         "stopped goes on where it was. See docs/leaderboard.md.",
     )
-    bench.add_argument("--filters", type=_names, metavar="A,B",
-                       help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all but "
-                       "iekf-bank, iekf-bias and iekf-cv")  # fmt: skip
-    bench.add_argument("--scenes", type=_names, metavar="A,B",
-                       help="names, or files .toml or .json: a scene with changes, or a "
-                       "recording; default all named ones")  # fmt: skip
+    bench.add_argument(
+        "--filters",
+        type=_names,
+        metavar="A,B",
+        help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all but "
+        "iekf-bank, iekf-bias and iekf-cv",
+    )
+    bench.add_argument(
+        "--scenes",
+        type=_names,
+        metavar="A,B",
+        help="names, or files .toml or .json: a scene with changes, or a "
+        "recording; default all named ones",
+    )
     bench.add_argument("--conditions", type=_names, metavar="A,B", help="default all")
     add_trials(bench, 200)
-    bench.add_argument("--out", default="out/bench.jsonl", metavar="F",
-                       help="records, one a line; default out/bench.jsonl")  # fmt: skip
+    bench.add_argument(
+        "--out",
+        default="out/bench.jsonl",
+        metavar="F",
+        help="records, one a line; default out/bench.jsonl",
+    )
     bench.add_argument("--fresh", action="store_true", help="do not take up what F holds")
     add_html(bench, "page: maps, sortable table")
     _add_workers(bench)

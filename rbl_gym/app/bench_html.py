@@ -15,10 +15,23 @@ _COLUMNS = 4
 # Ratios to the bound beyond this are one colour: the filter is lost.
 _LOST_RATIO = 30.0
 _HEADINGS = (
-    "scene", "condition", "filter", "position (m)", "rotation (deg)", "tags (m)", "median (m)",
-    "p95 (m)", "x bound", "ANEES", "verdict", "lost (%)", "flipped (%)", "triggered (%)",
-    "us / step", "remark",
-)  # fmt: skip
+    "scene",
+    "condition",
+    "filter",
+    "position (m)",
+    "rotation (deg)",
+    "tags (m)",
+    "median (m)",
+    "p95 (m)",
+    "x bound",
+    "ANEES",
+    "verdict",
+    "lost (%)",
+    "flipped (%)",
+    "triggered (%)",
+    "us / step",
+    "remark",
+)
 
 
 def bench(result: dict[str, Any]) -> str:
@@ -64,8 +77,14 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
     conditions = list(dict.fromkeys(row["condition"] for row in rows))
     columns = min(_COLUMNS, len(scenes))
     lines = -(-len(scenes) // columns)
-    shown = make_subplots(lines, columns, subplot_titles=scenes, shared_yaxes=True,
-                          horizontal_spacing=0.02, vertical_spacing=0.36 / lines)  # fmt: skip
+    shown = make_subplots(
+        lines,
+        columns,
+        subplot_titles=scenes,
+        shared_yaxes=True,
+        horizontal_spacing=0.02,
+        vertical_spacing=0.36 / lines,
+    )
     for k, scene in enumerate(scenes):
         ratio = np.full((len(filters), len(conditions)), np.nan)
         for row in rows:
@@ -75,31 +94,45 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
         text = [["" if np.isnan(r) else page.digits(r, 3) for r in line] for line in ratio]
         shown.add_trace(
             go.Heatmap(
-                z=np.log10(ratio), x=conditions, y=filters, text=text, texttemplate="%{text}",
-                coloraxis="coloraxis", hoverongaps=False,
+                z=np.log10(ratio),
+                x=conditions,
+                y=filters,
+                text=text,
+                texttemplate="%{text}",
+                coloraxis="coloraxis",
+                hoverongaps=False,
                 hovertemplate="%{y}, %{x}: %{text} x bound<extra>" + scene + "</extra>",
             ),
-            1 + k // columns, 1 + k % columns,
-        )  # fmt: skip
+            1 + k // columns,
+            1 + k % columns,
+        )
     ticks = [1, 2, 5, 10, _LOST_RATIO]
     shown.update_layout(
-        height=90 + lines * (110 + 30 * len(filters)), margin={"l": 10, "r": 10, "t": 50, "b": 10},
-        template="plotly_white", font={"size": 11},
+        height=90 + lines * (110 + 30 * len(filters)),
+        margin={"l": 10, "r": 10, "t": 50, "b": 10},
+        template="plotly_white",
+        font={"size": 11},
         coloraxis={
             "colorscale": [[0, "#e8f4ef"], [0.3, "#f6e3a1"], [0.65, "#e08a4b"], [1, "#9c2f3c"]],
-            "cmin": 0, "cmax": float(np.log10(_LOST_RATIO)),
-            "colorbar": {"title": "x bound", "tickvals": np.log10(ticks).tolist(),
-                         "ticktext": [f"{tick:g}" for tick in ticks], "thickness": 12},
+            "cmin": 0,
+            "cmax": float(np.log10(_LOST_RATIO)),
+            "colorbar": {
+                "title": "x bound",
+                "tickvals": np.log10(ticks).tolist(),
+                "ticktext": [f"{tick:g}" for tick in ticks],
+                "thickness": 12,
+            },
         },
-    )  # fmt: skip
+    )
     return shown
 
 
 def _cells(row: dict[str, Any]) -> list[Any]:
     """A row of the table; what a filter could not do is "-", with its remark."""
     head = [row["scene"], row["condition"], row["filter"]]
-    remark = row["message"] or (f"rank {row['rank']} of {row['states']}"
-                                if row["rank"] != row["states"] else None)  # fmt: skip
+    remark = row["message"] or (
+        f"rank {row['rank']} of {row['states']}" if row["rank"] != row["states"] else None
+    )
     if "tags_m" not in row:
         return [*head, *[None] * (len(_HEADINGS) - 4), f"{row['status']}: {remark}"]
     tags = row["tags_m"]
@@ -108,8 +141,13 @@ def _cells(row: dict[str, Any]) -> list[Any]:
         for key in ("lost", "flipped", "trigger_rate")
     ]
     figures = [
-        row["position_m"]["rmse"], row["rotation_deg"]["rmse"], tags["rmse"],
-        tags["median"], tags["p95"], tags.get("to_bound"), row["anees"],
-    ]  # fmt: skip
+        row["position_m"]["rmse"],
+        row["rotation_deg"]["rmse"],
+        tags["rmse"],
+        tags["median"],
+        tags["p95"],
+        tags.get("to_bound"),
+        row["anees"],
+    ]
     shown = [None if figure is None else page.digits(figure, 4) for figure in figures]
     return [*head, *shown, row["verdict"], *percent, row["microseconds_per_step"], remark]

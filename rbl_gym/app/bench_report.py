@@ -12,9 +12,19 @@ from rbl_gym.app.reports import new_console
 from rbl_gym.studies.bench.leaderboard import is_recording
 
 _HEADINGS = (
-    "filter", "position (m)", "rotation (deg)", "tags (m)", "median", "p95", "x bound",
-    "ANEES", "lost", "flipped", "worse than best, 95 %", "us / step",
-)  # fmt: skip
+    "filter",
+    "position (m)",
+    "rotation (deg)",
+    "tags (m)",
+    "median",
+    "p95",
+    "x bound",
+    "ANEES",
+    "lost",
+    "flipped",
+    "worse than best, 95 %",
+    "us / step",
+)
 # From here on a column would show nothing but digits.
 _HUGE = 1e4
 _STRESS = ("nlos", "lost-links", "noise-x2", "anchor-off", "tag-off")
@@ -115,10 +125,11 @@ def _stress(rows: list[dict[str, Any]]) -> list[str]:
     pairs = zip(fixed([row["tags_m"]["rmse"] for row in ran]), _anees(ran), strict=True)
     texts = iter([f"{error}  {honesty}" for error, honesty in pairs])
     return [
-        row["status"] if "tags_m" not in row
+        row["status"]
+        if "tags_m" not in row
         else next(texts) + (f" {_percent(row['lost'])} lost" if row.get("lost") else "")
         for row in rows
-    ]  # fmt: skip
+    ]
 
 
 def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
@@ -132,8 +143,10 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
             lines.append(f"{name}, {condition}: {row['status']} {row['message']}")
     rates = [rate for row in conditions.values() if (rate := row.get("trigger_rate")) is not None]
     if any(0 < rate < 1 for rate in rates):
-        lines.append(f"{name}: triggered at {100 * rates[0]:.0f} % of the updates, "
-                     f"{100 * max(rates):.0f} % where most")  # fmt: skip
+        lines.append(
+            f"{name}: triggered at {100 * rates[0]:.0f} % of the updates, "
+            f"{100 * max(rates):.0f} % where most"
+        )
     return lines
 
 
@@ -196,7 +209,13 @@ def print_rerun(result: dict[str, Any]) -> None:
     for row in result["changed"]:
         change = row["relative_change"]
         table.add_row(
-            row["scene"], row["condition"], row["filter"], str(row["fields"]), row["field"],
-            str(row["before"]), str(row["after"]), "-" if change is None else f"{change:.2g}",
-        )  # fmt: skip
+            row["scene"],
+            row["condition"],
+            row["filter"],
+            str(row["fields"]),
+            row["field"],
+            str(row["before"]),
+            str(row["after"]),
+            "-" if change is None else f"{change:.2g}",
+        )
     console.print(table)

@@ -82,14 +82,28 @@ def _add_place(commands: Any) -> None:
         description="Design a layout of anchors, predict the accuracy, compare with the usual "
         "layouts, check with real filters. See docs/placement.md for the file format.",
     )
-    place.add_argument("--scene", required=True, metavar="NAME|F",
-                       help="a named scene, or a file .toml or .json")  # fmt: skip
-    place.add_argument("--anchors", type=_numbers, metavar="N|A..B",
-                       help="how many; A..B: accuracy against the number")  # fmt: skip
-    place.add_argument("--racks", type=natural, default=0, metavar="K",
-                       help="random boxes that block sight in a named room, default 0")  # fmt: skip
-    place.add_argument("--region", type=_region, metavar="x0,y0,z0,x1,y1,z1",
-                       help="work region, metres; write --region=-1,... for a minus")  # fmt: skip
+    place.add_argument(
+        "--scene", required=True, metavar="NAME|F", help="a named scene, or a file .toml or .json"
+    )
+    place.add_argument(
+        "--anchors",
+        type=_numbers,
+        metavar="N|A..B",
+        help="how many; A..B: accuracy against the number",
+    )
+    place.add_argument(
+        "--racks",
+        type=natural,
+        default=0,
+        metavar="K",
+        help="random boxes that block sight in a named room, default 0",
+    )
+    place.add_argument(
+        "--region",
+        type=_region,
+        metavar="x0,y0,z0,x1,y1,z1",
+        help="work region, metres; write --region=-1,... for a minus",
+    )
     add_trials(place, 500, "of the check, ")
     place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
     add_html(place, "3-D page with the tables")
@@ -110,12 +124,23 @@ def _add_reproduce(commands: Any) -> None:
     reproduce.add_argument("--plot", metavar="F", help="default out/EXPERIMENT.png")
     reproduce.add_argument("--csv", metavar="F", help="every figure as a row")
     network = reproduce.add_argument_group("network2009")
-    network.add_argument("--positions", metavar="F",
-                         help="CSV, header x,y: fixed points, the reference first")  # fmt: skip
-    network.add_argument("--footprint", dest="footprints", metavar="R", type=float, nargs="+",
-                         help="sensing radii, in the unit of the positions")  # fmt: skip
-    network.add_argument("--variance", metavar="S2", type=float,
-                         help="of a bearing, rad^2; default 0.1, in Figs 5 and 6 0.01")  # fmt: skip
+    network.add_argument(
+        "--positions", metavar="F", help="CSV, header x,y: fixed points, the reference first"
+    )
+    network.add_argument(
+        "--footprint",
+        dest="footprints",
+        metavar="R",
+        type=float,
+        nargs="+",
+        help="sensing radii, in the unit of the positions",
+    )
+    network.add_argument(
+        "--variance",
+        metavar="S2",
+        type=float,
+        help="of a bearing, rad^2; default 0.1, in Figs 5 and 6 0.01",
+    )
     add_json(reproduce)
     reproduce.set_defaults(run=_reproduce)
 
@@ -129,9 +154,11 @@ def _add_network(commands: Any) -> None:
     )
     network.add_argument("file", metavar="FILE", help=".g2o, or CSV: i,j and dtheta (or a,b)")
     network.add_argument(
-        "--weights", choices=("information", "unit"), default="information",
+        "--weights",
+        choices=("information", "unit"),
+        default="information",
         help="of the edges: the file's information of theta (default), or all alike",
-    )  # fmt: skip
+    )
     network.add_argument("--plot", metavar="F", help="picture: the graph and the residuals")
     add_json(network)
     network.set_defaults(run=_network)

@@ -70,24 +70,45 @@ def print_doa2019(result: dict[str, Any]) -> None:
         table = Table(title=f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials")
         table.add_column("noise (deg)")
         table.add_column("method")
-        for heading in ("R RMSE", "R / bound", "t RMSE (m)", "t / bound", "near truth",
-                        "t < 0.5 m", "converged", "iterations", "us / trial",
-                        "x NIA"):  # fmt: skip
+        for heading in (
+            "R RMSE",
+            "R / bound",
+            "t RMSE (m)",
+            "t / bound",
+            "near truth",
+            "t < 0.5 m",
+            "converged",
+            "iterations",
+            "us / trial",
+            "x NIA",
+        ):
             table.add_column(heading, justify="right")
         for k, sigma in enumerate(data["sigma_deg"]):
             for name, method in data["methods"].items():
                 row = {key: values[k] for key, values in method.items()}
                 shares = (row["near"], row["within_half_metre"], row["converged"])
                 table.add_row(
-                    f"{sigma:g}", name, f"{row['rotation_rmse']:.5f}",
-                    f"{row['rotation_to_bound']:.3f}", f"{row['translation_rmse_m']:.5f}",
+                    f"{sigma:g}",
+                    name,
+                    f"{row['rotation_rmse']:.5f}",
+                    f"{row['rotation_to_bound']:.3f}",
+                    f"{row['translation_rmse_m']:.5f}",
                     f"{row['translation_to_bound']:.3f}",
-                    *(f"{100 * share:.1f} %" for share in shares), _counted(row),
-                    f"{row['microseconds_per_trial']:.0f}", f"{row['time_ratio']:.1f}",
-                )  # fmt: skip
+                    *(f"{100 * share:.1f} %" for share in shares),
+                    _counted(row),
+                    f"{row['microseconds_per_trial']:.0f}",
+                    f"{row['time_ratio']:.1f}",
+                )
             bound = [data["bound"][key][k] for key in ("rotation_rmse", "translation_rmse_m")]
-            table.add_row(f"{sigma:g}", "bound", f"{bound[0]:.5f}", "1", f"{bound[1]:.5f}", "1",
-                          end_section=True)  # fmt: skip
+            table.add_row(
+                f"{sigma:g}",
+                "bound",
+                f"{bound[0]:.5f}",
+                "1",
+                f"{bound[1]:.5f}",
+                "1",
+                end_section=True,
+            )
         out.print(table)
     out.print(
         "RMSE and ratios are of the trials near the truth: both errors within 6 times the bound.\n"
@@ -101,20 +122,33 @@ def print_doa2019(result: dict[str, Any]) -> None:
 def _print_table_1(out: Any, result: dict[str, Any]) -> None:
     data = result["settings"][_PAPERS]
     table = Table(title=f"Table 1 of the paper beside ours, {_PAPERS}")
-    for heading in ("noise (deg)", "method", "paper: success", "ours: near truth",
-                    "ours: t < 0.5 m", "paper: time (s)", "ours: time (s)", "paper: x NIA",
-                    "ours: x NIA"):  # fmt: skip
+    for heading in (
+        "noise (deg)",
+        "method",
+        "paper: success",
+        "ours: near truth",
+        "ours: t < 0.5 m",
+        "paper: time (s)",
+        "ours: time (s)",
+        "paper: x NIA",
+        "ours: x NIA",
+    ):
         table.add_column(heading, justify="right")
     for k, sigma in enumerate(data["sigma_deg"]):
         for name, paper in result["table_1"].items():
             method = data["methods"][name]
             table.add_row(
-                f"{sigma:g}", name, f"{paper['success_percent'][k]} %",
-                f"{100 * method['near'][k]:.1f} %", f"{100 * method['within_half_metre'][k]:.1f} %",
-                f"{paper['seconds'][k]:g}", f"{1e-6 * method['microseconds_per_trial'][k]:.2g}",
+                f"{sigma:g}",
+                name,
+                f"{paper['success_percent'][k]} %",
+                f"{100 * method['near'][k]:.1f} %",
+                f"{100 * method['within_half_metre'][k]:.1f} %",
+                f"{paper['seconds'][k]:g}",
+                f"{1e-6 * method['microseconds_per_trial'][k]:.2g}",
                 f"{paper['seconds'][k] / result['table_1']['NIA + UQ']['seconds'][k]:.0f}",
-                f"{method['time_ratio'][k]:.0f}", end_section=name == list(result["table_1"])[-1],
-            )  # fmt: skip
+                f"{method['time_ratio'][k]:.0f}",
+                end_section=name == list(result["table_1"])[-1],
+            )
     out.print(table)
 
 

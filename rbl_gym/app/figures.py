@@ -80,8 +80,14 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
     steps = np.arange(1, len(result["bound"]["rotation_rmse"]) + 1)
     for ax, (key, label, title) in zip(axes, panels, strict=True):
         for name, filter in result["filters"].items():
-            ax.plot(steps, filter["per_step"][key], color=COLOURS[name], label=name, lw=1.6,
-                    ls="--" if name == "KF-ortho" else "-")  # fmt: skip
+            ax.plot(
+                steps,
+                filter["per_step"][key],
+                color=COLOURS[name],
+                label=name,
+                lw=1.6,
+                ls="--" if name == "KF-ortho" else "-",
+            )
         if f"estimated_{key}" in result["filters"]["KF"]["per_step"]:
             estimated = result["filters"]["KF"]["per_step"][f"estimated_{key}"]
             ax.plot(steps, estimated, "x", color="0.25", ms=5, label="estimated by KF")
@@ -102,8 +108,15 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
         ax.grid(alpha=0.25, which="both", lw=0.5)
     axes[0].legend(frameon=False, fontsize=8, ncols=2)
     family = ", ".join(name for name in result["filters"] if name != "iterated EKF")
-    axes[1].text(0.98, 0.72, f"{family} coincide", transform=axes[1].transAxes,
-                 ha="right", fontsize=8, color=COLOURS["UC-KF"])  # fmt: skip
+    axes[1].text(
+        0.98,
+        0.72,
+        f"{family} coincide",
+        transform=axes[1].transAxes,
+        ha="right",
+        fontsize=8,
+        color=COLOURS["UC-KF"],
+    )
 
 
 def _trajectory(axes: Any, example: Example) -> None:
@@ -118,8 +131,16 @@ def _trajectory(axes: Any, example: Example) -> None:
             places = truth[k, :2] + _MAGNIFY * ring
             axes.plot(*places.T, color=COLOURS[name], lw=1.2, label=name if k == 0 else None)
     heading = episode.rotation[0][:, :2, 0]
-    axes.quiver(*truth[:, :2].T, *heading.T, angles="xy", scale_units="xy", scale=0.5,
-                width=0.004, color="0.3", zorder=3)  # fmt: skip
+    axes.quiver(
+        *truth[:, :2].T,
+        *heading.T,
+        angles="xy",
+        scale_units="xy",
+        scale=0.5,
+        width=0.004,
+        color="0.3",
+        zorder=3,
+    )
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
@@ -134,8 +155,13 @@ def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
     axes.plot(rates, errors, "o-", ms=4, lw=1.2, color=COLOURS["ET-KF"])
     for row, rate, error in zip(trade, rates, errors, strict=True):
         if 0 < rate < 97:
-            axes.annotate(f"{row['threshold']:g}", (rate, error), xytext=(3, 4),
-                          textcoords="offset points", fontsize=7)  # fmt: skip
+            axes.annotate(
+                f"{row['threshold']:g}",
+                (rate, error),
+                xytext=(3, 4),
+                textcoords="offset points",
+                fontsize=7,
+            )
     axes.set_xlabel("updates that project [%]")
     axes.set_ylabel("rotation RMSE (Frobenius)")
     axes.set_title("ET-KF's trade, labelled by threshold", fontsize=9)
@@ -194,12 +220,21 @@ def _static_panels(
         for row, (key, title) in enumerate(rows):
             ax = axes[row, column]
             for name, method in data["methods"].items():
-                ax.semilogy(data["reference_range_db"], method[key], label=name, lw=1.3,
-                            color=STATIC_COLOURS[name],
-                            ls="--" if name in ("two-step", "LS-projected") else "-")  # fmt: skip
+                ax.semilogy(
+                    data["reference_range_db"],
+                    method[key],
+                    label=name,
+                    lw=1.3,
+                    color=STATIC_COLOURS[name],
+                    ls="--" if name in ("two-step", "LS-projected") else "-",
+                )
             ax.semilogy(data["reference_range_db"], data["bound"][key], "k.", label="CRB")
-            ax.semilogy(data["reference_range_db"], data["bound_squared"][key], "k+",
-                        label="CRB, squared ranges")  # fmt: skip
+            ax.semilogy(
+                data["reference_range_db"],
+                data["bound_squared"][key],
+                "k+",
+                label="CRB, squared ranges",
+            )
             ax.grid(alpha=0.25, lw=0.5)
             ax.set_title(f"anchors in {label}" if row == 0 else "", fontsize=9)
             ax.set_xlabel("reference range [dB]" if row == 1 else "")
@@ -212,8 +247,14 @@ def _common_legend(figure: Figure, axes: Any) -> None:
         for ax in axes.flat
         for handle, text in zip(*ax.get_legend_handles_labels(), strict=True)
     }
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=5,
-                  frameon=False, fontsize=8)  # fmt: skip
+    figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=5,
+        frameon=False,
+        fontsize=8,
+    )
 
 
 def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:

@@ -11,8 +11,13 @@ from rich.table import Table
 from rbl_gym.app.figures import new_figure, styled
 from rbl_gym.app.reports import new_console
 
-_COLOURS = {"iekf": "#d1495b", "iekf, robust": "#2e86ab", "bank, robust": "#1b7f5c",
-            "bank": "#2e86ab", "bank, volume": "#1b7f5c"}  # fmt: skip
+_COLOURS = {
+    "iekf": "#d1495b",
+    "iekf, robust": "#2e86ab",
+    "bank, robust": "#1b7f5c",
+    "bank": "#2e86ab",
+    "bank, volume": "#1b7f5c",
+}
 
 
 @styled
@@ -25,8 +30,13 @@ def hard_figure(result: dict[str, Any]) -> Figure:
         filters = list(next(iter(conditions.values()))["filters"])
         for shift, label in enumerate(filters):
             ratios = [row["filters"][label]["clean"]["translation"] for row in conditions.values()]
-            axis.bar(np.arange(len(ratios)) + 0.27 * (shift - 1), ratios, 0.25, label=label,
-                     color=_COLOURS[label])  # fmt: skip
+            axis.bar(
+                np.arange(len(ratios)) + 0.27 * (shift - 1),
+                ratios,
+                0.25,
+                label=label,
+                color=_COLOURS[label],
+            )
         axis.axhline(1.0, color="k", lw=0.8)
         axis.set(yscale="log", title=name, ylabel="translation RMSE / clean bound")
         axis.set_xticks(
@@ -38,8 +48,14 @@ def hard_figure(result: dict[str, Any]) -> Figure:
     for axis, (name, starts) in zip(axes, result["starts"]["scenes"].items(), strict=True):
         for label in starts["wrong"]:
             for start, style in (("wrong", "o-"), ("wrong, 10 % NLOS", "s:")):
-                axis.plot(after, [100 * share for share in starts[start][label]["back"]], style,
-                          label=f"{label}{start[5:]}", color=_COLOURS[label], ms=4)  # fmt: skip
+                axis.plot(
+                    after,
+                    [100 * share for share in starts[start][label]["back"]],
+                    style,
+                    label=f"{label}{start[5:]}",
+                    color=_COLOURS[label],
+                    ms=4,
+                )
         axis.set(xlabel="epochs later", ylabel="trials that are back [%]", ylim=(-3, 103))
         axis.set_title(f"{name}: 180 degrees, 10 m off", fontsize=9)
     handles = axes[-1].get_legend_handles_labels()
@@ -54,19 +70,33 @@ def print_hard(result: dict[str, Any]) -> None:
         table = Table(title=f"{name}, {result['trials']} trials")
         table.add_column("links", no_wrap=True)
         table.add_column("filter", no_wrap=True)
-        for heading in ("rot / clean", "pos / clean", "rot / good", "pos / good", "NEES (6)",
-                        "lost last", "ever", "largest (m)", "us / step"):  # fmt: skip
+        for heading in (
+            "rot / clean",
+            "pos / clean",
+            "rot / good",
+            "pos / good",
+            "NEES (6)",
+            "lost last",
+            "ever",
+            "largest (m)",
+            "us / step",
+        ):
             table.add_column(heading, justify="right")
         for condition, row in conditions.items():
             for label, figures in row["filters"].items():
-                ratios = [figures[b][f] for b in ("clean", "good")
-                          for f in ("rotation", "translation")]  # fmt: skip
+                ratios = [
+                    figures[b][f] for b in ("clean", "good") for f in ("rotation", "translation")
+                ]
                 table.add_row(
-                    condition, label, *(f"{ratio:.3f}" for ratio in ratios),
-                    f"{figures['nees']:.2f}", f"{100 * figures['lost_at_the_end']:.1f} %",
-                    f"{100 * figures['lost_ever']:.1f} %", f"{figures['largest_error_m']:.2f}",
+                    condition,
+                    label,
+                    *(f"{ratio:.3f}" for ratio in ratios),
+                    f"{figures['nees']:.2f}",
+                    f"{100 * figures['lost_at_the_end']:.1f} %",
+                    f"{100 * figures['lost_ever']:.1f} %",
+                    f"{figures['largest_error_m']:.2f}",
                     f"{figures['microseconds_per_step']:.0f}",
-                )  # fmt: skip
+                )
             table.add_section()
         console.print(table)
     after = result["starts"]["after"]

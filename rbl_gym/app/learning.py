@@ -60,8 +60,9 @@ def add_transfer(commands: Any) -> None:
     )
     placements = [name for name, task in TASKS.items() if task.env_id == "RBL/AnchorPlacement-v0"]
     _add_players(transfer, placements, worlds=48, references="random, ring, greedy-swaps, cma-es")
-    transfer.add_argument("--repeats", type=positive, default=16,
-                          help="bodies in each world, default 16")  # fmt: skip
+    transfer.add_argument(
+        "--repeats", type=positive, default=16, help="bodies in each world, default 16"
+    )
     add_json(transfer)
     transfer.set_defaults(run=_transfer)
 
@@ -71,8 +72,13 @@ def _add_players(
 ) -> None:
     """The task, the policies and references that play it, and the worlds they play it in."""
     parser.add_argument("task", choices=sorted(tasks))
-    parser.add_argument("--policy", action="append", default=[], metavar="F",
-                        help="of rbl-gym train; may be given again")  # fmt: skip
+    parser.add_argument(
+        "--policy",
+        action="append",
+        default=[],
+        metavar="F",
+        help="of rbl-gym train; may be given again",
+    )
     parser.add_argument("--references", metavar="A,B", help=f"default {references}")
     parser.add_argument("--worlds", type=positive, default=worlds, help=f"default {worlds}")
     add_seed(parser, "which worlds")

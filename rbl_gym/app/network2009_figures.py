@@ -17,8 +17,11 @@ from rbl_gym.studies.papers import network2009
 _COLOURS = {"bfs": "#d1495b", "paton": "#2e86ab", "minimum": "#1b7f5c"}
 _RULE_COLOURS = {"theorem": "#2e86ab", "best": "#1b7f5c", "trace": "#d1495b", "rows": "#e8a33d"}
 # Fig. 6: solid, dotted, dashed.
-_FRAMES = (("theta", "-", "k", "true"), ("theta_measured", ":", "#d1495b", "measured"),
-           ("theta_estimated", "--", "#2e86ab", "estimated"))  # fmt: skip
+_FRAMES = (
+    ("theta", "-", "k", "true"),
+    ("theta_measured", ":", "#d1495b", "measured"),
+    ("theta_estimated", "--", "#2e86ab", "estimated"),
+)
 
 
 @styled
@@ -50,8 +53,10 @@ def _networks(axes: Any, result: dict[str, Any]) -> None:
             lines = list(places[np.array(data["edges"][k])])
             ax.add_collection(LineCollection(lines, colors="0.6", lw=0.8))
             complete = 2 * len(lines) == len(places) * (len(places) - 1)
-            title = f"Fig. 3 ({letter}): {'complete, ' if complete else ''}{loops[k]} loops, " \
-                    f"footprint {data['footprints'][k]:.3g}"  # fmt: skip
+            title = (
+                f"Fig. 3 ({letter}): {'complete, ' if complete else ''}{loops[k]} loops, "
+                f"footprint {data['footprints'][k]:.3g}"
+            )
         ax.plot(*places.T, "ko", ms=4)
         ax.margins(0.08)
         ax.set_aspect("equal", adjustable="datalim")
@@ -74,8 +79,9 @@ def _frames(ax: Axes, result: dict[str, Any]) -> None:
     ax.margins(0.15)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="x", ylabel="y")
-    ax.set_title(f"Fig. 6: frames, sigma^2 = {result['variance'][1]:g}, reference square",
-                 fontsize=9)  # fmt: skip
+    ax.set_title(
+        f"Fig. 6: frames, sigma^2 = {result['variance'][1]:g}, reference square", fontsize=9
+    )
     ax.legend(frameon=False, fontsize=8, ncols=3, loc="lower center")
 
 
@@ -85,11 +91,17 @@ def _accuracy(ax: Axes, result: dict[str, Any]) -> None:
     edges = [row["edges"] for row in rows]
     ax.plot(edges, [row["mse"]["measured"] for row in rows], "k--x", ms=4, label="y")
     ax.plot(edges, [row["mse"]["consensus"] for row in rows], "k-o", ms=4, label="psi")
-    ax.plot(edges, [row["bound"] for row in rows], color="#2e86ab", lw=0.8,
-            label="2 sigma^2 (n - 1) / m")  # fmt: skip
+    ax.plot(
+        edges,
+        [row["bound"] for row in rows],
+        color="#2e86ab",
+        lw=0.8,
+        label="2 sigma^2 (n - 1) / m",
+    )
     ax.set(xlabel="number of edges", ylabel="mean square error [rad^2]", ylim=(0, None))
-    ax.set_title(f"Fig. 4: sigma^2 = {result['variance'][0]:g}, {result['trials']} trials",
-                 fontsize=9)  # fmt: skip
+    ax.set_title(
+        f"Fig. 4: sigma^2 = {result['variance'][0]:g}, {result['trials']} trials", fontsize=9
+    )
     ax.legend(frameon=False, fontsize=8)
 
 
@@ -98,8 +110,9 @@ def _over_steps(axes: Any, result: dict[str, Any]) -> None:
     run = result["run"]
     axes[0].plot(run["edge_angles"], lw=0.7)
     axes[0].set(xlabel="iteration", ylabel="angle estimate of every edge [rad]")
-    axes[0].set_title(f"Fig. 5: kappa = {run['kappa']:.4f}, sigma^2 = {result['variance'][1]:g}",
-                      fontsize=9)  # fmt: skip
+    axes[0].set_title(
+        f"Fig. 5: kappa = {run['kappa']:.4f}, sigma^2 = {result['variance'][1]:g}", fontsize=9
+    )
     if run["loop_errors"]:
         axes[1].plot(run["loop_errors"], lw=0.7)
     axes[1].set(xlabel="iteration", ylabel="error of every loop [rad]")
@@ -110,9 +123,15 @@ def _growth(ax: Axes, name: str, data: dict[str, Any]) -> None:
     nodes = [row["nodes"] for row in data["rows"]]
     for rule, slope in data["slope"].items():
         # "best" lies on "theorem" where lambda_min is 1.
-        ax.loglog(nodes, [row["kappa"][rule] for row in data["rows"]],
-                  "o--" if rule == "best" else "o-", ms=3 if rule == "best" else 5, lw=1.2,
-                  color=_RULE_COLOURS[rule], label=f"{rule}: n^{slope:.2f}")  # fmt: skip
+        ax.loglog(
+            nodes,
+            [row["kappa"][rule] for row in data["rows"]],
+            "o--" if rule == "best" else "o-",
+            ms=3 if rule == "best" else 5,
+            lw=1.2,
+            color=_RULE_COLOURS[rule],
+            label=f"{rule}: n^{slope:.2f}",
+        )
     ax.minorticks_off()
     ax.set_xticks(nodes, [str(n) for n in nodes])
     ax.set(xlabel="n", ylabel="kappa")
@@ -129,8 +148,7 @@ def _distance(ax: Axes, result: dict[str, Any]) -> None:
         printed = distance[0] * history["printed_factor_squared"] ** (steps / 2)
         ax.semilogy(steps, printed, color=_COLOURS[basis], ls=":", lw=2)
     ax.set(xlabel="iteration", ylabel="distance from the limit [rad]", ylim=(1e-13, None))
-    ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: as Theorem 19 prints",
-                 fontsize=9)  # fmt: skip
+    ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: as Theorem 19 prints", fontsize=9)
     ax.legend(frameon=False, fontsize=8)
 
 
@@ -138,8 +156,13 @@ def _factors(ax: Axes, convergence: dict[str, Any]) -> None:
     rules = list(next(iter(convergence.values())))
     for shift, (basis, table) in enumerate(convergence.items()):
         places = np.arange(len(rules)) + 0.25 * (shift - 1)
-        ax.bar(places, [table[rule]["true_factor_squared"] for rule in rules], 0.22,
-               color=_COLOURS[basis], label=basis)  # fmt: skip
+        ax.bar(
+            places,
+            [table[rule]["true_factor_squared"] for rule in rules],
+            0.22,
+            color=_COLOURS[basis],
+            label=basis,
+        )
         ax.plot(places, [table[rule]["printed_factor_squared"] for rule in rules], "k_", ms=10)
     ax.set_xticks(range(len(rules)), rules)
     ax.set(xlabel="rule for kappa", ylabel="factor of the squared error", ylim=(0.4, 1.12))
@@ -167,23 +190,40 @@ def print_network2009(result: dict[str, Any]) -> None:
         out.print(f"kappa, {name}: {slopes}")
     out.print("Section IV-E: the trace's kappa is O(1 / n^3) at worst, O(1 / n) in triangulations.")
     table = Table(title=f"convergence, {network2009.EXAMPLE_LOOPS} loops")
-    for heading in ("cycles", "kappa", "steps", "lambda", "measured", "true", "true^2",
-                    "(1 - kappa)^2", "kappa <= Theorem 19's", "factor holds"):  # fmt: skip
+    for heading in (
+        "cycles",
+        "kappa",
+        "steps",
+        "lambda",
+        "measured",
+        "true",
+        "true^2",
+        "(1 - kappa)^2",
+        "kappa <= Theorem 19's",
+        "factor holds",
+    ):
         table.add_column(heading, justify="right")
     for basis, rules in result["convergence"].items():
         for rule, row in rules.items():
-            table.add_row(basis, f"{rule} {row['kappa']:.4f}", f"{row['steps']:.0f}",
-                          f"{row['lambda_min']:.2f} to {row['lambda_max']:.2f}",
-                          f"{row['measured_factor']:.4f}", f"{row['true_factor']:.4f}",
-                          f"{row['true_factor_squared']:.4f}",
-                          f"{row['printed_factor_squared']:.4f}",
-                          f"{100 * row['within_theorem']:.0f} %",
-                          f"{100 * row['printed_holds']:.0f} %")  # fmt: skip
+            table.add_row(
+                basis,
+                f"{rule} {row['kappa']:.4f}",
+                f"{row['steps']:.0f}",
+                f"{row['lambda_min']:.2f} to {row['lambda_max']:.2f}",
+                f"{row['measured_factor']:.4f}",
+                f"{row['true_factor']:.4f}",
+                f"{row['true_factor_squared']:.4f}",
+                f"{row['printed_factor_squared']:.4f}",
+                f"{100 * row['within_theorem']:.0f} %",
+                f"{100 * row['printed_holds']:.0f} %",
+            )
     out.print(table)
     for row in result["asynchronous"]:
-        out.print(f"one cycle at a time, {100 * row['loss']:.0f} % of the messages lost: "
-                  f"{row['rounds']:.0f} rounds, {row['largest_error_rad']:.1e} rad from the "
-                  "projection")  # fmt: skip
+        out.print(
+            f"one cycle at a time, {100 * row['loss']:.0f} % of the messages lost: "
+            f"{row['rounds']:.0f} rounds, {row['largest_error_rad']:.1e} rad from the "
+            "projection"
+        )
     table = Table(title=f"three nodes in space, {result['trials']} trials")
     for heading in (
         "triangle",
@@ -194,26 +234,51 @@ def print_network2009(result: dict[str, Any]) -> None:
     ):
         table.add_column(heading, justify="right")
     for row in result["space"]:
-        table.add_row(row["shape"], f"{row['bearing_std_rad']:g}", f"{row['rmse_rad']:.5f}",
-                      f"{row['ratio']:.3f}", f"{row['misfit']:.3f}")  # fmt: skip
+        table.add_row(
+            row["shape"],
+            f"{row['bearing_std_rad']:g}",
+            f"{row['rmse_rad']:.5f}",
+            f"{row['ratio']:.3f}",
+            f"{row['misfit']:.3f}",
+        )
     out.print(table)
 
 
 def _print_accuracy(out: Any, result: dict[str, Any]) -> None:
     places = result["networks"]["positions"]
-    table = Table(title=f"Fig. 4: {len(places)} points, sigma^2 = {result['variance'][0]:g}, "
-                  f"{result['trials']} trials")  # fmt: skip
-    for heading in ("footprint", "edges", "loops", "MSE of y", "MSE of psi", "bound (rad^2)",
-                    "psi / bound", "ml / bound"):  # fmt: skip
+    table = Table(
+        title=f"Fig. 4: {len(places)} points, sigma^2 = {result['variance'][0]:g}, "
+        f"{result['trials']} trials"
+    )
+    for heading in (
+        "footprint",
+        "edges",
+        "loops",
+        "MSE of y",
+        "MSE of psi",
+        "bound (rad^2)",
+        "psi / bound",
+        "ml / bound",
+    ):
         table.add_column(heading, justify="right")
     for row in result["accuracy"]:
-        ratios = [f"{row['ratio'][name]:.3f} +- {row['ratio_std_error'][name]:.3f}"
-                  for name in ("consensus", "ml")]  # fmt: skip
-        table.add_row(f"{row['footprint']:.4g}", str(row["edges"]), str(row["loops"]),
-                      f"{row['mse']['measured']:.5f}", f"{row['mse']['consensus']:.5f}",
-                      f"{row['bound']:.5f}", *ratios)  # fmt: skip
+        ratios = [
+            f"{row['ratio'][name]:.3f} +- {row['ratio_std_error'][name]:.3f}"
+            for name in ("consensus", "ml")
+        ]
+        table.add_row(
+            f"{row['footprint']:.4g}",
+            str(row["edges"]),
+            str(row["loops"]),
+            f"{row['mse']['measured']:.5f}",
+            f"{row['mse']['consensus']:.5f}",
+            f"{row['bound']:.5f}",
+            *ratios,
+        )
     out.print(table)
     run = result["run"]
-    out.print(f"Figs 5 and 6: kappa {run['kappa']:.4f}, {run['steps']} steps to 1e-12; RMS error "
-              f"of an edge {run['rms_measured']:.4f} rad measured, {run['rms_estimated']:.4f} "
-              "estimated")  # fmt: skip
+    out.print(
+        f"Figs 5 and 6: kappa {run['kappa']:.4f}, {run['steps']} steps to 1e-12; RMS error "
+        f"of an edge {run['rms_measured']:.4f} rad measured, {run['rms_estimated']:.4f} "
+        "estimated"
+    )

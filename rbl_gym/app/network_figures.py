@@ -40,8 +40,11 @@ def network_figure(solved: Solved) -> Figure:
 def print_network(result: dict[str, Any]) -> None:
     """The figures of a network, one a line."""
     out = new_console()
-    proof = "certified: no other orientations cost less" if result["certified"] else \
-        "NOT certified: others may cost less"  # fmt: skip
+    proof = (
+        "certified: no other orientations cost less"
+        if result["certified"]
+        else "NOT certified: others may cost less"
+    )
     out.print(f"{result['nodes']} nodes, {result['edges']} edges, {result['loops']} loops")
     if result["skipped_lines"]:
         lines = ", ".join(f"{count} {kind}" for kind, count in result["skipped_lines"].items())
@@ -49,14 +52,20 @@ def print_network(result: dict[str, Any]) -> None:
     without = result["edges_without_weight"]
     left_out = f"; {without} edges left out, without information of theta" if without else ""
     out.print(f"weights: {result['weights']}{left_out}")
-    out.print(f"cost {result['cost']:.10g}, sum of weight x residual^2 (along a tree: "
-              f"{result['tree_cost']:.4g})")  # fmt: skip
-    out.print(f"residuals {result['residual_rms_deg']:.3f} deg RMS "
-              f"({result['residual_weighted_rms_deg']:.3f} weighted), "
-              f"{result['residual_max_deg']:.2f} deg at most; largest:")  # fmt: skip
+    out.print(
+        f"cost {result['cost']:.10g}, sum of weight x residual^2 (along a tree: "
+        f"{result['tree_cost']:.4g})"
+    )
+    out.print(
+        f"residuals {result['residual_rms_deg']:.3f} deg RMS "
+        f"({result['residual_weighted_rms_deg']:.3f} weighted), "
+        f"{result['residual_max_deg']:.2f} deg at most; largest:"
+    )
     for edge in result["worst_edges"]:
         degrees = round(edge["residual_deg"], 3) + 0.0  # no "-0.000"
         out.print(f"  edge {edge['i']} {edge['j']}: {degrees:.3f} deg, weight {edge['weight']:g}")
     out.print(f"chordal cost {result['chordal_cost']:.10g}, {proof}")
-    out.print(f"solved in {1e3 * result['seconds']:.1f} ms, certified in "
-              f"{1e3 * result['certificate_seconds']:.1f} ms")  # fmt: skip
+    out.print(
+        f"solved in {1e3 * result['seconds']:.1f} ms, certified in "
+        f"{1e3 * result['certificate_seconds']:.1f} ms"
+    )

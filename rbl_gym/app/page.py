@@ -68,12 +68,18 @@ _MANY = 12
 def document(title: str, parts: Iterable[str]) -> str:
     """A whole page of parts that are HTML already."""
     name = html.escape(title)
-    return "\n".join([
-        "<!DOCTYPE html>", '<html lang="en"><head><meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<title>{name}</title><style>{_STYLE}</style></head><body>", f"<h1>{name}</h1>", *parts,
-        f"<script>{_SCRIPT}</script>", "</body></html>\n",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            "<!DOCTYPE html>",
+            '<html lang="en"><head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>{name}</title><style>{_STYLE}</style></head><body>",
+            f"<h1>{name}</h1>",
+            *parts,
+            f"<script>{_SCRIPT}</script>",
+            "</body></html>\n",
+        ]
+    )
 
 
 def note(text: str) -> str:
@@ -83,8 +89,13 @@ def note(text: str) -> str:
 
 def plot(figure: Any, name: str, first: bool = True) -> str:
     """A figure of plotly; the first of a page brings plotly's script."""
-    return figure.to_html(full_html=False, include_plotlyjs=first, div_id=name, auto_play=False,
-                          config={"displaylogo": False, "responsive": True})  # fmt: skip
+    return figure.to_html(
+        full_html=False,
+        include_plotlyjs=first,
+        div_id=name,
+        auto_play=False,
+        config={"displaylogo": False, "responsive": True},
+    )
 
 
 def table(title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

@@ -61,8 +61,10 @@ def place_figure(placed: Placed) -> Figure:
     shown.suptitle(_headline(placed.result), fontsize=12)
     shown.supxlabel(
         "triangles: anchors     dashed: work region     grey line: edge of where anchors may "
-        "stand     grey: obstacles (dotted: off the map's plane)", fontsize=8, color="0.35",
-    )  # fmt: skip
+        "stand     grey: obstacles (dotted: off the map's plane)",
+        fontsize=8,
+        color="0.35",
+    )
     return shown
 
 
@@ -91,8 +93,9 @@ def _limits(placed: Placed, axes: Plane, far: bool) -> FloatArray:
         region = placed.problem.task.scene.anchor_region
         if not isinstance(region, Shell):
             corners += [*region.bounds()]
-        corners += [box[:3] + sign * box[3:] for box in placed.problem.context.racks
-                    for sign in (-1, 1)]  # fmt: skip
+        corners += [
+            box[:3] + sign * box[3:] for box in placed.problem.context.racks for sign in (-1, 1)
+        ]
     points = np.array(corners)[:, list(axes)]
     extent = np.ptp(points, axis=0)
     margin = (0.22 if far else 0.06) * np.maximum(extent, 0.1 * extent.max())
@@ -102,14 +105,22 @@ def _limits(placed: Placed, axes: Plane, far: bool) -> FloatArray:
 def _draw_map(axes: Any, plane: Map, values: FloatArray, label: str) -> None:
     low, top = float(np.nanmin(values)), float(np.nanquantile(values, 0.99))
     mesh = axes.pcolormesh(
-        plane.columns, plane.rows, values, cmap="viridis_r", shading="nearest", zorder=0,
-        vmin=low, vmax=max(top, _LEAST_CONTRAST * low),
-    )  # fmt: skip
+        plane.columns,
+        plane.rows,
+        values,
+        cmap="viridis_r",
+        shading="nearest",
+        zorder=0,
+        vmin=low,
+        vmax=max(top, _LEAST_CONTRAST * low),
+    )
     # Inside the axes' own box: as high as the map, whatever its aspect.
     bar = axes.figure.colorbar(
-        mesh, cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)), label=label,
+        mesh,
+        cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)),
+        label=label,
         extend="max" if np.nanmax(values) > 1.001 * mesh.norm.vmax else "neither",
-    )  # fmt: skip
+    )
     bar.outline.set_visible(False)
 
 
@@ -128,8 +139,9 @@ def _draw_world(axes: Any, placed: Placed, plane: Plane, far: bool, heights: boo
         # Cut by the map's plane, or only an outline before or behind it.
         cut = abs(box[third] - at) <= box[3 + third]
         style = {"fc": OBSTACLE, "alpha": 0.9} if cut else {"fill": False, "ls": ":"}
-        _draw_box(axes, (box[:3] - box[3:])[pair], (box[:3] + box[3:])[pair],
-                  ec="0.25", lw=0.9, **style)  # fmt: skip
+        _draw_box(
+            axes, (box[:3] - box[3:])[pair], (box[:3] + box[3:])[pair], ec="0.25", lw=0.9, **style
+        )
     _draw_box(axes, low[pair], high[pair], fill=False, ec=REGION, lw=1.2, ls=(0, (4, 2)))
     centre = 0.5 * (low + high)
     shown: list[tuple[FloatArray, list[str]]] = []
@@ -140,10 +152,12 @@ def _draw_world(axes: Any, placed: Placed, plane: Plane, far: bool, heights: boo
             text += f" ({np.linalg.norm(anchor - centre):.3g} m away)"
         elif heights:
             text += f"  z {anchor[2]:.3g}"
-        axes.plot(*place, marker="^", ms=10, color=ANCHOR, mec="white", mew=1.0, zorder=5,
-                  clip_on=False)  # fmt: skip
-        close = (np.abs((place - other) / np.ptp(limits, axis=0)).max() < 0.05
-                 for other, _ in shown)  # fmt: skip
+        axes.plot(
+            *place, marker="^", ms=10, color=ANCHOR, mec="white", mew=1.0, zorder=5, clip_on=False
+        )
+        close = (
+            np.abs((place - other) / np.ptp(limits, axis=0)).max() < 0.05 for other, _ in shown
+        )
         group = next((k for k, is_close in enumerate(close) if is_close), None)
         if group is None:
             shown.append((place, [text]))
@@ -152,10 +166,15 @@ def _draw_world(axes: Any, placed: Placed, plane: Plane, far: bool, heights: boo
     for place, texts in shown:
         inward = place[0] > limits[0, 0] + 0.7 * np.ptp(limits[:, 0])
         axes.annotate(
-            ", ".join(texts), place, xytext=(-9 if inward else 9, 3), textcoords="offset points",
-            fontsize=8, ha="right" if inward else "left", zorder=6,
+            ", ".join(texts),
+            place,
+            xytext=(-9 if inward else 9, 3),
+            textcoords="offset points",
+            fontsize=8,
+            ha="right" if inward else "left",
+            zorder=6,
             bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
-        )  # fmt: skip
+        )
     axes.set_xlim(*limits[:, 0])
     axes.set_ylim(*limits[:, 1])
     axes.set_xlabel(f"{_NAMES[plane[0]]} [m]")
@@ -183,8 +202,11 @@ def _draw_layouts(axes: Any, rows: dict[str, dict[str, Any]]) -> None:
     """Typical and worst position error of every layout, the best on top."""
     names = list(rows)[::-1]
     places = np.arange(len(names))
-    for key, alpha, label in (("worst", 0.35, "worst"), ("p95", 0.65, "p95"),
-                              ("median", 1.0, "median")):  # fmt: skip
+    for key, alpha, label in (
+        ("worst", 0.35, "worst"),
+        ("p95", 0.65, "p95"),
+        ("median", 1.0, "median"),
+    ):
         values = [rows[name][f"position_{key}_m"] for name in names]
         colours = [DESIGNED if name == "designed" else USUAL for name in names]
         axes.barh(places, values, color=colours, alpha=alpha, height=0.72, label=label)
@@ -195,10 +217,15 @@ def _draw_layouts(axes: Any, rows: dict[str, dict[str, Any]]) -> None:
     for place, name in zip(places, names, strict=True):
         row = rows[name]
         axes.text(
-            0.985, place, f"b {row['score_m']:.3g} m  x{row['ratio']:.2f}", va="center",
-            ha="right", fontsize=8, transform=axes.get_yaxis_transform(),
+            0.985,
+            place,
+            f"b {row['score_m']:.3g} m  x{row['ratio']:.2f}",
+            va="center",
+            ha="right",
+            fontsize=8,
+            transform=axes.get_yaxis_transform(),
             bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85},
-        )  # fmt: skip
+        )
     axes.set_yticks(places, names)
     axes.set_xlabel("position, 1 sigma [m]: median, p95, worst place from dark to light")
     axes.set_title("the usual layouts (b: root mean square tag error)")
@@ -209,12 +236,21 @@ def _draw_numbers(axes: Any, rows: list[dict[str, float]]) -> None:
     """Accuracy against the number of anchors."""
     numbers = [int(row["n_anchors"]) for row in rows]
     other = axes.twinx()
-    for ax, key, unit, colour in ((axes, "position", "m", DESIGNED),
-                                  (other, "rotation", "deg", ANCHOR)):  # fmt: skip
+    for ax, key, unit, colour in (
+        (axes, "position", "m", DESIGNED),
+        (other, "rotation", "deg", ANCHOR),
+    ):
         for what, style in (("median", "o-"), ("p95", "s--"), ("worst", "^:")):
             values = [row[f"{key}_{what}_{unit}"] for row in rows]
-            ax.plot(numbers, values, style, color=colour, ms=4.5, lw=1.4,
-                    label=what if ax is axes else None)  # fmt: skip
+            ax.plot(
+                numbers,
+                values,
+                style,
+                color=colour,
+                ms=4.5,
+                lw=1.4,
+                label=what if ax is axes else None,
+            )
         name = "orientation" if key == "rotation" else key
         ax.set_ylabel(f"{name}, 1 sigma [{unit}]", color=colour)
         ax.set_ylim(bottom=0)

@@ -84,10 +84,13 @@ def print_place(result: dict[str, Any]) -> None:
 
 def _anchors(result: dict[str, Any]) -> Rows:
     rows = [
-        [str(index + 1), *(f"{anchor[key]:.3f}" for key in ("x_m", "y_m", "z_m")),
-         f"{100 * anchor['sees']:.0f} %"]
+        [
+            str(index + 1),
+            *(f"{anchor[key]:.3f}" for key in ("x_m", "y_m", "z_m")),
+            f"{100 * anchor['sees']:.0f} %",
+        ]
         for index, anchor in enumerate(result["anchors"])
-    ]  # fmt: skip
+    ]
     title = f"{result['scene']}: {result['n_anchors']} anchors ({result['method']})"
     return Rows(title, ["anchor", "x (m)", "y (m)", "z (m)", "sees of region"], rows)
 
@@ -95,8 +98,10 @@ def _anchors(result: dict[str, Any]) -> Rows:
 def _prediction(result: dict[str, Any]) -> Rows:
     rows = []
     for key, label in (
-        ("position_m", "position (m)"), ("rotation_deg", "orientation (deg)"), ("score_m", "b (m)")
-    ):  # fmt: skip
+        ("position_m", "position (m)"),
+        ("rotation_deg", "orientation (deg)"),
+        ("score_m", "b (m)"),
+    ):
         figures = result["predicted"][key]
         where = "(" + ", ".join(f"{x:.3g}" for x in figures["worst_at_m"]) + ")"
         rows.append(
@@ -141,8 +146,19 @@ def _check(check: dict[str, Any]) -> Rows:
             ratio = f"{quantity}_ratio"
             row.append(f"{figures[ratio]:.3f}" if ratio in figures else "-")
         rows.append([*row, f"{figures['nees']:.2f}" if "nees" in figures else "-"])
-    headings = ["filter", "lost", "position RMSE (m)", "of found", "predicted", "ratio",
-                "rotation RMSE (deg)", "of found", "predicted", "ratio", "NEES (6)"]  # fmt: skip
+    headings = [
+        "filter",
+        "lost",
+        "position RMSE (m)",
+        "of found",
+        "predicted",
+        "ratio",
+        "rotation RMSE (deg)",
+        "of found",
+        "predicted",
+        "ratio",
+        "NEES (6)",
+    ]
     return Rows(f"checked by Monte Carlo, {check['trials']} trials", headings, rows)
 
 

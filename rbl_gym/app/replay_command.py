@@ -127,7 +127,7 @@ def add_replay(commands: Any) -> None:
     replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")
     add_html(replay, "3-D page of the track with charts and tables")
     add_json(replay)
-    replay.set_defaults(run=_replay)  # fmt: skip
+    replay.set_defaults(run=_replay)
 
 
 def _replay(options: argparse.Namespace) -> int:

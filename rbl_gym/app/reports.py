@@ -51,9 +51,14 @@ def print_camsap2013(result: dict[str, Any]) -> None:
                 verdict = "holds" if claim["holds"] else "FAILS"
                 console.print(f"  {verdict}  {claim['statement']}  ({claim['figures']})")
     if "trade" in result:
-        console.print("ET-KF: " + ", ".join(
-            f"threshold {row['threshold']:g}: {100 * row['trigger_rate']:.0f} % projected, "
-            f"RMSE {row['rotation_rmse']:.4f}" for row in result["trade"]))  # fmt: skip
+        console.print(
+            "ET-KF: "
+            + ", ".join(
+                f"threshold {row['threshold']:g}: {100 * row['trigger_rate']:.0f} % projected, "
+                f"RMSE {row['rotation_rmse']:.4f}"
+                for row in result["trade"]
+            )
+        )
     deviation = 100 / (6 * result["trials"]) ** 0.5
     console.print(
         f"Assumed, for it is not printed: {', '.join(result['assumed'])}.\n"
@@ -68,8 +73,10 @@ def print_static(result: dict[str, Any]) -> None:
     console = new_console()
     for label, data in result["settings"].items():
         low, high = data["reference_range_db"][0], data["reference_range_db"][-1]
-        table = Table(title=f"{result['experiment']}, anchors in {label}, {low} to {high} dB, "
-                      f"{result['trials']} trials")  # fmt: skip
+        table = Table(
+            title=f"{result['experiment']}, anchors in {label}, {low} to {high} dB, "
+            f"{result['trials']} trials"
+        )
         table.add_column("method")
         for heading in ("angle / bound", "rotation / bound", "translation / bound"):
             table.add_column(heading, justify="right")
@@ -155,9 +162,13 @@ def print_evaluation(result: dict[str, Any]) -> None:
         table.add_column(heading, justify="right")
     for name, row in sorted(result["methods"].items(), key=lambda item: item[1]["loss"]):
         interval = f"{row['normalised_low']:.3f} to {row['normalised_high']:.3f}"
-        table.add_row(name, f"{row['loss']:.4f} +- {row['loss_std_error']:.4f}",
-                      "-" if row["score_m"] is None else f"{row['score_m']:.4f}",
-                      f"{row['normalised']:.3f}", interval)  # fmt: skip
+        table.add_row(
+            name,
+            f"{row['loss']:.4f} +- {row['loss_std_error']:.4f}",
+            "-" if row["score_m"] is None else f"{row['score_m']:.4f}",
+            f"{row['normalised']:.3f}",
+            interval,
+        )
     console.print(table)
     console.print(f"normalised: 0 is random, 1 is {result['best_reference']}")
 
@@ -166,13 +177,19 @@ def print_transfer(result: dict[str, Any]) -> None:
     """One table for each filter: score and real error, and how they go together."""
     console = new_console()
     for name, rows in result["filters"].items():
-        table = Table(title=f"{result['task']}, {name}, {result['worlds']} worlds, "
-                      f"{result['repeats']} bodies in each")  # fmt: skip
+        table = Table(
+            title=f"{result['task']}, {name}, {result['worlds']} worlds, "
+            f"{result['repeats']} bodies in each"
+        )
         table.add_column("layouts")
         for heading in ("score b (m)", "tag RMSE of the filter (m)", "correlation of the logs"):
             table.add_column(heading, justify="right")
         for label, row in rows.items():
             alike = row["correlation"]
-            table.add_row(label, f"{row['score_m']:.4f}", f"{row['tag_rmse_m']:.4f}",
-                          "-" if alike is None else f"{alike:.3f}")  # fmt: skip
+            table.add_row(
+                label,
+                f"{row['score_m']:.4f}",
+                f"{row['tag_rmse_m']:.4f}",
+                "-" if alike is None else f"{alike:.3f}",
+            )
         console.print(table)

@@ -11,8 +11,11 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.rendering.drawing import RADIUS_95, box_corners, box_edges, gapped
 
 # The twelve triangles of a box, by corner.
-_TRIANGLES = ((0, 0, 4, 4, 0, 0, 2, 2, 0, 0, 1, 1), (1, 3, 5, 7, 1, 5, 3, 7, 2, 6, 3, 7),
-              (3, 2, 7, 6, 5, 4, 7, 6, 6, 4, 7, 5))  # fmt: skip
+_TRIANGLES = (
+    (0, 0, 4, 4, 0, 0, 2, 2, 0, 0, 1, 1),
+    (1, 3, 5, 7, 1, 5, 3, 7, 2, 6, 3, 7),
+    (3, 2, 7, 6, 5, 4, 7, 6, 6, 4, 7, 5),
+)
 # Latitudes and longitudes of an ellipsoid's net.
 _LATITUDES, _LONGITUDES = 9, 16
 
@@ -39,8 +42,17 @@ def box(low: Any, high: Any, **style: Any) -> go.Scatter3d:
 def solid(low: Any, high: Any, **style: Any) -> go.Mesh3d:
     """A box with faces."""
     i, j, k = _TRIANGLES
-    return go.Mesh3d(**xyz(box_corners(low, high)), i=i, j=j, k=k, color="#6c757d", opacity=0.55,
-                     flatshading=True, hoverinfo="skip", **style)  # fmt: skip
+    return go.Mesh3d(
+        **xyz(box_corners(low, high)),
+        i=i,
+        j=j,
+        k=k,
+        color="#6c757d",
+        opacity=0.55,
+        flatshading=True,
+        hoverinfo="skip",
+        **style,
+    )
 
 
 def ellipsoid(centre: FloatArray, covariance: FloatArray) -> dict[str, list[float | None]]:
@@ -48,9 +60,12 @@ def ellipsoid(centre: FloatArray, covariance: FloatArray) -> dict[str, list[floa
     values, vectors = np.linalg.eigh(covariance)
     height = np.linspace(-np.pi / 2, np.pi / 2, _LATITUDES)[:, None]
     around = np.linspace(0, 2 * np.pi, _LONGITUDES, endpoint=False)
-    ball = np.stack(np.broadcast_arrays(np.cos(height) * np.cos(around),
-                                        np.cos(height) * np.sin(around), np.sin(height)),
-                    axis=-1).reshape(-1, 3)  # fmt: skip
+    ball = np.stack(
+        np.broadcast_arrays(
+            np.cos(height) * np.cos(around), np.cos(height) * np.sin(around), np.sin(height)
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
     half = RADIUS_95 * vectors * np.sqrt(np.maximum(values, 0.0))
     return xyz(centre + ball @ half.T)
 
@@ -61,6 +76,7 @@ def net() -> dict[str, list[int]]:
     along = np.arange(_LONGITUDES)
     next_ = (along + 1) % _LONGITUDES
     a, b, c, d = rows + along, rows + next_, rows + _LONGITUDES + along, rows + _LONGITUDES + next_
-    triangles = [np.concatenate([part.ravel() for part in corner])
-                 for corner in ((a, b), (b, d), (c, c))]  # fmt: skip
+    triangles = [
+        np.concatenate([part.ravel() for part in corner]) for corner in ((a, b), (b, d), (c, c))
+    ]
     return dict(zip("ijk", (corner.tolist() for corner in triangles), strict=True))

@@ -15,9 +15,13 @@ from rbl_gym.studies.extras import MissingExtraError, require
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     """The option --json."""
-    parser.add_argument("--json", nargs="?", const="-", metavar="F",
-                        help="write the figures as JSON to F; without F, to standard output "
-                        "in place of the table")  # fmt: skip
+    parser.add_argument(
+        "--json",
+        nargs="?",
+        const="-",
+        metavar="F",
+        help="write the figures as JSON to F; without F, to standard output in place of the table",
+    )
 
 
 def add_seed(parser: argparse.ArgumentParser, of: str = "of all randomness") -> None:

@@ -32,13 +32,18 @@ def demo_page(result: dict[str, Any], example: Example) -> str:
     }
     count = episode.rotation.shape[1]
     story = Story(
-        scene.dt * np.arange(1, count + 1), episode.anchors[0],
-        [str(k + 1) for k in range(scene.n_anchors)], np.asarray(scene.tags),
-        (episode.rotation[0], episode.translation[0], np.ones(count, dtype=np.bool_)), beliefs,
-    )  # fmt: skip
+        scene.dt * np.arange(1, count + 1),
+        episode.anchors[0],
+        [str(k + 1) for k in range(scene.n_anchors)],
+        np.asarray(scene.tags),
+        (episode.rotation[0], episode.translation[0], np.ones(count, dtype=np.bool_)),
+        beliefs,
+    )
     headings = ["filter", *(column[0] for column in CAMSAP_COLUMNS)]
-    rows = [[label, *(form.format(row[key]) for _, key, form in CAMSAP_COLUMNS)]
-            for label, row in result["filters"].items()]  # fmt: skip
+    rows = [
+        [label, *(form.format(row[key]) for _, key, form in CAMSAP_COLUMNS)]
+        for label, row in result["filters"].items()
+    ]
     claims = [
         [claim["source"], claim["statement"], claim["holds"], claim["figures"]]
         for claim in result["claims"]
@@ -49,23 +54,32 @@ def demo_page(result: dict[str, Any], example: Example) -> str:
         page.plot(track_html.track_figure(story), "track"),
         "<h2>All trials</h2>",
         page.plot(_curves(result), "curves", first=False),
-        page.note("Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward "
-                  "= -log b, b the expected RMS error of the tags in metres; NEES of an honest "
-                  f"filter is 6. Assumed, for the paper does not print it: {assumed}."),
+        page.note(
+            "Ratios are to the posterior Cramer-Rao bound, averaged over the steps; reward "
+            "= -log b, b the expected RMS error of the tags in metres; NEES of an honest "
+            f"filter is 6. Assumed, for the paper does not print it: {assumed}."
+        ),
         page.table(f"filters, {result['trials']} trials", headings, rows),
         page.table("claims", ["of", "claim", "holds", "figures"], claims),
-    ]  # fmt: skip
+    ]
     return page.document("Tracking a rigid body: five filters and the bound", parts)
 
 
 def _curves(result: dict[str, Any]) -> go.Figure:
     """RMSE (Fig. 2), MAE (Fig. 3) and mean NEES per step of all trials."""
-    charts = (("rotation_rmse", "rotation RMSE (Frobenius)"),
-              ("translation_rmse_m", "translation RMSE (m)"),
-              ("mean_angular_error_deg", "mean angular error (deg)"),
-              ("nees", "mean NEES"))  # fmt: skip
-    shown = make_subplots(2, 2, subplot_titles=[title for _, title in charts],
-                          horizontal_spacing=0.08, vertical_spacing=0.13)  # fmt: skip
+    charts = (
+        ("rotation_rmse", "rotation RMSE (Frobenius)"),
+        ("translation_rmse_m", "translation RMSE (m)"),
+        ("mean_angular_error_deg", "mean angular error (deg)"),
+        ("nees", "mean NEES"),
+    )
+    shown = make_subplots(
+        2,
+        2,
+        subplot_titles=[title for _, title in charts],
+        horizontal_spacing=0.08,
+        vertical_spacing=0.13,
+    )
     trials = result["trials"]
     low, high = nees_interval(trials)
     steps = list(range(1, len(result["bound"]["rotation_rmse"]) + 1))
@@ -81,23 +95,42 @@ def _curves(result: dict[str, Any]) -> go.Figure:
             lines["posterior CRB"] = (result["bound"][key], "#222222", "markers")
         for name, (values, colour, mode) in lines.items():
             shown.add_trace(
-                go.Scatter(x=steps, y=values, name=name, legendgroup=name, showlegend=k == 0,
-                           mode=mode, marker={"color": colour, "size": 5},
-                           line={"color": colour, "width": 2,
-                                 "dash": "dash" if name == "KF-ortho" else "solid"}),
-                row=row + 1, col=column + 1,
-            )  # fmt: skip
+                go.Scatter(
+                    x=steps,
+                    y=values,
+                    name=name,
+                    legendgroup=name,
+                    showlegend=k == 0,
+                    mode=mode,
+                    marker={"color": colour, "size": 5},
+                    line={
+                        "color": colour,
+                        "width": 2,
+                        "dash": "dash" if name == "KF-ortho" else "solid",
+                    },
+                ),
+                row=row + 1,
+                col=column + 1,
+            )
         if key != "nees":
             drawn = [value for values, _, _ in lines.values() for value in values]
-            shown.update_yaxes(type="log", **track_html.log_ticks(min(drawn), max(drawn)),
-                               row=row + 1, col=column + 1)  # fmt: skip
+            shown.update_yaxes(
+                type="log",
+                **track_html.log_ticks(min(drawn), max(drawn)),
+                row=row + 1,
+                col=column + 1,
+            )
     shown.update_xaxes(range=[0.5, steps[-1] + 0.5])
     shown.add_hrect(low, high, row=2, col=2, line_width=0, fillcolor="#868e96", opacity=0.25)  # pyright: ignore[reportArgumentType]
     shown.update_xaxes(title_text="time step", title_standoff=4)
     shown.update_annotations(font_size=13)
     legend = {"orientation": "h", "x": 0, "y": 1.06, "yanchor": "bottom"}
-    shown.update_layout(height=680, template="plotly_white", legend=legend,
-                        margin={"l": 50, "r": 10, "t": 60, "b": 40})  # fmt: skip
+    shown.update_layout(
+        height=680,
+        template="plotly_white",
+        legend=legend,
+        margin={"l": 50, "r": 10, "t": 60, "b": 40},
+    )
     return shown
 
 
@@ -113,9 +146,14 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
     if truth is not None:
         truth = truth[0], truth[1] - origin, truth[2]
     story = Story(
-        times, recording.anchors - origin, recording.anchor_ids, recording.tags, truth,
-        {settings.filter: beliefs}, "xy" if settings.planar else "xyz",
-    )  # fmt: skip
+        times,
+        recording.anchors - origin,
+        recording.anchor_ids,
+        recording.tags,
+        truth,
+        {settings.filter: beliefs},
+        "xy" if settings.planar else "xyz",
+    )
     parts = [*map(page.note, result["notes"]), page.note(_LEGEND)]
     if origin.any():
         shift = ", ".join(f"{x:.0f}" for x in origin)
@@ -123,13 +161,19 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
     parts.append(page.plot(track_html.track_figure(story), "track"))
     if truth is not None:
         rows = [
-            [f"{name} {result['position_axes']} (m)" if unit == "m" else f"{name} (deg)",
-             *(result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95"))]
+            [
+                f"{name} {result['position_axes']} (m)" if unit == "m" else f"{name} (deg)",
+                *(result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")),
+            ]
             for name, unit in (("position", "m"), ("yaw", "deg"), ("rotation", "deg"))
-        ]  # fmt: skip
+        ]
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
-        parts.append(page.note(f"NEES per degree of freedom {result['anees']:.2f} (1: honest); "
-                               f"{result['epochs_with_truth']} epochs have truth."))  # fmt: skip
+        parts.append(
+            page.note(
+                f"NEES per degree of freedom {result['anees']:.2f} (1: honest); "
+                f"{result['epochs_with_truth']} epochs have truth."
+            )
+        )
     parts.append(track_html.anchors_table(story))
     used = [[name.replace("_", " "), value] for name, value in result["settings"].items()]
     parts.append(page.table("settings", ["setting", "value"], used))

@@ -12,5 +12,6 @@ class MissingExtraError(Exception):
 def require(module: str, extra: str, also: str = "") -> None:
     """Say which extra is missing before the work begins, and what is needed `also`, of no extra."""
     if importlib.util.find_spec(module) is None:
-        raise MissingExtraError(f"this command needs the extra {extra}: pip install "
-                                f"'rbl-gym[{extra}]' {also}".rstrip())  # fmt: skip
+        raise MissingExtraError(
+            f"this command needs the extra {extra}: pip install 'rbl-gym[{extra}]' {also}".rstrip()
+        )

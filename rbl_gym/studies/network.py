@@ -71,8 +71,10 @@ def _solved(path: str, graph: PoseGraph, weights: str) -> Solved:
         try:
             graphs.check_connected(edges, n_nodes, graph.ids)
         except ValueError as error:
-            raise ValueError(f"of those with information of theta (I33): {error}; "
-                             "--weights unit takes all edges alike") from error  # fmt: skip
+            raise ValueError(
+                f"of those with information of theta (I33): {error}; "
+                "--weights unit takes all edges alike"
+            ) from error
     begin = time.perf_counter()
     theta = estimators.orientations(edges, y, n_nodes, weights=w)
     solved = time.perf_counter()
@@ -132,8 +134,10 @@ def edge_weights(graph: PoseGraph) -> FloatArray:
     needed = missing & _on_cycles(graph.edges, len(graph.ids))
     if needed.any():
         i, j = graph.ids[graph.edges[np.argmax(needed)]]
-        raise ValueError(f"every edge on a cycle must have information (I11 to I33), got none in "
-                         f"edge {i} {j}; --weights unit takes all edges alike")  # fmt: skip
+        raise ValueError(
+            f"every edge on a cycle must have information (I11 to I33), got none in "
+            f"edge {i} {j}; --weights unit takes all edges alike"
+        )
     return np.where(missing, np.nanmax(weight) or 1.0, weight)
 
 

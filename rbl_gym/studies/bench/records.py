@@ -190,14 +190,18 @@ def tasks_of(records: Sequence[Mapping[str, Any]]) -> list[Task]:
     grouped: dict[str, Task] = {}
     for record in records:
         task = Task(
-            record["scene"], record["spec"], record["condition"],
-            (record["filter"],), record["trials"], record["seed"],
-        )  # fmt: skip
+            record["scene"],
+            record["spec"],
+            record["condition"],
+            (record["filter"],),
+            record["trials"],
+            record["seed"],
+        )
         key = json.dumps(task._replace(filters=()), sort_keys=True)
         before = grouped.get(key)
-        grouped[key] = task if before is None else before._replace(
-            filters=(*before.filters, record["filter"])
-        )  # fmt: skip
+        grouped[key] = (
+            task if before is None else before._replace(filters=(*before.filters, record["filter"]))
+        )
     return list(grouped.values())
 
 
@@ -275,9 +279,12 @@ def rerun(
     order = list(before)
     rows.sort(key=lambda row: order.index(_place(row)))
     return {
-        "records": len(records), "identical": identical, "changed": rows,
-        "versions": versions, "sources": sources,
-    }  # fmt: skip
+        "records": len(records),
+        "identical": identical,
+        "changed": rows,
+        "versions": versions,
+        "sources": sources,
+    }
 
 
 def _place(record: Mapping[str, Any]) -> tuple[str, ...]:

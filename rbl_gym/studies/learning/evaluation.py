@@ -287,10 +287,14 @@ def layouts_of(
     """
     env, _, _ = _held_out(task, worlds, seed)
     found = _of_all(
-        task, policies, names, seed, advance,
+        task,
+        policies,
+        names,
+        seed,
+        advance,
         lambda name, rng: _reference_layout(task, env, name, rng),
         lambda policy: _policy_layout(task, policy, worlds, seed),
-    )  # fmt: skip
+    )
     return env.task, env.contexts, found
 
 
@@ -336,6 +340,10 @@ def _refined(
 ) -> FloatArray:
     """Layouts after a tenth of the generations that CMA-ES alone takes."""
     return search.cma_es(
-        problem, contexts, rng, generations=REFINE_GENERATIONS, sigma=_REFINE_SIGMA,
+        problem,
+        contexts,
+        rng,
+        generations=REFINE_GENERATIONS,
+        sigma=_REFINE_SIGMA,
         start=anchors,
-    )  # fmt: skip
+    )

@@ -48,8 +48,10 @@ def train(
         Without stable-baselines3 (extra ``rl``).
     """
     if seed * SEED_STRIDE >= HELD_OUT_SEED:
-        raise ValueError(f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the "
-                         "worlds of larger ones are held out for evaluations")  # fmt: skip
+        raise ValueError(
+            f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the "
+            "worlds of larger ones are held out for evaluations"
+        )
     import torch  # pyright: ignore[reportMissingImports]
 
     # Small networks: threads cost more than they give, and vary the sums.

@@ -222,23 +222,37 @@ def claims(
     linear = [label for label in ("KF-ortho", "ET-KF", "UC-KF") if label in traces]
     spread = np.max([np.abs(translation[label] / translation["KF"] - 1) for label in linear])
     found = [
-        _of_paper("KF's estimated RMSE within 12 % of its RMSE, rotation and translation; "
-                  "5 % on average", follows, followed),
-        _of_paper("UC-KF's RMSE below KF's at every step", to_kf("UC-KF").max() < 1,
-                  to_kf("UC-KF")),
-        _of_paper("KF-ortho's RMSE below KF's at every step", to_kf("KF-ortho").max() < 1,
-                  to_kf("KF-ortho")),
-    ]  # fmt: skip
+        _of_paper(
+            "KF's estimated RMSE within 12 % of its RMSE, rotation and translation; 5 % on average",
+            follows,
+            followed,
+        ),
+        _of_paper(
+            "UC-KF's RMSE below KF's at every step", to_kf("UC-KF").max() < 1, to_kf("UC-KF")
+        ),
+        _of_paper(
+            "KF-ortho's RMSE below KF's at every step",
+            to_kf("KF-ortho").max() < 1,
+            to_kf("KF-ortho"),
+        ),
+    ]
     if "ET-KF" in traces:
         found += _claims_of_et_kf(traces, to_kf("ET-KF"), rotation)
     in_angle = np.array([angle[label] / angle["KF"] for label in linear])
     found += [
-        _of_paper(f"the same in MAE: {', '.join(linear)} below KF, averaged over the steps",
-                  in_angle.mean(axis=1).max() < 1, in_angle),
-        Claim(f"translation of KF, {', '.join(linear)} equal within 1 %", "paper",
-              bool(spread < 0.01), f"largest difference {100 * spread:.2g} %"),
+        _of_paper(
+            f"the same in MAE: {', '.join(linear)} below KF, averaged over the steps",
+            in_angle.mean(axis=1).max() < 1,
+            in_angle,
+        ),
+        Claim(
+            f"translation of KF, {', '.join(linear)} equal within 1 %",
+            "paper",
+            bool(spread < 0.01),
+            f"largest difference {100 * spread:.2g} %",
+        ),
         _of_paper("UC-KF's covariance an overestimate at every step", covered.min() > 1, covered),
-    ]  # fmt: skip
+    ]
     return found + _claims_of_ours(traces, consistent, bound, rotation, translation)
 
 
@@ -249,12 +263,17 @@ def _claims_of_et_kf(
     beyond = ((to_kf - 1) / noise).max()
     above = rotation["ET-KF"] / rotation["KF-ortho"]
     return [
-        _of_paper("ET-KF(0.15)'s RMSE below KF's, averaged over the steps", to_kf.mean() < 1,
-                  to_kf),
-        Claim(f"and at no step above it by more than {_SIGMAS:.0f} standard errors", "paper",
-              bool(beyond <= _SIGMAS), f"largest excess {beyond:.1f} standard errors"),
+        _of_paper(
+            "ET-KF(0.15)'s RMSE below KF's, averaged over the steps", to_kf.mean() < 1, to_kf
+        ),
+        Claim(
+            f"and at no step above it by more than {_SIGMAS:.0f} standard errors",
+            "paper",
+            bool(beyond <= _SIGMAS),
+            f"largest excess {beyond:.1f} standard errors",
+        ),
         _of_paper("ET-KF(0.15)'s RMSE above KF-ortho's at every step", above.min() > 1, above),
-    ]  # fmt: skip
+    ]
 
 
 def _claims_of_ours(
@@ -274,13 +293,20 @@ def _claims_of_ours(
     average = ratios.mean(axis=1).max()
     nees = float(traces["iterated EKF"].nees.mean())
     return [
-        Claim("KF within 3 % of its estimate with sigma_q_scale = sqrt(2/3), mean over the steps",
-              "ours", bool(abs(scaled.mean() - 1) < 0.03), _range_of(scaled)),
-        Claim("iterated EKF <= 1.08 of the bound at each step, <= 1.03 on average", "ours",
-              bool(ratios.max() <= 1.08 and average <= 1.03),
-              f"worst step {ratios.max():.3f}, average {average:.3f}"),
+        Claim(
+            "KF within 3 % of its estimate with sigma_q_scale = sqrt(2/3), mean over the steps",
+            "ours",
+            bool(abs(scaled.mean() - 1) < 0.03),
+            _range_of(scaled),
+        ),
+        Claim(
+            "iterated EKF <= 1.08 of the bound at each step, <= 1.03 on average",
+            "ours",
+            bool(ratios.max() <= 1.08 and average <= 1.03),
+            f"worst step {ratios.max():.3f}, average {average:.3f}",
+        ),
         Claim("iterated EKF's NEES 6 +- 0.4", "ours", bool(abs(nees - 6) <= 0.4), f"{nees:.2f}"),
-    ]  # fmt: skip
+    ]
 
 
 def _standard_error_of_ratio(one: FloatArray, other: FloatArray) -> FloatArray:

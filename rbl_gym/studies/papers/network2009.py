@@ -35,9 +35,20 @@ __all__ = [
 ]
 
 # Node 0, the reference, is the one at the bottom left, as in Fig. 6.
-PLACES = np.array([[0.07, 0.13], [0.13, 0.50], [0.60, 0.03], [0.37, 0.51], [0.14, 0.79],
-                   [0.66, 0.28], [0.15, 0.93], [0.67, 0.51], [0.82, 0.55],
-                   [0.95, 0.62]])  # fmt: skip
+PLACES = np.array(
+    [
+        [0.07, 0.13],
+        [0.13, 0.50],
+        [0.60, 0.03],
+        [0.37, 0.51],
+        [0.14, 0.79],
+        [0.66, 0.28],
+        [0.15, 0.93],
+        [0.67, 0.51],
+        [0.82, 0.55],
+        [0.95, 0.62],
+    ]
+)
 LOOPS = (5, 10, 15, 20, 25, 30, 36)  # of Fig. 4, where no footprints are asked for
 VARIANCE, RUN_VARIANCE = 0.1, 0.01  # sigma^2 of Fig. 4, of Figs 5 and 6
 _SHOWN_LOOPS, _SHOWN_STEPS = 10, 60
@@ -113,8 +124,11 @@ def network_experiment(
     if isinstance(positions, str):
         positions = read_points(positions)
     places = PLACES if positions is None else check_positions(positions)
-    radii = _default_footprints(places) if footprints is None else \
-        sorted(check_number("footprint", radius, low=0.0) for radius in footprints)  # fmt: skip
+    radii = (
+        _default_footprints(places)
+        if footprints is None
+        else sorted(check_number("footprint", radius, low=0.0) for radius in footprints)
+    )
     if not radii:
         raise ValueError("footprint must be at least one radius, got none")
     graphs = [_seen(places, radius) for radius in radii]
@@ -129,14 +143,20 @@ def network_experiment(
     sigma = np.sqrt([VARIANCE, RUN_VARIANCE] if variance is None else [variance] * 2)
     result["variance"] = [float(one**2) for one in sigma]
     result["accuracy"] = [
-        {"footprint": float(radius), **_accuracy(places, edges, float(sigma[0]), trials,
-                                                 np.random.default_rng([seed, len(edges)]))}
+        {
+            "footprint": float(radius),
+            **_accuracy(
+                places, edges, float(sigma[0]), trials, np.random.default_rng([seed, len(edges)])
+            ),
+        }
         for radius, edges in zip(radii, graphs, strict=True)
-    ]  # fmt: skip
+    ]
     advance()
     result["run"] = _run(places, graphs[-1], float(sigma[1]), np.random.default_rng([seed, 500]))
-    samples = [draw_network(EXAMPLE_LOOPS, np.random.default_rng([seed, 1000, k]))
-               for k in range(_NETWORKS)]  # fmt: skip
+    samples = [
+        draw_network(EXAMPLE_LOOPS, np.random.default_rng([seed, 1000, k]))
+        for k in range(_NETWORKS)
+    ]
     result["convergence"] = {
         basis: {rule: _convergence(samples, basis, rule) for rule in RULES} for basis in BASES
     }
@@ -322,8 +342,9 @@ def measured_factor(one: DrawnNetwork, C: Any, run: consensus.CycleRun) -> float
     nothing = np.zeros(C.shape[0])
     limit = consensus.cycle_projection(C, one.y, run.branch)
     for _ in range(_STRETCHES):
-        again = consensus.cycle_iteration(one.edges, psi, N_NODES, C, run.kappa, history=True,
-                                          branch=run.branch)  # fmt: skip
+        again = consensus.cycle_iteration(
+            one.edges, psi, N_NODES, C, run.kappa, history=True, branch=run.branch
+        )
         distance = distances_from_limit(C, one.y, again)
         late = np.flatnonzero(distance > 1e-8 * distance[0])
         first, last = late[len(late) // 2], late[-1]
@@ -341,8 +362,9 @@ def _asynchronous(
     steps, off = [], []
     for one in samples:
         C = network_graphs.cycle_matrix(one.edges, N_NODES, "paton")
-        run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, order="asynchronous",
-                                        rng=rng, loss=loss)  # fmt: skip
+        run = consensus.cycle_iteration(
+            one.edges, one.y, N_NODES, C, order="asynchronous", rng=rng, loss=loss
+        )
         steps.append(run.steps)
         limit = consensus.cycle_projection(C, one.y, run.branch)
         off.append(float(np.abs(run.psi - limit).max()))

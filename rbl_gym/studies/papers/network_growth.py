@@ -56,9 +56,17 @@ def _grown(sizes: list[tuple[int, sp.csr_matrix]]) -> dict[str, Any]:
         kappa = {rule: consensus.step_size(C, rule) for rule in consensus.STEP_RULES}
         factor = {rule: consensus.convergence_factor(C, one) for rule, one in kappa.items()}
         low, high = consensus.eigenvalues(C)
-        rows.append({"nodes": n_nodes, "edges": C.shape[1], "loops": C.shape[0],
-                     "lambda_min": low, "lambda_max": high, "kappa": kappa,
-                     "factor": factor})  # fmt: skip
+        rows.append(
+            {
+                "nodes": n_nodes,
+                "edges": C.shape[1],
+                "loops": C.shape[0],
+                "lambda_min": low,
+                "lambda_max": high,
+                "kappa": kappa,
+                "factor": factor,
+            }
+        )
     at = np.log([row["nodes"] for row in rows[-_FITTED:]])
     slope = {
         rule: float(np.polyfit(at, np.log([row["kappa"][rule] for row in rows[-_FITTED:]]), 1)[0])
@@ -108,7 +116,14 @@ def three_in_space(trials: int, rng: np.random.Generator) -> list[dict[str, Any]
         rmse = float(np.sqrt(np.mean(np.sum(error**2, axis=-1))))
         P = bounds.space_orientation_covariance(places, TRIANGLE_EDGES, sigma)
         bound = float(np.sqrt(np.trace(P) / 2))
-        rows.append({"shape": shape, "bearing_std_rad": sigma, "rmse_rad": rmse,
-                     "bound_rad": bound, "ratio": rmse / bound,
-                     "misfit": float(np.std(found.misfit) / (6**0.5 * sigma))})  # fmt: skip
+        rows.append(
+            {
+                "shape": shape,
+                "bearing_std_rad": sigma,
+                "rmse_rad": rmse,
+                "bound_rad": bound,
+                "ratio": rmse / bound,
+                "misfit": float(np.std(found.misfit) / (6**0.5 * sigma)),
+            }
+        )
     return rows

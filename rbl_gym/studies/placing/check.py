@@ -171,8 +171,10 @@ def found_figures(drawn: DrawnBodies, found: Any, bound: FloatArray) -> dict[str
         ):
             real = scale * np.sqrt((error[rows, part] ** 2).sum(-1).mean())
             predicted = scale * np.sqrt(variance[rows, part].sum(-1).mean())
-            result |= {f"{name}_rmse{of}_{unit}": float(real),
-                       f"{name}_predicted{of}_{unit}": float(predicted),
-                       f"{name}_ratio{of}": float(real / predicted)}  # fmt: skip
+            result |= {
+                f"{name}_rmse{of}_{unit}": float(real),
+                f"{name}_predicted{of}_{unit}": float(predicted),
+                f"{name}_ratio{of}": float(real / predicted),
+            }
         result[f"nees{of}"] = float(nees[rows].mean())
     return result

@@ -104,9 +104,13 @@ def design_layout(
     advance()
     for sigma in _SIGMAS:
         found = search.cma_es(
-            task, _repeated(context, len(starts)), rng, _GENERATIONS, sigma=sigma,
+            task,
+            _repeated(context, len(starts)),
+            rng,
+            _GENERATIONS,
+            sigma=sigma,
             start=np.array(list(starts.values())),
-        )  # fmt: skip
+        )
         for name, anchors in zip(starts, found, strict=True):
             searched[f"CMA-ES from {name}, step {sigma:g}"] = anchors
         advance()
@@ -115,9 +119,10 @@ def design_layout(
     searched = {name: region.project(np.round(x, 3)) for name, x in searched.items()}
     searched |= usual(task, context, rng)
     legal = {
-        name: anchors for name, anchors in searched.items()
+        name: anchors
+        for name, anchors in searched.items()
         if not problem.obstacles.contain(anchors).any()
-    }  # fmt: skip
+    }
     # Judged over more places than those that the search has seen.
     places = free_sample(problem)
     scores = {name: float(rms(accuracy(problem, x, places).score)) for name, x in legal.items()}
@@ -254,8 +259,10 @@ def _summary(problem: Problem, anchors: FloatArray) -> dict[str, float]:
     found = prediction(problem, anchors)
     row = {"score_m": found["score_m"]["rms"]}
     for name in ("position_m", "rotation_deg"):
-        row |= {f"{name.replace('_', f'_{what}_')}": found[name][what]
-                for what in ("median", "p95", "worst")}  # fmt: skip
+        row |= {
+            f"{name.replace('_', f'_{what}_')}": found[name][what]
+            for what in ("median", "p95", "worst")
+        }
     return row
 
 

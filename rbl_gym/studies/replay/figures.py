@@ -129,8 +129,10 @@ def track_figures(
     yaw = np.rad2deg(found.yaw[known])
     rotation = np.rad2deg(found.rotation[known])
     for name, values in (
-        ("position_{}_m", found.position[known]), ("yaw_{}_deg", yaw), ("rotation_{}_deg", rotation)
-    ):  # fmt: skip
+        ("position_{}_m", found.position[known]),
+        ("yaw_{}_deg", yaw),
+        ("rotation_{}_deg", rotation),
+    ):
         result[name.format("rmse")] = float(np.sqrt(np.mean(values**2)))
         result[name.format("median")] = float(np.median(np.abs(values)))
         result[name.format("p95")] = float(np.quantile(np.abs(values), 0.95))

@@ -171,8 +171,10 @@ def fault_hints(
         tried = [(text, other, most) for text, other in faults]
         for text, other in (("", judged), *faults):
             limit = min(most, _share_of_frames(other) * other.excess())
-            tried += [(f"{text}, with {frame}" if text else frame, both, limit)
-                      for frame, both in _frames(other, planar)]  # fmt: skip
+            tried += [
+                (f"{text}, with {frame}" if text else frame, both, limit)
+                for frame, both in _frames(other, planar)
+            ]
         for text, other, limit in tried:
             left = other.excess()
             if left < limit and (best is None or left * _AS_GOOD < best[0]):
@@ -199,12 +201,16 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
     Q = judged.true_rotation
     q = rotations.quaternion(Q)
     for text, other in (
-        ("the truth's quaternions look like x, y, z, w under the names w, x, y, z",
-         rotations.from_quaternion(q[..., [3, 0, 1, 2]])),
-        ("the truth's quaternions look like w, x, y, z under the names x, y, z, w",
-         rotations.from_quaternion(q[..., [1, 2, 3, 0]])),
+        (
+            "the truth's quaternions look like x, y, z, w under the names w, x, y, z",
+            rotations.from_quaternion(q[..., [3, 0, 1, 2]]),
+        ),
+        (
+            "the truth's quaternions look like w, x, y, z under the names x, y, z, w",
+            rotations.from_quaternion(q[..., [1, 2, 3, 0]]),
+        ),
         ("the truth's rotations look inverted (from the world to the body)", np.swapaxes(Q, 1, 2)),
-    ):  # fmt: skip
+    ):
         yield text, judged._replace(true_rotation=other)
     spread = [np.ptp(a, axis=0).max() for a in (judged.translation, judged.true_translation)]
     for scale, unit in ((0.01, "centimetres"), (0.001, "millimetres")):
@@ -274,7 +280,11 @@ def judged_of(truth: tuple[FloatArray, FloatArray, BoolArray], track: Any, plana
         place[:, 2] = track.translation[known, 2]
     variance = np.einsum("kii->ki", track.covariance[known])
     return Judged(
-        track.times[known], track.rotation[known], track.translation[known], rotation[known], place,
+        track.times[known],
+        track.rotation[known],
+        track.translation[known],
+        rotation[known],
+        place,
         variance[:, 2 if planar else 0 : 3].sum(axis=-1),
         variance[:, 3 : 5 if planar else 6].sum(axis=-1),
-    )  # fmt: skip
+    )
