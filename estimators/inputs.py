@@ -88,7 +88,8 @@ def is_plain_epoch(ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int
     """
     return (
         type(ranges) is type(anchors) is np.ndarray
-        and ranges.dtype is anchors.dtype is _FLOAT64
+        # Not by identity: what was pickled has a type of its own.
+        and ranges.dtype == anchors.dtype == _FLOAT64
         and anchors.ndim == len(batch) + 2
         and tags.ndim == 2
         and anchors.shape[-1] == 3
