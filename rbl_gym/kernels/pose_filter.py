@@ -13,7 +13,6 @@ import numpy as np
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
-from rbl_gym.kernels.noise_laws import reference_of
 from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
 from rbl_gym.kernels.range_cost import loss_of, squared_residuals
 
@@ -76,28 +75,29 @@ def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, weights: Any) -> boo
     `shares` are 0 where nothing was measured. `law` has the numbers of `noise_laws`, of an epoch
     without lost links; or it is of the kind 2, where the shares are the weights.
     """
+    squared_range, given = law[0] == 1, law[0] == 2
+    floor, growth, reference = law[1] * law[1], law[2] * law[2], int(law[3])
     for m in range(anchors.shape[0]):
         for i in range(3):
             if not abs(anchors[m, i]) < HUGE:
                 return False
         for n in range(shares.shape[1]):
-            weights[m, n] = 0.0
-            if shares[m, n] == 0:
+            share, distance = shares[m, n], ranges[m, n]
+            if share == 0:
+                weights[m, n] = 0.0
                 continue
-            square = ranges[m, n] * ranges[m, n]
-            if not (ranges[m, n] > 0 and square < HUGE * HUGE):
+            if not 0 < distance < HUGE:
                 return False
-            variance = 1.0
-            if law[0] < 2:
-                reference = ranges[m, reference_of(law, n)]
-                reference *= reference
-                if law[0] == 0:
-                    variance = law[1] * law[1] + law[2] * law[2] * reference
+            weight = share
+            if not given:
+                told_by = distance if reference < 0 else ranges[m, reference]
+                if squared_range:
+                    weight *= 4 * distance * distance / (floor * told_by * told_by)
                 else:
-                    variance = law[1] * law[1] * reference / (4 * square)
-            weights[m, n] = shares[m, n] / variance
-            if not 0 < weights[m, n] < math.inf:
+                    weight /= floor + growth * told_by * told_by
+            if not 0 < weight < math.inf:
                 return False
+            weights[m, n] = weight
     return True
 
 

@@ -71,7 +71,7 @@ def add_prior(
     return cost
 
 
-@helper
+@inlined
 def solve(
     Q: Any, t: Any, has_prior: bool, Q0: Any, t0: Any, information: Any,
     ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any,

@@ -10,8 +10,8 @@ from typing import Any
 
 from rbl_gym.kernels.jit import helper, inlined
 
-# Below these squared angles series take the place of the closed forms.
-_SMALL, _SMALL_INVERSE = 0.25, 1e-2
+# Below this squared angle series take the place of the closed forms.
+_SMALL = 0.25
 
 
 @helper
@@ -67,8 +67,9 @@ def left_jacobian(x: float, y: float, z: float, out: Any) -> None:
 def left_jacobian_inverse(x: float, y: float, z: float, out: Any) -> None:
     """Inverse of the left Jacobian at (x, y, z), of length below 2 pi."""
     s = x * x + y * y + z * z
-    if s < _SMALL_INVERSE:
-        c = (1 + s / 60 * (1 + s / 42 * (1 + s / 40 * (1 + s * 5 / 198)))) / 12
+    if s < _SMALL:
+        c = 1 + s * (691 / 27300) * (1 + s * (35 / 1382) * (1 + s * (3617 / 142800)))
+        c = (1 + s / 60 * (1 + s / 42 * (1 + s / 40 * (1 + s * (5 / 198) * c)))) / 12
     else:
         half = 0.5 * math.sqrt(s)
         c = (1 - half * math.cos(half) / math.sin(half)) / s
