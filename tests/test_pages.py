@@ -16,6 +16,7 @@ pytest.importorskip("plotly", reason="the extra viz is not installed")
 
 from rbl_gym.app import page, solids, track_html, track_pages
 from rbl_gym.app.cli import main
+from rbl_gym.app.story import Beliefs, Story, errors_of
 from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import RADIUS_95
 from rbl_gym.studies.papers import camsap2013
@@ -200,26 +201,24 @@ def test_a_page_needs_no_network_and_is_the_same_for_the_same_result(demo):
     assert demo.count("<!DOCTYPE html>") == 1
 
 
-def story(axes: str = "xyz", known: bool = True) -> track_html.Story:
+def story(axes: str = "xyz", known: bool = True) -> Story:
     rng = np.random.default_rng(0)
     count = 7
     covariance = np.tile(np.diag([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]) ** 2, (count, 1, 1))
     w, v = 0.1 * rng.normal(size=(2, count, 3))
     rotation, translation = rotations.random(rng, (count,)), rng.normal(size=(count, 3))
-    belief = track_html.Beliefs(rotations.exp(w) @ rotation, translation + v, covariance, "#1b7f5c")
+    belief = Beliefs(rotations.exp(w) @ rotation, translation + v, covariance, "#1b7f5c")
     where = np.arange(count) != 2
     truth = (rotation, translation, where) if known else None
     names = ["a", "b", "c"]
-    return track_html.Story(
-        np.arange(count) / 10, np.eye(3), names, np.eye(3), truth, {"f": belief}, axes
-    )
+    return Story(np.arange(count) / 10, np.eye(3), names, np.eye(3), truth, {"f": belief}, axes)
 
 
 def test_errors_of_a_story_are_those_that_were_put_in():
     rng = np.random.default_rng(0)
     w, v = 0.1 * rng.normal(size=(2, 7, 3))
     told = story()
-    found = track_html.errors_of(told, told.beliefs["f"])
+    found = errors_of(told, told.beliefs["f"])
     known = np.arange(7) != 2
     for values in (found.position_m, found.rotation_deg, found.nees):
         assert np.isnan(values[2])
@@ -229,7 +228,7 @@ def test_errors_of_a_story_are_those_that_were_put_in():
     np.testing.assert_allclose(found.position_std_m, np.sqrt(14))
     expected = ((w / [0.1, 0.2, 0.3]) ** 2 + (v / [1, 2, 3]) ** 2).sum(axis=1)
     np.testing.assert_allclose(found.nees[known], expected[known])
-    flat = track_html.errors_of(story("xy"), told.beliefs["f"])
+    flat = errors_of(story("xy"), told.beliefs["f"])
     np.testing.assert_allclose(flat.position_m[known], np.linalg.norm(v[:, :2], axis=1)[known])
     np.testing.assert_allclose(flat.rotation_std_deg, np.rad2deg(0.3))
 

@@ -144,9 +144,7 @@ def _distance(ax: Axes, result: dict[str, Any]) -> None:
     for basis, history in result["history"].items():
         distance = np.maximum(history["distance"], 1e-16)
         ax.semilogy(distance, color=_COLOURS[basis], label=basis)
-        steps = np.arange(len(distance))
-        printed = distance[0] * history["printed_factor_squared"] ** (steps / 2)
-        ax.semilogy(steps, printed, color=_COLOURS[basis], ls=":", lw=2)
+        ax.semilogy(history["printed_distance"], color=_COLOURS[basis], ls=":", lw=2)
     ax.set(xlabel="iteration", ylabel="distance from the limit [rad]", ylim=(1e-13, None))
     ax.set_title(f"{network2009.EXAMPLE_LOOPS} loops; dotted: as Theorem 19 prints", fontsize=9)
     ax.legend(frameon=False, fontsize=8)

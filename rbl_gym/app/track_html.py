@@ -3,68 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from rbl_gym.app import page, solids
-from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators import PoseBelief
+from rbl_gym.app.story import FREEDOM, Story, chart_limits, enlargement, errors_of
+from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import (
     ANCHOR,
     AXES,
     INK,
-    RADIUS_95,
     body_edges,
     gapped,
-    round_number,
 )
-from rbl_gym.studies.epochs import AxisErrors, axis_errors, nees_interval
+from rbl_gym.studies.epochs import nees_interval
 
 # Moments of the slider, and epochs of the curves; longer tracks are thinned out.
 _MOMENTS, _POINTS = 120, 1500
-_FREEDOM = {"xy": 3, "xyz": 6}
-
-
-class Beliefs(NamedTuple):
-    """Of K epochs: rotation (K, 3, 3), translation (K, 3), covariance (K, 6, 6); and a colour."""
-
-    rotation: FloatArray
-    translation: FloatArray
-    covariance: FloatArray
-    colour: str
-
-
-class Story(NamedTuple):
-    """A track of K epochs.
-
-    Attributes
-    ----------
-    times
-        (K,), seconds.
-    anchors, names
-        (M, 3) and what they are called.
-    tags
-        (N, 3) in the body frame.
-    truth
-        Rotation (K, 3, 3) and translation (K, 3), and where they are known (K,); None: nowhere.
-    beliefs
-        By the filters' names.
-    axes
-        ``"xyz"``, or ``"xy"``: only yaw and the position in the plane are judged.
-    """
-
-    times: FloatArray
-    anchors: FloatArray
-    names: Sequence[str]
-    tags: FloatArray
-    truth: tuple[FloatArray, FloatArray, BoolArray] | None
-    beliefs: dict[str, Beliefs]
-    axes: str = "xyz"
 
 
 def track_figure(story: Story) -> go.Figure:
@@ -78,14 +37,19 @@ def track_figure(story: Story) -> go.Figure:
         specs.append([{"colspan": 2}, None] * 3)
         titles += [f"position error {story.axes} (m)", f"{judged} error (deg)", "NEES"]
     shown: Any = make_subplots(
-        rows, 6, specs=specs, subplot_titles=titles, row_heights=[0.66, 0.34][:rows],
-        horizontal_spacing=0.05, vertical_spacing=0.07,
-    )  # fmt: skip
+        rows,
+        6,
+        specs=specs,
+        subplot_titles=titles,
+        row_heights=[0.66, 0.34][:rows],
+        horizontal_spacing=0.05,
+        vertical_spacing=0.07,
+    )
     moments = _thinned(len(story.times), _MOMENTS)
     _add_still(shown, story)
     if rows == 2:
         _add_curves(shown, story)
-    tops = _tops(story) if rows == 2 else []
+    tops = chart_limits(story) if rows == 2 else []
     count = len(shown.data)
     first = _moving(story, int(moments[0]), tops)
     for trace, (row, column) in first:
@@ -95,21 +59,31 @@ def track_figure(story: Story) -> go.Figure:
     places = max(0, -math.floor(math.log10(max(apart, 1e-9))))
     labels = [f"{story.times[k]:.{places}f}" for k in moments]
     shown.frames = [
-        go.Frame(name=label, traces=which,
-                 data=[_change(trace) for trace, _ in _moving(story, int(k), tops)])
+        go.Frame(
+            name=label,
+            traces=which,
+            data=[_change(trace) for trace, _ in _moving(story, int(k), tops)],
+        )
         for k, label in zip(moments, labels, strict=True)
-    ]  # fmt: skip
+    ]
     reach = _reach(story)
     hidden = {"visible": False, "range": [-reach, reach]}
     shown.update_layout(
-        height=880 if rows == 2 else 640, margin={"l": 50, "r": 10, "t": 60, "b": 20},
+        height=880 if rows == 2 else 640,
+        margin={"l": 50, "r": 10, "t": 60, "b": 20},
         template="plotly_white",
         scene=_world(story),
-        scene2={"aspectmode": "cube", "camera": {"eye": {"x": 0.65, "y": -1.1, "z": 0.6}},
-                "xaxis": hidden, "yaxis": hidden, "zaxis": hidden},
+        scene2={
+            "aspectmode": "cube",
+            "camera": {"eye": {"x": 0.65, "y": -1.1, "z": 0.6}},
+            "xaxis": hidden,
+            "yaxis": hidden,
+            "zaxis": hidden,
+        },
         legend={"orientation": "h", "x": 0, "y": 1.05, "yanchor": "bottom"},
-        sliders=[_slider(labels)], updatemenus=[_play()],
-    )  # fmt: skip
+        sliders=[_slider(labels)],
+        updatemenus=[_play()],
+    )
     if rows == 2:
         shown.update_xaxes(title_text="time (s)", title_standoff=4)
         for column, (low, high) in zip((1, 3), tops, strict=False):
@@ -131,38 +105,52 @@ def _thinned(count: int, most: int) -> np.ndarray:
 def _add_still(shown: go.Figure, story: Story) -> None:
     shown.add_trace(
         go.Scatter3d(
-            **solids.xyz(story.anchors), mode="markers+text", name="anchors",
-            text=list(story.names), textposition="top center", textfont={"size": 10},
+            **solids.xyz(story.anchors),
+            mode="markers+text",
+            name="anchors",
+            text=list(story.names),
+            textposition="top center",
+            textfont={"size": 10},
             hovertemplate="anchor %{text}<br>x %{x:.2f}, y %{y:.2f}, z %{z:.2f} m<extra></extra>",
             marker={"size": 5, "color": ANCHOR, "symbol": "diamond"},
         ),
-        row=1, col=1,
-    )  # fmt: skip
+        row=1,
+        col=1,
+    )
     points = _thinned(len(story.times), _POINTS)
     if story.truth is not None:
         _, places, known = story.truth
         places = np.where(known[:, None], places, np.nan)[points]
-        shown.add_trace(go.Scatter3d(**solids.xyz(places), mode="lines", name="true path",
-                                     line={"color": "#868e96", "width": 5}, hoverinfo="skip"),
-                        row=1, col=1)  # fmt: skip
+        shown.add_trace(
+            go.Scatter3d(
+                **solids.xyz(places),
+                mode="lines",
+                name="true path",
+                line={"color": "#868e96", "width": 5},
+                hoverinfo="skip",
+            ),
+            row=1,
+            col=1,
+        )
     for name, belief in story.beliefs.items():
-        shown.add_trace(go.Scatter3d(**solids.xyz(belief.translation[points]), mode="lines",
-                                     name=name, legendgroup=name, hoverinfo="skip",
-                                     line={"color": belief.colour, "width": 2}),
-                        row=1, col=1)  # fmt: skip
-
-
-def errors_of(story: Story, belief: Beliefs) -> AxisErrors:
-    """Errors of a track, with the standard deviations that it claims."""
-    assert story.truth is not None
-    found = PoseBelief(belief.rotation, belief.translation, belief.covariance, belief.rotation)
-    return axis_errors(found, *story.truth, planar=story.axes == "xy")
+        shown.add_trace(
+            go.Scatter3d(
+                **solids.xyz(belief.translation[points]),
+                mode="lines",
+                name=name,
+                legendgroup=name,
+                hoverinfo="skip",
+                line={"color": belief.colour, "width": 2},
+            ),
+            row=1,
+            col=1,
+        )
 
 
 def _add_curves(shown: go.Figure, story: Story) -> None:
     points = _thinned(len(story.times), _POINTS)
     times = solids.numbers(story.times[points], 6)
-    freedom = _FREEDOM[story.axes]
+    freedom = FREEDOM[story.axes]
     low, high = nees_interval(dof=freedom)
     for name, belief in story.beliefs.items():
         found = errors_of(story, belief)
@@ -171,46 +159,52 @@ def _add_curves(shown: go.Figure, story: Story) -> None:
             (3, found.rotation_deg, found.rotation_std_deg),
         ):
             shown.add_trace(
-                go.Scatter(x=times, y=solids.numbers(3 * std[points]), mode="lines", fill="tozeroy",
-                           fillcolor=_faint(belief.colour), line={"width": 0}, name="3 sigma",
-                           legendgroup=name, showlegend=False, hoverinfo="skip"),
-                row=2, col=column,
-            )  # fmt: skip
+                go.Scatter(
+                    x=times,
+                    y=solids.numbers(3 * std[points]),
+                    mode="lines",
+                    fill="tozeroy",
+                    fillcolor=_faint(belief.colour),
+                    line={"width": 0},
+                    name="3 sigma",
+                    legendgroup=name,
+                    showlegend=False,
+                    hoverinfo="skip",
+                ),
+                row=2,
+                col=column,
+            )
             shown.add_trace(
-                go.Scatter(x=times, y=solids.numbers(size[points]), mode="lines", name=name,
-                           legendgroup=name, showlegend=False,
-                           line={"color": belief.colour, "width": 1.5}),
-                row=2, col=column,
-            )  # fmt: skip
+                go.Scatter(
+                    x=times,
+                    y=solids.numbers(size[points]),
+                    mode="lines",
+                    name=name,
+                    legendgroup=name,
+                    showlegend=False,
+                    line={"color": belief.colour, "width": 1.5},
+                ),
+                row=2,
+                col=column,
+            )
         shown.add_trace(
-            go.Scatter(x=times, y=solids.numbers(found.nees[points]), mode="lines", name=name,
-                       legendgroup=name, showlegend=False,
-                       line={"color": belief.colour, "width": 1.5}),
-            row=2, col=5,
-        )  # fmt: skip
+            go.Scatter(
+                x=times,
+                y=solids.numbers(found.nees[points]),
+                mode="lines",
+                name=name,
+                legendgroup=name,
+                showlegend=False,
+                line={"color": belief.colour, "width": 1.5},
+            ),
+            row=2,
+            col=5,
+        )
     # Without the option plotly looks for two axes in the traces of 3-D scenes, too.
     where: dict[str, Any] = {"row": 2, "col": 5, "exclude_empty_subplots": False}
     grey = "#868e96"
     shown.add_hrect(low, high, line_width=0, fillcolor=grey, opacity=0.2, **where)
     shown.add_hline(freedom, line={"color": grey, "width": 1, "dash": "dot"}, **where)
-
-
-def _tops(story: Story) -> list[tuple[float, float]]:
-    """Limits of the three charts; what the first epochs do from far off is cut."""
-    found = [errors_of(story, belief) for belief in story.beliefs.values()]
-    limits = []
-    pairs = (
-        [(errors.position_m, errors.position_std_m) for errors in found],
-        [(errors.rotation_deg, errors.rotation_std_deg) for errors in found],
-    )
-    for pair in pairs:
-        values = [np.maximum(np.nan_to_num(size), 3 * std) for size, std in pair]
-        limits.append((0.0, 1.15 * float(np.quantile(np.concatenate(values), 0.98))))
-    nees = np.concatenate([errors.nees[np.isfinite(errors.nees)] for errors in found])
-    freedom = _FREEDOM[story.axes]
-    low, high = nees_interval(dof=freedom)
-    low, high = min(low, np.quantile(nees, 0.01)), max(high, np.quantile(nees, 0.995))
-    return [*limits, (0.7 * max(float(low), 1e-3), 1.5 * float(high))]
 
 
 def _faint(colour: str) -> str:
@@ -233,9 +227,18 @@ def _moving(
         rotation, place = story.truth[0][k], story.truth[1][k]
     body = story.tags @ rotation.T
     traces: list[tuple[Any, tuple[int, int]]] = [
-        (go.Scatter3d(**solids.xyz(place[None]), mode="markers", name="body", hoverinfo="skip",
-                      marker={"size": 5, "color": INK}, showlegend=False), (1, 1)),
-    ]  # fmt: skip
+        (
+            go.Scatter3d(
+                **solids.xyz(place[None]),
+                mode="markers",
+                name="body",
+                hoverinfo="skip",
+                marker={"size": 5, "color": INK},
+                showlegend=False,
+            ),
+            (1, 1),
+        ),
+    ]
     edges = body_edges(story.tags)
     if story.truth is not None:
         shape = gapped(body[edges]) if known else np.full((1, 3), np.nan)
@@ -244,7 +247,7 @@ def _moving(
     for axis, colour in zip(rotation.T, AXES, strict=True):
         line = np.stack([np.zeros(3), reach * axis])
         traces.append((_wire(line, colour, "axis", width=5), (1, 4)))
-    factor = _factor(story)
+    factor = enlargement(story)
     for name, belief in story.beliefs.items():
         off = factor * (belief.translation[k] - place)
         turn = factor * rotations.error(belief.rotation[k], rotation)
@@ -252,21 +255,43 @@ def _moving(
         traces.append((_wire(gapped(ghost[edges]), belief.colour, name, legendgroup=name), (1, 4)))
         region = solids.ellipsoid(off, factor**2 * belief.covariance[k, 3:, 3:])
         traces.append(
-            (go.Mesh3d(**region, **solids.net(), color=belief.colour, opacity=0.25, name=name,
-                       legendgroup=name, showlegend=False, hoverinfo="skip"), (1, 4))
-        )  # fmt: skip
+            (
+                go.Mesh3d(
+                    **region,
+                    **solids.net(),
+                    color=belief.colour,
+                    opacity=0.25,
+                    name=name,
+                    legendgroup=name,
+                    showlegend=False,
+                    hoverinfo="skip",
+                ),
+                (1, 4),
+            )
+        )
     for column, limits in zip((1, 3, 5), tops, strict=False):
-        now = go.Scatter(x=[float(story.times[k])] * 2, y=list(limits), mode="lines",
-                         line={"color": INK, "width": 1}, hoverinfo="skip",
-                         showlegend=False)  # fmt: skip
+        now = go.Scatter(
+            x=[float(story.times[k])] * 2,
+            y=list(limits),
+            mode="lines",
+            line={"color": INK, "width": 1},
+            hoverinfo="skip",
+            showlegend=False,
+        )
         traces.append((now, (2, column)))
     return traces
 
 
 def _wire(points: FloatArray, colour: str, name: str, width: float = 4, **style: Any) -> Any:
     style = {"showlegend": False, **style}
-    return go.Scatter3d(**solids.xyz(points), mode="lines", name=name, hoverinfo="skip",
-                        line={"color": colour, "width": width}, **style)  # fmt: skip
+    return go.Scatter3d(
+        **solids.xyz(points),
+        mode="lines",
+        name=name,
+        hoverinfo="skip",
+        line={"color": colour, "width": width},
+        **style,
+    )
 
 
 def _change(trace: Any) -> Any:
@@ -275,17 +300,8 @@ def _change(trace: Any) -> Any:
     return type(trace)(**data)
 
 
-def _factor(story: Story) -> float:
-    """By how much errors are enlarged close up, so that a usual ellipsoid is of the body's size."""
-    size = float(np.linalg.norm(story.tags, axis=-1).max())
-    widest = [np.sqrt(np.linalg.eigvalsh(belief.covariance[:, 3:, 3:])[:, -1])
-              for belief in story.beliefs.values()]  # fmt: skip
-    usual = RADIUS_95 * float(np.median(np.concatenate(widest)))
-    return max(1.0, round_number(0.6 * size / max(usual, 1e-12)))
-
-
 def _close_title(story: Story) -> str:
-    factor = _factor(story)
+    factor = enlargement(story)
     scale = "to scale" if factor == 1 else f"enlarged x {factor:g}"
     centre = "true place" if story.truth is not None else "estimate"
     return f"close up, about the {centre}: beliefs with 95 % regions, errors {scale}"
@@ -321,32 +337,52 @@ def _reach(story: Story) -> float:
 
 
 def _slider(labels: list[str]) -> dict[str, Any]:
-    options = {"mode": "immediate", "frame": {"duration": 0, "redraw": True},
-               "transition": {"duration": 0}}  # fmt: skip
+    options = {
+        "mode": "immediate",
+        "frame": {"duration": 0, "redraw": True},
+        "transition": {"duration": 0},
+    }
     steps = [{"label": label, "method": "animate", "args": [[label], options]} for label in labels]
-    return {"steps": steps, "x": 0.12, "len": 0.88, "y": -0.02, "pad": {"t": 30},
-            "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "left"},
-            "transition": {"duration": 0}}  # fmt: skip
+    return {
+        "steps": steps,
+        "x": 0.12,
+        "len": 0.88,
+        "y": -0.02,
+        "pad": {"t": 30},
+        "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "left"},
+        "transition": {"duration": 0},
+    }
 
 
 def _play() -> dict[str, Any]:
-    play = {"fromcurrent": True, "frame": {"duration": 60, "redraw": True},
-            "transition": {"duration": 0}}  # fmt: skip
+    play = {
+        "fromcurrent": True,
+        "frame": {"duration": 60, "redraw": True},
+        "transition": {"duration": 0},
+    }
     stop = {"mode": "immediate", "frame": {"duration": 0, "redraw": False}}
     return {
-        "type": "buttons", "direction": "right", "x": 0, "xanchor": "left", "y": -0.02,
-        "yanchor": "top", "pad": {"t": 46}, "showactive": False,
+        "type": "buttons",
+        "direction": "right",
+        "x": 0,
+        "xanchor": "left",
+        "y": -0.02,
+        "yanchor": "top",
+        "pad": {"t": 46},
+        "showactive": False,
         "buttons": [
             {"label": "play", "method": "animate", "args": [None, play]},
             {"label": "pause", "method": "animate", "args": [[None], stop]},
         ],
-    }  # fmt: skip
+    }
 
 
 def anchors_table(story: Story) -> str:
     """Where the anchors stand."""
-    rows = [[str(name), *map(float, place)]
-            for name, place in zip(story.names, story.anchors, strict=True)]  # fmt: skip
+    rows = [
+        [str(name), *map(float, place)]
+        for name, place in zip(story.names, story.anchors, strict=True)
+    ]
     return page.table("anchors", ["anchor", "x (m)", "y (m)", "z (m)"], rows)
 
 

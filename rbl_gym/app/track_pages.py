@@ -11,7 +11,7 @@ from plotly.subplots import make_subplots
 from rbl_gym.app import page, track_html
 from rbl_gym.app.figures import COLOURS
 from rbl_gym.app.reports import CAMSAP_COLUMNS
-from rbl_gym.app.track_html import Beliefs, Story
+from rbl_gym.app.story import Beliefs, Story
 from rbl_gym.recordings.reading import Recording
 from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example

@@ -372,11 +372,14 @@ def _asynchronous(
 
 
 def _history(one: DrawnNetwork, basis: str) -> dict[str, Any]:
-    """Distances from the limit over the steps of a run, and the factor that Theorem 19 prints."""
+    """Distances from the limit over the steps of a run, and those that Theorem 19 prints."""
     C = network_graphs.cycle_matrix(one.edges, N_NODES, basis)
     run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, history=True)
     assert run.kappa is not None
+    distance = distances_from_limit(C, one.y, run)
+    squared = consensus.printed_factor(run.kappa)
     return {
-        "distance": distances_from_limit(C, one.y, run).tolist(),
-        "printed_factor_squared": consensus.printed_factor(run.kappa),
+        "distance": distance.tolist(),
+        "printed_factor_squared": squared,
+        "printed_distance": (distance[0] * squared ** (np.arange(len(distance)) / 2)).tolist(),
     }

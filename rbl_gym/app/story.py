@@ -1,0 +1,86 @@
+"""A track as its page tells it: what was believed, what is true, how large errors are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.rendering.drawing import RADIUS_95, round_number
+from rbl_gym.studies.epochs import AxisErrors, axis_errors, nees_interval
+
+FREEDOM = {"xy": 3, "xyz": 6}
+
+
+class Beliefs(NamedTuple):
+    """Of K epochs: rotation (K, 3, 3), translation (K, 3), covariance (K, 6, 6); and a colour."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    colour: str
+
+
+class Story(NamedTuple):
+    """A track of K epochs.
+
+    Attributes
+    ----------
+    times
+        (K,), seconds.
+    anchors, names
+        (M, 3) and what they are called.
+    tags
+        (N, 3) in the body frame.
+    truth
+        Rotation (K, 3, 3) and translation (K, 3), and where they are known (K,); None: nowhere.
+    beliefs
+        By the filters' names.
+    axes
+        ``"xyz"``, or ``"xy"``: only yaw and the position in the plane are judged.
+    """
+
+    times: FloatArray
+    anchors: FloatArray
+    names: Sequence[str]
+    tags: FloatArray
+    truth: tuple[FloatArray, FloatArray, BoolArray] | None
+    beliefs: dict[str, Beliefs]
+    axes: str = "xyz"
+
+
+def errors_of(story: Story, belief: Beliefs) -> AxisErrors:
+    """Errors of a track, with the standard deviations that it claims."""
+    assert story.truth is not None
+    found = PoseBelief(belief.rotation, belief.translation, belief.covariance, belief.rotation)
+    return axis_errors(found, *story.truth, planar=story.axes == "xy")
+
+
+def chart_limits(story: Story) -> list[tuple[float, float]]:
+    """Limits of the three charts; what the first epochs do from far off is cut."""
+    found = [errors_of(story, belief) for belief in story.beliefs.values()]
+    limits = []
+    pairs = (
+        [(errors.position_m, errors.position_std_m) for errors in found],
+        [(errors.rotation_deg, errors.rotation_std_deg) for errors in found],
+    )
+    for pair in pairs:
+        values = [np.maximum(np.nan_to_num(size), 3 * std) for size, std in pair]
+        limits.append((0.0, 1.15 * float(np.quantile(np.concatenate(values), 0.98))))
+    nees = np.concatenate([errors.nees[np.isfinite(errors.nees)] for errors in found])
+    freedom = FREEDOM[story.axes]
+    low, high = nees_interval(dof=freedom)
+    low, high = min(low, np.quantile(nees, 0.01)), max(high, np.quantile(nees, 0.995))
+    return [*limits, (0.7 * max(float(low), 1e-3), 1.5 * float(high))]
+
+
+def enlargement(story: Story) -> float:
+    """By how much errors are enlarged close up, so that a usual ellipsoid is of the body's size."""
+    size = float(np.linalg.norm(story.tags, axis=-1).max())
+    widest = [np.sqrt(np.linalg.eigvalsh(belief.covariance[:, 3:, 3:])[:, -1])
+              for belief in story.beliefs.values()]  # fmt: skip
+    usual = RADIUS_95 * float(np.median(np.concatenate(widest)))
+    return max(1.0, round_number(0.6 * size / max(usual, 1e-12)))
