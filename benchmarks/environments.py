@@ -6,6 +6,8 @@ Process time of one thread, medians over interleaved repeats:
 - the vector environment against the scalar one, whole episodes with their resets on both sides,
   per epoch (an episode of T steps has T + 1, that of the reset among them);
 - the scalar environment beside Gymnasium's CartPole, steps alone, no resets on either side;
+- every environment of one world as `gym.make` makes it, with its resets, in steps of CartPole-v1
+  with its resets (environments under `EstimatePose` with ``reward="none"``);
 - vector environment + iterated EKF + belief observation + reward, in steps per CPU second;
 - ``import rbl_gym`` against ``import gymnasium``.
 
@@ -28,9 +30,37 @@ import numpy as np
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
-from rbl_gym.wrappers import VectorEstimatePose
+from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 
 SCENES = ("camsap2013", "auv_buoys", "uwb_room")
+
+
+CART_POLE = "CartPole-v1, resets too"
+
+
+def tracking(scene: str, **arguments: Any) -> gym.Env[Any, Any]:
+    return gym.make("RBL/Tracking-v0", scene=scene, **arguments)
+
+
+def estimated(scene: str, filter: str, **options: Any) -> gym.Env[Any, Any]:
+    return EstimatePose(tracking(scene, reward="none"), filter, options)
+
+
+# `kf` needs anchors out of one plane, which auv_buoys has not.
+ONE_WORLD: dict[str, Callable[[], gym.Env[Any, Any]]] = {
+    CART_POLE: lambda: gym.make("CartPole-v1"),
+    "Tracking, bound, auv_buoys": lambda: tracking("auv_buoys"),
+    "Tracking, bound, uwb_room": lambda: tracking("uwb_room"),
+    "EstimatePose, iekf, auv_buoys": lambda: estimated("auv_buoys", "iekf"),
+    "EstimatePose, iekf, uwb_room": lambda: estimated("uwb_room", "iekf"),
+    "EstimatePose, kf batched, uwb_room": lambda: estimated("uwb_room", "kf", engine="batched"),
+    "EstimatePose, kf on filterpy, uwb_room": lambda: estimated("uwb_room", "kf"),
+    "MobileAnchors": lambda: gym.make("RBL/MobileAnchors-v0"),
+    "AnchorSelection": lambda: gym.make("RBL/AnchorSelection-v0"),
+    "BaseStation": lambda: gym.make("RBL/BaseStation-v0"),
+    "AnchorPlacement": lambda: gym.make("RBL/AnchorPlacement-v0"),
+    "AnchorPlacement, racks": lambda: gym.make("RBL/AnchorPlacement-v0", scene="uwb_room", racks=2),
+}
 
 
 def main() -> None:
@@ -43,6 +73,8 @@ def main() -> None:
             jobs[f"{scene} scalar {reward}"] = scalar_job(scene, reward)
         jobs[f"{scene} scalar steps"] = steps_job(TrackingEnv(scene, "none"))
         jobs[f"{scene} vector iekf"] = belief_job(scene, options.num_envs)
+    made = {name: make() for name, make in ONE_WORLD.items()}
+    jobs |= {name: made_job(env) for name, env in made.items()}
     times: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(options.repeats):
         for name, job in jobs.items():
@@ -56,11 +88,15 @@ def main() -> None:
             "scalar to CartPole": micro[f"{scene} scalar steps"] / micro["CartPole-v1 steps"],
             "env + iekf steps per CPU second": 1e6 / micro[f"{scene} vector iekf"],
         }
+    cart_poles = {name: micro[name] / micro[CART_POLE] for name in ONE_WORLD}
+    result["in_steps_of_CartPole"] = cart_poles
     result["import_seconds"] = import_times(options.repeats)
     for name, value in micro.items():
         print(f"{name:<28} {value:9.2f} us per environment step")
     for scene, ratios in result["ratios"].items():
         print(scene, ", ".join(f"{name} {value:,.4g}" for name, value in ratios.items()))
+    for name, ratio in cart_poles.items():
+        print(f"{name:<44} {ratio:6.2f} steps of CartPole-v1")
     print("import", result["import_seconds"])
     side_by_side.write(result, options.json)
 
@@ -153,6 +189,20 @@ def steps_job(env: gym.Env[Any, Any], steps: int = 400) -> Callable[[], float]:
         return total / done
 
     return job
+
+
+def made_job(env: gym.Env[Any, Any], steps: int = 600) -> Callable[[], float]:
+    """Steps of one world with their resets."""
+    env.reset(seed=0)
+    action = zero_action(env)
+
+    def work() -> None:
+        for _ in range(steps):
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return lambda: timed(work, steps)
 
 
 def import_times(repeats: int) -> dict[str, float]:
