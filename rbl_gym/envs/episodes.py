@@ -64,10 +64,10 @@ class EpisodeStore:
             stored[rows] = field
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
-        """All worlds, each at its epoch (B,); copies."""
+        """All worlds, each at its epoch (B,); random numbers not to be written to."""
         where = self._where(epochs)
-        uniforms = None if self._uniforms is None else np.array(self._uniforms[where])
-        return simulation.Epoch(*self.motion_at(epochs), np.array(self._normals[where]), uniforms)
+        uniforms = None if self._uniforms is None else self._uniforms[where]
+        return simulation.Epoch(*self.motion_at(epochs), self._normals[where], uniforms)
 
     def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
         """The motion of all worlds, each at its epoch (B,); copies."""

@@ -6,6 +6,7 @@ is arithmetic on arrays with leading batch axes.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -200,7 +201,8 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
-    return np.split(block, np.cumsum(sizes)[:-1], axis=-1)
+    ends = list(itertools.accumulate(sizes))
+    return [block[..., end - size : end] for size, end in zip(sizes, ends, strict=True)]
 
 
 def _trajectory(
@@ -268,10 +270,14 @@ def measure(
     if quality is not None:
         normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
     taken = ranging.sample(at.rotation, at.translation, scene.body, anchors, normals, scene.noise)
-    ranges, links, nlos = ranging.lose_links(*taken, scene.links, at.uniforms)
+    if scene.links.never_fails:
+        ranges, links, nlos = taken[0], None, np.zeros(taken[0].shape, dtype=np.bool_)
+    else:
+        ranges, links, nlos = ranging.lose_links(*taken, scene.links, at.uniforms)
     np.minimum(ranges, scene.range_limit_m, out=ranges)
     # A range of zero has no variance under a proportional law: such a reading is no reading.
-    links &= ranges > 0
+    measured = ranges > 0
+    links = measured if links is None else links & measured
     if quality is not None and not scene.blocked_information:
         links &= quality[..., None] > 0
         ranges[~links] = 0.0
