@@ -16,7 +16,7 @@ _BLOCK = 256
 
 
 class EpisodeStore:
-    """The running episodes of B worlds: arrays (B, T + 1, ...).
+    """The running episodes of B worlds: arrays (T + 1, B, ...), an epoch of all worlds together.
 
     They are written anew by every reset, not made anew: fresh memory is slow.
     """
@@ -24,8 +24,9 @@ class EpisodeStore:
     def __init__(self, scene: Scene, num_envs: int) -> None:
         self._scene = scene
         self._num_envs = num_envs
-        self._draws = simulation.empty_draws(scene, num_envs)
-        self._timed: list[FloatArray] = []
+        self._draws = simulation.empty_draws(scene, min(num_envs, _BLOCK))
+        # The fields of `simulation.Epoch`.
+        self._timed: list[FloatArray | None] = []
 
     @property
     def empty(self) -> bool:
@@ -42,42 +43,46 @@ class EpisodeStore:
         starts: list[Any] = []
         for first in range(0, len(worlds), _BLOCK):
             block = worlds[first : first + _BLOCK]
-            simulation.draw_each(self._draws, block, generators[first : first + _BLOCK])
-            rows = _rows(block)
-            draws = simulation.Draws(*(field[rows] for field in self._draws))
+            count = len(block)
+            simulation.draw_each(self._draws, range(count), generators[first : first + count])
+            draws = simulation.Draws(*(field[:count] for field in self._draws))
             episode = simulation.build_episode(self._scene, draws)
-            self._write(rows, episode)
+            self._write(_rows(block), simulation.whole(episode))
             starts.append(episode[len(simulation.Epoch._fields) :])
-        # Views, taken anew because a pickled store comes back with copies of them.
-        self._normals, self._uniforms = simulation.of_ranges(self._scene, self._draws)
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
+            # Copies: what is not random may be a view of the scene's own.
             name: np.concatenate(parts)
             for name, parts in zip(names, zip(*starts, strict=True), strict=True)
         }
 
-    def _write(self, rows: slice | np.ndarray, episode: simulation.Episode) -> None:
-        fields = episode.rotation, episode.translation, episode.twists
+    def _write(self, rows: slice | np.ndarray, fields: simulation.Epoch) -> None:
         if not self._timed:
-            self._timed = [np.empty((self._num_envs, *field.shape[1:])) for field in fields]
+            self._timed = [
+                None
+                if field is None
+                else np.empty((field.shape[1], self._num_envs, *field.shape[2:]))
+                for field in fields
+            ]
         for stored, field in zip(self._timed, fields, strict=True):
-            stored[rows] = field
+            if stored is not None and field is not None:
+                stored[:, rows] = np.swapaxes(field, 0, 1)
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
         """All worlds, each at its epoch (B,); random numbers not to be written to."""
         where = self._where(epochs)
-        uniforms = None if self._uniforms is None else self._uniforms[where]
-        return simulation.Epoch(*self.motion_at(epochs), self._normals[where], uniforms)
+        random = (None if field is None else field[where] for field in self._timed[3:])
+        return simulation.Epoch(*self.motion_at(epochs), *random)  # pyright: ignore[reportArgumentType]
 
     def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
         """The motion of all worlds, each at its epoch (B,); copies."""
         where = self._where(epochs)
-        return simulation.Motion(*(np.array(field[where]) for field in self._timed))
+        return simulation.Motion(*(np.array(field[where]) for field in self._timed[:3]))  # pyright: ignore[reportOptionalSubscript]
 
     def _where(self, epochs: np.ndarray) -> Any:
         if self._num_envs == 1 or (epochs == epochs[0]).all():
-            return slice(None), epochs[0]
-        return np.arange(self._num_envs), epochs
+            return epochs[0]
+        return epochs, np.arange(self._num_envs)
 
 
 def _rows(worlds: np.ndarray) -> slice | np.ndarray:
