@@ -101,7 +101,7 @@ def test_a_task_that_kills_every_worker_is_an_error_that_names_it(monkeypatch):
     with pytest.raises(
         ChildProcessError, match=r"workers died 2 times .* 1 tasks left, .* them poison"
     ):
-        list(backends.each(dies, ["poison"], jobs=2))
+        list(backends.each(dies, ["poison"], backends.Workers(jobs=2)))
 
 
 def test_a_missing_backend_names_its_extra(folder, monkeypatch, capsys):

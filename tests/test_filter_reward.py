@@ -18,7 +18,7 @@ from rbl_gym.measurements.ranging import LinkNoise
 from rbl_gym.placement import Context
 from rbl_gym.wrappers import FilterReward, VectorFilterReward
 from rbl_gym.wrappers.filter_reward import anchor_placement, anchor_placement_vector
-from rbl_gym.wrappers.filter_tracks import track_error, tracks
+from rbl_gym.wrappers.filter_tracks import Tracks, track_error, tracks
 from tests.helpers import assert_same
 from tests.side_by_side import (
     assert_masks_alike,
@@ -61,6 +61,7 @@ def error_by_hand(task, context, anchors, filter_of):
     """One problem: each track by itself, epoch by epoch, distances and sight in plain steps."""
     scene, tags = task.scene, np.array(task.scene.tags)
     course = tracks(task, context)
+    assert isinstance(course, Tracks)
     centre, half = context.racks[:, :3], context.racks[:, 3:]
     along = np.linspace(0, 1, 4001 if len(centre) else 1)[:, None]
     squares = []

@@ -9,7 +9,7 @@ import pytest
 
 from rbl_gym.app.cli import main
 from rbl_gym.placement import scene_files
-from rbl_gym.studies import hard, monte_carlo, network, replay
+from rbl_gym.studies import backends, hard, monte_carlo, network, replay
 from rbl_gym.studies.bench import leaderboard, records, spec_files
 from rbl_gym.studies.learning import evaluation, transfer
 from rbl_gym.studies.learning.rl_tasks import rl_task
@@ -74,7 +74,7 @@ def test_bench(capsys, tmp_path):
     )  # fmt: skip
     assert leaderboard.summary(mine, timings)["rows"] == theirs["rows"]
     assert records.read_records(tmp_path / "theirs.jsonl") == mine
-    assert records.rerun(mine)["identical"] == 2
+    assert records.rerun(mine, workers=backends.HERE)["identical"] == 2
 
 
 def test_replay_in_one_call_is_the_four():

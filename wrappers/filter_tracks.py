@@ -16,7 +16,7 @@ from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.worlds import simulation
 from rbl_gym.wrappers.estimate import update
 
-__all__ = ["Tracks", "check_determined", "follow", "track_error", "tracks"]
+__all__ = ["Tracks", "track_error", "tracks"]
 
 TRACKS, EPOCHS = 8, 20
 # A filter is tried on so many random layouts, on so many tracks each, from two priors of which one
@@ -164,9 +164,20 @@ def follow(
     wider: float = 1.0,
     measures: bool = True,
 ) -> Iterator[PoseBelief]:
-    """Beliefs (..., 8) of the filter at every epoch of the tracks.
+    """Beliefs (..., 8) of a filter at every epoch of the tracks.
 
-    `wider`: times the scene's initial standard deviations; `measures`: whether there are ranges.
+    Parameters
+    ----------
+    task, context, anchors
+        The family of problems, problems (...,) of it, and their layouts (..., M, 3).
+    filter
+        The filter; it knows the scene's tags, noise and process.
+    course
+        Of `tracks`.
+    wider
+        The prior has so many times the scene's initial standard deviations.
+    measures
+        Whether there are ranges.
     """
     scene, shape = task.scene, course.normals.shape[:-3]
     anchors = np.broadcast_to(anchors[..., None, :, :], (*shape, *anchors.shape[-2:]))

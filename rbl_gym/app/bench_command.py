@@ -92,7 +92,7 @@ def _bench(options: argparse.Namespace) -> int:
     )
     with progress("bench", sum(len(task.filters) for task in tasks)) as advance:
         records, timings = bench_files.run_tasks(
-            tasks, Path(options.out), fresh=options.fresh, advance=advance, **workers
+            tasks, Path(options.out), workers=workers, fresh=options.fresh, advance=advance
         )
     result = leaderboard.summary(records, timings)
     if options.html:
@@ -116,7 +116,7 @@ def _rerun(options: argparse.Namespace) -> int:
     if not records:
         raise ValueError(f"{path} holds no record of rbl-gym bench")
     with progress("rerun", len(records)) as advance:
-        result = bench_files.rerun(records, advance=advance, **workers)
+        result = bench_files.rerun(records, workers=workers, advance=advance)
     if write_json(result, options.json):
         from rbl_gym.app import bench_report
 
@@ -124,11 +124,12 @@ def _rerun(options: argparse.Namespace) -> int:
     return int(bool(result["changed"]))
 
 
-def _workers(options: argparse.Namespace) -> dict[str, Any]:
+def _workers(options: argparse.Namespace) -> backends.Workers:
     if options.address and options.backend not in ("dask", "ray"):
         raise ValueError(f"--address needs --backend dask or ray, got {options.backend}")
-    backends.check(options.jobs, options.backend)
-    return {"jobs": options.jobs, "backend": options.backend, "address": options.address}
+    workers = backends.Workers(options.jobs, options.backend, options.address)
+    backends.check(workers)
+    return workers
 
 
 def _names(text: str) -> list[str]:

@@ -5,21 +5,42 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 from rbl_gym.studies.extras import require
+
+__all__ = ["HERE", "Workers", "each"]
 
 BACKENDS = ("loky", "dask", "ray")
 # Workers may die so often in a row without one more task done, before that is an error.
 _PATIENCE = 3
 
 
+class Workers(NamedTuple):
+    """Where tasks are run.
+
+    Attributes
+    ----------
+    jobs
+        Processes of this machine.
+    backend
+        None: this process where `jobs` is 1, else ``"loky"``. ``"dask"`` or ``"ray"``: the
+        cluster at `address`, or one of `jobs` local workers.
+    address
+        Of the cluster's scheduler.
+    """
+
+    jobs: int = 1
+    backend: str | None = None
+    address: str | None = None
+
+
+# One task after the other, in this process.
+HERE = Workers()
+
+
 def each(
-    function: Callable[[Any], Any],
-    tasks: Sequence[Any],
-    jobs: int = 1,
-    backend: str | None = None,
-    address: str | None = None,
+    function: Callable[[Any], Any], tasks: Sequence[Any], workers: Workers = HERE
 ) -> Iterator[tuple[int, Any]]:
     """``function(task)`` of every task, as (index, result), in the order they finish.
 
@@ -27,13 +48,8 @@ def each(
     ----------
     function, tasks
         Picklable; the function must be importable where the workers run.
-    jobs
-        Processes of this machine.
-    backend
-        None: this process where `jobs` is 1, else ``"loky"``. ``"dask"`` or ``"ray"``: the
-        cluster at `address`, or one of `jobs` local workers.
-    address
-        Of the scheduler.
+    workers
+        Where they are run.
 
     Raises
     ------
@@ -43,7 +59,8 @@ def each(
         When workers die again and again on the same tasks; a worker that dies otherwise loses
         nothing but time: its tasks are run again.
     """
-    check(jobs, backend)
+    check(workers)
+    jobs, backend, address = workers
     if backend is None and jobs == 1:
         yield from ((index, function(task)) for index, task in enumerate(tasks))
     elif backend in (None, "loky"):
@@ -54,8 +71,9 @@ def each(
         yield from _ray(function, tasks, jobs, address)
 
 
-def check(jobs: int, backend: str | None) -> None:
+def check(workers: Workers) -> None:
     """A MissingExtraError where `each` lacks what it needs."""
+    jobs, backend, _ = workers
     if backend is None and jobs == 1:
         return
     require("joblib", "parallel")

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rbl_gym.studies import backends
+from rbl_gym.studies.backends import HERE, Workers
 from rbl_gym.studies.bench import leaderboard
 from rbl_gym.studies.bench.leaderboard import Task
 
@@ -37,9 +38,7 @@ def run_tasks(
     tasks: Sequence[Task],
     path: Path,
     *,
-    jobs: int = 1,
-    backend: str | None = None,
-    address: str | None = None,
+    workers: Workers = HERE,
     fresh: bool = False,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> tuple[Records, dict[tuple[str, ...], float]]:
@@ -55,8 +54,8 @@ def run_tasks(
         Of `leaderboard.tasks`.
     path
         File of the records.
-    jobs, backend, address
-        See `backends.each`.
+    workers
+        Where they are run.
     fresh
         Overwrite the file in place of taking it up.
     advance
@@ -82,9 +81,7 @@ def run_tasks(
     _write(path, list(found.values()))
     advance(sum(key in found for key in wanted))
     with path.open("a", encoding="utf-8") as file, timings_path(path).open("a") as times:
-        for _, results in backends.each(
-            leaderboard.run_task, _left(tasks, found), jobs, backend, address
-        ):
+        for _, results in backends.each(leaderboard.run_task, _left(tasks, found), workers):
             for record, microseconds in results:
                 _check_same_run("a worker", [record], tasks)
                 found[leaderboard.key_of(record)] = record
@@ -235,9 +232,7 @@ def relative_change(pair: tuple[Any, Any]) -> float:
 def rerun(
     records: Sequence[Mapping[str, Any]],
     *,
-    jobs: int = 1,
-    backend: str | None = None,
-    address: str | None = None,
+    workers: Workers = HERE,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
     """Run again what made some records, and say what came out differently.
@@ -246,8 +241,8 @@ def rerun(
     ----------
     records
         Of `read_records`.
-    jobs, backend, address
-        See `backends.each`.
+    workers
+        Where they are run.
     advance
         Called with the number of records that are done, as they come.
 
@@ -261,9 +256,7 @@ def rerun(
     """
     before = {_place(record): record for record in records}
     rows, versions, sources, identical = [], {}, {}, 0
-    for _, results in backends.each(
-        leaderboard.run_task, tasks_of(records), jobs, backend, address
-    ):
+    for _, results in backends.each(leaderboard.run_task, tasks_of(records), workers):
         for record, _ in results:
             old = before[_place(record)]
             found = compare(old, record)
