@@ -119,7 +119,7 @@ class IteratedEkf:
         """State after `dt` seconds (...) of the twist (..., 6), ``P <- F P F^T + Q``."""
         twist = check_array("twist", twist, (6,))
         dt = check_duration("dt", dt)
-        if twist.ndim > 1 or np.ndim(dt) or self._variance.ndim > 1:
+        if twist.ndim > 1 or type(dt) is not float or self._variance.ndim > 1:
             batches = {"twist": twist.shape[:-1], "dt": np.shape(dt)}
             batches["process"] = self._variance.shape[:-1]
             check_batches(state=state.translation.shape[:-1], **batches)
@@ -182,14 +182,19 @@ class IteratedEkf:
         if not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
             return None
         numbers = numbers_of(self.noise, len(self.tags))
-        wide = P[..., 0, 0] + P[..., 1, 1] + P[..., 2, 2] > VAGUE_ROTATION_RAD**2
-        if numbers is None or (wide if P.ndim == 2 else wide.any()):
+        if P.ndim == 2:
+            # The trace of the rotation's block; single numbers are quickest as floats.
+            wide = P.item(0) + P.item(7) + P.item(14) > VAGUE_ROTATION_RAD**2
+        else:
+            wide = is_vague(P).any()
+        if numbers is None or wide:
             return None
-        rotation, translation, P, _ = update_pose(
+        rotation, translation, P, cost = update_pose(
             *state, ranges, all_links(*ranges.shape[-2:]), numbers, anchors, self.tags,
             state.rotation, state.translation, self.iterations, self.robust,
         )  # fmt: skip
-        if not math.isfinite(np.vdot(P, P)):
+        # One number tells of all: it is finite where the covariance is.
+        if not math.isfinite(np.vdot(cost, cost) if P.ndim > 2 else cost):
             return None
         return PoseState(rotation, translation, P)
 
@@ -297,7 +302,7 @@ def update_pose(
 
     Returns
     -------
-    Rotation, translation, covariance, cost (...). The covariance is NaN where a matrix is not
+    Rotation, translation, covariance, cost (...). The last two are NaN where a matrix is not
     positive definite, a range that counts not positive, or anything not finite.
     """
     weights = shares if law[0] == WEIGHTS[0] else shares / law_of(law).variance(ranges)
@@ -315,7 +320,9 @@ def update_pose(
     sound = sound.all(axis=(-2, -1)) & (np.abs(anchors) < HUGE).all(axis=(-2, -1))
     covariance = np.where(sound[..., None, None], positive_inverse(found.at.hessian), np.nan)
     pose = PoseState(found.rotation, found.translation, covariance)
-    return *kept_wide(prior, pose, (weights > 0).any(axis=-2), tags), cost
+    pose = kept_wide(prior, pose, (weights > 0).any(axis=-2), tags)
+    known = np.isfinite(pose.covariance).all(axis=(-2, -1))
+    return *pose, np.where(known, cost, np.nan)
 
 
 def as_state(rotation: FloatArray, translation: FloatArray, covariance: FloatArray) -> PoseState:

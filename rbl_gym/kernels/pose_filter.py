@@ -311,7 +311,8 @@ def update(
         squared_residuals(Q, t, ranges, weights, anchors, tags, squared)
     mirror(H)
     keep_wide(Q0, information, Q, weights, tags, H)
-    invert(H, L, P)
+    if not invert(H, L, P):
+        total = math.nan
     if robust:
         # A link that contradicts the pose costs so much and no more, whoever left it out.
         of_prior = total
