@@ -128,3 +128,26 @@ def test_the_other_filters_and_scenes_refuse_a_process_of_each_trial(name):
     )
     with pytest.raises(ValueError, match="dt must be a number"):
         filter.predict(filter.initial(*world["prior"]), world["twist"], world["dt"])
+
+
+@pytest.mark.parametrize("batch", [(), (B,)], ids=str)
+@pytest.mark.parametrize("lost", [0.0, 7.0, np.nan])
+def test_a_law_for_every_link_and_lost_links_by_booleans_and_by_numbers(batch, lost):
+    """Booleans and arrays of full shape go a quicker way than what has to be broadcast."""
+    world = worlds() if batch else alone(worlds(), 2)
+    links = np.random.default_rng(1).random((*batch, M, N)) < 0.7
+    law = LinkNoise(world["noise"])
+    filter: Any = estimators.make(
+        "iekf", tags=np.random.default_rng(2).uniform(-0.5, 0.5, (N, 3)), noise=RangeNoise(0.1),
+        process=motion.ProcessNoise(0.1, 0.1),
+    )  # fmt: skip
+    state = filter.initial(*world["prior"])
+    ranges = np.where(links, world["ranges"], lost)
+    quick = filter.update(state, ranges, world["anchors"], links, noise=law)
+    slow = filter.update(state, ranges, world["anchors"], links.astype(int), noise=law)
+    for got, want in zip(quick, slow, strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-12)
+    ranges[..., 0, 0] = -1.0
+    links[..., 0, 0] = True
+    with pytest.raises(ValueError, match="ranges must be positive where measured"):
+        filter.update(state, ranges, world["anchors"], links, noise=law)

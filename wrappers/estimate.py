@@ -198,7 +198,7 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
         return filter.update(state, ranges, anchors, None if links.all() else links)
     seen = links.astype(np.bool_, copy=False)
     law = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
-    return filter.update(state, ranges, anchors, links, noise=law)
+    return filter.update(state, ranges, anchors, seen, noise=law)
 
 
 def judge(

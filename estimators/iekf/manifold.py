@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,7 +49,7 @@ from rbl_gym.estimators.inputs import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
-from rbl_gym.measurements.noise_laws import law_of, numbers_of
+from rbl_gym.measurements.noise_laws import LinkNoise, law_of, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -146,10 +147,9 @@ class IteratedEkf:
         ValueError
             On wrong shapes, NaN, ranges that are not positive.
         """
-        if links is None and noise is None:
-            found = self._update_plain(state, ranges, anchors)
-            if found is not None:
-                return found
+        found = self._update_plain(state, ranges, anchors, links, noise)
+        if found is not None:
+            return found
         state = plain(state)
         ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
         batch = state.translation.shape[:-1]
@@ -171,7 +171,7 @@ class IteratedEkf:
         )
 
     def _update_plain(
-        self, state: PoseState, ranges: ArrayLike, anchors: ArrayLike
+        self, state: PoseState, ranges: ArrayLike, anchors: ArrayLike, links: Any, noise: Any
     ) -> PoseState | None:
         """The update by an epoch with nothing special about it, in few calls.
 
@@ -181,7 +181,7 @@ class IteratedEkf:
         P = state.covariance
         if not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
             return None
-        numbers = numbers_of(self.noise, len(self.tags))
+        shares, numbers = self._plain_law(ranges, links, noise)
         if P.ndim == 2:
             # The trace of the rotation's block; single numbers are quickest as floats.
             wide = P.item(0) + P.item(7) + P.item(14) > VAGUE_ROTATION_RAD**2
@@ -190,13 +190,32 @@ class IteratedEkf:
         if numbers is None or wide:
             return None
         rotation, translation, P, cost = update_pose(
-            *state, ranges, all_links(*ranges.shape[-2:]), numbers, anchors, self.tags,
+            *state, ranges, shares, numbers, anchors, self.tags,
             state.rotation, state.translation, self.iterations, self.robust,
         )  # fmt: skip
         # One number tells of all: it is finite where the covariance is.
         if not math.isfinite(np.vdot(cost, cost) if P.ndim > 2 else cost):
             return None
         return PoseState(rotation, translation, P)
+
+    def _plain_law(
+        self, ranges: FloatArray, links: Any, noise: Any
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Shares and law as `update_pose` takes them; None where the long way finds them."""
+        shares = all_links(*ranges.shape[-2:])
+        if links is None and noise is None:
+            return shares, numbers_of(self.noise, len(self.tags))
+        if (
+            type(noise) is LinkNoise
+            and type(links) is np.ndarray
+            and links.dtype == np.bool_
+            and links.shape == noise.std_m.shape == ranges.shape
+            # A lost range may be anything: the long way puts zeros in its place.
+            and math.isfinite(np.vdot(ranges, ranges))
+            and noise.std_m.min() > 0
+        ):
+            return links / (noise.std_m * noise.std_m), WEIGHTS
+        return shares, None
 
     def weighed(
         self,
