@@ -19,7 +19,7 @@ from rbl_gym.estimators import filter as belief
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import read_recording
-from rbl_gym.studies import extras, replay
+from rbl_gym.studies import extras, monte_carlo, replay
 from rbl_gym.studies.bench import figures as bench_figures
 from rbl_gym.studies.bench import leaderboard, records
 from rbl_gym.studies.bench import worlds as bench_worlds
@@ -179,13 +179,13 @@ def test_differences_have_the_interval_of_the_paired_bootstrap():
     base = np.abs(rng.standard_normal(150))
     errors = {"good": base, "bad": base * 1.1 + 0.05, "none": np.full(150, np.nan)}
     per_trial = {
-        name: {part: bench_figures.plain(values) for part in bench_figures.PARTS}
+        name: {part: bench_figures.json_number(values) for part in bench_figures.PARTS}
         for name, values in errors.items()
     }
     found = bench_figures.differences(per_trial, 0)
     want = stats.bootstrap(
-        (errors["bad"], errors["good"]), lambda a, b, axis: bench_figures.rms(a, axis)
-        - bench_figures.rms(b, axis), paired=True, method="percentile", n_resamples=4000,
+        (errors["bad"], errors["good"]), lambda a, b, axis: monte_carlo.rms(a, axis)
+        - monte_carlo.rms(b, axis), paired=True, method="percentile", n_resamples=4000,
         rng=np.random.default_rng(2),
     ).confidence_interval  # fmt: skip
     row = found["bad"]["tags_m"]
@@ -224,7 +224,7 @@ def test_a_record_has_the_figures_of_a_plain_loop(tmp_path, short):
     for b in range(6):
         state = filter.initial(*(array[b] for array in world.prior))
         for k, reading in enumerate(world.readings):
-            if k:
+            if reading.twist is not None:
                 state = filter.predict(state, reading.twist[b], scene.dt)
             state = filter.update(state, reading.ranges[b], world.anchors[b])
             belief = filter.belief(state)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,7 +91,7 @@ def measure_episode(scene: Scene, episode: simulation.Episode) -> list[ranging.M
     return [ranging.Measurement(*epoch) for epoch in zip(*columns, strict=True)]
 
 
-def bound_of(scene: Scene, episode: simulation.Episode, links: Sequence[BoolArray]) -> FloatArray:
+def bound_of(scene: Scene, episode: simulation.Episode, links: Iterable[BoolArray]) -> FloatArray:
     """Posterior Cramer-Rao covariances (K, B, 6, 6) of true poses, by the links (K, B, M, N)."""
     covariances, information = [], None
     for epoch, measured in enumerate(links):
@@ -191,13 +191,16 @@ def track_trials(
     rotation = np.moveaxis(episode.rotation[:, :count], 1, 0)
     translation = np.moveaxis(episode.translation[:, :count], 1, 0)
     errors = pose_errors(belief, rotation, translation, tags)
+    own_rotation, own_translation, constrained = map(np.array, zip(*rows, strict=True))
     return Trace(
         np.linalg.norm(belief.matrix - rotation, axis=(-2, -1)),
         metrics.mean_angular_error(belief.matrix, rotation),
         errors.pose,
         errors.nees,
         bounds.score(belief.covariance, belief.rotation, tags),
-        *(np.array(column) for column in zip(*rows, strict=True)),
+        own_rotation,
+        own_translation,
+        constrained,
         seconds / errors.nees.size,
     )
 
@@ -212,5 +215,6 @@ def _own_variances(state: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def rms(values: FloatArray, axis: int | None = None) -> Any:
-    """Root mean square."""
-    return np.sqrt(np.mean(np.square(values), axis=axis))
+    """Root mean square; inf where any is."""
+    with np.errstate(over="ignore"):
+        return np.sqrt(np.mean(np.square(values), axis=axis))

@@ -8,6 +8,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.epochs import nees_interval
+from rbl_gym.studies.monte_carlo import rms
 
 PARTS = ("position_m", "rotation_deg", "tags_m")
 # A trial is lost where its tags end off by more than this many bounds, and by more than the
@@ -71,25 +72,19 @@ def error_figures(errors: BenchErrors, reference: Reference | None) -> dict[str,
         if reference is not None:
             bound = rms(reference.bound[part])
             rows |= {"bound": bound, "to_bound": rows["rmse"] / bound}
-        result[part] = {key: plain(value) for key, value in rows.items()}
-        result["per_trial"][part] = plain(rms(values, axis=0))
+        result[part] = {key: json_number(value) for key, value in rows.items()}
+        result["per_trial"][part] = json_number(rms(values, axis=0))
     result |= consistency(errors.nees, errors.dof)
     if reference is not None:
         lost = is_lost(errors.tags_m, reference)
-        result["lost"] = plain(lost.mean())
-        result["flipped"] = plain(is_flipped(errors, reference).mean())
+        result["lost"] = json_number(lost.mean())
+        result["flipped"] = json_number(is_flipped(errors, reference).mean())
         result["per_epoch"] = {
-            "tags_m": plain(rms(_finite_or_inf(errors.tags_m), axis=1)),
-            "bound_tags_m": plain(rms(reference.bound["tags_m"], axis=1)),
-            "anees": plain(_finite_or_inf(errors.nees).mean(axis=1) / errors.dof),
+            "tags_m": json_number(rms(_finite_or_inf(errors.tags_m), axis=1)),
+            "bound_tags_m": json_number(rms(reference.bound["tags_m"], axis=1)),
+            "anees": json_number(_finite_or_inf(errors.nees).mean(axis=1) / errors.dof),
         }
     return result
-
-
-def rms(values: FloatArray, axis: int | None = None) -> Any:
-    """Root mean square; inf where any is."""
-    with np.errstate(over="ignore"):
-        return np.sqrt(np.mean(np.square(values), axis=axis))
 
 
 def consistency(nees: FloatArray, dof: int) -> dict[str, Any]:
@@ -107,10 +102,10 @@ def consistency(nees: FloatArray, dof: int) -> dict[str, Any]:
     verdict = "optimistic" if anees > high else "pessimistic" if anees < low else "consistent"
     per_epoch = nees.mean(axis=1) / dof
     return {
-        "anees": plain(anees),
-        "anees_interval": [plain(low), plain(high)],
+        "anees": json_number(anees),
+        "anees_interval": [json_number(low), json_number(high)],
         "verdict": verdict,
-        "within": plain(((per_epoch >= low) & (per_epoch <= high)).mean()),
+        "within": json_number(((per_epoch >= low) & (per_epoch <= high)).mean()),
     }
 
 
@@ -174,9 +169,9 @@ def differences(
             low, high = np.quantile(difference, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
             result[name][part] = {
                 "best": names[best],
-                "difference": plain(rmse[k] - rmse[best]),
-                "low": plain(low),
-                "high": plain(high),
+                "difference": json_number(rmse[k] - rmse[best]),
+                "low": json_number(low),
+                "high": json_number(high),
             }
     return result
 
@@ -185,11 +180,11 @@ def _finite_or_inf(values: FloatArray) -> FloatArray:
     return np.where(np.isfinite(values), values, np.inf)
 
 
-def plain(value: Any) -> Any:
+def json_number(value: Any) -> Any:
     """Numbers for JSON, to nine digits; None for what is not finite."""
     if value is None:
         return None
     if np.ndim(value):
-        return [plain(item) for item in value]
+        return [json_number(item) for item in value]
     value = float(value)
     return float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None

@@ -12,7 +12,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.linear.squared_range import geometric_rank
 from rbl_gym.studies import monte_carlo, replay
 from rbl_gym.studies.bench import recordings, worlds
-from rbl_gym.studies.bench.figures import BenchErrors, Reference, error_figures, plain
+from rbl_gym.studies.bench.figures import BenchErrors, Reference, error_figures, json_number
 from rbl_gym.studies.epochs import Step, pose_errors, stack_beliefs, timed, track_epochs
 from rbl_gym.worlds import scenes
 
@@ -129,7 +129,7 @@ def run_filter(
         tracked = _track(stage.track(filter), stage.batch)
     except StoppedError as stop:
         return result | _stopped(stop), None
-    result["trigger_rate"] = plain(tracked.trigger_rate)
+    result["trigger_rate"] = json_number(tracked.trigger_rate)
     steps = tracked.belief.translation[..., 0].size
     return result | stage.figures(tracked), 1e6 * tracked.seconds / steps
 
