@@ -23,7 +23,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 
 SIZES = {(4, 5): 20, (10, 6): 10, (50, 20): 1}  # peer trials for each (M, N)
-NOISE = ranging.SquaredRangeNoise(0.05)
+NOISE, RANGES = ranging.SquaredRangeNoise(0.05), ranging.RangeNoise(0.05, 0.001)
 PROCESS = motion.ProcessNoise(0.02, 0.1)
 DT = 0.1
 STEPS = 5
@@ -47,6 +47,7 @@ def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, s
         "et-kf": World(rng, "et-kf", m, n, trials),
         "uc-kf": World(rng, "uc-kf", m, n, trials),
         "kf, one covariance": World(rng, "kf", m, n, trials, fixed=True),
+        "kf, noise of each link": World(rng, "kf", m, n, trials, noise=RANGES),
     }
     for path, world in worlds.items():
         world.check(n_trials=SIZES[m, n], path=path)
@@ -69,10 +70,11 @@ class World:
         trials: int,
         *,
         fixed: bool = False,
+        noise: ranging.NoiseLaw = NOISE,
     ) -> None:
         tags = rng.uniform(-0.5, 0.5, (n, 3))
         tags -= tags.mean(axis=0)
-        self.tags, self.name, self.trials = tags, name, trials
+        self.tags, self.name, self.trials, self.noise = tags, name, trials, noise
         # On a shell around the body: no anchor stands on a tag.
         places = rng.standard_normal((m, 3) if fixed else (trials, m, 3))
         self.anchors = 15 * places / np.linalg.norm(places, axis=-1, keepdims=True)
@@ -83,11 +85,11 @@ class World:
         start = rotations.exp(0.1 * rng.standard_normal((trials, 3))) @ rotation, translation
         for _ in range(STEPS):
             rotation, translation = motion.propagate(rotation, translation, self.twist, DT)
-            measured = ranging.simulate(self.anchors, tags, rotation, translation, NOISE, rng)
+            measured = ranging.simulate(self.anchors, tags, rotation, translation, noise, rng)
             self.ranges.append(measured.ranges)
         self.weights = 1 / NOISE.squared_range_variance(self.ranges[0][0])[:, 0] if fixed else None
         self.filter = estimators.make(
-            name, tags=tags, noise=NOISE, process=PROCESS, weights=self.weights
+            name, tags=tags, noise=noise, process=PROCESS, weights=self.weights
         )
         self.prior = self.filter.initial(*start, np.diag([0.02] * 3 + [1.0] * 3))
 
@@ -137,15 +139,17 @@ class World:
     def _model(self, k: int, ranges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Whitened H and z of one epoch, ``|s|^2`` projected out by U_M, as in the papers."""
         anchors = self.anchors if self.anchors.ndim == 2 else self.anchors[k]
-        if self.weights is None:
-            root = np.sqrt(1 / NOISE.squared_range_variance(ranges)[:, 0])
-        else:
-            root = np.sqrt(self.weights)
-        basis = np.linalg.svd(root[:, None])[0][:, 1:]
+        weights = self.weights
+        if weights is None:
+            weights = 1 / self.noise.squared_range_variance(ranges)
+        weights = np.broadcast_to(weights.reshape(len(anchors), -1), ranges.shape)
         d = ranges**2 - (anchors**2).sum(axis=1)[:, None]
-        rows = basis.T @ (root[:, None] * (-2 * anchors))
-        extended = np.concatenate([self.tags, np.ones((len(self.tags), 1))], axis=1)
-        return np.kron(extended, rows), (basis.T @ (root[:, None] * d)).T.ravel()
+        H, z = [], []
+        for tag, root, told in zip(self.tags, np.sqrt(weights).T, d.T, strict=True):
+            basis = np.linalg.svd(root[:, None])[0][:, 1:]
+            H.append(np.kron([*tag, 1.0], basis.T @ (root[:, None] * (-2 * anchors))))
+            z.append(basis.T @ (root * told))
+        return np.concatenate(H), np.concatenate(z)
 
 
 if __name__ == "__main__":
