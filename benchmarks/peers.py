@@ -111,7 +111,8 @@ class Tracks:
 
     def ours(self, trial: int | slice) -> Any:
         """Our filter over all steps of a trial, or of several at once."""
-        state = type(self.prior)(*(field[trial] for field in self.prior))
+        mean, covariance, constrained = self.prior
+        state = type(self.prior)(mean[trial], covariance, constrained[trial])
         for ranges in self.ranges:
             state = self.filter.predict(state, self.twist, DT)
             state = self.filter.update(state, ranges[trial], self.anchors)
@@ -119,7 +120,8 @@ class Tracks:
 
     def apart(self) -> Any:
         """As `ours` of all, with a covariance for each trial, as bodies of their own have."""
-        state = self.prior._replace(covariance=self.prior.covariance.copy())
+        each = np.tile(self.prior.covariance, (len(self.prior.mean), 1, 1))
+        state = self.prior._replace(covariance=each)
         for ranges in self.ranges:
             state = self.filter.predict(state, self.twist, DT)
             state = self.filter.update(state, ranges, self.anchors)
@@ -162,7 +164,7 @@ def against_simdkalman(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
         unit = np.eye(len(H))
 
         def peer() -> tuple[np.ndarray, np.ndarray]:
-            mean, P = tracks.prior.mean[..., None], tracks.prior.covariance[:1]
+            mean, P = tracks.prior.mean[..., None], tracks.prior.covariance[None]
             for values in z:
                 mean, P = primitives.predict(mean, P, F, noise)
                 mean = mean + shift[:, None]
@@ -173,7 +175,7 @@ def against_simdkalman(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
             mean, P = peer()
             state = tracks.ours(slice(None))
             require_equal("simdkalman: mean", state.mean, mean, 1e-8)
-            require_equal("simdkalman: covariance", state.covariance[0], P[0], 1e-8)
+            require_equal("simdkalman: covariance", state.covariance, P[0], 1e-8)
 
         count = TRIALS * STEPS
         return Duel(
@@ -225,7 +227,7 @@ def against_stonesoup(rng: np.random.Generator, m: int, n: int) -> list[Duel]:
         states = []
         for trial in range(BODIES):
             state: Any = GaussianState(
-                tracks.prior.mean[trial][:, None], tracks.prior.covariance[trial], timestamp=begin
+                tracks.prior.mean[trial][:, None], tracks.prior.covariance, timestamp=begin
             )
             for detection in detections[trial]:
                 prediction = predictor.predict(
