@@ -67,55 +67,53 @@ def in_tree(tree: Path) -> dict[str, float]:
 
 def measure() -> dict[str, float]:
     """Seconds of each job by its size and name: the median of some runs after a first one."""
+    return {
+        f"{m}x{n} {name}": seconds for m, n in SIZES for name, seconds in measure_size(m, n).items()
+    }
+
+
+def measure_size(m: int, n: int) -> dict[str, float]:
+    """Seconds of each job with m anchors and n tags, by its name."""
     from rbl_gym import bodies, estimators, motion, ranging, rotations  # those of the tree
 
+    rng = np.random.default_rng([m, n])
+    tags = bodies.octahedron(0.8)[:n]
+    noise = ranging.RangeNoise(0.05, 0.001)
+    anchors = rng.uniform(-10, 10, (BODIES, m, 3))
+    rotation, translation = rotations.random(rng, (BODIES,)), rng.uniform(-3, 3, (BODIES, 3))
+    ranges = ranging.simulate(anchors, tags, rotation, translation, noise, rng).ranges
+    near = rotations.exp(0.05 * rng.standard_normal((BODIES, 3))) @ rotation
+    place = translation + 0.2 * rng.standard_normal((BODIES, 3))
+    prior = near, place, np.diag([0.02] * 3 + [0.1] * 3)
+    twist = 0.1 * rng.standard_normal((BODIES, 6))
+    laws: Any = {"tags": tags, "noise": noise, "process": motion.ProcessNoise(0.02, 0.1)}
+    two = estimators.make("iekf", **laws, iterations=2)
+    four = estimators.make("iekf", **laws, iterations=4)
+    state, one = two.initial(*prior), four.initial(near[0], place[0], prior[2])
+
+    def one_body() -> None:
+        for _ in range(100):
+            after = four.update(four.predict(one, twist[0], 0.1), ranges[0], anchors[0])
+            four.belief(after)
+
+    def one_by_one() -> None:
+        for k in range(20):
+            estimators.locate(ranges[k], anchors[k], tags, noise, "ml")
+
+    def at_once() -> None:
+        estimators.locate(ranges[:EPOCHS], anchors[:EPOCHS], tags, noise, "ml")
+
+    jobs = {
+        "update, 1024 bodies": (lambda: two.update(state, ranges, anchors), BODIES),
+        "epoch, one body": (one_body, 100),
+        "locate, one epoch": (one_by_one, 20),
+        "locate, 512 epochs": (at_once, EPOCHS),
+    }
     result = {}
-    for m, n in SIZES:
-        rng = np.random.default_rng([m, n])
-        tags = bodies.octahedron(0.8)[:n]
-        noise = ranging.RangeNoise(0.05, 0.001)
-        anchors = rng.uniform(-10, 10, (BODIES, m, 3))
-        rotation, translation = rotations.random(rng, (BODIES,)), rng.uniform(-3, 3, (BODIES, 3))
-        ranges = ranging.simulate(anchors, tags, rotation, translation, noise, rng).ranges
-        near = rotations.exp(0.05 * rng.standard_normal((BODIES, 3))) @ rotation
-        place = translation + 0.2 * rng.standard_normal((BODIES, 3))
-        prior = near, place, np.diag([0.02] * 3 + [0.1] * 3)
-        twist = 0.1 * rng.standard_normal((BODIES, 6))
-
-        def filter_of(iterations: int, tags: Any = tags, noise: Any = noise) -> Any:
-            process = motion.ProcessNoise(0.02, 0.1)
-            return estimators.make(
-                "iekf", tags=tags, noise=noise, process=process, iterations=iterations
-            )
-
-        two, four = filter_of(2), filter_of(4)
-        state, one = two.initial(*prior), four.initial(near[0], place[0], prior[2])
-
-        def epoch(state: Any, k: Any, filter: Any, twist: Any, ranges: Any, anchors: Any) -> None:
-            after = filter.update(filter.predict(state, twist[k], 0.1), ranges[k], anchors[k])
-            filter.belief(after)
-
-        def alone(one: Any = one, four: Any = four, data: Any = (twist, ranges, anchors)) -> None:
-            for _ in range(100):
-                epoch(one, 0, four, *data)
-
-        def one_by_one(ranges: Any = ranges, anchors: Any = anchors, tags: Any = tags) -> None:
-            for k in range(20):
-                estimators.locate(ranges[k], anchors[k], tags, noise, "ml")
-
-        jobs = {
-            "update, 1024 bodies": (lambda: two.update(state, ranges, anchors), BODIES),
-            "epoch, one body": (alone, 100),
-            "locate, one epoch": (one_by_one, 20),
-            "locate, 512 epochs": (
-                lambda: estimators.locate(ranges[:EPOCHS], anchors[:EPOCHS], tags, noise, "ml"),
-                EPOCHS,
-            ),
-        }
-        for name, (run, count) in jobs.items():
-            run()
-            runs = [side_by_side.seconds(side_by_side.Job(run, count)) for _ in range(5)]
-            result[f"{m}x{n} {name}"] = float(np.median(runs))
+    for name, (run, count) in jobs.items():
+        run()
+        runs = [side_by_side.seconds(side_by_side.Job(run, count)) for _ in range(5)]
+        result[name] = float(np.median(runs))
     return result
 
 

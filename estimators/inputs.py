@@ -58,7 +58,7 @@ def check_epoch(
     if (
         links is None
         and is_plain_epoch(ranges, anchors, tags, ())
-        and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportArgumentType]
+        and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportCallIssue, reportArgumentType]
         and are_positive(ranges)  # pyright: ignore[reportArgumentType]
     ):
         # The quick way of one body; what is wrong goes the long one, which names it.

@@ -188,7 +188,7 @@ def _judge(
     """`judge`; NaN for the NEES of a covariance that is not positive definite."""
     truth = rotation, translation
     error = kernel(pose_error)(rotation_hat, translation_hat, *truth)
-    good = np.isfinite(covariance).all(axis=(-2, -1))
+    good = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))
     safe = np.where(good[..., None, None], covariance, np.eye(6))
     good &= np.linalg.eigvalsh(safe)[..., 0] > 0
     safe = np.where(good[..., None, None], covariance, np.eye(6))

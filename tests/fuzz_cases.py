@@ -128,7 +128,7 @@ case(estimators.cycle_consensus, **GRAPH, y=EDGE_ANGLES)
 case(estimators.ring_least_squares, y=np.array([1.0, 2, 3]))
 _cycles = graphs.cycle_matrix(**GRAPH)
 case(lambda y, branch: estimators.cycle_projection(_cycles, y, branch), "cycle_projection",
-     y=EDGE_ANGLES, branch=np.zeros(_cycles.shape[0]))  # fmt: skip
+     y=EDGE_ANGLES, branch=np.zeros(len(_cycles.toarray())))  # fmt: skip
 _seen = sensing.measure_in_space(
     np.eye(3), np.tile(Q, (3, 1, 1)), [[0, 1], [1, 2], [2, 0]], 0.0, np.random.default_rng(0)
 )

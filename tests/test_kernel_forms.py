@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -27,7 +29,7 @@ every_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
 every_batch = pytest.mark.parametrize("batch", [(), (3,), (2, 3)], ids=str)
 
 
-def assert_equal_forms(form, *args, atol=1e-9):
+def assert_equal_forms(form, *args, atol=1e-9) -> Any:
     """Both forms of a function: relative to the largest entry, and for shapes that broadcast."""
     with np.errstate(all="ignore"):
         got, want = form.kernel(*args), form.textbook(*args)
@@ -381,6 +383,6 @@ def test_scores_of_layouts(law, batch, m):
         anchors, poses.rotation, poses.translation, world.tags, 0.1 * np.eye(6), law.numbers, share
     )  # fmt: skip
     assert_equal_forms(placement._mean_square, *args)
-    square, _ = assert_equal_forms(gradient._mean_square_and_gradient, *args)
+    square, *_ = assert_equal_forms(gradient._mean_square_and_gradient, *args)
     np.testing.assert_allclose(square, placement._mean_square(*args), rtol=1e-12)
     assert_equal_forms(placement._mean_square_of, poses.matrix, poses.rotation, world.tags)

@@ -81,7 +81,7 @@ def test_one_state_goes_on_by_many_steps():
 
 
 def test_the_noise_of_many_motions():
-    process = motion.ProcessNoise([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]], 0.7)
+    process = motion.ProcessNoise(np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]), 0.7)  # pyright: ignore[reportArgumentType]
     np.testing.assert_array_equal(
         process.std(), [[0.1, 0.2, 0.3, 0.7, 0.7, 0.7], [0.4, 0.5, 0.6, 0.7, 0.7, 0.7]]
     )

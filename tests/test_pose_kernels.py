@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbl_gym import bounds, estimators, kernels, motion
+from rbl_gym.bounds import pose
 from rbl_gym.estimators.costs import range_cost
 from rbl_gym.estimators.costs.map_problem import PoseState, minimize_ranges, positive_inverse
 from rbl_gym.estimators.iekf.manifold import WEIGHTS, predict_pose, update_pose
@@ -86,7 +87,7 @@ def test_prediction(seed, turn, dt):
 @needs_kernels
 @given(st.integers(0, 999), shapes, geometries, st.booleans(), st.sampled_from([1, 2, 4]))
 def test_update(seed, shape, geometry, robust, iterations):
-    prior, *data = epoch(seed, *shape, geometry, wrong=0.1 if robust else 0.0)
+    prior, *data = epoch(seed, *shape, geometry=geometry, wrong=0.1 if robust else 0.0)
     ranges, weights, *places = data
     args = *prior, ranges, weights, WEIGHTS, *places, *prior[:2], iterations, robust
     with np.errstate(all="ignore"):
@@ -121,7 +122,7 @@ def test_update_by_the_numbers_of_a_law(law):
 @needs_kernels
 @given(st.integers(0, 999), shapes, geometries, losses)
 def test_a_few_steps_by_every_loss(seed, shape, geometry, loss):
-    prior, *data = epoch(seed, *shape, geometry, wrong=0.1)
+    prior, *data = epoch(seed, *shape, geometry=geometry, wrong=0.1)
     information = positive_inverse(prior[2])
     args = *prior[:2], *prior[:2], information, *data, loss, 3, 1e-6
     with np.errstate(all="ignore"):
@@ -133,7 +134,7 @@ def test_a_few_steps_by_every_loss(seed, shape, geometry, loss):
 @needs_kernels
 @given(st.integers(0, 999), st.sampled_from([(4, 3), (5, 4), (10, 6)]), geometries)
 def test_linear_starts(seed, shape, geometry):
-    _, *data = epoch(seed, *shape, geometry, lost=0.1)
+    _, *data = epoch(seed, *shape, geometry=geometry, lost=0.1)
     with np.errstate(all="ignore"):
         got, want = points_start.kernel(*data), points_start.textbook(*data)
     # Of tags in a line any turn about it will do; of anchors in a plane rounding is the height.
@@ -145,7 +146,7 @@ def test_linear_starts(seed, shape, geometry):
 @pytest.mark.parametrize("geometry", ["solid", "anchors in a plane", "tags in a plane"])
 @pytest.mark.parametrize("shape", [(4, 5), (6, 6), (10, 6)])
 def test_most_likely_poses_and_their_alternatives(shape, geometry):
-    _, *data = epoch(1, *shape, geometry, lost=0.0, batch=(30,))
+    _, *data = epoch(1, *shape, geometry=geometry, lost=0.0, batch=(30,))
     start = points_start(*data)
     args = *data, *start, ROTATION_NET, np.empty((3, 6))
     with np.errstate(all="ignore"):
@@ -334,7 +335,7 @@ def test_bounds_of_one_pose_equal_those_of_a_batch():
     twist = np.random.default_rng(5).standard_normal((4, 6))
     places = anchors, tags, rotation, translation
     distance, J = bounds.range_jacobian(*places)
-    information = bounds.pose.information_at(*places, NOISE)
+    information = pose.information_at(*places, NOISE)
     predicted = bounds.predict_information(np.linalg.inv(P), twist, 0.2, PROCESS)
     b = bounds.score(P, rotation, tags)
     for k in range(4):
@@ -343,7 +344,7 @@ def test_bounds_of_one_pose_equal_those_of_a_batch():
         np.testing.assert_allclose(single[0], distance[k], rtol=1e-14)
         np.testing.assert_allclose(single[1], J[k], atol=1e-14)
         np.testing.assert_allclose(
-            bounds.pose.information_at(*one, NOISE), information[k], rtol=1e-10, atol=1e-8
+            pose.information_at(*one, NOISE), information[k], rtol=1e-10, atol=1e-8
         )
         alone = bounds.predict_information(np.linalg.inv(P[k]), twist[k], 0.2, PROCESS)
         scale = np.abs(alone).max()

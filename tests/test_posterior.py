@@ -9,6 +9,7 @@ from rbl_gym import bounds
 from rbl_gym.bounds import posterior
 from rbl_gym.bounds.doa import doa_information
 from rbl_gym.geometry import rotations
+from rbl_gym.measurements import noise_laws
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.motion import ProcessNoise
 from rbl_gym.worlds import scene_bounds, scenes, simulation
@@ -54,7 +55,7 @@ def test_uneven_noise_is_predicted_all_the_same():
     scene = scenes.get("uwb_room")
     got, _ = posterior.step_of_ranges(
         J, twist, 1.0, process.std(), np.ones((4, 3)), scene.body, np.eye(3), np.zeros(3),
-        scene.noise.numbers, np.zeros((4, len(scene.body))),
+        noise_laws.numbers_of(scene.noise, len(scene.tags)), np.zeros((4, len(scene.body))),
     )  # fmt: skip
     assert_close(got, bounds.predict_information(J, twist, 1.0, process), 1e-9)
 
@@ -64,7 +65,7 @@ def test_an_anchor_on_a_tag_tells_nothing_of_that_tag():
     anchors = np.array([scene.tags[0], (5.0, 0, 1), (0, 6, 2)])
     got, _ = posterior.step_of_ranges(
         np.eye(6), np.zeros(6), 0.0, np.ones(6), anchors, scene.body, np.eye(3), np.zeros(3),
-        scene.noise.numbers, np.ones((3, len(scene.body))),
+        noise_laws.numbers_of(scene.noise, len(scene.tags)), np.ones((3, len(scene.body))),
     )  # fmt: skip
     seen = bounds.range_information(anchors, scene.tags, np.eye(3), np.zeros(3), scene.noise)
     assert_close(got, np.eye(6) + seen, 1e-12)

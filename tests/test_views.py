@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ def belief(rng, batch):
     )
 
 
-def assert_equal_forms(form, *args):
+def assert_equal_forms(form, *args) -> Any:
     got, want = form.kernel(*args), form.textbook(*args)
     got, want = (x if isinstance(x, tuple) else (x,) for x in (got, want))
     for mine, plain in zip(got, want, strict=True):

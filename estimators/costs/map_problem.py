@@ -145,7 +145,8 @@ def minimize_ranges(
     prior = PoseState(rotation, translation, information)
     problem = MapProblem(prior, information, RangeCost(ranges, weights, anchors, tags, loss))
     found = minimize_pose(problem, start_rotation, start_translation, iterations, tolerance)
-    return found.rotation, found.translation, *found.at, found.converged
+    cost, gradient, hessian = found.at
+    return found.rotation, found.translation, cost, gradient, hessian, found.converged
 
 
 def positive_inverse(matrix: FloatArray) -> FloatArray:

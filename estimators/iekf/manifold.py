@@ -181,7 +181,7 @@ class IteratedEkf:
         P = state.covariance
         if not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
             return None
-        shares, numbers = self._plain_law(ranges, links, noise)
+        shares, numbers = self._plain_law(ranges, links, noise)  # pyright: ignore[reportArgumentType]
         if P.ndim == 2:
             # The trace of the rotation's block; single numbers are quickest as floats.
             wide = P.item(0) + P.item(7) + P.item(14) > VAGUE_ROTATION_RAD**2
@@ -273,11 +273,11 @@ def predict_pose(
     noise, of `variance` (6,) after 1 s, is on the angular velocity.
     """
     rotation, translation, covariance = plain(PoseState(rotation, translation, covariance))
-    dt = np.asarray(dt)[..., None]
-    turn = twist[..., :3] * dt
+    seconds = np.asarray(dt)[..., None]
+    turn = twist[..., :3] * seconds
     F, G = (np.broadcast_to(np.eye(6), (*turn.shape[:-1], 6, 6)).copy() for _ in range(2))
     F[..., :3, :3], G[..., :3, :3] = _EXP(turn), _LEFT_JACOBIAN(turn)
-    spread = (G * (dt * variance)[..., None, :]) @ np.swapaxes(G, -1, -2)
+    spread = (G * (seconds * variance)[..., None, :]) @ np.swapaxes(G, -1, -2)
     return (
         F[..., :3, :3] @ rotation,
         translation + twist[..., 3:] * dt,

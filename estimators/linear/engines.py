@@ -222,5 +222,5 @@ def _kalman_filter() -> Any:
 
     kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
     # Without B filterpy ignores u in silence.
-    kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])
+    kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])  # pyright: ignore[reportAttributeAccessIssue]
     return kf

@@ -109,8 +109,8 @@ def _procrustes(epoch: Epoch) -> Fit:
 
 def _ml(epoch: Epoch) -> Fit:
     cost = _range_cost(epoch)
-    start = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
-    return _from_solution(*maximum_likelihood(cost, *start, epoch.tag_std_m))
+    rotation, translation = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
+    return _from_solution(*maximum_likelihood(cost, rotation, translation, epoch.tag_std_m))
 
 
 def _two_step(epoch: Epoch) -> Fit:

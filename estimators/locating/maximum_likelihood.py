@@ -6,7 +6,7 @@ Problems are flat here: one batch axis B, arrays (B, M, N), (B, M, 3), (B, N, 3)
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -121,7 +121,7 @@ def most_likely_pose(
     translation: FloatArray,
     net: FloatArray,
     room: FloatArray,
-) -> tuple[FloatArray, ...]:
+) -> tuple[Any, ...]:
     """`maximum_likelihood` as arrays.
 
     Parameters
@@ -337,7 +337,7 @@ def rivals(tags: FloatArray, solutions: Solution) -> Alternatives:
 def merge(solution: Solution, found: Solution, where: np.ndarray) -> Solution:
     """`solution` with the trials at an index replaced by `found`."""
 
-    def put(old: FloatArray, new: FloatArray) -> FloatArray:
+    def put(old: Any, new: Any) -> Any:
         result = np.array(old)
         result[where] = new
         return result

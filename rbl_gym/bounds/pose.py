@@ -6,6 +6,8 @@ information and covariance are 6 x 6 in that order.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -152,7 +154,7 @@ def information_at(
     rotation: FloatArray,
     translation: FloatArray,
     noise: ranging.NoiseLaw,
-    share: FloatArray | BoolArray | None = None,
+    share: Any = None,
 ) -> FloatArray:
     """`range_information` on arrays that are known to be good.
 

@@ -162,7 +162,7 @@ def _predicted(prior: FloatArray, twist: FloatArray, dt: ArrayLike, std: FloatAr
 def _with_score(
     information: FloatArray, rotation: FloatArray, tags: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    good = np.isfinite(information).all(axis=(-2, -1))
+    good = np.asarray(np.isfinite(information).all(axis=(-2, -1)))
     safe = np.where(good[..., None, None], information, 0.0)
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", safe), 1e-300))
     scaled = safe / (scale[..., :, None] * scale[..., None, :])

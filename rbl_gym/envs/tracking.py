@@ -177,8 +177,9 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     def _shoot(self, at: simulation.Epoch, links: np.ndarray) -> None:
         bound = None if self._information is None else np.linalg.inv(self._information)[None]
-        one = (field[None] for field in (links.view(np.bool_), self._anchors, *at[:2]))
-        self.film.take([self._epoch], rendering.shot(*one, bound))  # pyright: ignore[reportOptionalMemberAccess]
+        world = links.view(np.bool_)[None], self._anchors[None], at.rotation[None]
+        shot = rendering.shot(*world, at.translation[None], bound)
+        self.film.take([self._epoch], shot)  # pyright: ignore[reportOptionalMemberAccess]
 
     def render(self) -> Any:
         """The world, the body close up, and its errors (or the bound): an RGB frame, uint8."""

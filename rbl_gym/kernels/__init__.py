@@ -91,7 +91,7 @@ class Compiled:
             return run(*args)
 
     def __reduce__(self) -> str:
-        return self.__qualname__
+        return self.__qualname__  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def compiled(name: str) -> Callable[[Callable[..., Any]], Compiled]:

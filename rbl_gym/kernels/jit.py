@@ -71,11 +71,13 @@ def _find_cache() -> bool:
 
 
 _CACHE = _find_cache()
+# numba's annotations leave out options that it takes.
+_njit: Any = numba.njit
 
 
 def helper(function: F) -> F:
     """Compile a function that kernels call; division by zero gives inf, as in NumPy."""
-    return numba.njit(error_model="numpy", cache=_CACHE, no_cfunc_wrapper=True)(function)
+    return _njit(error_model="numpy", cache=_CACHE, no_cfunc_wrapper=True)(function)
 
 
 def inlined(function: F) -> F:
@@ -83,7 +85,7 @@ def inlined(function: F) -> F:
 
     A call takes 0.1 us and more, as an array is passed as seven numbers.
     """
-    return numba.njit(error_model="numpy", cache=_CACHE, no_cfunc_wrapper=True, forceinline=True)(
+    return _njit(error_model="numpy", cache=_CACHE, no_cfunc_wrapper=True, forceinline=True)(
         function
     )
 

@@ -285,7 +285,7 @@ def update(
         loss[0] = HUBER
         squared, kept = np.empty(weights.shape), np.empty(weights.shape)
         for m in range(weights.shape[0]):
-            for n in range(weights.shape[1]):
+            for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
                 kept[m, n] = weights[m, n]
                 links += weights[m, n] > 0
         squared_residuals(Q0, t0, ranges, weights, anchors, tags, squared)
@@ -317,7 +317,7 @@ def update(
         # A link that contradicts the pose costs so much and no more, whoever left it out.
         of_prior = total
         for m in range(weights.shape[0]):
-            for n in range(weights.shape[1]):
+            for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
                 if kept[m, n] > 0:
                     of_prior -= loss_of(squared[m, n], loss)[0]
         loss[1] = GATE

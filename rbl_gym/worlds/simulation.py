@@ -320,5 +320,5 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
 def _move(places: FloatArray, velocity: FloatArray, reach: float) -> FloatArray:
     """Places (..., M, 3) after a step of `reach` along velocities of length 1 at the most."""
     length = np.linalg.norm(velocity, axis=-1, keepdims=True)
-    reach = np.asarray(reach)[..., None, None]
-    return velocity * (reach / np.maximum(length, 1.0)) + places
+    longest = np.asarray(reach)[..., None, None]
+    return velocity * (longest / np.maximum(length, 1.0)) + places
