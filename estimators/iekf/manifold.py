@@ -280,7 +280,7 @@ def predict_pose(
     spread = (G * (seconds * variance)[..., None, :]) @ np.swapaxes(G, -1, -2)
     return (
         F[..., :3, :3] @ rotation,
-        translation + twist[..., 3:] * dt,
+        translation + twist[..., 3:] * seconds,
         F @ covariance @ np.swapaxes(F, -1, -2) + spread,
     )
 
