@@ -15,7 +15,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.geometry.regions import Region
-from rbl_gym.placement.problem import Context
+from rbl_gym.placement.problem import Context, score_of_checked
 from rbl_gym.rendering import placement as rendering
 
 # Signs by which a problem may be mirrored: neither, x, y, both.
@@ -67,8 +67,10 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self._contexts = placement.build_contexts(self.task, uniforms)
         # Signs of the axes by which each problem is shown mirrored.
         self._signs = np.ones((num_envs, 3))
-        self._features = context_features(self.task, self._contexts)
-        self._actions = np.zeros((num_envs, self.task.n_anchors, 3))
+        # What the observation shows, in its own type.
+        self._features = context_features(self.task, self._contexts).astype(np.float32)
+        self._actions = np.zeros((num_envs, self.task.n_anchors, 3), np.float32)
+        self._next = np.eye(self.task.n_anchors + 1, self.task.n_anchors, dtype=np.float32)
         self._anchors = np.zeros((num_envs, self.task.n_anchors, 3))
         self._score_m = np.zeros(num_envs)
         if self.sight:
@@ -108,8 +110,8 @@ class AnchorPlacementVectorEnv(BatchEnv):
             held[chosen] = new
         shown = fresh
         if self.mirror:
-            self._signs[chosen] = signs_of(self.task, fresh)
-            shown = mirrored_context(self.task, fresh, self._signs[chosen])
+            self._signs[chosen] = signs = signs_of(self.task, fresh)
+            shown = mirrored_context(self.task, fresh, signs)
         self._features[chosen] = context_features(self.task, shown)
         self._actions[chosen] = 0.0
         self._anchors[chosen] = 0.0
@@ -122,27 +124,38 @@ class AnchorPlacementVectorEnv(BatchEnv):
             self._log_score[chosen] = math.log(_EMPTY_SCORE_M)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        rows = np.flatnonzero(moving)
-        step = self._epochs[rows] - 1
-        complete = np.asarray(moving & (self._epochs == self._placements))
+        complete = moving & (self._epochs == self._placements)
         if self.mode == "mounts":
-            return self._mount(actions, rows, step, complete), complete
+            rows = np.flatnonzero(moving)
+            return self._mount(actions, rows, self._epochs[rows] - 1, complete), complete
         # One-shot: all anchors of a world; else the next one.
-        new = (rows,) if self.mode == "one-shot" else (rows, step)
+        rows, step = self._places(moving)
+        new = rows if self.mode == "one-shot" else (rows, step)
         placed = np.minimum(np.maximum(actions[rows], -1.0), 1.0)
         signs = self._signs[rows]
         if self.mode == "one-shot":
-            placed, signs = placed.reshape((len(rows), -1, 3)), signs[:, None]
+            placed, signs = placed.reshape((len(placed), -1, 3)), signs[:, None]
         self._actions[new] = placed
         self._anchors[new] = self.task.scene.anchor_region.place(signs * placed)
         reward = np.zeros(self.num_envs)
         if complete.any():
-            problems = self._contexts
+            problems, anchors = self._contexts, self._anchors
             if not complete.all():
                 problems = Context(*(field[complete] for field in problems))
-            self._score_m[complete] = placement.score(self.task, problems, self._anchors[complete])
-            reward[complete] = -np.log(self._score_m[complete])
+                anchors = anchors[complete]
+            score_m = score_of_checked(self.task, problems, anchors)
+            self._score_m[complete] = score_m
+            reward[complete] = -np.log(score_m)
         return reward, complete
+
+    def _places(self, moving: BoolArray) -> tuple[Any, Any]:
+        """Indices of the worlds of the mask, and of the anchor that each places."""
+        epochs = self._epochs
+        if self.num_envs == 1 or (moving.all() and (epochs == epochs[0]).all()):
+            # Views are quicker than copies.
+            return slice(None), epochs[0] - 1
+        rows = np.flatnonzero(moving)
+        return rows, epochs[rows] - 1
 
     def _mount(
         self, actions: np.ndarray, rows: np.ndarray, step: np.ndarray, complete: BoolArray
@@ -176,7 +189,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
         if self.mode == "mounts":
             parts.append(np.take_along_axis(self._taken, self._shown(), axis=-1))
         if self.mode != "one-shot":
-            parts.append(self._epochs[:, None] == np.arange(self.task.n_anchors))
+            parts.append(self._next[self._epochs])
         return np.concatenate(parts, axis=-1, dtype=np.float32)
 
     def _inform(self) -> dict[str, np.ndarray]:
@@ -307,16 +320,18 @@ def _centre(region: Region) -> FloatArray:
 
 def signs_of(task: placement.PlacementTask, context: Context) -> FloatArray:
     """Signs (..., 3) of the axes that bring the region's centre towards +x and +y."""
-    off = context.centre - _centre(task.scene.volume)
-    return np.where((off < 0) & (_LEVEL > 0), -1.0, 1.0)
+    signs = np.where(context.centre < _centre(task.scene.volume), -1.0, 1.0)
+    signs[..., 2] = 1.0
+    return signs
 
 
 def mirrored_context(task: placement.PlacementTask, context: Context, signs: FloatArray) -> Context:
     """The problem mirrored by signs (..., 3), its racks in the order of falling x."""
     middle = _centre(task.scene.anchor_region) * _LEVEL
-    centre, racks = middle + signs * (context.centre - middle), context.racks.copy()
+    centre, racks = middle + signs * (context.centre - middle), context.racks
     if not racks.shape[-2]:
         return Context(centre, context.half, racks)
+    racks = racks.copy()
     racks[..., :3] = middle + signs[..., None, :] * (racks[..., :3] - middle)
     order = np.argsort(-racks[..., 0], axis=-1)
     racks = np.take_along_axis(racks, order[..., None], axis=-2)

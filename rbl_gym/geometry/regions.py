@@ -83,7 +83,12 @@ class Box:
 
     def place(self, action: FloatArray) -> FloatArray:
         """The box is [-1, 1]^3."""
-        return _scaled(_cut(action), *self.bounds())
+        middle, half = self._middle
+        return middle + _cut(action) * half
+
+    @functools.cached_property
+    def _middle(self) -> tuple[FloatArray, FloatArray]:
+        return _middle(*self._corners)
 
     def action(self, points: FloatArray) -> FloatArray:
         """Inverse of `place`; zero along an axis without extent."""
@@ -120,23 +125,20 @@ class Walls:
         # x walls run along y, y walls and the ceiling along x; the ceiling's "up" is y.
         inside = np.stack([along, np.where(face < 2, along, up), up], axis=-1)
         points = low + inside * (high - low)
-        for index, (axis, value) in enumerate(self._faces()):
-            points[..., axis] = np.where(face == index, value, points[..., axis])
-        return points
+        axes, values = self._faces
+        face = face[..., None]
+        return np.where(axes[face] == np.arange(3), values[face], points)
 
     def project(self, points: FloatArray) -> FloatArray:
         """The nearest point of a wall or the ceiling."""
-        inside = np.clip(points, *self.bounds())
+        low, high = self._corners
+        axes, values = self._faces
+        inside = np.minimum(np.maximum(points, low), high)
         outside = (points - inside) ** 2
-        squares = outside.sum(axis=-1)
         # Squared distance to each surface; below the floor the nearest gap alone misleads.
-        distances = [
-            squares - outside[..., a] + (points[..., a] - v) ** 2 for a, v in self._faces()
-        ]
-        face = np.argmin(np.stack(distances, axis=-1), axis=-1)
-        for index, (axis, value) in enumerate(self._faces()):
-            inside[..., axis] = np.where(face == index, value, inside[..., axis])
-        return inside
+        squares = outside.sum(axis=-1)[..., None] - outside[..., axes]
+        face = (squares + (points[..., axes] - values) ** 2).argmin(axis=-1)[..., None]
+        return np.where(axes[face] == np.arange(3), values[face], inside)
 
     def place(self, action: FloatArray) -> FloatArray:
         """Where the ray from the middle of the room along the action meets a wall or the ceiling.
@@ -145,18 +147,27 @@ class Walls:
         nearest legal point.
         """
         action = _cut(action)
+        middle, half = self._middle
         reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
-        met = np.clip(action / np.maximum(reach, 1e-3)[..., None], -1, 1)
-        points = _scaled(met, *self.bounds())
-        return np.where((reach < 1e-3)[..., None], self.project(points), points)
+        points = middle + _cut(action / np.maximum(reach, 1e-3)[..., None]) * half
+        nowhere = reach < 1e-3
+        if nowhere.any():
+            points = np.where(nowhere[..., None], self.project(points), points)
+        return points
+
+    @functools.cached_property
+    def _middle(self) -> tuple[FloatArray, FloatArray]:
+        return _middle(*self._corners)
 
     def action(self, points: FloatArray) -> FloatArray:
         """An inverse of `place`: the point itself, in units of the room's half size."""
         return _unscaled(points, *self.bounds())
 
-    def _faces(self) -> list[tuple[int, float]]:
+    @functools.cached_property
+    def _faces(self) -> tuple[np.ndarray, FloatArray]:
+        """The axis on which each wall and the ceiling stands, and where."""
         low, high = self.low, self.high
-        return [(0, low[0]), (0, high[0]), (1, low[1]), (1, high[1]), (2, high[2])]
+        return np.array([0, 0, 1, 1, 2]), np.array([low[0], high[0], low[1], high[1], high[2]])
 
 
 @dataclass(frozen=True)
@@ -222,12 +233,12 @@ def _cut(action: FloatArray) -> FloatArray:
     return np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
 
 
-def _scaled(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Points of the box [low, high] from those of [-1, 1]^3."""
-    return 0.5 * (low + high) + unit * (0.5 * (high - low))
+def _middle(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Middle and half size of a box: [-1, 1]^3 scales to it."""
+    return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _unscaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Inverse of `_scaled`, zero along an axis without extent."""
-    half = 0.5 * (high - low)
-    return np.where(half > 0, (points - 0.5 * (low + high)) / np.where(half > 0, half, 1.0), 0.0)
+    """Points in units of a box's half size, zero along an axis without extent."""
+    middle, half = _middle(low, high)
+    return np.where(half > 0, (points - middle) / np.where(half > 0, half, 1.0), 0.0)

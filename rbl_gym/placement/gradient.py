@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from rbl_gym import bounds
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, check_array
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
-from rbl_gym.placement.problem import Context, PlacementTask, arguments, root_of
+from rbl_gym.placement.problem import (
+    Context,
+    PlacementTask,
+    arguments,
+    checked_context,
+    root_of,
+)
 
 __all__ = ["score_and_gradient"]
 
@@ -21,6 +27,7 @@ def score_and_gradient(
     What blocks sight is taken as it is: an anchor that is about to lose sight of a pose is not
     warned.
     """
+    anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
     square, gradient = _mean_square_and_gradient(*arguments(task, context, anchors))
     root = root_of(square)
     return root, gradient / (2 * root[..., None, None])

@@ -181,11 +181,14 @@ def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
     """Contexts of uniforms (..., `context_uniforms`)."""
     low, high = task.scene.volume.bounds()
     half = (_LEAST + (_MOST - _LEAST) * uniforms[..., :3]) * 0.5 * (high - low)
-    centre = (low + half) + uniforms[..., 3:6] * ((high - half) - (low + half))
+    least = low + half
+    centre = least + uniforms[..., 3:6] * ((high - half) - least)
     of_racks = uniforms[..., _REGION_UNIFORMS:]
     of_racks = of_racks.reshape((*uniforms.shape[:-1], task.racks, _RACK_UNIFORMS))
     drawn = _racks(task, of_racks) if task.racks else of_racks
     own = task.scene.obstruction.boxes
+    if not len(own):
+        return Context(centre, half, drawn)
     own = np.broadcast_to(own, (*uniforms.shape[:-1], *own.shape))
     return Context(centre, half, np.concatenate([own, drawn], axis=-2))
 
@@ -247,12 +250,17 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
     prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
     coincident anchors from winning.
     """
+    anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
+    return score_of_checked(task, context, anchors)
+
+
+def score_of_checked(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
+    """`score`, of arrays that the caller has checked."""
     return root_of(_mean_square(*arguments(task, context, anchors)))
 
 
 def arguments(task: PlacementTask, context: Context, anchors: FloatArray) -> tuple[FloatArray, ...]:
-    """What the score is computed from: arguments of `_mean_square`, checked."""
-    anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
+    """What the score is computed from: arguments of `_mean_square`."""
     places = positions(task, context)
     share = _share(task, context, anchors, places)
     law = ranging.numbers_of(task.scene.noise, len(task.scene.tags))
