@@ -51,6 +51,5 @@ def sample(law: Any, square: float, reference: float, normal: float) -> float:
     """A noisy range, never below zero."""
     if law[0] == 1:
         return math.sqrt(max(law[1] * math.sqrt(reference) * normal + square, 0.0))
-    growth = law[2] * math.sqrt(reference)
-    std = math.sqrt(law[1] * law[1] + growth * growth)
+    std = math.sqrt(law[1] * law[1] + law[2] * law[2] * reference)
     return max(math.sqrt(square) + std * normal, 0.0)

@@ -63,6 +63,7 @@ def add_range_information(
             information,
             x - translation[0], y - translation[1], z - translation[2], xx, xy, xz, yy, yz, zz,
         )  # fmt: skip
+    _mirror_upper(information)
 
 
 @helper
@@ -70,7 +71,7 @@ def _add_lifted(
     H: Any, x: float, y: float, z: float,
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
 ) -> None:  # fmt: skip
-    """Add ``J^T U J`` to H, ``J = [-[c]x, I]`` of the arm c = (x, y, z)."""
+    """Add ``J^T U J`` to the upper half of H, ``J = [-[c]x, I]`` of the arm c = (x, y, z)."""
     # Rows of [c]x U.
     a0, a1, a2 = y * xz - z * xy, y * yz - z * yy, y * zz - z * yz
     b0, b1, b2 = z * xx - x * xz, z * xy - x * yz, z * xz - x * zz
@@ -96,6 +97,11 @@ def _add_lifted(
     H[4, 4] += yy
     H[4, 5] += yz
     H[5, 5] += zz
+
+
+@helper
+def _mirror_upper(H: Any) -> None:
+    """The lower half of a symmetric matrix from its upper one."""
     for i in range(6):
         for j in range(i):
             H[i, j] = H[j, i]
@@ -243,3 +249,4 @@ def _add_angle_information(
             information,
             a - translation[0], b - translation[1], c - translation[2], xx, xy, xz, yy, yz, zz,
         )  # fmt: skip
+    _mirror_upper(information)
