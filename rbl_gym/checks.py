@@ -147,6 +147,14 @@ def check_finite(name: str, array: FloatArray) -> FloatArray:
     return array
 
 
+def all_finite(figures: Any) -> bool:
+    """Whether figures (...), an array or a single number of NumPy's, are all finite; quick."""
+    if figures.ndim == 0:
+        return math.isfinite(figures)
+    # Mostly one product tells; it may overflow.
+    return math.isfinite(np.vdot(figures, figures)) or bool(np.isfinite(figures).all())
+
+
 def are_finite(array: FloatArray, trailing: int) -> BoolArray:
     """Whether all of the last `trailing` axes are finite, (...) of the axes before them."""
     return np.asarray(np.isfinite(array).all(axis=tuple(range(-trailing, 0))))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from scipy import special
 
 from rbl_gym import bounds
-from rbl_gym.checks import FloatArray, checked, kernel
+from rbl_gym.checks import FloatArray, all_finite, checked, kernel
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 
@@ -165,9 +164,9 @@ def judge(
     figures = Figures(
         *_judge(rotation_hat, translation_hat, covariance, rotation, translation, tags)
     )
-    # A NaN or inf of any of them is one here; mostly one product tells, which may overflow.
+    # A NaN or inf of any of them is one here.
     total = figures.nees + figures.score_m + figures.tag_error_m
-    if not (math.isfinite(np.vdot(total, total)) or np.isfinite(total).all()):
+    if not all_finite(total):
         wrong = covariance if np.isfinite(figures.tag_error_m).all() else translation_hat
         raise ValueError(
             "beliefs must be finite, and their covariance positive definite, got "

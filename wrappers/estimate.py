@@ -16,7 +16,7 @@ from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import check_takes_noise
 from rbl_gym.measurements.bearing import AngleNoise
-from rbl_gym.worlds import simulation
+from rbl_gym.measurements.noise_laws import WeakenedNoise
 from rbl_gym.worlds.scene import Scene
 
 REWARDS = ("belief", "error")
@@ -87,7 +87,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._scene = scene_of(env)
         self._reward = check_one_of("reward", reward, REWARDS)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
-        self._tags = np.asarray(self._scene.tags)
+        self._tags = self._scene.body
+        self._rendered = getattr(env.unwrapped, "film", None) is not None
         self._filter = make_filter(env, self._scene, filter, options)
         self._state: Any = None
         self.observation_space = observation_space(self._kind, env.observation_space, self._scene)
@@ -119,10 +120,10 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _judged(self, belief: PoseBelief, info: dict[str, Any]) -> dict[str, Any]:
         """The infos with the errors against the true pose."""
         figures = judge(belief, info["rotation"], info["translation"], self._tags)
-        rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
+        if self._rendered:
+            rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
         info = with_bound(info)
-        for name, value in figures.items():
-            info[name] = float(value)
+        info.update(zip(figures, map(float, figures.values()), strict=True))
         return info
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
@@ -143,8 +144,11 @@ def scene_of(env: Any) -> Scene:
 
 def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of an environment's infos in which b of its bound is `bound_m`, not `score_m`."""
-    names = {"score_m": "bound_m", "_score_m": "_bound_m"}
-    return {names.get(key, key): value for key, value in info.items()}
+    told = dict(info)
+    for name, bound in (("score_m", "bound_m"), ("_score_m", "_bound_m")):
+        if name in told:
+            told[bound] = told.pop(name)
+    return told
 
 
 def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
@@ -195,9 +199,10 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
         return filter.update(state, observation["angles"], observation["station"])
     ranges, anchors, links = observation["ranges"], observation["anchors"], observation["links"]
     if "quality" not in observation:
-        return filter.update(state, ranges, anchors, None if links.all() else links)
+        every = np.count_nonzero(links) == links.size
+        return filter.update(state, ranges, anchors, None if every else links)
     seen = links.astype(np.bool_, copy=False)
-    law = simulation.perceived_noise(scene, ranges, seen, observation["quality"])
+    law = WeakenedNoise(scene.noise, observation["quality"])
     return filter.update(state, ranges, anchors, seen, noise=law)
 
 

@@ -44,6 +44,7 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self._n_anchors = scene_of(env).n_anchors
+        self._rendered = getattr(env.unwrapped, "film", None) is not None
         self.action_space = spaces.MultiBinary(self._n_anchors)
         self._still = _zeros(env.action_space)
 
@@ -62,7 +63,8 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _selected(self, observation: Any, info: dict[str, Any], chosen: BoolArray) -> Any:
         info["chosen"] = chosen.astype(np.int8)
-        rendering.select(self.env, chosen)
+        if self._rendered:
+            rendering.select(self.env, chosen)
         return select(observation, chosen)
 
 

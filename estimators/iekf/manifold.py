@@ -20,6 +20,7 @@ from rbl_gym.checks import (
     HUGE,
     BoolArray,
     FloatArray,
+    all_finite,
     check_array,
     check_count,
     check_duration,
@@ -49,7 +50,7 @@ from rbl_gym.estimators.inputs import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
-from rbl_gym.measurements.noise_laws import LinkNoise, law_of, numbers_of
+from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise, law_of, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -194,28 +195,32 @@ class IteratedEkf:
             state.rotation, state.translation, self.iterations, self.robust,
         )  # fmt: skip
         # One number tells of all: it is finite where the covariance is.
-        if not math.isfinite(np.vdot(cost, cost) if P.ndim > 2 else cost):
+        if not all_finite(cost):
             return None
         return PoseState(rotation, translation, P)
 
     def _plain_law(
         self, ranges: FloatArray, links: Any, noise: Any
-    ) -> tuple[FloatArray, FloatArray | None]:
+    ) -> tuple[FloatArray | None, FloatArray | None]:
         """Shares and law as `update_pose` takes them; None where the long way finds them."""
-        shares = all_links(*ranges.shape[-2:])
         if links is None and noise is None:
-            return shares, numbers_of(self.noise, len(self.tags))
+            return all_links(*ranges.shape[-2:]), numbers_of(self.noise, len(self.tags))
         if (
-            type(noise) is LinkNoise
-            and type(links) is np.ndarray
-            and links.dtype == np.bool_
-            and links.shape == noise.std_m.shape == ranges.shape
+            type(links) is not np.ndarray
+            or links.dtype != np.bool_
+            or links.shape != ranges.shape
             # A lost range may be anything: the long way puts zeros in its place.
-            and math.isfinite(np.vdot(ranges, ranges))
-            and noise.std_m.min() > 0
+            or not math.isfinite(np.vdot(ranges, ranges))
         ):
+            return None, None
+        if type(noise) is LinkNoise and noise.std_m.shape == ranges.shape and noise.std_m.min() > 0:
             return links / (noise.std_m * noise.std_m), WEIGHTS
-        return shares, None
+        if type(noise) is WeakenedNoise and noise.share.shape == ranges.shape[:-1]:
+            numbers = numbers_of(noise.law, len(self.tags))
+            # The range of a reference tag may be lost.
+            if numbers is not None and numbers[3] < 0:
+                return links * noise.share[..., None], numbers
+        return None, None
 
     def weighed(
         self,

@@ -13,6 +13,7 @@ import numpy as np
 
 from rbl_gym.bounds.pose import symmetric
 from rbl_gym.checks import FloatArray, kernel
+from rbl_gym.estimators.filter import inverse
 from rbl_gym.estimators.linear.squared_range import (
     Statistic,
     compressed,
@@ -25,6 +26,8 @@ from rbl_gym.kernels import compiled
 # Behind the door: what comes to it was checked.
 _EXP = kernel(rotations.exp)
 _EYE = np.eye(12)
+# The angular velocity of a twist.
+_TURN = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 class Motion(NamedTuple):
@@ -148,6 +151,12 @@ def compress(
     return compressed(statistic(ranges, anchors, tags, weights))
 
 
+@compiled("linear_filter:inverse")
+def inverse12(matrix: FloatArray) -> FloatArray:
+    """Inverse of symmetric positive definite matrices (..., 12, 12)."""
+    return inverse(matrix)
+
+
 class FilterPy:
     """filterpy's KalmanFilter on the compressed measurement; one body."""
 
@@ -158,7 +167,9 @@ class FilterPy:
         """As `Batched.predict`."""
         kf = cls._filter(mean, P)
         twist, dt, rate = motion
-        kf.F, kf.Q = transition(_EXP(twist[:3] * dt)), dt * rate * _EYE
+        # F is what a turn alone does to the unit vectors.
+        turn = twist * _TURN
+        kf.F, kf.Q = predict_mean(_EYE, turn, dt).T, np.diag(dt * rate)
         kf.predict(u=twist[3:, None] * dt)
         return cls._result(kf)
 
@@ -203,8 +214,10 @@ def engine_for(name: str, **arrays: tuple[int, ...]) -> type[Batched] | type[Fil
     ValueError
         For filterpy, where an argument has leading axes.
     """
+    if name == "batched":
+        return Batched
     many = {key: batch for key, batch in arrays.items() if batch}
-    if name == "batched" or (name == "auto" and many):
+    if name == "auto" and many:
         return Batched
     if many:
         key, batch = next(iter(many.items()))
@@ -221,6 +234,7 @@ def _kalman_filter() -> Any:
     from filterpy.kalman import KalmanFilter  # slow to import, and not always needed
 
     kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
+    kf.inv = inverse12
     # Without B filterpy ignores u in silence.
     kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])  # pyright: ignore[reportAttributeAccessIssue]
     return kf

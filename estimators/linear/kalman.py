@@ -224,8 +224,8 @@ class KalmanFamily:
         return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
 
     def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
-        vague = np.asarray(_is_vague(state.covariance, anchors, VAGUE_ENTRY_VARIANCE))
-        if not vague.any():
+        vague = _is_vague(state.covariance, anchors, VAGUE_ENTRY_VARIANCE)
+        if not np.count_nonzero(vague):
             return
         rank = geometric_rank(anchors, self.tags)
         if ((rank < 12) & vague).any():

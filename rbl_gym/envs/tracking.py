@@ -224,7 +224,7 @@ def check_action(action: ArrayLike, size: int) -> FloatArray:
 
 def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
     """Whether an action is the only one of fixed anchors: zeros of this shape."""
-    return action.shape == shape and action.dtype.kind in "iub" and not action.any()
+    return action.shape == shape and action.dtype.kind in "iub" and not np.count_nonzero(action)
 
 
 def observation_space(scene: Scene) -> spaces.Dict:

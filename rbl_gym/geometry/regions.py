@@ -73,9 +73,7 @@ class Box:
 
     def project(self, points: FloatArray) -> FloatArray:
         """Every coordinate clipped."""
-        low, high = self._corners
-        clipped = np.maximum(points, low)
-        return np.minimum(clipped, high, out=clipped)
+        return points.clip(*self._corners)
 
     @functools.cached_property
     def _corners(self) -> tuple[FloatArray, FloatArray]:

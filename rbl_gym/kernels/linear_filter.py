@@ -187,6 +187,14 @@ def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any)
     _invert_factored(L, new_P)
 
 
+@gufunc("(p,p)->(p,p)")
+def inverse(matrix: Any, inverted: Any) -> None:
+    """Inverse of a symmetric positive definite matrix of the filter's size."""
+    L = np.empty((_STATES, _STATES))
+    _cholesky(matrix, L)
+    _invert_factored(L, inverted)
+
+
 @gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p)")
 def update_mean(
     mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any

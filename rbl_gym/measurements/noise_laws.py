@@ -18,7 +18,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
 __all__ = [
     "NOISE_FORMS", "NOISE_LAWS", "LinkNoise", "NoiseLaw", "RangeNoise", "SquaredRangeNoise",
-    "reference_range",
+    "WeakenedNoise", "reference_range",
 ]  # fmt: skip
 
 
@@ -125,7 +125,10 @@ class RangeNoise:
         square = self._scale(ranges, links) ** 2
         if self.proportional == 0:
             return 4 * self.floor_m**2 * square
-        return 4 * square * (self.floor_m**2 + self.proportional**2 * square)
+        variance = (4 * self.proportional**2) * square
+        variance += 4 * self.floor_m**2
+        variance *= square
+        return variance
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
         """Ranges with noise of this law, never below zero."""
@@ -226,6 +229,42 @@ class LinkNoise:
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
         """Ranges with noise of this law, never below zero."""
         return np.maximum(distances + self.std_m * normals, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class WeakenedNoise:
+    """A law of which the links of an anchor have only a share of the information.
+
+    What a receiver knows that learns with a range how good the link is.
+
+    Parameters
+    ----------
+    law
+        Of links with all of it.
+    share
+        (..., M), 0 to 1; where it is 0, the variance is inf.
+    """
+
+    law: NoiseLaw
+    share: FloatArray
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        return self._weakened(self.law.variance(ranges, links))
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance of the squared ranges [m^4]; see `NoiseLaw`."""
+        return self._weakened(self.law.squared_range_variance(ranges, links))
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of this law, never below zero."""
+        return self.law.sample(distances, normals / np.sqrt(self.share)[..., None])
+
+    def _weakened(self, variance: FloatArray) -> FloatArray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return variance / self.share[..., None]
 
 
 def numbers_of(noise: NoiseLaw, n_tags: int) -> FloatArray | None:

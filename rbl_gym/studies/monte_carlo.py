@@ -11,6 +11,7 @@ from rbl_gym import bounds, estimators, metrics
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.linear.kalman import KalmanState
 from rbl_gym.measurements import ranging
+from rbl_gym.measurements.noise_laws import WeakenedNoise
 from rbl_gym.studies.epochs import Reading, Step, pose_errors, stack_beliefs, timed, track_epochs
 from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
@@ -130,7 +131,7 @@ def told_readings(
         at, law = simulation.epoch_of(episode, epoch), None
         if scene.obstacles:
             quality = simulation.link_quality(scene, at, episode.anchors)
-            law = simulation.perceived_noise(told, measured.ranges, measured.links, quality)
+            law = WeakenedNoise(told.noise, quality)
         twist = at.twist if epoch else None
         readings.append(Reading(measured.ranges, anchors, measured.links, law, twist, told.dt))
     return readings

@@ -191,6 +191,21 @@ class Scene:
         std = [self.initial_rotation_rad] * 3 + [self.initial_translation_m] * 3
         return np.diag(np.square(std))
 
+    @property
+    def steps_of_motion(self) -> int:
+        """Steps of an episode, one more where the prior is older than epoch 0."""
+        return self.steps + (self.prior == "start")
+
+    @functools.cached_property
+    def n_waypoints(self) -> int:
+        """Points that an episode draws in the volume, the start among them."""
+        if self.trajectory != "waypoints":
+            return 1
+        extent = max(float(np.linalg.norm(np.ptp(self.volume.bounds(), axis=0))), 1e-9)
+        # Legs average above a quarter of the extent: four times as many as that calls for, and 8.
+        travelled = self.speed_m_s * self.dt * self.steps_of_motion
+        return 8 + int(np.ceil(16 * travelled / extent))
+
     @functools.cached_property
     def range_limit_m(self) -> float:
         """A range that no measurement of this scene exceeds (measurements are clipped to it)."""

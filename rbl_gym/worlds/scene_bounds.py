@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rbl_gym.bounds import posterior
-from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.checks import BoolArray, FloatArray, all_finite
 from rbl_gym.measurements import ranging
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scene import Scene
@@ -58,6 +56,6 @@ def posterior_step(
         law,
         simulation.shares(scene, at, anchors, links),
     )
-    if not math.isfinite(np.vdot(score, score)):
+    if not all_finite(score):
         raise ValueError("the information about the pose is singular or not finite")
     return information, score

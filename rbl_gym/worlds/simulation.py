@@ -132,34 +132,21 @@ def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] 
     return build_episode(scene, draw(scene, rng, batch))
 
 
-def _steps(scene: Scene) -> int:
-    """Steps of motion: one more than the episode's where the prior is older than epoch 0."""
-    return scene.steps + (scene.prior == "start")
-
-
 def _links(scene: Scene) -> int:
     return scene.n_anchors * len(scene.tags)
 
 
 def _normal_sizes(scene: Scene) -> tuple[int, int, int, int]:
     """Normals of the start, the process, the ranges, the random twists."""
-    held = -(-_steps(scene) // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
-    return _START_NORMALS, 6 * _steps(scene), (scene.steps + 1) * _links(scene), held
+    held = -(-scene.steps_of_motion // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
+    return _START_NORMALS, 6 * scene.steps_of_motion, (scene.steps + 1) * _links(scene), held
 
 
 def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
     """Uniforms of the way-points, the orbit's phase, the anchors, the links."""
     anchors = 3 * scene.n_anchors if scene.anchors is None else 0
     links = 2 * (scene.steps + 1) * _links(scene) if scene.links.is_random else 0
-    return 3 * _n_points(scene), int(scene.trajectory == "orbit"), anchors, links
-
-
-def _n_points(scene: Scene) -> int:
-    if scene.trajectory != "waypoints":
-        return 1
-    extent = max(float(np.linalg.norm(np.ptp(scene.volume.bounds(), axis=0))), 1e-9)
-    # Legs average above a quarter of the extent: four times as many as that calls for, and 8.
-    return 8 + int(np.ceil(16 * scene.speed_m_s * scene.dt * _steps(scene) / extent))
+    return 3 * scene.n_waypoints, int(scene.trajectory == "orbit"), anchors, links
 
 
 def build_episode(scene: Scene, draws: Draws) -> Episode:
@@ -168,7 +155,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     start, process, _, held = _split(draws.normals, _normal_sizes(scene))
     places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
-    steps = _steps(scene)
+    steps = scene.steps_of_motion
     path = motion.simulate(trajectory, scene.dt, scene.process, process.reshape((*batch, steps, 6)))
     twists = np.broadcast_to(trajectory.twists, (*batch, steps, 6))
     offset = start[..., 7:]
@@ -209,7 +196,7 @@ def _trajectory(
     scene: Scene, start: FloatArray, places: FloatArray, phase: FloatArray, held: FloatArray
 ) -> motion.Trajectory:
     """The scene's nominal motion; way-points and the start are uniform in its volume."""
-    batch, steps = start.shape[:-1], _steps(scene)
+    batch, steps = start.shape[:-1], scene.steps_of_motion
     if scene.start_rotation is None:
         rotation = rotations.from_quaternion(start[..., :4])
     else:
@@ -292,17 +279,6 @@ def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
 def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> Any:
     """Share (..., M, N) of its information that each link has: none where it gave no range."""
     return links * link_quality(scene, at, anchors)[..., None] if scene.obstacles else links
-
-
-def perceived_noise(
-    scene: Scene, ranges: FloatArray, links: BoolArray, quality: FloatArray
-) -> ranging.LinkNoise:
-    """The noise of an epoch to a receiver that learns how good a link is with its range.
-
-    `quality` (..., M) is that of `link_quality`, `ranges` and `links` are (..., M, N).
-    """
-    variance = scene.noise.variance(np.where(links, ranges, 1.0), links)
-    return ranging.LinkNoise(np.sqrt(variance / np.where(quality > 0, quality, 1.0)[..., None]))
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:
