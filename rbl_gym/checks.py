@@ -198,7 +198,7 @@ def as_tuples(value: FloatArray) -> Any:
 
 def check_duration(name: str, value: ArrayLike) -> Any:
     """Seconds that are not negative, a float or an array (...) of trials; or a ValueError."""
-    if not getattr(value, "ndim", 0) and not isinstance(value, list | tuple):
+    if type(value) is float or not (getattr(value, "ndim", 0) or isinstance(value, list | tuple)):
         return check_number(name, value, low=0.0)
     array = check_array(name, value, ())
     if (array < 0).any():

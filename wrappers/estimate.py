@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
 from rbl_gym import estimators, metrics, rendering
-from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.checks import check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import check_takes_noise
 from rbl_gym.measurements.bearing import AngleNoise
@@ -119,11 +119,11 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
     def _judged(self, belief: PoseBelief, info: dict[str, Any]) -> dict[str, Any]:
         """The infos with the errors against the true pose."""
-        figures = judge(belief, info["rotation"], info["translation"], self._tags)
+        figures = metrics.judge(*belief[:3], info["rotation"], info["translation"], self._tags)
         if self._rendered:
             rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
         info = with_bound(info)
-        info.update(zip(figures, map(float, figures.values()), strict=True))
+        info.update(zip(figures._fields, map(float, figures), strict=True))
         return info
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
@@ -204,13 +204,6 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
     seen = links.astype(np.bool_, copy=False)
     law = WeakenedNoise(scene.noise, observation["quality"])
     return filter.update(state, ranges, anchors, seen, noise=law)
-
-
-def judge(
-    belief: PoseBelief, rotation: FloatArray, translation: FloatArray, tags: FloatArray
-) -> dict[str, FloatArray]:
-    """Errors of beliefs against true poses, their NEES and score, arrays (...)."""
-    return metrics.judge(*belief[:3], rotation, translation, tags)._asdict()
 
 
 def present(

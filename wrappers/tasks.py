@@ -236,7 +236,7 @@ class _AnchorSelection:
         """Which anchors (..., M) an action chooses, int8; ties go to the lower number."""
         if self.mode == "priced":
             return action
-        best = np.argsort(-action, axis=-1, kind="stable")[..., : self.k]
+        best = (-action).argsort(axis=-1, kind="stable")[..., : self.k]
         chosen = np.zeros(action.shape, dtype=np.int8)
         chosen[(*_worlds(action.shape[:-1]), best)] = 1
         return chosen

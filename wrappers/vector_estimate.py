@@ -10,13 +10,12 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
-from rbl_gym import rendering
+from rbl_gym import metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.wrappers.estimate import (
     OBSERVATIONS,
     REWARDS,
-    judge,
     make_filter,
     measured_of,
     observation_space,
@@ -61,7 +60,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         self._scene = scene_of(env)
         self._reward = check_one_of("reward", reward, REWARDS)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
-        self._tags = np.asarray(self._scene.tags)
+        self._tags = self._scene.body
         self._filter = make_filter(env, self._scene, filter, options)
         self._state: Any = None
         self._belief: PoseBelief | None = None
@@ -151,7 +150,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             rotation = np.where(last[:, None, None], final["rotation"], rotation)
             translation = np.where(last[:, None], final["translation"], translation)
         assert self._belief is not None
-        return judge(self._belief, rotation, translation, self._tags)
+        return metrics.judge(*self._belief[:3], rotation, translation, self._tags)._asdict()
 
     def _finish(
         self, info: dict[str, Any], figures: dict[str, FloatArray], last: BoolArray

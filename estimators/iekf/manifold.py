@@ -112,9 +112,9 @@ class IteratedEkf:
             rotation.shape[:-2], translation.shape[:-1], covariance.shape[:-2]
         )
         return PoseState(
-            np.broadcast_to(rotation, (*batch, 3, 3)).copy(),
-            np.broadcast_to(translation, (*batch, 3)).copy(),
-            np.broadcast_to(covariance, (*batch, 6, 6)).copy(),
+            np.full((*batch, 3, 3), rotation),
+            np.full((*batch, 3), translation),
+            np.full((*batch, 6, 6), covariance),
         )
 
     def predict(self, state: PoseState, twist: ArrayLike, dt: ArrayLike) -> PoseState:

@@ -261,7 +261,7 @@ def check_actions(
         raise ValueError(f"{name} must be finite, got {array[~np.isfinite(array)][0]}")
     if isinstance(space, gym.spaces.Box):
         return array.astype(np.float64)
-    if not whole and array.dtype == np.int8 and array.view(np.uint8).max() <= 1:
+    if not whole and array.dtype == np.int8 and not np.count_nonzero(array & ~1):
         return array.copy()
     # Before the cast: a narrow type would wrap large numbers round into the space.
     if isinstance(space, gym.spaces.Discrete):

@@ -185,11 +185,13 @@ class Scene:
         body.flags.writeable = False
         return body
 
-    @property
+    @functools.cached_property
     def prior_covariance(self) -> FloatArray:
-        """Pose covariance (6, 6) of the prior."""
+        """Pose covariance (6, 6) of the prior, not to be written to."""
         std = [self.initial_rotation_rad] * 3 + [self.initial_translation_m] * 3
-        return np.diag(np.square(std))
+        covariance = np.diag(np.square(std))
+        covariance.flags.writeable = False
+        return covariance
 
     @property
     def steps_of_motion(self) -> int:

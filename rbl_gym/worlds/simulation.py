@@ -157,7 +157,8 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = scene.steps_of_motion
     path = motion.simulate(trajectory, scene.dt, scene.process, process.reshape((*batch, steps, 6)))
-    twists = np.broadcast_to(trajectory.twists, (*batch, steps, 6))
+    twists = np.zeros((*batch, scene.steps + 1, 6))
+    twists[..., scene.steps + 1 - steps :, :] = trajectory.twists
     offset = start[..., 7:]
     covariance = scene.prior_covariance
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
@@ -172,7 +173,6 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
             rotations.exp(scene.initial_rotation_rad * offset[..., :3]) @ rotation,
             translation + scene.initial_translation_m * offset[..., 3:],
         )
-        twists = np.concatenate([np.zeros((*batch, 1, 6)), twists], axis=-2)
     if scene.anchors is None:
         spots = spots.reshape((*batch, scene.n_anchors, 3))
         if scene.anchor_start_m is None:
@@ -181,8 +181,8 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
             around = path.translation[..., :1, :] + scene.anchor_start_m * (2 * spots - 1)
             anchors = scene.anchor_region.project(around)
     else:
-        anchors = np.broadcast_to(scene.anchors, (*batch, scene.n_anchors, 3))
-    covariance = np.broadcast_to(covariance, (*batch, 6, 6))
+        anchors = np.full((*batch, scene.n_anchors, 3), scene.anchors)
+    covariance = np.full((*batch, 6, 6), covariance)
     random = of_ranges(scene, draws)
     return Episode(*path, twists, *random, *prior, covariance, anchors)
 
