@@ -286,6 +286,7 @@ def test_linear_update(batch, weights, m, n, flat):
     assert_equal_forms(engines.update_covariance, np.eye(12), *linear.epoch[1:])
     # The textbook form adds and subtracts numbers of the size of the squared ranges.
     assert_equal_forms(engines.update_mean, linear.mean, P, *linear.epoch, atol=1e-8)
+    assert_equal_forms(engines.inverse12, np.eye(12) + P)
 
 
 @every_batch
