@@ -37,7 +37,7 @@ class _Task(StatedLength):
         The last observation of `inner`, None before the first reset.
     """
 
-    inner: Any
+    inner: Any = None
     scene: Scene
     seen: dict[str, np.ndarray] | None = None
 
@@ -147,5 +147,6 @@ class VectorTaskEnv(_Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportI
         return self._show(self._told()), reward - price, *ended, info
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the stack."""
-        self.inner.close(**kwargs)
+        """Close the stack, where there is one: a refused constructor is closed by `__del__` too."""
+        if self.inner is not None:
+            self.inner.close(**kwargs)
