@@ -234,7 +234,7 @@ def _kalman_filter() -> Any:
     from filterpy.kalman import KalmanFilter  # slow to import, and not always needed
 
     kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
-    kf.inv = inverse12
+    kf.inv = inverse12  # pyright: ignore[reportAttributeAccessIssue]
     # Without B filterpy ignores u in silence.
     kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])  # pyright: ignore[reportAttributeAccessIssue]
     return kf
