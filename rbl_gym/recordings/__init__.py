@@ -1,11 +1,7 @@
 """Recordings: real measurement logs as arrays."""
 
-from rbl_gym.recordings.reading import (
-    Recording,
-    Truth,
-    read_recording,
-    truth_at,
-)
+from rbl_gym.recordings.reading import Recording, read_recording
+from rbl_gym.recordings.truth import Truth, truth_at
 
 __all__ = [
     "Recording",

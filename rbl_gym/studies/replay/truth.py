@@ -10,7 +10,7 @@ import numpy as np
 from rbl_gym import motion, recordings
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import rotations
-from rbl_gym.recordings.reading import Truth
+from rbl_gym.recordings.truth import Truth
 
 # Epochs further apart than this are seldom a log in seconds.
 _LONG_STEP_S = 10.0
