@@ -274,7 +274,7 @@ def test_biases_of_a_real_recording(calibrated, options, limits, tmp_path, capsy
 @pytest.mark.parametrize("every", [16, pytest.param(4, marks=pytest.mark.long)])
 def test_static_runs_of_a_real_recording(every, tmp_path):
     """30 poses, each from nothing: at most 0.035 m over all runs, thinned by so much."""
-    settings = replay.Settings(
+    settings = replay.Settings.of(
         filter="iekf-bias", planar=True, height_offset_m=0.08, yaw_offset_deg=5.6, range_std_m=0.06
     )
     truth = {

@@ -95,7 +95,7 @@ def log(std: float) -> recordings.Recording:
 
 @pytest.mark.parametrize("name", ["iekf", "kf", "iekf-bank", "iekf-cv", "iekf-bias", NEW])
 def test_a_recording_with_its_own_noise_is_weighed_by_it(name):
-    settings = replay.Settings(filter=name, robust=False)
+    settings = replay.Settings.of(filter=name, robust=False)
     found = []
     for std in (0.02, 10.0):
         track = replay.track_recording(log(std), settings)
@@ -118,7 +118,7 @@ def test_a_filter_of_the_old_interface_is_refused_by_name_where_it_matters():
     with pytest.raises(ValueError, match=REFUSAL):
         monte_carlo.scene_filter(scenes.get("hall"), OLD, {})
     with pytest.raises(ValueError, match=REFUSAL + ".*recording"):
-        replay.track_recording(log(0.02), replay.Settings(filter=OLD))
+        replay.track_recording(log(0.02), replay.Settings.of(filter=OLD))
     stage = stages.scene_stage({"name": "hall", "steps": 2}, "nominal", 2, 0)
     record, _ = stages.run_filter(stage, OLD, {})
     assert record["status"] == "refused"
@@ -126,7 +126,7 @@ def test_a_filter_of_the_old_interface_is_refused_by_name_where_it_matters():
     # Elsewhere it runs as ever.
     env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene="uwb_room"), OLD)
     assert env.reset(seed=1)[1]["nees"] > 0
-    replay.track_recording(log(0.02), replay.Settings(filter=OLD, range_std_m=0.1))
+    replay.track_recording(log(0.02), replay.Settings.of(filter=OLD, range_std_m=0.1))
 
 
 @pytest.mark.parametrize("name", ["kf", "iekf", "iekf-bank", "iekf-cv", "iekf-bias"])

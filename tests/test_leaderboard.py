@@ -484,7 +484,7 @@ def test_a_recording_is_a_scene(tmp_path, recording, capsys):
     found = {(r["condition"], r["filter"]): r for r in rows(data)}
     assert len(found) == 12
     first = found["nominal", "iekf"]
-    settings = replay.Settings(range_std_m=0.03, walk_m=0.5, walk_deg=25, robust=False)
+    settings = replay.Settings.of(range_std_m=0.03, walk_m=0.5, walk_deg=25, robust=False)
     files = {name: tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags", "truth")}
     log = read_recording(**files)
     track = replay.track_recording(log, settings)

@@ -196,7 +196,7 @@ def test_scenes(changes, message):
 
 def test_replays():
     with pytest.raises(ValueError, match="height_offset_m means nothing without planar"):
-        replay.Settings(height_offset_m=0.1)
+        replay.Settings.of(height_offset_m=0.1)
     times = np.arange(3.0)
     truth = Truth(times + 100, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
     links = np.ones((3, 4, 5), dtype=bool)

@@ -41,7 +41,7 @@ def record(anchors, tags, seed=0, epochs=25, noise_m=0.03, start=(1.5, 1.2, 0.8)
 
 
 def outcome(recording, **options):
-    settings = replay.Settings(**{**OPTIONS, **options})
+    settings = replay.Settings.of(**{**OPTIONS, **options})
     track = replay.track_recording(recording, settings)
     found = replay.track_errors(recording, track, settings)
     return track, replay.track_figures(recording, track, found, settings)
@@ -120,7 +120,7 @@ def test_one_range_at_a_time():
     recording = whole._replace(
         links=one, ranges=whole.ranges * one, range_std=np.where(one, 0.03, 0.0)
     )
-    settings = replay.Settings(walk_m=0.3, walk_deg=20)
+    settings = replay.Settings.of(walk_m=0.3, walk_deg=20)
     judge = replay.recording_filter(recording, settings)
     P = np.broadcast_to(1e-3 * np.eye(6), (count, 6, 6))
     assert whole.truth is not None
@@ -138,7 +138,9 @@ def test_one_range_at_a_time():
 def test_a_mirrored_planar_track_is_held_by_its_height():
     recording = record(CEILING, FLAT)
     assert (
-        replay.track_recording(recording, replay.Settings(planar=True, height_offset_m=1.2)).other
+        replay.track_recording(
+            recording, replay.Settings.of(planar=True, height_offset_m=1.2)
+        ).other
         is None
     )
 
@@ -154,7 +156,7 @@ def test_map_coordinates_give_the_track_of_local_ones():
     for name in ("iekf", "iekf-bank"):
         tracks = [
             replay.track_recording(
-                recording, replay.Settings(**{**OPTIONS, "filter": name, "below_anchors": True})
+                recording, replay.Settings.of(**{**OPTIONS, "filter": name, "below_anchors": True})
             )
             for recording in (near, far)
         ]
@@ -207,14 +209,14 @@ def test_the_command_takes_a_volume(tmp_path, capsys):
 )  # fmt: skip
 def test_wrong_volumes_are_named(volume, message):
     with pytest.raises(ValueError, match=message):
-        replay.Settings(volume=volume)
+        replay.Settings.of(volume=volume)
 
 
 def test_a_volume_out_of_reach_is_named():
-    settings = replay.Settings(volume=(None, None, None, None, 50, None))
+    settings = replay.Settings.of(volume=(None, None, None, None, 50, None))
     with pytest.raises(ValueError, match=r"volume must be in reach of the anchors, .* got \(None"):
         replay.recording_filter(record(CEILING, FLAT, epochs=2), settings)
-    settings = replay.Settings(volume=(None, None, None, None, 2.5, None), below_anchors=True)
+    settings = replay.Settings.of(volume=(None, None, None, None, 2.5, None), below_anchors=True)
     with pytest.raises(ValueError, match="volume must reach below the anchors' mean height of 2 m"):
         replay.recording_filter(record(CEILING, FLAT, epochs=2), settings)
 
@@ -222,7 +224,7 @@ def test_a_volume_out_of_reach_is_named():
 def test_the_bank_covers_its_rivals():
     """Its covariance is the second moment about the leader of a mixture."""
     recording = record(CEILING, FLAT)
-    settings = replay.Settings(**OPTIONS, filter="iekf-bank")
+    settings = replay.Settings.of(**OPTIONS, filter="iekf-bank")
     bank: Any = replay.recording_filter(recording, settings)
     states = [step.state for step in replay.recording_steps(recording, settings, bank)]
     state, belief = states[3], bank.belief(states[3])

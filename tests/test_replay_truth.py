@@ -167,7 +167,7 @@ def test_two_faults_are_both_hinted():
 
 
 def test_a_planar_offset_of_the_heading_is_hinted():
-    settings = replay.Settings(planar=True, height_offset_m=0.0)
+    settings = replay.Settings.of(planar=True, height_offset_m=0.0)
     times, _, place = moving(0.05)
     flat = motion.Path(rotations.exp(0.4 * times[:, None] * [0, 0, 1]), place)
     turn = rotations.exp(np.array([0, 0, -0.2]))
@@ -180,7 +180,7 @@ def test_a_planar_offset_of_the_heading_is_hinted():
 
 
 def test_another_order_of_quaternions_is_hinted_for_planar_bodies():
-    settings = replay.Settings(planar=True, height_offset_m=0.0)
+    settings = replay.Settings.of(planar=True, height_offset_m=0.0)
     times, _, place = moving(0.05)
     q = rotations.quaternion(rotations.exp(0.4 * times[:, None] * [0, 0, 1]))
     turned = rotations.from_quaternion(np.roll(q, -1, axis=-1))

@@ -77,8 +77,33 @@ def test_bench(capsys, tmp_path):
     assert records.rerun(mine, workers=backends.HERE)["identical"] == 2
 
 
+def test_settings_of_a_replay_by_group_and_by_name():
+    grouped = replay.Settings(
+        range_std_m=0.05,
+        motion=replay.Motion(walk_m=0.3),
+        biases=replay.Biases(bias_time_s=None),
+        loss=replay.Loss(robust=False),
+        knowledge=replay.Knowledge(planar=True, height_offset_m=0.2),
+        comparison=replay.Comparison(yaw_offset_deg=7),
+    )
+    named = {
+        "range_std_m": 0.05,
+        "walk_m": 0.3,
+        "bias_time_s": None,
+        "robust": False,
+        "planar": True,
+        "height_offset_m": 0.2,
+        "yaw_offset_deg": 7,
+    }
+    assert replay.Settings.of(**named) == grouped
+    assert grouped.flat() == {**replay.Settings().flat(), **named}
+    assert grouped.changed(walk_m=0.1).motion == replay.Motion()
+    with pytest.raises(ValueError, match="settings have no 'walk'; they have filter, "):
+        replay.Settings.of(walk=0.1)
+
+
 def test_replay_in_one_call_is_the_four():
-    recording, settings = log(0.02), replay.Settings(walk_m=0.3)
+    recording, settings = log(0.02), replay.Settings.of(walk_m=0.3)
     found = replay.replay_recording(recording, settings)
     assert isinstance(found, replay.Replayed)
     track = replay.track_recording(recording, settings)
@@ -89,7 +114,7 @@ def test_replay_in_one_call_is_the_four():
     np.testing.assert_array_equal(replay.origin_of(recording), np.zeros(3))
     assert replay.volume_of(recording, settings) is None
     checked = replay.check_replay(recording, settings)
-    assert checked.height_offset_m == replay.height_offset(recording, settings)
+    assert checked.knowledge.height_offset_m == replay.height_offset(recording, settings)
     assert checked == found.settings
     # The filter by its name, with options of its own.
     filter = replay.named_filter(recording, settings, "iekf", {"robust": True})

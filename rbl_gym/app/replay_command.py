@@ -14,120 +14,121 @@ from rbl_gym.app.terminal import (
     write_json,
 )
 
+# Law of the biases of radios that nobody calibrated: constant ones, learned.
+_RAW = {"bias_std_m": 0.05, "bias_time_s": None, "bias_common_m": 0.1}
+
 
 def add_replay(commands: Any) -> None:
-    """The parser of ``rbl-gym replay``."""
+    """The parser of ``rbl-gym replay``.
+
+    An argument of a field of `rbl_gym.studies.replay.Settings` has its name and no default: what
+    is not given is left to the settings.
+    """
     replay = commands.add_parser(
         "replay",
         help="a recording of ranges through a filter",
         description="Track a recorded body; with --truth, the errors. All files are CSV; "
         "see docs/recordings.md for their columns.",
     )
+    _add_files(replay)
+    _add_knowledge(replay.add_argument_group("what is known of the body's place"))
+    _add_filter(replay.add_argument_group("filter"))
+    _add_motion(replay.add_argument_group("how the body moves"))
+    _add_biases(replay.add_argument_group("biases of the links (filter iekf-bias)"))
+    _add_comparison(replay.add_argument_group("comparison with the truth"))
+    _add_output(replay.add_argument_group("output"))
+    replay.set_defaults(run=_replay)
+
+
+def _add_files(group: Any) -> None:
     for name, text in (
         ("ranges", "t,anchor,tag,range[,std,valid] or t,a0t0,a0t1,..."),
         ("anchors", "anchor,x,y,z"),
         ("tags", "tag,x,y,z"),
     ):
-        replay.add_argument(f"--{name}", required=True, metavar="F", help=text)
-    replay.add_argument("--truth", metavar="F", help="t,x,y,z,qw,qx,qy,qz or t,x,y[,z],yaw_deg")
-    replay.add_argument("--calibration", metavar="F", help="anchor,tag,bias_m,slope")
-    replay.add_argument("--planar", action="store_true", help="hold height, roll and pitch")
-    replay.add_argument(
+        group.add_argument(f"--{name}", required=True, metavar="F", help=text)
+    group.add_argument("--truth", metavar="F", help="t,x,y,z,qw,qx,qy,qz or t,x,y[,z],yaw_deg")
+    group.add_argument("--calibration", metavar="F", help="anchor,tag,bias_m,slope")
+
+
+def _add_knowledge(group: Any) -> None:
+    group.add_argument(
+        "--planar", action="store_true", default=None, help="hold height, roll and pitch"
+    )
+    _add_number(
+        group,
         "--height-offset-m",
-        type=float,
-        metavar="X",
-        help="of the tags' mean height below the anchors', with --planar; default 0 where the "
+        "of the tags' mean height below the anchors', with --planar; default 0 where the "
         "anchors stand at one height",
     )
-    replay.add_argument(
-        "--yaw-offset-deg",
-        type=float,
-        default=0.0,
-        metavar="X",
-        help="yaw error = estimate - (truth + offset)",
-    )
-    replay.add_argument(
-        "--truth-gap-s",
-        type=float,
-        default=0.5,
-        metavar="X",
-        help="longest gap that is bridged between truth and ranges, default 0.5",
-    )
-    replay.add_argument(
+    group.add_argument(
         "--volume",
         type=_volume,
         metavar="xmin,xmax,ymin,ymax,zmin,zmax",
         help="where the body's origin may be, metres: tells a pose from its mirror image; empty "
         "where there is no limit, as in --volume=,,,,,1.8; write --volume=-1,... for a minus",
     )
-    replay.add_argument(
+    group.add_argument(
         "--below-anchors",
         action="store_true",
+        default=None,
         help="the body stays below the anchors' mean height",
     )
-    replay.add_argument("--filter", metavar="NAME", help="default iekf, iekf-bias with a bias")
-    replay.add_argument(
-        "--range-std-m",
-        type=float,
-        metavar="X",
-        help="of a range; default the recording's own, else 0.12",
+
+
+def _add_filter(group: Any) -> None:
+    group.add_argument("--filter", metavar="NAME", help="default iekf, iekf-bias with a bias")
+    _add_number(group, "--range-std-m", "of a range; default the recording's own, else 0.12")
+    group.add_argument(
+        "--no-robust",
+        dest="robust",
+        action="store_false",
+        default=None,
+        help="squares in place of Huber's loss",
     )
-    replay.add_argument(
-        "--walk-m",
-        type=float,
-        default=0.1,
-        metavar="X",
-        help="random walk of the position after 1 s, default 0.1",
+
+
+def _add_motion(group: Any) -> None:
+    _add_number(group, "--walk-m", "random walk of the position after 1 s, default 0.1")
+    _add_number(group, "--walk-deg", "random walk of the rotation after 1 s, default 7")
+    _add_number(
+        group, "--accel-m", "filter iekf-cv: change of the speed (m/s) after 1 s, default 0.5"
     )
-    replay.add_argument(
-        "--walk-deg",
-        type=float,
-        default=7.0,
-        metavar="X",
-        help="random walk of the rotation after 1 s, default 7",
+    _add_number(
+        group,
+        "--accel-deg",
+        "filter iekf-cv: of the turn rate (deg/s) after 1 s, default 30",
     )
-    replay.add_argument(
-        "--bias-std-m",
-        type=float,
-        metavar="X",
-        help="filter iekf-bias: of a link's bias, default 0.02, with --raw 0.05",
-    )
-    replay.add_argument(
-        "--bias-time-s",
-        type=float,
-        metavar="X",
-        help="how long a bias lasts, default 3, with --raw for ever",
-    )
-    replay.add_argument(
+
+
+def _add_biases(group: Any) -> None:
+    _add_number(group, "--bias-std-m", "of a link's bias, default 0.02, with --raw 0.05")
+    _add_number(group, "--bias-time-s", "how long a bias lasts, default 3, with --raw for ever")
+    _add_number(
+        group,
         "--bias-common-m",
-        type=float,
-        metavar="X",
-        help="of the bias that all links have in common, default 0, with --raw 0.1",
+        "of the bias that all links have in common, default 0, with --raw 0.1",
     )
-    replay.add_argument(
+    group.add_argument(
         "--raw",
         action="store_true",
         help="ranges of radios that nobody calibrated: iekf-bias learns the biases that stay",
     )
-    replay.add_argument(
-        "--accel-m",
-        type=float,
-        default=0.5,
-        metavar="X",
-        help="filter iekf-cv: change of the speed (m/s) after 1 s, default 0.5",
-    )
-    replay.add_argument(
-        "--accel-deg",
-        type=float,
-        default=30.0,
-        metavar="X",
-        help="filter iekf-cv: change of the turn rate (deg/s) after 1 s, default 30",
-    )
-    replay.add_argument("--no-robust", action="store_true", help="squares in place of Huber's loss")
-    replay.add_argument("--plot", metavar="F", help="picture of the track and the errors")
-    add_html(replay, "3-D page of the track with charts and tables")
-    add_json(replay)
-    replay.set_defaults(run=_replay)
+
+
+def _add_comparison(group: Any) -> None:
+    _add_number(group, "--yaw-offset-deg", "yaw error = estimate - (truth + offset)")
+    _add_number(group, "--truth-gap-s", "longest gap bridged between truth and ranges, default 0.5")
+
+
+def _add_output(group: Any) -> None:
+    group.add_argument("--plot", metavar="F", help="picture of the track and the errors")
+    add_html(group, "3-D page of the track with charts and tables")
+    add_json(group)
+
+
+def _add_number(group: Any, name: str, text: str) -> None:
+    group.add_argument(name, type=float, metavar="X", help=text)
 
 
 def _replay(options: argparse.Namespace) -> int:
@@ -135,21 +136,7 @@ def _replay(options: argparse.Namespace) -> int:
     from rbl_gym.studies import replay
 
     check_html(options)
-    settings = replay.Settings(
-        **_bias(options),
-        range_std_m=options.range_std_m,
-        walk_m=options.walk_m,
-        walk_deg=options.walk_deg,
-        accel_m=options.accel_m,
-        accel_deg=options.accel_deg,
-        robust=not options.no_robust,
-        planar=options.planar,
-        height_offset_m=options.height_offset_m,
-        yaw_offset_deg=options.yaw_offset_deg,
-        volume=options.volume,
-        below_anchors=options.below_anchors,
-        truth_gap_s=options.truth_gap_s,
-    )
+    settings = _settings(options)
     recording = recordings.read_recording(
         options.ranges, options.anchors, options.tags, options.truth, options.calibration
     )
@@ -173,21 +160,24 @@ def _replay(options: argparse.Namespace) -> int:
     return 0
 
 
-def _bias(options: argparse.Namespace) -> dict[str, Any]:
-    """The filter's name and the law of the biases, from what was said of either."""
+def _settings(options: argparse.Namespace) -> Any:
+    """`rbl_gym.studies.replay.Settings` of what was given."""
+    from rbl_gym.studies import replay
+
     given = {
         name: getattr(options, name)
-        for name in ("bias_std_m", "bias_time_s", "bias_common_m")
-        if getattr(options, name) is not None
+        for name in replay.Settings().flat()
+        if getattr(options, name, None) is not None
     }
+    biases = {name: value for name, value in given.items() if name in _RAW}
     if options.raw:
         if options.calibration:
             raise ValueError("--raw means ranges without --calibration")
-        given = {"bias_std_m": 0.05, "bias_time_s": None, "bias_common_m": 0.1, **given}
-    name = options.filter or ("iekf-bias" if given else "iekf")
-    if given and name != "iekf-bias":
+        biases = {**_RAW, **biases}
+    name = options.filter or ("iekf-bias" if biases else "iekf")
+    if biases and name != "iekf-bias":
         raise ValueError(f"{name} knows no biases: --raw and --bias-... are of iekf-bias")
-    return {"filter": name, **given}
+    return replay.Settings.of(**{**given, **biases, "filter": name})
 
 
 def _volume(text: str) -> tuple[float | None, ...]:

@@ -152,7 +152,7 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         recording.tags,
         truth,
         {settings.filter: beliefs},
-        "xy" if settings.planar else "xyz",
+        "xy" if settings.knowledge.planar else "xyz",
     )
     parts = [*map(page.note, result["notes"]), page.note(_LEGEND)]
     if origin.any():

@@ -26,9 +26,7 @@ from rbl_gym.studies.bench.worlds import (
 
 FILES = ("ranges", "anchors", "tags", "truth", "calibration")
 # What of `replay.Settings` a recording sets; filters are the benchmark's.
-SETTINGS = tuple(
-    f.name for f in dataclasses.fields(replay.Settings) if f.name not in ("filter", "robust")
-)
+SETTINGS = tuple(name for name in replay.Settings().flat() if name not in ("filter", "robust"))
 # Stretches of equal length that stand for trials: errors within one are correlated.
 SEGMENTS = 20
 
@@ -69,11 +67,11 @@ def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...
     spec = dict(items)
     paths = {key: spec[key] for key in FILES if key in spec}
     recording = read_recording(**paths)
-    settings = replay.Settings(**{key: spec[key] for key in SETTINGS if key in spec})
+    settings = replay.Settings.of(**{key: spec[key] for key in SETTINGS if key in spec})
     # Said once and for all: a condition may put an anchor at another height.
     offset = replay.height_offset(recording, settings)
-    settings = dataclasses.replace(settings, height_offset_m=offset)
-    digest = hashlib.sha256(repr(settings).encode())
+    settings = settings.changed(height_offset_m=offset)
+    digest = hashlib.sha256(repr([item for item in items if item[0] not in FILES]).encode())
     for key in sorted(paths):
         digest.update(key.encode() + Path(paths[key]).read_bytes())
     return Log(recording, settings, digest.hexdigest()[:16])
@@ -126,5 +124,5 @@ def recording_errors(log: Log, track: replay.Track) -> figures.BenchErrors:
         np.rad2deg(cut(found.rotation)),
         cut(found.tags),
         cut(found.nees),
-        3 if log.settings.planar else 6,
+        3 if log.settings.knowledge.planar else 6,
     )

@@ -2,12 +2,15 @@
 
 from rbl_gym.studies.replay.figures import TrackErrors, track_errors, track_figures, truth_of
 from rbl_gym.studies.replay.mirror import Mirror, covering, other_pose
+from rbl_gym.studies.replay.place import height_offset, origin_of, volume_of
 from rbl_gym.studies.replay.settings import (
     DEFAULT_RANGE_STD_M,
+    Biases,
+    Comparison,
+    Knowledge,
+    Loss,
+    Motion,
     Settings,
-    height_offset,
-    origin_of,
-    volume_of,
 )
 from rbl_gym.studies.replay.study import Replayed, check_replay, replay_recording
 from rbl_gym.studies.replay.tracking import (
@@ -22,7 +25,12 @@ from rbl_gym.studies.replay.truth import check_overlap
 
 __all__ = [
     "DEFAULT_RANGE_STD_M",
+    "Biases",
+    "Comparison",
+    "Knowledge",
+    "Loss",
     "Mirror",
+    "Motion",
     "Replayed",
     "Settings",
     "Track",

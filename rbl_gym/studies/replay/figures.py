@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -13,7 +12,8 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.reading import Recording
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
-from rbl_gym.studies.replay.settings import Settings, volume_of
+from rbl_gym.studies.replay.place import volume_of
+from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track, range_std_of
 from rbl_gym.studies.replay.truth import (
     Judged,
@@ -58,15 +58,16 @@ def truth_of(
     """
     if recording.truth is None:
         return None
-    check_overlap(recording.truth, track.times, settings.truth_gap_s)
-    rotation, translation, known = matched(recording.truth, *track[:3], settings.truth_gap_s)
+    gap_s = settings.comparison.truth_gap_s
+    check_overlap(recording.truth, track.times, gap_s)
+    rotation, translation, known = matched(recording.truth, *track[:3], gap_s)
     return _as_judged(rotation, settings), translation, known
 
 
 def _as_judged(rotation: FloatArray, settings: Settings) -> FloatArray:
     """Rotations (K, 3, 3) of the truth, turned by the offset; planar: their headings."""
-    offset = rotations.exp([0.0, 0.0, math.radians(settings.yaw_offset_deg)])
-    if settings.planar:
+    offset = rotations.exp([0.0, 0.0, math.radians(settings.comparison.yaw_offset_deg)])
+    if settings.knowledge.planar:
         heading = np.zeros((len(rotation), 3))
         heading[:, 2] = rotations.yaw(rotation)
         rotation = rotations.exp(heading)
@@ -83,15 +84,15 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
         return None
     expected, translation, known = truth
     error = metrics.pose_error(track.rotation, track.translation, expected, translation)
-    axes = [2, 3, 4] if settings.planar else list(range(6))
+    axes = [2, 3, 4] if settings.knowledge.planar else list(range(6))
     block = track.covariance[:, axes][:, :, axes]
     turn = rotations.yaw(track.rotation) - rotations.yaw(expected)
     place = translation.copy()
-    if settings.planar:
+    if settings.knowledge.planar:
         place[:, 2] = track.translation[:, 2]
     return TrackErrors(
         known,
-        np.linalg.norm(error[:, 3 : 5 if settings.planar else 6], axis=-1),
+        np.linalg.norm(error[:, 3 : 5 if settings.knowledge.planar else 6], axis=-1),
         (turn + np.pi) % (2 * np.pi) - np.pi,
         np.linalg.norm(error[:, :3], axis=-1),
         metrics.nees(error[:, axes], block),
@@ -113,7 +114,7 @@ def track_figures(
     """
     result: dict[str, Any] = {
         "settings": {
-            **dataclasses.asdict(settings),
+            **settings.flat(),
             "range_std_m": range_std_of(recording, settings),
         },
         "epochs": len(track.times),
@@ -125,7 +126,7 @@ def track_figures(
         return result
     known = found.known
     result["epochs_with_truth"] = int(known.sum())
-    result["position_axes"] = "xy" if settings.planar else "xyz"
+    result["position_axes"] = "xy" if settings.knowledge.planar else "xyz"
     yaw = np.rad2deg(found.yaw[known])
     rotation = np.rad2deg(found.rotation[known])
     for name, values in (
@@ -137,7 +138,7 @@ def track_figures(
         result[name.format("median")] = float(np.median(np.abs(values)))
         result[name.format("p95")] = float(np.quantile(np.abs(values), 0.95))
     result["yaw_mean_deg"] = float(yaw.mean())
-    result["anees"] = float(found.nees[known].mean() / (3 if settings.planar else 6))
+    result["anees"] = float(found.nees[known].mean() / (3 if settings.knowledge.planar else 6))
     return result
 
 
@@ -198,7 +199,9 @@ def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list
 
     def at(late_s: float) -> Judged:
         moved = truth._replace(times=truth.times - late_s)
-        there = matched(moved, *track[:3], settings.truth_gap_s)
-        return judged_of(there, track, settings.planar)
+        there = matched(moved, *track[:3], settings.comparison.truth_gap_s)
+        return judged_of(there, track, settings.knowledge.planar)
 
-    return fault_hints(at, lambda rotation: _as_judged(rotation, settings), settings.planar)
+    return fault_hints(
+        at, lambda rotation: _as_judged(rotation, settings), settings.knowledge.planar
+    )

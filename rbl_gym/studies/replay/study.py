@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rbl_gym.recordings.reading import Recording
 from rbl_gym.studies.replay.figures import TrackErrors, track_errors, track_figures
-from rbl_gym.studies.replay.settings import Settings, height_offset
+from rbl_gym.studies.replay.place import height_offset
+from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track, recording_filter, track_recording
 from rbl_gym.studies.replay.truth import check_overlap
 
@@ -46,10 +46,10 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
         not overlap the ranges.
     """
     offset = height_offset(recording, settings)
-    settings = dataclasses.replace(settings, height_offset_m=offset)
+    settings = settings.changed(height_offset_m=offset)
     recording_filter(recording, settings)
     if recording.truth is not None:
-        check_overlap(recording.truth, recording.times, settings.truth_gap_s)
+        check_overlap(recording.truth, recording.times, settings.comparison.truth_gap_s)
     return settings
 
 

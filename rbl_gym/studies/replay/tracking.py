@@ -17,15 +17,14 @@ from rbl_gym.measurements import ranging
 from rbl_gym.recordings.reading import Recording
 from rbl_gym.studies.epochs import Reading, Step, stack_beliefs, track_epochs
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
-from rbl_gym.studies.replay.settings import (
-    DEFAULT_RANGE_STD_M,
-    Settings,
+from rbl_gym.studies.replay.place import (
     has_own_std,
     height_offset,
     origin_of,
     reach_of,
     volume_of,
 )
+from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 
 __all__ = [
     "Track",
@@ -67,13 +66,13 @@ def track_recording(
         beliefs.append(step.belief)
         advance()
     track = Track(recording.times, *stack_beliefs(beliefs)[:3])
-    if settings.planar:
+    if settings.knowledge.planar:
         # Height, roll and pitch are held: they tell the sides apart.
         return track
     std = None
     if not has_own_std(recording, settings):
         std = settings.range_std_m or DEFAULT_RANGE_STD_M
-    judge = named_filter(recording, settings, "iekf", {"robust": settings.robust})
+    judge = named_filter(recording, settings, "iekf", {"robust": settings.loss.robust})
     poses = track[1:4]
     other = other_pose(recording, judge, std, poses, volume_of(recording, settings))
     if other is None:
@@ -160,8 +159,8 @@ def named_filter(
         As `estimators.make`; and for a filter that does not take the law of an epoch, where the
         recording has one.
     """
-    walk, turn = settings.walk_m, math.radians(settings.walk_deg)
-    if settings.planar:
+    walk, turn = settings.motion.walk_m, math.radians(settings.motion.walk_deg)
+    if settings.knowledge.planar:
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
     else:
         process = motion.ProcessNoise(turn, walk)
@@ -186,22 +185,26 @@ _ANY_TURN, _ANY_SPEED = 1.0, 3.0
 def _options(settings: Settings) -> dict[str, Any]:
     """What the settings say to the named filter."""
     if settings.filter in ("iekf", "iekf-bank"):
-        return {"robust": settings.robust}
+        return {"robust": settings.loss.robust}
     if settings.filter == "iekf-bias":
         return {
-            "robust": settings.robust,
-            "bias_std_m": settings.bias_std_m,
-            "bias_time_s": settings.bias_time_s,
-            "common_std_m": settings.bias_common_m,
+            "robust": settings.loss.robust,
+            "bias_std_m": settings.biases.bias_std_m,
+            "bias_time_s": settings.biases.bias_time_s,
+            "common_std_m": settings.biases.bias_common_m,
         }
     if settings.filter == "iekf-cv":
-        turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.planar else ((1, 1, 1), (1, 1, 1))
+        turn, shift = (
+            ((0, 0, 1), (1, 1, 0)) if settings.knowledge.planar else ((1, 1, 1), (1, 1, 1))
+        )
         return {
-            "robust": settings.robust,
+            "robust": settings.loss.robust,
             "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),
             "speed_m_s": tuple(_ANY_SPEED * axis for axis in shift),
-            "turn_acceleration": tuple(math.radians(settings.accel_deg) * axis for axis in turn),
-            "acceleration": tuple(settings.accel_m * axis for axis in shift),
+            "turn_acceleration": tuple(
+                math.radians(settings.motion.accel_deg) * axis for axis in turn
+            ),
+            "acceleration": tuple(settings.motion.accel_m * axis for axis in shift),
         }
     return {}
 
@@ -218,7 +221,7 @@ def _prior(
         centre = np.where(bounded, np.where(bounded, volume, 0.0).mean(axis=0), centre)
         half = 0.5 * np.diff(np.where(bounded, volume, 0.0), axis=0)[0]
         std[3:] = np.where(bounded, half, std[3:])
-    if settings.planar:
+    if settings.knowledge.planar:
         centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
         std[[0, 1, 5]] = _PLANAR_STD
     return np.eye(3), centre, np.diag(std**2)
