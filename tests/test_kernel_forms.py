@@ -10,7 +10,7 @@ import pytest
 from rbl_gym import kernels, metrics
 from rbl_gym.bounds import pose, posterior
 from rbl_gym.estimators.linear import engines, kalman, least_squares, unitary
-from rbl_gym.geometry import obstacles, rotations
+from rbl_gym.geometry import obstacles, regions, rotations
 from rbl_gym.measurements import bearing, noise_laws, ranging
 from rbl_gym.metrics import Figures
 from rbl_gym.motion import kinematics
@@ -387,3 +387,14 @@ def test_scores_of_layouts(law, batch, m):
     square, *_ = assert_equal_forms(gradient._mean_square_and_gradient, *args)
     np.testing.assert_allclose(square, placement._mean_square(*args), rtol=1e-12)
     assert_equal_forms(placement._mean_square_of, poses.matrix, poses.rotation, world.tags)
+
+
+@every_batch
+def test_places_on_walls(batch):
+    low, high = np.array([-1.0, 0, 2]), np.array([5.0, 3, 4])
+    steps = np.array([-3, -1, -1e-4, 0, 5e-4, 0.3, 2])
+    actions = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    actions = np.concatenate([actions, np.random.default_rng(0).normal(0, 1, (100, 3))])
+    actions = actions.reshape(-1, *(1 for _ in batch), 3) * np.ones((*batch, 1))
+    assert_equal_forms(regions._place_on_walls, actions, low, high)
+    assert_equal_forms(regions._project_on_walls, 0.7 + 3.1 * actions, low, high)

@@ -47,7 +47,7 @@ class EpisodeStore:
             simulation.draw_each(self._draws, range(count), generators[first : first + count])
             draws = simulation.Draws(*(field[:count] for field in self._draws))
             episode = simulation.build_episode(self._scene, draws)
-            self._write(_rows(block), simulation.whole(episode))
+            self._write(rows_of(block), simulation.whole(episode))
             starts.append(episode[len(simulation.Epoch._fields) :])
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
@@ -85,7 +85,7 @@ class EpisodeStore:
         return epochs, np.arange(self._num_envs)
 
 
-def _rows(worlds: np.ndarray) -> slice | np.ndarray:
+def rows_of(worlds: np.ndarray) -> slice | np.ndarray:
     """Indices in ascending order, as a slice where they are neighbours."""
     first, last = worlds[0], worlds[-1]
     return slice(first, last + 1) if last - first + 1 == len(worlds) else worlds

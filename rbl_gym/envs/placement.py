@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.batch import BatchEnv
+from rbl_gym.envs.episodes import rows_of
 from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.geometry.regions import Region
 from rbl_gym.placement.problem import Context, score_of_checked
@@ -68,7 +69,8 @@ class AnchorPlacementVectorEnv(BatchEnv):
         # Signs of the axes by which each problem is shown mirrored.
         self._signs = np.ones((num_envs, 3))
         # What the observation shows, in its own type.
-        self._features = context_features(self.task, self._contexts).astype(np.float32)
+        self._view = _View(self.task)
+        self._features = self._view.features(self._contexts).astype(np.float32)
         self._actions = np.zeros((num_envs, self.task.n_anchors, 3), np.float32)
         self._next = np.eye(self.task.n_anchors + 1, self.task.n_anchors, dtype=np.float32)
         self._anchors = np.zeros((num_envs, self.task.n_anchors, 3))
@@ -106,22 +108,23 @@ class AnchorPlacementVectorEnv(BatchEnv):
         size = placement.context_uniforms(self.task)
         uniforms = np.array([generator.random(size) for generator in generators])
         fresh = placement.build_contexts(self.task, uniforms)
+        rows = rows_of(chosen)
         for held, new in zip(self._contexts, fresh, strict=True):
-            held[chosen] = new
+            held[rows] = new
         shown = fresh
         if self.mirror:
-            self._signs[chosen] = signs = signs_of(self.task, fresh)
-            shown = mirrored_context(self.task, fresh, signs)
-        self._features[chosen] = context_features(self.task, shown)
-        self._actions[chosen] = 0.0
-        self._anchors[chosen] = 0.0
-        self._score_m[chosen] = 0.0
+            self._signs[rows] = signs = self._view.signs(fresh)
+            shown = self._view.mirrored(fresh, signs)
+        self._features[rows] = self._view.features(shown)
+        self._actions[rows] = 0.0
+        self._anchors[rows] = 0.0
+        self._score_m[rows] = 0.0
         if self.sight:
-            self._seen[chosen] = placement.sight_fractions(self.task, fresh, self._mounts)
+            self._seen[rows] = placement.sight_fractions(self.task, fresh, self._mounts)
         if self.mode == "mounts":
-            self._taken[chosen] = False
-            self._information[chosen] = 0.0
-            self._log_score[chosen] = math.log(_EMPTY_SCORE_M)
+            self._taken[rows] = False
+            self._information[rows] = 0.0
+            self._log_score[rows] = math.log(_EMPTY_SCORE_M)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         complete = moving & (self._epochs == self._placements)
@@ -138,9 +141,9 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self._actions[new] = placed
         self._anchors[new] = self.task.scene.anchor_region.place(signs * placed)
         reward = np.zeros(self.num_envs)
-        if complete.any():
+        if count := np.count_nonzero(complete):
             problems, anchors = self._contexts, self._anchors
-            if not complete.all():
+            if count < self.num_envs:
                 problems = Context(*(field[complete] for field in problems))
                 anchors = anchors[complete]
             score_m = score_of_checked(self.task, problems, anchors)
@@ -318,26 +321,6 @@ def _centre(region: Region) -> FloatArray:
     return 0.5 * (low + high)
 
 
-def signs_of(task: placement.PlacementTask, context: Context) -> FloatArray:
-    """Signs (..., 3) of the axes that bring the region's centre towards +x and +y."""
-    signs = np.where(context.centre < _centre(task.scene.volume), -1.0, 1.0)
-    signs[..., 2] = 1.0
-    return signs
-
-
-def mirrored_context(task: placement.PlacementTask, context: Context, signs: FloatArray) -> Context:
-    """The problem mirrored by signs (..., 3), its racks in the order of falling x."""
-    middle = _centre(task.scene.anchor_region) * _LEVEL
-    centre, racks = middle + signs * (context.centre - middle), context.racks
-    if not racks.shape[-2]:
-        return Context(centre, context.half, racks)
-    racks = racks.copy()
-    racks[..., :3] = middle + signs[..., None, :] * (racks[..., :3] - middle)
-    order = np.argsort(-racks[..., 0], axis=-1)
-    racks = np.take_along_axis(racks, order[..., None], axis=-2)
-    return Context(centre, context.half, racks)
-
-
 def mirrored_mounts(task: placement.PlacementTask, mounts: FloatArray) -> np.ndarray:
     """Indices (4, 57) of the mounts mirrored in neither, x, y, both."""
     middle = _centre(task.scene.anchor_region) * [1, 1, 0]
@@ -345,16 +328,48 @@ def mirrored_mounts(task: placement.PlacementTask, mounts: FloatArray) -> np.nda
     return np.abs(moved[:, :, None] - mounts).sum(axis=-1).argmin(axis=-1)
 
 
-def context_features(task: placement.PlacementTask, context: Context) -> FloatArray:
-    """A problem as numbers (..., 6 + 6 K) of [-1, 1]: region, then the racks that it drew."""
-    low, high = task.scene.volume.bounds()
-    half = np.maximum(0.5 * (high - low), 1e-9)
-    region = [(context.centre - 0.5 * (low + high)) / half, 2 * context.half / half - 1]
-    drawn = context.racks[..., len(task.scene.obstacles) :, :]
-    if drawn.shape[-2]:
+class _View:
+    """How a task shows its problems, of B worlds: mirrored, and scaled to [-1, 1]."""
+
+    def __init__(self, task: placement.PlacementTask) -> None:
+        self._own = len(task.scene.obstacles)
+        self._centre = _centre(task.scene.volume)
+        self._middle = _centre(task.scene.anchor_region) * _LEVEL
+        low, high = task.scene.volume.bounds()
+        half = np.maximum(0.5 * (high - low), 1e-9)
+        # Of the region: the half size is between none and that of the volume.
+        self._shift = np.concatenate([self._centre, 0.5 * half])
+        self._scale = np.concatenate([half, 0.5 * half])
+        # Of a rack: it stands on the floor.
         floor, ceiling = task.scene.anchor_region.bounds()
         room = 0.5 * (ceiling - floor)
-        racks = [(drawn[..., :3] - floor) / room - 1, drawn[..., 3:] / room]
-        racks = np.concatenate(racks, axis=-1)
-        region.append(racks.reshape((*racks.shape[:-2], 6 * task.racks)))
-    return np.minimum(np.maximum(np.concatenate(region, axis=-1), -1.0), 1.0)
+        self._rack_shift = np.concatenate([floor + room, np.zeros(3)])
+        self._rack_scale = np.concatenate([room, room])
+
+    def signs(self, context: Context) -> FloatArray:
+        """Signs (B, 3) of the axes that bring the region's centre towards +x and +y."""
+        signs = np.where(context.centre < self._centre, -1.0, 1.0)
+        signs[..., 2] = 1.0
+        return signs
+
+    def mirrored(self, context: Context, signs: FloatArray) -> Context:
+        """The problem mirrored by signs (B, 3), its racks in the order of falling x."""
+        centre, racks = self._middle + signs * (context.centre - self._middle), context.racks
+        if not racks.shape[-2]:
+            return Context(centre, context.half, racks)
+        racks = racks.copy()
+        racks[..., :3] = self._middle + signs[:, None] * (racks[..., :3] - self._middle)
+        if racks.shape[-2] > 1:
+            order = (-racks[..., 0]).argsort(axis=-1)
+            racks = racks[np.arange(len(racks))[:, None], order]
+        return Context(centre, context.half, racks)
+
+    def features(self, context: Context) -> FloatArray:
+        """A problem as numbers (B, 6 + 6 K) of [-1, 1]: region, then the racks that it drew."""
+        region = np.concatenate([context.centre, context.half], axis=-1)
+        parts = [(region - self._shift) / self._scale]
+        drawn = context.racks[..., self._own :, :]
+        if drawn.shape[-2]:
+            racks = (drawn - self._rack_shift) / self._rack_scale
+            parts.append(racks.reshape(len(racks), -1))
+        return np.minimum(np.maximum(np.concatenate(parts, axis=-1), -1.0), 1.0)

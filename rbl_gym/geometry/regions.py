@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.kernels import compiled
 
 __all__ = ["REGIONS", "Box", "Region", "Shell", "Walls"]
 
@@ -123,20 +124,13 @@ class Walls:
         # x walls run along y, y walls and the ceiling along x; the ceiling's "up" is y.
         inside = np.stack([along, np.where(face < 2, along, up), up], axis=-1)
         points = low + inside * (high - low)
-        axes, values = self._faces
+        axes, values = _faces(low, high)
         face = face[..., None]
         return np.where(axes[face] == np.arange(3), values[face], points)
 
     def project(self, points: FloatArray) -> FloatArray:
         """The nearest point of a wall or the ceiling."""
-        low, high = self._corners
-        axes, values = self._faces
-        inside = np.minimum(np.maximum(points, low), high)
-        outside = (points - inside) ** 2
-        # Squared distance to each surface; below the floor the nearest gap alone misleads.
-        squares = outside.sum(axis=-1)[..., None] - outside[..., axes]
-        face = (squares + (points[..., axes] - values) ** 2).argmin(axis=-1)[..., None]
-        return np.where(axes[face] == np.arange(3), values[face], inside)
+        return _project_on_walls(points, *self._corners)
 
     def place(self, action: FloatArray) -> FloatArray:
         """Where the ray from the middle of the room along the action meets a wall or the ceiling.
@@ -144,28 +138,39 @@ class Walls:
         A ray that points down is cut at the floor's height; one to the floor itself goes to the
         nearest legal point.
         """
-        action = _cut(action)
-        middle, half = self._middle
-        reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
-        points = middle + _cut(action / np.maximum(reach, 1e-3)[..., None]) * half
-        nowhere = reach < 1e-3
-        if nowhere.any():
-            points = np.where(nowhere[..., None], self.project(points), points)
-        return points
-
-    @functools.cached_property
-    def _middle(self) -> tuple[FloatArray, FloatArray]:
-        return _middle(*self._corners)
+        return _place_on_walls(action, *self._corners)
 
     def action(self, points: FloatArray) -> FloatArray:
         """An inverse of `place`: the point itself, in units of the room's half size."""
         return _unscaled(points, *self.bounds())
 
-    @functools.cached_property
-    def _faces(self) -> tuple[np.ndarray, FloatArray]:
-        """The axis on which each wall and the ceiling stands, and where."""
-        low, high = self.low, self.high
-        return np.array([0, 0, 1, 1, 2]), np.array([low[0], high[0], low[1], high[1], high[2]])
+
+def _faces(low: FloatArray, high: FloatArray) -> tuple[np.ndarray, FloatArray]:
+    """The axis on which each wall and the ceiling stands, and where."""
+    return np.array([0, 0, 1, 1, 2]), np.array([low[0], high[0], low[1], high[1], high[2]])
+
+
+@compiled("walls:project")
+def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """`Walls.project` in a room between two corners (3,)."""
+    axes, values = _faces(low, high)
+    inside = np.minimum(np.maximum(points, low), high)
+    outside = (points - inside) ** 2
+    # Squared distance to each surface; below the floor the nearest gap alone misleads.
+    squares = outside.sum(axis=-1)[..., None] - outside[..., axes]
+    face = (squares + (points[..., axes] - values) ** 2).argmin(axis=-1)[..., None]
+    return np.where(axes[face] == np.arange(3), values[face], inside)
+
+
+@compiled("walls:place")
+def _place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """`Walls.place` in a room between two corners (3,)."""
+    action = _cut(action)
+    middle, half = _middle(low, high)
+    reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
+    points = middle + _cut(action / np.maximum(reach, 1e-3)[..., None]) * half
+    nowhere = reach[..., None] < 1e-3
+    return np.where(nowhere, _project_on_walls.textbook(points, low, high), points)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from rbl_gym import bounds
 from rbl_gym.checks import (
     BoolArray,
     FloatArray,
+    all_finite,
     as_float,
     check_array,
     check_count,
@@ -51,8 +52,11 @@ _PRIOR_ROTATION_RAD = math.radians(60)
 _POSE_SEED = 20130821
 # Range of the work region's half size as a share of the volume's, (x, y, z).
 _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
+_SPAN = _MOST - _LEAST
 # Uniforms that a context takes: region 6, each rack 6.
 _REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
+# Which of `PlacementTask.rack_limits` are a rack's centre and half sizes.
+_LONG_X, _LONG_Y = np.array([0, 1, 5, 3, 2, 5]), np.array([0, 1, 5, 2, 3, 5])
 
 
 class Context(NamedTuple):
@@ -133,6 +137,14 @@ class PlacementTask:
         return _read_only(rotations.random(rng, (self.n_poses,))), _read_only(offsets)
 
     @functools.cached_property
+    def rack_limits(self) -> tuple[FloatArray, FloatArray]:
+        """Least (6,) and span of a rack's x, y, shorter and longer half size, none, half height."""
+        low, high = self.scene.anchor_region.bounds()
+        x, y, _ = high - low
+        least = np.array([low[0] + 0.15 * x, low[1] + 0.15 * y, 0.2, 1.0, 0.0, 0.6])
+        return _read_only(least), _read_only(np.array([0.7 * x, 0.7 * y, 0.2, 1.0, 0.0, 0.6]))
+
+    @functools.cached_property
     def prior_information(self) -> FloatArray:
         """(6, 6): 60 degrees, and half of the volume's largest extent."""
         extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
@@ -180,7 +192,7 @@ def draw_contexts(
 def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
     """Contexts of uniforms (..., `context_uniforms`)."""
     low, high = task.scene.volume.bounds()
-    half = (_LEAST + (_MOST - _LEAST) * uniforms[..., :3]) * 0.5 * (high - low)
+    half = (_LEAST + _SPAN * uniforms[..., :3]) * (0.5 * (high - low))
     least = low + half
     centre = least + uniforms[..., 3:6] * ((high - half) - least)
     of_racks = uniforms[..., _REGION_UNIFORMS:]
@@ -195,17 +207,10 @@ def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
 
 def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
     """Racks (..., K, 6) on the floor, in the middle 70 % of the room, long in x or in y."""
-    low, high = task.scene.anchor_region.bounds()
-    racks = np.empty((*uniforms.shape[:-1], 6))
-    middle = 0.15 + 0.7 * uniforms[..., :2]
-    racks[..., :2] = low[:2] + middle * (high - low)[:2]
-    thin, long = 0.2 + 0.2 * uniforms[..., 2], 1 + uniforms[..., 3]
-    along_x = uniforms[..., 4] < 0.5
-    racks[..., 3] = np.where(along_x, long, thin)
-    racks[..., 4] = np.where(along_x, thin, long)
-    racks[..., 5] = 0.6 + 0.6 * uniforms[..., 5]
-    racks[..., 2] = racks[..., 5]
-    return racks
+    least, span = task.rack_limits
+    drawn = least + span * uniforms
+    along_x = uniforms[..., 4:5] < 0.5
+    return np.where(along_x, drawn[..., _LONG_X], drawn[..., _LONG_Y])
 
 
 def whole_volume(task: PlacementTask) -> Context:
@@ -311,7 +316,8 @@ def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
 
 def root_of(square: FloatArray) -> FloatArray:
     """Scores (...) of their squares, or a ValueError where those are not finite."""
-    if not (np.isfinite(square) & (square > 0)).all():
+    # False of NaN too.
+    if np.count_nonzero(square > 0) < square.size or not all_finite(square):
         raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
     return np.sqrt(square)
 
