@@ -12,7 +12,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.tables import AnyPath, read_table
 
-__all__ = ["Truth", "truth_at"]
+__all__ = ["Truth", "read_truth", "truth_at"]
 
 MAX_YAW_DEG = 1e6
 
