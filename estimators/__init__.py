@@ -22,6 +22,7 @@ from rbl_gym.estimators.filter import (
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
 from rbl_gym.estimators.iekf.doa_filter import DoaEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.estimators.innovation import Innovations, innovations
 from rbl_gym.estimators.linear.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.locating.doa import locate_doa
 from rbl_gym.estimators.locating.localization import PoseEstimate, locate, methods
@@ -48,6 +49,7 @@ __all__ = [
     "DoaEkf",
     "Filter",
     "FrameEstimate",
+    "Innovations",
     "IteratedEkf",
     "IteratedEkfBank",
     "KalmanFamily",
@@ -62,6 +64,7 @@ __all__ = [
     "cycle_iteration",
     "cycle_projection",
     "frames",
+    "innovations",
     "locate",
     "locate_doa",
     "make",

@@ -16,8 +16,8 @@ from rbl_gym.studies.epochs import (
     Reading,
     Step,
     axis_errors,
+    innovations_of,
     nees_interval,
-    nis,
     pose_errors,
     stack_beliefs,
     timed,
@@ -142,42 +142,37 @@ def test_the_interval_of_the_nees_holds_what_honest_beliefs_have(count, dof):
     assert np.mean(drawn > low) == pytest.approx(0.975, abs=0.0045)
 
 
-def test_nis_by_the_full_innovation_covariance():
-    tags, prior, readings = world()
-    filter = estimators.make("iekf", tags=tags, noise=NOISE, process=PROCESS)
-    for k, step in enumerate(track_epochs(filter, prior, readings)):
-        seen, belief = readings[k], filter.belief(step.predicted)
-        links = np.ones(seen.ranges.shape, dtype=bool) if seen.links is None else seen.links
-
-        def predicted(error, belief=belief, seen=seen):
-            Q = rotations.exp(error[:3]) @ belief.rotation
-            places = tags @ Q.T + belief.translation + error[3:]
-            return np.linalg.norm(places - seen.anchors[:, None], axis=-1)
-
-        steps = 1e-6 * np.eye(6)
-        H = np.stack([(predicted(e) - predicted(-e))[links] / 2e-6 for e in steps], axis=1)
-        v = (seen.ranges - predicted(np.zeros(6)))[links]
-        std = 0.2 if k == 3 else 0.05
-        S = H @ belief.covariance @ H.T + std**2 * np.eye(len(v))
-        value, count = nis(belief, seen, tags, NOISE)
-        np.testing.assert_allclose(value, v @ np.linalg.solve(S, v), rtol=1e-5)
-        assert count == links.sum()
-
-
 def test_an_honest_filter_foretells_its_ranges_as_well_as_it_says():
     """The mean NIS is the number of ranges; three hundred trials know it to 4 sigma."""
     scene = scenes.get({"name": "uwb_room", "steps": 3})
     trials = monte_carlo.simulate_trials(scene, 300, np.random.default_rng(3))
     filter = monte_carlo.scene_filter(scene, "iekf", {})
-    readings = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
-    tags = np.asarray(scene.tags)
-    for step, reading in zip(monte_carlo.trial_steps(trials, filter), readings, strict=True):
-        value, count = nis(filter.belief(step.predicted), reading, tags, scene.noise)
-        size = scene.n_anchors * len(tags)
-        assert (count == size).all()
-        # Before the first epoch 10 degrees and half a metre bend the ranges: then no claim.
-        if reading.twist is not None:
-            assert abs(value.mean() - size) < 4 * np.sqrt(2 * size / 300)
+    steps = monte_carlo.trial_steps(trials, filter)
+    size = scene.n_anchors * len(scene.tags)
+    told = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
+    found_of = innovations_of(filter, steps, np.asarray(scene.tags), scene.noise)
+    for (step, found), reading in zip(found_of, told, strict=True):
+        np.testing.assert_array_equal(step.reading.ranges, reading.ranges)
+        assert found.nis.shape == found.dof.shape == (300,)
+        # One range in 16,000 is refused.
+        assert (found.dof >= size - 2).all()
+        assert abs(found.nis.mean() - size) < 4 * np.sqrt(2 * size / 300)
+
+
+@pytest.mark.parametrize("name", ["iekf", "iekf-bias", "iekf-bank", "uc-kf"])
+def test_innovations_come_with_their_steps(name):
+    """Many epochs at once are the same as one after the other, whatever their laws and links."""
+    tags, prior, readings = world(6)
+    filter = estimators.make(name, tags=tags, noise=NOISE, process=PROCESS)
+    pairs = list(innovations_of(filter, track_epochs(filter, prior, readings), tags, NOISE))
+    assert len(pairs) == len(readings)
+    for (step, found), reading in zip(pairs, readings, strict=True):
+        assert step.reading is reading
+        law = NOISE if reading.noise is None else reading.noise
+        told = reading.ranges, reading.anchors, tags, law, reading.links
+        alone = estimators.innovations(filter, step.predicted, step.state, *told)
+        for one, other in zip(alone, found, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
 def test_a_trace_is_of_the_beliefs():

@@ -225,6 +225,15 @@ class AugmentedEkf:
         law = ranging.LinkNoise(np.sqrt(variance + spread.reshape(biases.shape)))
         return self.pose.update(prior, np.maximum(ranges - biases, 1e-6), anchors, mask, law)
 
+    def biases_of(
+        self, state: AugmentedState, shape: tuple[int, ...]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Extra states (..., K), covariance, and what they add to (M, N) ranges (M N, K)."""
+        if self.biases:
+            state = self._with_biases(plain(state), shape)
+        sums = bias_cost.sums_of(self._n_twist, len(self.biases), math.prod(shape))
+        return state.extra, state.covariance, sums
+
     def belief(self, state: AugmentedState) -> PoseBelief:
         """What the state says about the pose (copies)."""
         rotation = state.rotation.copy()

@@ -15,10 +15,9 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from rbl_gym import metrics
-from rbl_gym.bounds.pose import range_jacobian
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators import Filter, PoseBelief
-from rbl_gym.measurements.ranging import NoiseLaw
+from rbl_gym.estimators import Filter, Innovations, PoseBelief, innovations
+from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
 
 __all__ = [
     "AxisErrors",
@@ -26,8 +25,8 @@ __all__ = [
     "Reading",
     "Step",
     "axis_errors",
+    "innovations_of",
     "nees_interval",
-    "nis",
     "pose_errors",
     "stack_beliefs",
     "timed",
@@ -64,11 +63,12 @@ class Reading(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A filter after an epoch: its state before and after the ranges, and its belief."""
+    """A filter after an epoch: its state before and after the ranges, its belief, the epoch."""
 
     predicted: Any
     state: Any
     belief: PoseBelief
+    reading: Reading
 
 
 def track_epochs(
@@ -107,7 +107,7 @@ def track_epochs(
             predicted = filter.initial(*other)
             state = _updated(filter, predicted, reading)
             belief = filter.belief(state)
-        yield Step(predicted, state, belief)
+        yield Step(predicted, state, belief, reading)
 
 
 def _updated(filter: Filter, state: Any, reading: Reading) -> Any:
@@ -132,6 +132,64 @@ def stack_beliefs(beliefs: Iterable[PoseBelief]) -> PoseBelief:
     """Beliefs of K epochs as one, with arrays (K, ...)."""
     columns = zip(*beliefs, strict=True)
     return PoseBelief(*(np.array(column, dtype=np.float64) for column in columns))
+
+
+# So many epochs at once: their matrices fit into the processor's caches.
+_CHUNK = 128
+
+
+def innovations_of(
+    filter: Filter, steps: Iterable[Step], tags: FloatArray, noise: NoiseLaw
+) -> Iterator[tuple[Step, Innovations]]:
+    """Steps, each with its innovations (`estimators.innovations`), some epochs behind.
+
+    Parameters
+    ----------
+    filter
+        That made the steps.
+    steps
+        Of `track_epochs`.
+    tags
+        Places on the body (N, 3).
+    noise
+        Law of the ranges where an epoch has none of its own.
+    """
+    kept: list[Step] = []
+    for step in steps:
+        if kept and (len(kept) == _CHUNK or _shapes(step) != _shapes(kept[0])):
+            yield from _innovations(filter, kept, tags, noise)
+            kept = []
+        kept.append(step)
+    yield from _innovations(filter, kept, tags, noise)
+
+
+def _shapes(step: Step) -> list[tuple[int, ...]]:
+    return [a.shape for a in (*step.predicted, *step.state, *step.reading[:2])]
+
+
+def _innovations(
+    filter: Filter, steps: list[Step], tags: FloatArray, noise: NoiseLaw
+) -> Iterator[tuple[Step, Innovations]]:
+    if not steps:
+        return
+    before, after = (
+        type(steps[0][k])(*(np.array(field) for field in zip(*(s[k] for s in steps), strict=True)))
+        for k in (0, 1)
+    )
+    readings = [step.reading for step in steps]
+    ranges, anchors = (np.array([r[k] for r in readings]) for k in (0, 1))
+    links = np.array(
+        [np.broadcast_to(True if r.links is None else r.links, r.ranges.shape) for r in readings]
+    )
+    own = [reading.noise for reading in readings]
+    variance = np.broadcast_to(noise.variance(ranges, links), ranges.shape).copy()
+    for k, law in enumerate(own):
+        if law is not None:
+            variance[k] = law.variance(ranges[k], links[k])
+    law = LinkNoise(np.sqrt(np.where(links, variance, 1.0)))
+    found = innovations(filter, before, after, ranges, anchors, tags, law, links)
+    for k, step in enumerate(steps):
+        yield step, Innovations(*(field[k] for field in found))
 
 
 class PoseErrors(NamedTuple):
@@ -250,43 +308,3 @@ def nees_interval(count: int = 1, dof: int = 6, level: float = 0.95) -> tuple[fl
     tail = 0.5 * (1 - level)
     low, high = (special.chdtri(dof * count, p) / count for p in (1 - tail, tail))
     return float(low), float(high)
-
-
-def nis(
-    predicted: PoseBelief, reading: Reading, tags: FloatArray, noise: NoiseLaw
-) -> tuple[FloatArray, np.ndarray]:
-    """Normalised innovation squared of ranges: how well a prediction foretold them.
-
-    ``v^T (H P H^T + R)^-1 v``, v the measured ranges minus those of the predicted pose, H their
-    derivative there. An honest filter has the number of ranges as its mean. No truth is needed.
-
-    Parameters
-    ----------
-    predicted
-        Belief before the ranges, ``filter.belief(step.predicted)``.
-    reading
-        The epoch; its own `noise` comes first.
-    tags
-        Places on the body (N, 3).
-    noise
-        Law of the ranges where the epoch has none of its own.
-
-    Returns
-    -------
-    The statistic (...), and how many ranges (...) it is of.
-    """
-    law = noise if reading.noise is None else reading.noise
-    distance, H = range_jacobian(reading.anchors, tags, *predicted[:2])
-    links = np.broadcast_to(True if reading.links is None else reading.links, distance.shape)
-    variance = np.broadcast_to(law.variance(reading.ranges), distance.shape)
-    weight = (links / np.where(links, variance, 1.0)).reshape(*distance.shape[:-2], -1)
-    v = np.where(links, reading.ranges - distance, 0.0).reshape(weight.shape)
-    # (H P H^T + R)^-1 = R^-1 - R^-1 H (P^-1 + H^T R^-1 H)^-1 H^T R^-1
-    information = np.linalg.inv(predicted.covariance) + (H * weight[..., None, :]) @ np.swapaxes(
-        H, -1, -2
-    )
-    pull = np.einsum("...ij,...j->...i", H, weight * v)
-    explained = np.einsum(
-        "...i,...i->...", pull, np.linalg.solve(information, pull[..., None])[..., 0]
-    )
-    return (weight * v**2).sum(axis=-1) - explained, links.sum(axis=(-2, -1))

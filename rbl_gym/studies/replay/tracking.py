@@ -11,11 +11,12 @@ import numpy as np
 
 from rbl_gym import estimators, motion
 from rbl_gym.checks import FloatArray
+from rbl_gym.estimators import Innovations
 from rbl_gym.estimators.filter import check_takes_noise
 from rbl_gym.geometry.mirror import mirror_pose
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings.reading import Recording
-from rbl_gym.studies.epochs import Reading, Step, stack_beliefs, track_epochs
+from rbl_gym.studies.epochs import Reading, Step, innovations_of, stack_beliefs, track_epochs
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
 from rbl_gym.studies.replay.place import (
     has_own_std,
@@ -45,6 +46,8 @@ class Track(NamedTuple):
     """Beliefs after every epoch: times (K,), rotation, translation, covariance (K, 6, 6).
 
     `other`: the mirror pose where one explains the ranges too; the covariance covers it then.
+    `innovations`: how well the filter foretold the ranges, arrays (K, ...); its `nis` over its
+    `dof` is 1 on average where the filter is honest.
     """
 
     times: FloatArray
@@ -52,6 +55,7 @@ class Track(NamedTuple):
     translation: FloatArray
     covariance: FloatArray
     other: Mirror | None = None
+    innovations: Innovations | None = None
 
 
 def track_recording(
@@ -61,11 +65,16 @@ def track_recording(
 
     Where a mirror pose explains the ranges as well, the belief covers both (`replay.mirror`).
     """
-    beliefs = []
-    for step in recording_steps(recording, settings, recording_filter(recording, settings)):
+    filter = recording_filter(recording, settings)
+    beliefs, found = [], []
+    steps = recording_steps(recording, settings, filter)
+    for step, innovation in innovations_of(
+        filter, _counted(steps, advance), recording.tags, _noise(settings)
+    ):
         beliefs.append(step.belief)
-        advance()
-    track = Track(recording.times, *stack_beliefs(beliefs)[:3])
+        found.append(innovation)
+    foretold = Innovations(*map(np.array, zip(*found, strict=True)))
+    track = Track(recording.times, *stack_beliefs(beliefs)[:3], innovations=foretold)
     if settings.knowledge.planar:
         # Height, roll and pitch are held: they tell the sides apart.
         return track
@@ -78,6 +87,12 @@ def track_recording(
     if other is None:
         return track
     return track._replace(covariance=covering(other, poses), other=other)
+
+
+def _counted(steps: Iterator[Step], advance: Callable[[], None]) -> Iterator[Step]:
+    for step in steps:
+        yield step
+        advance()
 
 
 def recording_steps(
@@ -164,18 +179,22 @@ def named_filter(
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
     else:
         process = motion.ProcessNoise(turn, walk)
-    noise = ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
     volume = volume_of(recording, settings)
     if name == "iekf-bank" and volume is not None:
         # The bank looks for a lost body in its volume, which is finite.
         box = np.clip(volume, *reach_of(recording))
         options = {"volume": box - origin_of(recording), **options}
-    laws = {"tags": recording.tags, "noise": noise, "process": process}
+    laws = {"tags": recording.tags, "noise": _noise(settings), "process": process}
     filter = estimators.make(name, **laws, **options)
     if has_own_std(recording, settings):
         why = "the recording has a standard deviation for every range"
         check_takes_noise(name, filter, why)
     return filter
+
+
+def _noise(settings: Settings) -> ranging.RangeNoise:
+    """Law of the ranges that have none of their own."""
+    return ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
 
 
 # Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.

@@ -1,0 +1,151 @@
+"""How well a filter foretold an epoch: innovations, their covariance, NIS and likelihood.
+
+With x the pose and the further states that bias the ranges, e and dx by how much an update moved
+them, and H, S the derivatives of the ranges by them at the pose after it, the innovation is
+
+    v = r - h(after) + H e + S dx,   cov(v) = [H S] P [H S]^T + R,
+
+P the covariance before the update. To first order v is the range less the one foretold. Taken
+about the pose after the update, it holds for a filter that starts from nothing as well, and its
+normalised square is twice the cost that an iterated EKF has minimised.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym import bounds
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.filter import Filter
+from rbl_gym.estimators.inputs import check_epoch, check_variance
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements.ranging import NoiseLaw
+
+# Standard deviations of a range beyond which it contradicts the pose after the update: it is
+# refused, as by the robust filters.
+GATE = 4.0
+# What the likelihood supposes of refused ranges: this share of all, at any of 10 m (1/m). Without
+# such a constant the deviation that refuses everything would be the likeliest.
+OUTLIER_SHARE, OUTLIER_DENSITY = 0.05, 0.1
+_LOG_USED = np.log((1 - OUTLIER_SHARE) / np.sqrt(2 * np.pi))
+_LOG_REFUSED = np.log(OUTLIER_SHARE * OUTLIER_DENSITY)
+
+
+class Innovations(NamedTuple):
+    """What an epoch's ranges say to a filter, with leading axes.
+
+    Attributes
+    ----------
+    innovation, std
+        (..., M, N), metres: the range less the one foretold, and the standard deviation that the
+        filter expected of that; 0 where there is no link.
+    residual
+        (..., M, N), metres: the range less that of the state after the update; 0 without a link.
+    used
+        (..., M, N): the links measured, but for the refused, whose residual is beyond `GATE`
+        standard deviations of a range.
+    nis
+        Normalised innovation squared (...) of the ranges used, of mean `dof` where the filter is
+        honest; inf where a state is not finite.
+    dof
+        How many ranges (...) were used.
+    log_likelihood
+        Natural logarithm (...) of the density of the ranges: Gaussian of those used, constant of
+        those refused.
+    """
+
+    innovation: FloatArray
+    std: FloatArray
+    residual: FloatArray
+    used: BoolArray
+    nis: FloatArray
+    dof: FloatArray
+    log_likelihood: FloatArray
+
+
+def innovations(
+    filter: Filter,
+    before: Any,
+    after: Any,
+    ranges: ArrayLike,
+    anchors: ArrayLike,
+    tags: FloatArray,
+    noise: NoiseLaw,
+    links: ArrayLike | None = None,
+) -> Innovations:
+    """Innovations of an update, seen from the pose after it.
+
+    Parameters
+    ----------
+    filter
+        Any filter. One whose states bias the ranges has a method ``biases_of(state, (M, N))``: the
+        states besides the pose (..., K), the covariance (..., 6 + K, 6 + K) of the pose's error
+        and theirs, and by how much (M N, K) each of them lengthens every range.
+    before, after
+        Its states, as `predict` and as `update` gave them.
+    ranges, anchors, links
+        As `update` was told.
+    tags
+        Places on the body (N, 3).
+    noise
+        Law of the epoch.
+
+    Raises
+    ------
+    ValueError
+        As `update`.
+    """
+    ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
+    variance = check_variance(noise.variance(ranges, mask), mask)
+    pose, x, P, S = _states(filter, before, ranges.shape[-2:])
+    new, y, _, _ = _states(filter, after, ranges.shape[-2:])
+    distance, H = bounds.range_jacobian(anchors, tags, *new)
+    shape = np.broadcast_shapes(distance.shape, ranges.shape, (*P.shape[:-2], 1, 1))
+    flat = (*shape[:-2], shape[-2] * shape[-1])
+    links = np.broadcast_to(True if mask is None else mask, shape).reshape(flat)
+    variance = np.broadcast_to(variance, shape).reshape(flat)
+    residual = np.broadcast_to(ranges - distance, shape).reshape(flat) - y @ S.T
+    moved = np.concatenate([rotations.error(new[0], pose[0]), new[1] - pose[1], y - x], axis=-1)
+    H = np.swapaxes(H, -1, -2)
+    H = np.concatenate([H, np.broadcast_to(S, (*H.shape[:-1], S.shape[-1]))], axis=-1)
+    v = residual + (H @ moved[..., None])[..., 0]
+    used: BoolArray = np.asarray(links & (residual**2 <= GATE**2 * variance))
+    # A = R^-1/2 H of what was used: cov(v) = R^1/2 (I + A P A^T) R^1/2.
+    scale = np.where(links, 1 / np.sqrt(variance), 0.0)
+    A = H * scale[..., None]
+    spread = A @ P @ np.swapaxes(A, -1, -2)
+    own = np.diagonal(spread, axis1=-2, axis2=-1)
+    spread = np.where(used[..., None] & used[..., None, :], spread, 0.0)
+    sound = np.isfinite(spread).all(axis=(-2, -1)) & np.isfinite(residual).all(axis=-1)
+    spread = np.where(sound[..., None, None], spread, 0.0) + np.eye(flat[-1])
+    root = np.linalg.cholesky(spread)
+    u = np.where(used & sound[..., None], v * scale, 0.0)
+    nis = (np.linalg.solve(root, u[..., None])[..., 0] ** 2).sum(axis=-1)
+    log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+    log_det = log_det + np.where(used, np.log(variance), 0.0).sum(axis=-1)
+    dof = used.sum(axis=-1)
+    refused = links.sum(axis=-1) - dof
+    likelihood = dof * _LOG_USED - 0.5 * (nis + log_det) + refused * _LOG_REFUSED
+    std = np.sqrt(variance * (1 + own))
+    return Innovations(
+        *(np.where(links, a, 0.0).reshape(shape) for a in (v, std, residual)),
+        used.reshape(shape),
+        np.where(sound, nis, np.inf),
+        dof,
+        np.where(sound, likelihood, -np.inf),
+    )
+
+
+def _states(
+    filter: Filter, state: Any, shape: tuple[int, ...]
+) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray]:
+    """Pose, further states x, covariance P of both, and what x adds to the ranges (M N, K)."""
+    own = getattr(filter, "biases_of", None)
+    if own is not None:
+        return (state.rotation, state.translation), *own(state, shape)
+    belief = filter.belief(state)
+    x = np.zeros((*belief.translation.shape[:-1], 0))
+    return belief[:2], x, belief.covariance, np.zeros((shape[0] * shape[1], 0))
