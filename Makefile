@@ -51,7 +51,7 @@ dist: .venv/dev.stamp
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/twine check --strict dist/*
 	$(BIN)/python -m venv .venv/smoke
-	.venv/smoke/bin/python -m pip install --quiet "$$(ls dist/*.whl)[cli]"
+	.venv/smoke/bin/python -m pip install --quiet "$$(ls dist/*.whl)"
 	cd "$${TMPDIR:-/tmp}" && "$(CURDIR)/.venv/smoke/bin/python" -W error "$(CURDIR)/tests/smoke.py"
 
 clean:

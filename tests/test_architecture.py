@@ -153,7 +153,7 @@ BEYOND = {
 }
 
 
-@needs("rich", "cmaes", "plotly")
+@needs("cmaes", "plotly")
 def test_every_module_imports_alone_and_none_under_a_second_name():
     absent = {name for name, needs in BEYOND.items() if find_spec(needs) is None} | {
         name for name in MODULES if name.endswith("__main__")

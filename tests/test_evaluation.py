@@ -170,7 +170,6 @@ def test_a_policy_as_saved_is_scored_in_the_worlds_of_evaluations(kind):
     assert evaluation.held_out_returns(task, policy, 3, 2) == got
 
 
-@needs("rich")
 def test_a_training_says_how_good_the_policy_is_that_it_saved(monkeypatch, tmp_path, capsys):
     """By a stand-in for PPO: the learning curve shines, the policy that is saved does not."""
     size = rl_task("auv_buoys").make(1).single_observation_space.shape[0]
@@ -305,7 +304,7 @@ def test_correlations_need_three():
 # --- the command line -------------------------------------------------------------------------
 
 
-@needs("rich", "cmaes")
+@needs("cmaes")
 def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
     path = tmp_path / "mine.npz"
     policies.save(random_policy(sizes=(18, 4, 12), task="selection"), path)
@@ -325,7 +324,7 @@ def test_evaluate_prints_a_table_or_json(tmp_path, capsys):
     assert "greedy-with-map" in capsys.readouterr().out
 
 
-@needs("rich", "cmaes")
+@needs("cmaes")
 def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(transfer, "_STEPS", 14)
     path = tmp_path / "mine.npz"
@@ -347,7 +346,6 @@ def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     assert re.findall("greedy\\S*|random", table) == ["greedy"] * 4
 
 
-@needs("rich")
 def test_errors_are_one_line(tmp_path, capsys):
     good, same = tmp_path / "mine.npz", tmp_path / "other" / "mine.npz"
     for path in (good, same):

@@ -14,7 +14,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.studies import hard, monte_carlo
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scenes import SCENES
-from tests.helpers import assert_table_holds, needs
+from tests.helpers import assert_table_holds
 
 
 @pytest.fixture
@@ -30,7 +30,6 @@ def part(monkeypatch):
     monkeypatch.setattr(hard, "_START_STEPS", max(hard.AFTER) + 1)
 
 
-@needs("rich")
 def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(part, tmp_path, capsys):
     picture, table, figures = (tmp_path / f"x.{kind}" for kind in ("png", "csv", "json"))
     arguments = ["reproduce", "hard", "--trials", "4", "--plot", str(picture)]

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-pytest.importorskip("rich", reason="needs the extra cli")
-
 from rbl_gym import estimators, metrics, motion
 from rbl_gym.app import bench_report
 from rbl_gym.app.cli import main

@@ -13,7 +13,7 @@ from rbl_gym.networks.graphs import cycle_matrix
 from rbl_gym.networks.sensing import proj
 from rbl_gym.studies import network
 from rbl_gym.studies.papers import network2009, network_growth
-from tests.helpers import ROOT, assert_table_holds, needs
+from tests.helpers import ROOT, assert_table_holds
 
 G2O = ROOT.parent / "shared" / "data" / "g2o_planar"
 
@@ -32,7 +32,6 @@ def ring(tmp_path):
     return path
 
 
-@needs("rich")
 def test_a_network_is_solved_certified_and_drawn(ring, tmp_path, capsys):
     picture = tmp_path / "new" / "ring.png"
     assert main(["network", str(ring), "--plot", str(picture)]) == 0
@@ -47,7 +46,6 @@ def test_a_network_is_solved_certified_and_drawn(ring, tmp_path, capsys):
     assert result["chordal_cost"] == pytest.approx(result["cost_rad2"], rel=1e-3)
 
 
-@needs("rich")
 def test_a_network_of_bearings_without_places(tmp_path, capsys):
     rows = [(0, 1, 0.5, -2.0), (1, 2, 1.0, 2.0), (0, 2, -0.5, 3.0)]
     path = tmp_path / "edges.csv"
@@ -117,7 +115,6 @@ def test_edges_without_information_where_none_is_needed(tmp_path, capsys):
     assert result["weights"] == "all edges alike: the file has no information"
 
 
-@needs("rich")
 def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
     path = tmp_path / "a.g2o"
     path.write_text("EDGE_SE2 5 6 1 0 0.1 1 0 0 1 0 9\nEDGE_SE2 6 5 1 0 1 1 0 0 1 0 0\n")
@@ -135,7 +132,6 @@ def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
     assert "with information of theta (I33)" in error
 
 
-@needs("rich")
 def test_skipped_lines_and_large_keys_are_named(tmp_path, capsys):
     path = tmp_path / "a.g2o"
     key = ord("x") * 2**56
@@ -188,7 +184,6 @@ def small(monkeypatch):
     monkeypatch.setattr(network_growth, "TRIANGULATION_SIZES", (10, 20, 40, 80))
 
 
-@needs("rich")
 def test_reproduce_network2009(small, tmp_path, capsys):
     picture, table, figures = (tmp_path / f"x.{kind}" for kind in ("png", "csv", "json"))
     arguments = ["reproduce", "network2009", "--trials", "5", "--plot", str(picture)]
@@ -214,7 +209,6 @@ def test_reproduce_network2009(small, tmp_path, capsys):
     assert run["rms_estimated"] < run["rms_measured"]
 
 
-@needs("rich")
 def test_network2009_takes_points_footprints_and_a_variance(small, tmp_path, capsys):
     points, figures = tmp_path / "points.csv", tmp_path / "x.json"
     points.write_text("x,y\n0,0\n10,0\n10,10\n0,10\n5,4\n")

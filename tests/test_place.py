@@ -9,7 +9,6 @@ import sys
 import numpy as np
 import pytest
 
-pytest.importorskip("rich", reason="needs the extra cli")
 pytest.importorskip("cmaes", reason="needs the extra placement")
 pytest.importorskip("plotly", reason="needs the extra viz")
 

@@ -31,7 +31,7 @@ print({"estimators", "wrappers"} & set(sys.modules))
     ]  # fmt: skip
 
 
-@needs("rich", "cmaes")
+@needs("cmaes")
 @pytest.mark.parametrize(
     "command",
     [

@@ -19,8 +19,6 @@ from rbl_gym.worlds import scenes
 from tests.helpers import needs
 from tests.test_epoch_noise import log
 
-pytestmark = needs("rich")
-
 
 def printed(capsys, *arguments):
     """The JSON that a command prints."""

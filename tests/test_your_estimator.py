@@ -15,7 +15,7 @@ from rbl_gym import estimators
 from rbl_gym.app.cli import main
 from rbl_gym.estimators.locating import localization
 from rbl_gym.testing import check_locator
-from tests.helpers import ROOT, needs
+from tests.helpers import ROOT
 
 TEXT = (ROOT / "docs" / "your_estimator.md").read_text(encoding="utf-8")
 
@@ -50,7 +50,6 @@ def test_the_template_has_ten_lines_to_write():
     assert len(body) == 10
 
 
-@needs("rich")
 def test_its_commands_bring_it_into_the_table(package, monkeypatch, capsys):
     # As the installed command starts: its own folder is searched, the working folder is not.
     monkeypatch.setattr(

@@ -6,9 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.table import Table
-
-from rbl_gym.app.reports import new_console
+from rbl_gym.app.tables import new_console, new_table
 from rbl_gym.studies.bench.leaderboard import is_recording
 
 _HEADINGS = (
@@ -58,8 +56,8 @@ def print_bench(result: dict[str, Any]) -> None:
     )
 
 
-def _nominal(scene: str, first: dict[str, Any], by_filter: dict[str, dict[str, Any]]) -> Table:
-    table = Table(title=f"{scene}, {trials(first)}, seed {first['seed']}")
+def _nominal(scene: str, first: dict[str, Any], by_filter: dict[str, dict[str, Any]]) -> Any:
+    table = new_table(f"{scene}, {trials(first)}, seed {first['seed']}")
     for heading in _HEADINGS:
         table.add_column(heading, justify="left" if heading == "filter" else "right")
     order = sorted(by_filter.items(), key=lambda item: _tags(item[1], "nominal"))
@@ -105,8 +103,8 @@ def _worse(ran: dict[str, dict[str, Any]]) -> list[str]:
     return [texts.get(name, "-") for name in ran]
 
 
-def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str]) -> Table:
-    table = Table(title=f"{scene}, stress")
+def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str]) -> Any:
+    table = new_table(f"{scene}, stress")
     table.add_column("filter")
     for heading in stress:
         table.add_column(heading, justify="right")
@@ -203,7 +201,7 @@ def print_rerun(result: dict[str, Any]) -> None:
         console.print(f"  {name}: {before} then, {after} now")
     if not result["changed"]:
         return
-    table = Table(title="what differs")
+    table = new_table("what differs")
     for heading in ("scene", "condition", "filter", "fields", "most: field", "then", "now", "by"):
         table.add_column(heading)
     for row in result["changed"]:

@@ -11,7 +11,6 @@ from typing import Any
 from rbl_gym import __version__
 from rbl_gym.app import bench_command, learning, replay_command
 from rbl_gym.app.terminal import (
-    MissingExtraError,
     add_html,
     add_json,
     add_trials,
@@ -20,9 +19,9 @@ from rbl_gym.app.terminal import (
     positive,
     print_files,
     progress,
-    require,
     write_json,
 )
+from rbl_gym.studies.extras import MissingExtraError, require
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from rbl_gym.app.figures import new_figure, styled
-from rbl_gym.app.reports import new_console
+from rbl_gym.app.tables import new_console, new_table
 
 _COLOURS = {"NIA + UQ": "#2e86ab", "ML": "#1b7f5c", "PSO": "#e8a33d", "PSA": "#d1495b"}
 _PAPERS = "R = I"  # the setting of Fig. 2 and Table 1
@@ -67,7 +66,7 @@ def print_doa2019(result: dict[str, Any]) -> None:
     out = new_console()
     _print_table_1(out, result)
     for label, data in result["settings"].items():
-        table = Table(title=f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials")
+        table = new_table(f"doa2019, {label}, t = (5, 5, 3) m, {result['trials']} trials")
         table.add_column("noise (deg)")
         table.add_column("method")
         for heading in (
@@ -121,7 +120,7 @@ def print_doa2019(result: dict[str, Any]) -> None:
 
 def _print_table_1(out: Any, result: dict[str, Any]) -> None:
     data = result["settings"][_PAPERS]
-    table = Table(title=f"Table 1 of the paper beside ours, {_PAPERS}")
+    table = new_table(f"Table 1 of the paper beside ours, {_PAPERS}")
     for heading in (
         "noise (deg)",
         "method",

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from rbl_gym.app.figures import new_figure, styled
-from rbl_gym.app.reports import new_console
+from rbl_gym.app.tables import new_console, new_table
 
 _COLOURS = {
     "iekf": "#d1495b",
@@ -67,7 +66,7 @@ def print_hard(result: dict[str, Any]) -> None:
     """One table of links for each scene, one of starts."""
     console = new_console()
     for name, conditions in result["links"].items():
-        table = Table(title=f"{name}, {result['trials']} trials")
+        table = new_table(f"{name}, {result['trials']} trials")
         table.add_column("links", no_wrap=True)
         table.add_column("filter", no_wrap=True)
         for heading in (
@@ -100,7 +99,7 @@ def print_hard(result: dict[str, Any]) -> None:
             table.add_section()
         console.print(table)
     after = result["starts"]["after"]
-    table = Table(title=f"trials that are back so many epochs later, {result['trials']} trials")
+    table = new_table(f"trials that are back so many epochs later, {result['trials']} trials")
     for heading in ("scene", "start", "filter"):
         table.add_column(heading)
     for heading in (*map(str, after), "us / step"):

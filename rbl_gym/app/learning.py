@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.terminal import (
-    MissingExtraError,
     add_json,
     add_seed,
     positive,
     progress,
-    require,
     write_json,
 )
 from rbl_gym.checks import check_one_of
+from rbl_gym.studies.extras import MissingExtraError, require
 from rbl_gym.studies.learning.rl_tasks import TASKS, rl_task
 
 # Held-out worlds in which a trained policy is scored, those of ``evaluate``.

@@ -8,10 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from rbl_gym.app.figures import new_figure, styled
-from rbl_gym.app.reports import new_console
+from rbl_gym.app.tables import new_console, new_table
 from rbl_gym.studies.papers import network2009
 
 _COLOURS = {"bfs": "#d1495b", "paton": "#2e86ab", "minimum": "#1b7f5c"}
@@ -187,7 +186,7 @@ def print_network2009(result: dict[str, Any]) -> None:
         slopes = ", ".join(f"{rule} n^{slope:.2f}" for rule, slope in data["slope"].items())
         out.print(f"kappa, {name}: {slopes}")
     out.print("Section IV-E: the trace's kappa is O(1 / n^3) at worst, O(1 / n) in triangulations.")
-    table = Table(title=f"convergence, {network2009.EXAMPLE_LOOPS} loops")
+    table = new_table(f"convergence, {network2009.EXAMPLE_LOOPS} loops")
     for heading in (
         "cycles",
         "kappa",
@@ -222,7 +221,7 @@ def print_network2009(result: dict[str, Any]) -> None:
             f"{row['rounds']:.0f} rounds, {row['largest_error_rad']:.1e} rad from the "
             "projection"
         )
-    table = Table(title=f"three nodes in space, {result['trials']} trials")
+    table = new_table(f"three nodes in space, {result['trials']} trials")
     for heading in (
         "triangle",
         "sigma (rad)",
@@ -244,8 +243,8 @@ def print_network2009(result: dict[str, Any]) -> None:
 
 def _print_accuracy(out: Any, result: dict[str, Any]) -> None:
     places = result["networks"]["positions"]
-    table = Table(
-        title=f"Fig. 4: {len(places)} points, sigma^2 = {result['variance'][0]:g}, "
+    table = new_table(
+        f"Fig. 4: {len(places)} points, sigma^2 = {result['variance'][0]:g}, "
         f"{result['trials']} trials"
     )
     for heading in (

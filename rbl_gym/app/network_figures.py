@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from rbl_gym.app.figures import new_figure, styled
-from rbl_gym.app.reports import new_console
+from rbl_gym.app.tables import new_console
 from rbl_gym.studies.network import Solved
 
 

@@ -1,4 +1,4 @@
-"""Tables of a placement on the terminal, by rich, and the same as HTML's."""
+"""Tables of a placement on the terminal, and the same as HTML's."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.table import Table
-
 from rbl_gym.app.page import digits
+from rbl_gym.app.tables import new_console, new_table
 
 # A share of lost bodies above this is said in words.
 _MANY_LOST = 0.01
@@ -69,17 +67,16 @@ def notes(result: dict[str, Any]) -> list[str]:
 
 def print_place(result: dict[str, Any]) -> None:
     """Every table, and the notes."""
-    terminal = Console().is_terminal
-    console = Console(width=None if terminal else 130, highlight=False)
+    console = new_console()
     for rows in tables(result):
-        table = Table(title=rows.title, title_justify="left")
+        table = new_table(rows.title)
         for index, heading in enumerate(rows.headings):
             table.add_column(heading, justify="right" if index else "left")
         for row in rows.rows:
             table.add_row(*row)
         console.print(table)
     for note in notes(result):
-        console.print(note, markup=False)
+        console.print(note)
 
 
 def _anchors(result: dict[str, Any]) -> Rows:

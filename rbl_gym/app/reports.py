@@ -1,11 +1,10 @@
-"""Tables on the terminal, by rich."""
+"""Tables on the terminal."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
+from rbl_gym.app.tables import new_console, new_table
 
 CAMSAP_COLUMNS = (
     ("rotation RMSE", "rotation_rmse", "{:.4f}"),
@@ -28,16 +27,10 @@ _NO_NUMBERS = {
 }
 
 
-def new_console(width: int = 130) -> Console:
-    """Standard output."""
-    # Piped, a table keeps all of its columns.
-    return Console(width=None if Console().is_terminal else width, highlight=False)
-
-
 def print_camsap2013(result: dict[str, Any]) -> None:
     """The filters in a table, and the claims of the paper and ours with their figures."""
     console = new_console()
-    table = Table(title=f"{result['experiment']}, {result['trials']} trials")
+    table = new_table(f"{result['experiment']}, {result['trials']} trials")
     table.add_column("filter")
     for heading, _, _ in CAMSAP_COLUMNS:
         table.add_column(heading, justify="right")
@@ -73,8 +66,8 @@ def print_static(result: dict[str, Any]) -> None:
     console = new_console()
     for label, data in result["settings"].items():
         low, high = data["reference_range_db"][0], data["reference_range_db"][-1]
-        table = Table(
-            title=f"{result['experiment']}, anchors in {label}, {low} to {high} dB, "
+        table = new_table(
+            f"{result['experiment']}, anchors in {label}, {low} to {high} dB, "
             f"{result['trials']} trials"
         )
         table.add_column("method")
@@ -99,7 +92,7 @@ def print_slides2013(result: dict[str, Any]) -> None:
 
 def print_replay(result: dict[str, Any]) -> None:
     """The figures of a recording, one a line."""
-    console = Console(highlight=False)
+    console = new_console()
     console.print(
         f"{result['epochs']} epochs, {result['links']} ranges in {result['duration_s']:.1f} s, "
         f"filter {result['settings']['filter']}"
@@ -109,7 +102,7 @@ def print_replay(result: dict[str, Any]) -> None:
         _print_notes(console, result)
         return
     console.print(f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth")
-    table = Table()
+    table = new_table()
     for heading in ("error", "RMSE", "median", "p95"):
         table.add_column(heading, justify="left" if heading == "error" else "right")
     axes = result["position_axes"]
@@ -125,9 +118,9 @@ def print_replay(result: dict[str, Any]) -> None:
     _print_notes(console, result)
 
 
-def _print_notes(console: Console, result: dict[str, Any]) -> None:
+def _print_notes(console: Any, result: dict[str, Any]) -> None:
     for note in result["notes"]:
-        console.print(note, markup=False, soft_wrap=True)
+        console.print(note, soft_wrap=True)
 
 
 def print_training(result: dict[str, Any]) -> None:
@@ -156,7 +149,7 @@ def print_training(result: dict[str, Any]) -> None:
 def print_evaluation(result: dict[str, Any]) -> None:
     """Policies and references, the best first."""
     console = new_console()
-    table = Table(title=f"{result['task']}, {result['worlds']} held-out worlds")
+    table = new_table(f"{result['task']}, {result['worlds']} held-out worlds")
     table.add_column("policy")
     for heading in ("loss", "score b (m)", "normalised", "95 %"):
         table.add_column(heading, justify="right")
@@ -177,8 +170,8 @@ def print_transfer(result: dict[str, Any]) -> None:
     """One table for each filter: score and real error, and how they go together."""
     console = new_console()
     for name, rows in result["filters"].items():
-        table = Table(
-            title=f"{result['task']}, {name}, {result['worlds']} worlds, "
+        table = new_table(
+            f"{result['task']}, {name}, {result['worlds']} worlds, "
             f"{result['repeats']} bodies in each"
         )
         table.add_column("layouts")

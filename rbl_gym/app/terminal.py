@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.studies.extras import MissingExtraError, require
+from rbl_gym.app.tables import has_rich
+from rbl_gym.studies.extras import require
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -49,17 +50,32 @@ def check_html(options: argparse.Namespace) -> None:
 @contextlib.contextmanager
 def progress(label: str, total: int) -> Iterator[Callable[..., None]]:
     """A progress bar on standard error; yields the function that advances it (by 1)."""
-    try:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-    except ImportError as error:
-        raise MissingExtraError(
-            "this command needs the extra cli: pip install 'rbl-gym[cli]'"
-        ) from error
+    if not has_rich():
+        yield from _plain_progress(label, total)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(label, total=total)
         yield lambda steps=1: bar.advance(task, steps)
+
+
+def _plain_progress(label: str, total: int) -> Iterator[Callable[..., None]]:
+    """A line that is written over, on a terminal only."""
+    done = shown = 0
+
+    def advance(steps: int = 1) -> None:
+        nonlocal done, shown
+        done += steps
+        if sys.stderr.isatty() and (percent := 100 * done // max(total, 1)) > shown:
+            shown = percent
+            print(f"\r{label} {done}/{total}", end="", file=sys.stderr, flush=True)
+
+    yield advance
+    if shown:
+        print(file=sys.stderr)
 
 
 def write_json(result: dict[str, Any], target: str | None) -> bool:

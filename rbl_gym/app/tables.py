@@ -1,0 +1,79 @@
+"""Tables and text on the terminal: by rich where it is installed (extra ``cli``), else plain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def has_rich() -> bool:
+    """Whether rich is installed."""
+    try:
+        import rich  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def new_console(width: int = 130) -> Any:
+    """Standard output: rich's console, or one that prints plain text."""
+    if not has_rich():
+        return _PlainConsole()
+    from rich.console import Console
+
+    # Piped, a table keeps all of its columns.
+    return Console(width=None if Console().is_terminal else width, highlight=False, markup=False)
+
+
+def new_table(title: str | None = None) -> Any:
+    """A table that `new_console` prints: rich's, or one of plain text with the same methods."""
+    if not has_rich():
+        return _PlainTable(title)
+    from rich.table import Table
+
+    return Table(title=title, title_justify="left")
+
+
+class _PlainConsole:
+    """`print` as rich's, without style."""
+
+    def print(self, *shown: Any, **_style: Any) -> None:
+        """Text, or tables."""
+        print(*shown)
+
+
+class _PlainTable:
+    """Columns, rows and sections as rich's `Table` takes them; `str` gives the text."""
+
+    def __init__(self, title: str | None) -> None:
+        self._title = title
+        self._headings: list[str] = []
+        self._right: list[bool] = []
+        self._rows: list[tuple[str, ...] | None] = []  # None: a section ends
+
+    def add_column(self, heading: str, justify: str = "left", **_style: Any) -> None:
+        """A column, to the left or to the right."""
+        self._headings.append(heading)
+        self._right.append(justify == "right")
+
+    def add_row(self, *cells: str, **_style: Any) -> None:
+        """A row; cells at its end may be missing."""
+        self._rows.append((*cells, *[""] * (len(self._headings) - len(cells))))
+
+    def add_section(self) -> None:
+        """A line below the rows so far."""
+        self._rows.append(None)
+
+    def __str__(self) -> str:
+        rows = [tuple(self._headings), *(row for row in self._rows if row)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        line = "  ".join("-" * width for width in widths)
+
+        def text(row: tuple[str, ...]) -> str:
+            cells = zip(row, widths, self._right, strict=True)
+            return "  ".join(c.rjust(w) if right else c.ljust(w) for c, w, right in cells).rstrip()
+
+        body = [line if row is None else text(row) for row in self._rows]
+        while body and body[-1] is line:
+            body.pop()
+        title = [self._title] if self._title else []
+        return "\n".join([*title, text(rows[0]), line, *body, ""])

@@ -1,0 +1,81 @@
+"""Tables and progress with rich and without it."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from rbl_gym.app import tables, terminal
+from rbl_gym.app.cli import main
+from tests.helpers import needs
+
+
+@pytest.fixture
+def without_rich(monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "rich"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "rich", None)
+
+
+def example():
+    table = tables.new_table("errors [m]")
+    table.add_column("filter", no_wrap=True)
+    for heading in ("position (m)", "NEES"):
+        table.add_column(heading, justify="right")
+    table.add_row("iekf", "0.0412", "1.02", style="dim")
+    table.add_section()
+    table.add_row("bound", "0.04")
+    table.add_section()
+    return table
+
+
+def test_a_plain_table_has_its_columns_in_line(without_rich, capsys):
+    tables.new_console().print(example())
+    assert capsys.readouterr().out == (
+        "errors [m]\n"
+        "filter  position (m)  NEES\n"
+        "------  ------------  ----\n"
+        "iekf          0.0412  1.02\n"
+        "------  ------------  ----\n"
+        "bound           0.04\n\n"
+    )
+
+
+@needs("rich")
+def test_a_table_by_rich_holds_the_same_text(capsys):
+    tables.new_console().print(example())
+    shown = capsys.readouterr().out
+    for text in ("errors [m]", "filter", "position (m)", "0.0412", "1.02", "bound"):
+        assert text in shown
+
+
+def test_plain_progress_is_silent_away_from_a_terminal(without_rich, capsys):
+    with terminal.progress("replay", 10) as advance:
+        advance()
+        advance(9)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_plain_progress_counts_on_a_terminal(without_rich, capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with terminal.progress("replay", 1000) as advance:
+        for _ in range(1000):
+            advance()
+    shown = capsys.readouterr().err.split("\r")[1:]
+    assert len(shown) == 100
+    assert shown[0] == "replay 10/1000"
+    assert shown[-1] == "replay 1000/1000\n"
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (["demo", "--trials", "2"], ["UC-KF", "rotation RMSE", "claims of the paper"]),
+        (["reproduce", "doa2019", "--trials", "2"], ["NIA + UQ", "bound"]),
+    ],
+)
+def test_commands_run_without_rich(without_rich, command, words, tmp_path, capsys):
+    assert main([*command, "--plot", str(tmp_path / "x.png")]) == 0
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in words)
