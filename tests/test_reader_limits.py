@@ -21,7 +21,10 @@ from tests.test_recordings import CALIBRATION, LONG, LONG_STD, PLANAR, TRUTH, wr
     ("texts", "message"),
     [
         ({"ranges": LONG.replace("0.1,B", "1e12,B")}, "line 5, column 't': must be at most 1e"),
-        ({"ranges": LONG_STD.replace("2.5,0.1", "2.5,1e9")}, "line 2, column 'std': must be at"),
+        (
+            {"ranges": LONG_STD.replace("2.5,0.1", "2.5,1e9")},
+            "line 2, column 'std': must be .*no longer than",
+        ),
         (
             {"calibration": CALIBRATION.replace("3.5,0", "-1e300,-0.9999999999")},
             "line 3, column 'bias_m': corrected ranges must be at most 10000 m",

@@ -147,10 +147,9 @@ ERRORS = {
     "ragged": ({"ranges": LONG + "0.2,A,1\n"}, r"ranges.csv, line 6: must have 4 .*, got 3"),
     "ragged wide": ({"ranges": WIDE + "0.2\n"}, r"ranges.csv, line 4: must have 5 .*, got 1"),
     "missing column": (
-        {"anchors": "anchor,x,y\nA,0,0\n"},
-        r"anchors.csv, line 1: missing column 'z', must be of .*, got \['anchor', 'x', 'y'\]",
+        {"anchors": "anchor,x,z\nA,0,0\n"},
+        r"anchors.csv, line 1: missing column 'y', got \['anchor', 'x', 'z'\]; say .* y=NAME",
     ),
-    "semicolons": ({"ranges": LONG.replace(",", ";")}, r"line 1: missing column 't'.*t;anchor"),
     "missing range": (
         {"ranges": "# x\nt,anchor,tag\n0,A,1\n"},
         r"ranges.csv, line 2: missing column 'range'",
@@ -159,18 +158,6 @@ ERRORS = {
         {"tags": "tag,x,y,z,x\n1,0,0,0,0\n"},
         r"tags.csv, line 1: column 'x' comes twice",
     ),
-    "unknown column": (
-        {"ranges": "t,anchor,tag,range,rssi\n0,A,1,2,-80\n"},
-        r"ranges.csv, line 1: unknown column 'rssi', must be of .*'std', 'valid'\]",
-    ),
-    "unknown tag column": (
-        {"tags": "tag,x,y,z,colour\n1,0,0,0,red\n"},
-        r"tags.csv, line 1: unknown column 'colour', must be of \['tag', 'x', 'y', 'z'\]",
-    ),
-    "no such pair": (
-        {"ranges": "t,aAt1,aDt1\n0,1,1\n"},
-        r"ranges.csv, line 1: unknown column 'aDt1', must be of \['t', 'aAt1'",
-    ),
     "two pairs fit": (
         {
             "ranges": "t,a1t2t3\n0,1\n",
@@ -178,10 +165,6 @@ ERRORS = {
             "tags": "id,x,y,z\n3,0,0,0\n2t3,0,0,0\n",
         },
         r"ranges.csv: column 'a1t2t3' fits two pairs",
-    ),
-    "yaw and quaternion": (
-        {"truth": "t,x,y,yaw_deg,qw\n0,0,0,0,1\n"},
-        r"truth.csv, line 1: unknown column 'qw'",
     ),
     "not a number": (
         {"ranges": LONG.replace("3.0", "three")},
@@ -212,21 +195,13 @@ ERRORS = {
         r"anchors.csv, line 5, column 'anchor': id must be unique, got 'A'",
     ),
     "empty id": ({"tags": TAGS + ",0,0,0\n"}, r"tags.csv, line 4, column 'tag': .* be empty"),
-    "link twice": (
-        {"ranges": LONG + "0.1,B,left,1.6\n"},
-        r"ranges.csv, line 6, column 'tag': each link may come once .*, got \('B', 'left'\)",
-    ),
     "calibration twice": (
         {"calibration": CALIBRATION + "A,1,0,0,0\n"},
         r"calibration.csv, line 4, column 'tag': each link may come once .*, got \('A', '1'\)",
     ),
     "time falls": (
-        {"ranges": LONG + "0.05,A,1,1\n"},
-        r"ranges.csv, line 6, column 't': time must not decrease from row to row, got '0.05'",
-    ),
-    "time repeats": (
-        {"ranges": WIDE + "0.1,1,1,1,1\n"},
-        r"ranges.csv, line 4, column 't': time must increase from row to row, got '0.1'",
+        {"ranges": LONG + "-1.05,A,1,1\n"},
+        r"ranges.csv, line 6, column 't': time must not fall by more than 1 s .*, got '-1.05'",
     ),
     "truth repeats": ({"truth": TRUTH + "1,0,0,0,1,0,0,0\n"}, r"truth.csv, line 4, column 't'"),
     "zero range": (
@@ -260,11 +235,11 @@ ERRORS = {
     ),
     "std": (
         {"ranges": "t,anchor,tag,range,std\n0,A,1,2,0\n"},
-        r"ranges.csv, line 2, column 'std': must be positive, got '0'",
+        r"ranges.csv, line 2, column 'std': must be positive .*, got '0'",
     ),
     "empty std": (
         {"ranges": "t,anchor,tag,range,std\n0,A,1,2,\n"},
-        r"ranges.csv, line 2, column 'std': must be positive, got ''",
+        r"ranges.csv, line 2, column 'std': must be positive .*, got ''",
     ),
     "valid": (
         {"ranges": "t,anchor,tag,range,valid\n0,A,1,2,2\n"},

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.recordings.reading import Recording
+from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example
 from rbl_gym.studies.replay import Replayed

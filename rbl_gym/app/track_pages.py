@@ -12,7 +12,7 @@ from rbl_gym.app import page, track_html
 from rbl_gym.app.figures import COLOURS
 from rbl_gym.app.reports import CAMSAP_COLUMNS
 from rbl_gym.app.story import Beliefs, Story
-from rbl_gym.recordings.reading import Recording
+from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example
 from rbl_gym.studies.replay import Replayed, origin_of, truth_of

@@ -1,21 +1,27 @@
 """Recordings: real measurement logs as arrays."""
 
 from rbl_gym.recordings.align import ALIGNMENTS, Alignment, align_positions, apply_alignment
+from rbl_gym.recordings.format import Format
 from rbl_gym.recordings.motion_offset import motion_offset
-from rbl_gym.recordings.reading import Recording, read_recording
+from rbl_gym.recordings.reading import read_recording, read_runs
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.recordings.report import Report
 from rbl_gym.recordings.time_offset import TimeOffset, time_offset
 from rbl_gym.recordings.truth import Truth, read_truth, truth_at
 
 __all__ = [
     "ALIGNMENTS",
     "Alignment",
+    "Format",
     "Recording",
+    "Report",
     "TimeOffset",
     "Truth",
     "align_positions",
     "apply_alignment",
     "motion_offset",
     "read_recording",
+    "read_runs",
     "read_truth",
     "time_offset",
     "truth_at",

@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import MAX_RANGE_M, TOO_LONG, Ids, Table
 
 
 def calibrated(
-    ranges: FloatArray, std: FloatArray | None, table: Table, ids: Ids
+    ranges: FloatArray, std: FloatArray | None, table: Table, ids: Ids, said: Said
 ) -> tuple[FloatArray, FloatArray | None]:
     """Ranges (K, M, N) and their deviations with bias and slope of each link taken off."""
-    table.check_columns(("anchor", "tag", "bias_m", "slope"), ("sigma_m",))
+    table.require("anchor", "tag", "bias_m")
+    said.read(table, ("anchor", "tag", "bias_m", "slope", "sigma_m"))
     link = table.links(ids)
-    slope = table.numbers("slope")
+    slope = table.numbers("slope") if "slope" in table.columns else np.zeros(len(table.lines))
     table.check(slope > -1, "slope", "must be above -1")
     bias, scale = np.zeros(ranges.shape[1:]), np.ones(ranges.shape[1:])
     bias[link], scale[link] = table.numbers("bias_m"), 1 + slope
@@ -23,5 +25,8 @@ def calibrated(
     too_long = f"corrected ranges {TOO_LONG}"
     table.check(corrected.max(axis=0)[link] <= MAX_RANGE_M, "bias_m", too_long)
     links = (ranges > 0) & (corrected > 0)
+    if lost := int((ranges > 0).sum() - links.sum()):
+        said.drop("not positive once calibrated", lost)
+        said.note(table.path, f"{lost} ranges are not positive once calibrated and are left out")
     std = None if std is None else np.where(links, std / scale, 0.0)
     return np.where(links, corrected, 0.0), std

@@ -1,21 +1,82 @@
-"""Tables of anchors and tags."""
+"""Tables of anchors and tags, and where points that move are at a time."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from rbl_gym.checks import FloatArray
-from rbl_gym.recordings.tables import MAX_COORDINATE_M, AnyPath, is_first, read_table
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.recordings.report import Said
+from rbl_gym.recordings.tables import MAX_COORDINATE_M, AnyPath, Source, is_first, read_table
 
 MAX_TAG_M = 1e4
 
 
-def read_points(path: AnyPath, kind: str) -> tuple[tuple[str, ...], FloatArray]:
-    """Ids and coordinates (P, 3) of a table; `kind` is ``"anchor"`` or ``"tag"``."""
-    table = read_table(path)
-    column = "id" if next(iter(table.columns)) == "id" else kind
-    table.check_columns((column, "x", "y", "z"))
-    ids = tuple(cell.strip() for cell in table.columns[column])
+class Points(NamedTuple):
+    """Ids and places (P, 3) of points; of those that move, times (L,) and places (L, 3) of each."""
+
+    ids: tuple[str, ...]
+    places: FloatArray
+    tracks: tuple[tuple[FloatArray, FloatArray], ...] | None = None
+
+    def at(self, times: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Places (K, P, 3) at times (K,), and where they are known (K, P).
+
+        Between its times a point moves straight; before the first and after the last it is known
+        for as long as two of them are apart.
+        """
+        shape = len(times), len(self.ids)
+        if self.tracks is None:
+            return np.broadcast_to(self.places, (*shape, 3)), np.ones(shape, dtype=bool)
+        places, known = np.empty((*shape, 3)), np.ones(shape, dtype=bool)
+        for p, (at, where) in enumerate(self.tracks):
+            for axis in range(3):
+                places[:, p, axis] = np.interp(times, at, where[:, axis])
+            if len(at) > 1:
+                step = float(np.median(np.diff(at)))
+                known[:, p] = (times >= at[0] - step) & (times <= at[-1] + step)
+        return places, known
+
+
+def read_points(path: AnyPath, kind: str, source: Source, said: Said) -> Points:
+    """The points of a table; `kind` is ``"anchor"`` or ``"tag"``. Anchors may move: column `t`."""
+    table = read_table(path, source)
+    column = kind if kind in table.columns or "id" not in table.columns else "id"
+    axes = [axis for axis in "xyz" if axis in table.columns]
+    if axes == ["x", "y"] and len(table.columns) == 3 + ("t" in table.columns):
+        said.note(table.path, "has no column z, heights are 0")
+    else:
+        axes = [*"xyz"]
+    table.require(column, *axes)
+    ids = table.text(column)
     table.check(np.array([*map(bool, ids)]), column, "id must not be empty")
-    table.check(is_first(ids), column, "id must be unique")
-    return ids, table.points("xyz", MAX_TAG_M if kind == "tag" else MAX_COORDINATE_M)
+    places = table.points(axes, MAX_TAG_M if kind == "tag" else MAX_COORDINATE_M)
+    places = np.pad(places, ((0, 0), (0, 3 - len(axes))))
+    once = is_first(ids)
+    if once.all() or kind == "tag" or "t" not in table.columns:
+        table.check(once, column, "id must be unique")
+        said.read(table, (column, *axes))
+        return Points(tuple(ids), places)
+    said.read(table, (column, *axes, "t"))
+    times, note = table.seconds()
+    said.note(table.path, note)
+    every = np.array(ids)
+    names = tuple(every[once].tolist())
+    tracks = []
+    for name in names:
+        rows = np.flatnonzero(every == name)
+        rows = rows[np.argsort(times[rows], kind="stable")]
+        again = np.ones(len(times), dtype=bool)
+        again[rows[1:]] = np.diff(times[rows]) > 0
+        table.check(again, "t", f"{kind} {name!r} may have one place at a time")
+        tracks.append((times[rows], places[rows]))
+    return moving(names, tuple(tracks))
+
+
+def moving(ids: tuple[str, ...], tracks: tuple[tuple[FloatArray, FloatArray], ...]) -> Points:
+    """Points of these tracks; fixed ones where none of them moves."""
+    places = np.array([where.mean(axis=0) for _, where in tracks])
+    if all(np.ptp(where, axis=0).max() < 1e-9 for _, where in tracks):
+        return Points(ids, np.array([where[0] for _, where in tracks]))
+    return Points(ids, places, tracks)

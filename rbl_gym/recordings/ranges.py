@@ -1,46 +1,110 @@
-"""Tables of ranges, long and wide, as arrays over epochs and links."""
+"""Tables of ranges as arrays over epochs and links."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.recordings.tables import MAX_RANGE_M, TOO_LONG, Ids, Table, is_first
+from rbl_gym.recordings.format import Format
+from rbl_gym.recordings.measured import Measured, mark_doubles, read_measured, settle
+from rbl_gym.recordings.points import Points, moving
+from rbl_gym.recordings.report import Said
+from rbl_gym.recordings.tables import IntArray, Table
 
-Log = tuple[FloatArray, FloatArray, FloatArray | None]  # times, ranges (0: no link), range_std
-
-
-def read_wide(table: Table, ids: Ids) -> Log:
-    """A row an epoch, a column a link."""
-    names = [f"a{anchor}t{tag}" for anchor in ids[0] for tag in ids[1]]
-    if not (first := is_first(names)).all():
-        name = names[first.argmin()]
-        raise ValueError(f"{table.path}: column {name!r} fits two pairs, use a long table")
-    table.check_columns(("t",), names)
-    times = table.times()
-    ranges = np.zeros((len(times), len(names)))
-    for link, name in enumerate(names):
-        if name in table.columns:
-            ranges[:, link] = table.ranges(name)
-    return times, ranges.reshape(len(times), len(ids[0]), len(ids[1])), None
+# Rows that come later than this after a later one are not sorted (s).
+_LATE_S = 1.0
 
 
-def read_long(table: Table, ids: Ids) -> Log:
-    """A row a range; rows of one time are an epoch."""
-    table.check_columns(("t", "anchor", "tag", "range"), ("std", "valid"))
-    times = table.times(may_repeat=True)
-    starts = np.diff(times, prepend=-np.inf) > 0
-    epoch = np.cumsum(starts) - 1
-    cells = (epoch, *table.links(ids, epoch))
-    valid = table.numbers("valid") if "valid" in table.columns else np.ones(len(times))
-    table.check(np.isin(valid, (0, 1)), "valid", "must be 0 or 1")
-    measured = table.ranges("range", valid)
-    ranges, range_std = np.zeros((epoch[-1] + 1, len(ids[0]), len(ids[1]))), None
-    ranges[cells] = measured
-    if "std" in table.columns:
-        std = table.numbers("std", may_be_empty=True)
-        table.check((std > 0) | (measured == 0), "std", "must be positive")
-        table.check((std <= MAX_RANGE_M) | (measured == 0), "std", TOO_LONG)
-        range_std = np.zeros_like(ranges)
-        range_std[cells] = np.where(measured > 0, std, 0.0)
-    return times[starts], ranges, range_std
+class Log(NamedTuple):
+    """Times (K,), ranges (K, M, N), 0 where no link, their deviations, anchors and tags."""
+
+    times: FloatArray
+    ranges: FloatArray
+    range_std: FloatArray | None
+    anchors: Points
+    anchor_places: FloatArray  # (K, M, 3)
+    tags: Points
+
+
+def read_log(
+    table: Table, anchors: Points | None, tags: Points | None, format: Format, said: Said
+) -> Log:
+    """The ranges of a table, long or wide.
+
+    Without a table of anchors their places stand beside the ranges; without one of tags there is
+    one tag, at the body's origin.
+
+    Raises
+    ------
+    ValueError
+        As `rbl_gym.recordings.read_recording`.
+    """
+    table.require("t")
+    if format.strict and table.cut:
+        raise ValueError(f"{table.path}, line {table.cut}: the last line is cut off")
+    measured, ids = read_measured(table, anchors, tags, format, said)
+    times, note = table.seconds(format.time_unit)
+    said.note(table.path, note)
+    _sort(measured, table, times, format, said)
+    if anchors is None:
+        anchors, at = _anchors_beside(table, measured, ids[0], times, said)
+        ids = anchors.ids, ids[1]
+        measured = measured._replace(anchor=at)
+    if tags is None:
+        tags = Points(ids[1], np.zeros((1, 3)))
+    known = anchors.at(times)[1][measured.row, measured.anchor]
+    measured.drop(~known, "of an anchor whose place is not known then")
+    epochs, epoch = np.unique(times[measured.row], return_inverse=True)
+    mark_doubles(measured, epoch)
+    settle(measured, table, ids, format, said)
+    used = measured.cause == 0
+    if not used.any():
+        raise ValueError(f"{table.path}: must have an epoch with a link, got none")
+    cells = epoch[used], measured.anchor[used], measured.tag[used]
+    ranges = np.zeros((len(epochs), len(ids[0]), len(ids[1])))
+    ranges[cells] = measured.range[used]
+    std = None
+    if measured.std is not None:
+        std = np.zeros_like(ranges)
+        std[cells] = measured.std[used]
+    return Log(epochs, ranges, std, anchors, anchors.at(epochs)[0], tags)
+
+
+def _sort(measured: Measured, table: Table, times: FloatArray, format: Format, said: Said) -> None:
+    """Count rows that come after a later one; refuse them where `strict`, or by more than 1 s."""
+    late = np.maximum.accumulate(times) - times
+    allowed = 0.0 if format.strict else _LATE_S
+    table.check(
+        late <= allowed + 1e-9,
+        "t",
+        f"time must not fall by more than {allowed:g} s from row to row (several runs in one file "
+        "need a column run)",
+    )
+    if count := int((late > 0).sum()):
+        said.sorted_rows += count
+        said.note(table.path, f"{count} rows come after later ones and are sorted by time")
+
+
+def _anchors_beside(
+    table: Table, measured: Measured, ids: tuple[str, ...], times: FloatArray, said: Said
+) -> tuple[Points, IntArray]:
+    """Anchors whose places stand beside the ranges, and which of them each range is of."""
+    axes = ["ax", "ay", *(["az"] if "az" in table.columns else [])]
+    if len(axes) == 2:
+        said.note(table.path, "has no heights of the anchors, they are 0")
+    places = np.pad(table.points(axes), ((0, 0), (0, 3 - len(axes))))
+    anchor = measured.anchor
+    if "anchor" not in table.columns:
+        distinct, anchor = np.unique(places, axis=0, return_inverse=True)
+        anchor = anchor.reshape(-1)
+        ids = tuple(" ".join(f"{x:g}" for x in place) for place in distinct)
+        if len(set(ids)) < len(ids):
+            ids = tuple(map(str, range(len(distinct))))
+    tracks = []
+    for i in range(len(ids)):
+        rows = np.flatnonzero(anchor == i)
+        at, first = np.unique(times[rows], return_index=True)
+        tracks.append((at, places[rows[first]]))
+    return moving(ids, tuple(tracks)), anchor

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import os
-from collections.abc import Iterable
-from pathlib import Path
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.recordings.stamps import found_unit, iso_seconds, seconds_per
+from rbl_gym.recordings.text import is_number, read_cells
 
 AnyPath = str | os.PathLike[str]
 IntArray = NDArray[np.intp]
@@ -21,53 +22,126 @@ MAX_RANGE_M = 10e3
 MAX_COORDINATE_M = 1e8  # geocentric and map coordinates are in the world frame
 MAX_TIME_S = 1e11  # the year 5138
 TOO_LONG = f"must be at most {MAX_RANGE_M:.0f} m (looks like millimetres?)"
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+
+# What loggers write where there is no number.
+_MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-", "inf", "-inf", "+inf"))
+# Other names that a column often has; a unit may stand behind them: time_ms, range_mm.
+_OTHER_NAMES = {
+    "t": ("t", "time", "timestamp", "stamp"),
+    "range": ("range", "distance", "dist"),
+    "anchor": ("anchor", "anchor_id"),
+    "tag": ("tag", "tag_id"),
+    "run": ("run", "run_id"),
+    **{f"a{axis}": (f"a{axis}", f"anchor_{axis}") for axis in "xyz"},
+}
+_UNIT = re.compile(r"\s*[\[(](|s|ms|us|ns|m|cm|mm|deg|rad)[\])]$|_(s|ms|us|ns|m|cm|mm)$")
+
+
+class Source(NamedTuple):
+    """How the columns of a file are named, and which of its rows are meant.
+
+    `columns`: what a column is called in the file, by what it holds; ``{"*": "B_*"}`` names all
+    that begin so; a unit may stand in brackets behind a name, ``"stamp[ms]"``. `where`: cells that
+    the rows meant have, by column.
+    """
+
+    columns: Mapping[str, str] = {}
+    where: Mapping[str, str] = {}
+
+
+AS_NAMED = Source()
 
 
 class Table(NamedTuple):
-    """Cells of a CSV file by column, the line of the header and the lines of the rows."""
+    """Cells of a text file by column, the line of the header and the lines of the rows."""
 
     path: str
     header_line: int
-    lines: list[int]
-    columns: dict[str, tuple[str, ...]]
+    lines: NDArray[np.int64]
+    columns: dict[str, NDArray[np.object_]]  # by what they hold, or else by their name in the file
+    names: dict[str, str]  # in the file
+    units: dict[str, str]  # that the header tells
+    decimal: str  # "." or ","
+    cut: int | None  # line of a last row that was cut off and is not here
+    chosen_by: tuple[str, ...]  # names in the file of columns that chose the rows
 
-    def check_columns(self, required: Iterable[str], optional: Iterable[str] = ()) -> None:
-        """Raise unless all of `required` and nothing beyond `optional` is there."""
-        required, got = list(required), list(self.columns)
-        known = [*required, *optional]
-        missing = [name for name in required if name not in got]
-        unknown = [name for name in got if name not in known]
-        if wrong := missing + unknown:
-            what = f"{'missing' if missing else 'unknown'} column {wrong[0]!r}"
-            where = f"{self.path}, line {self.header_line}"
-            raise ValueError(f"{where}: {what}, must be of {known!r:.200}, got {got!r:.200}")
+    def require(self, *columns: str) -> None:
+        """Raise unless all `columns` are there."""
+        for column in columns:
+            if column not in self.columns:
+                raise ValueError(
+                    f"{self.path}, line {self.header_line}: missing column {column!r}, got "
+                    f"{[*self.names.values()]!r:.200}; say which it is by columns, {column}=NAME"
+                )
+
+    def name(self, column: str) -> str:
+        """What `column` is called in the file."""
+        return self.names.get(column, column)
+
+    def place(self, row: int, column: str) -> str:
+        """File, line and column in words."""
+        return f"{self.path}, line {self.lines[row]}, column {self.name(column)!r}"
 
     def check(self, ok: BoolArray, column: str, must: str, got: Any = None) -> None:
         """Raise at the first row where `ok` is False; `got` replaces the cells in the message."""
         if not ok.all():
             row = int(np.argmin(ok))
             value = repr(self.columns[column][row]) if got is None else str(got[row])
-            where = f"{self.path}, line {self.lines[row]}, column {column!r}"
-            raise ValueError(f"{where}: {must}, got {value:.80}")
+            raise ValueError(f"{self.place(row, column)}: {must}, got {value:.80}")
 
-    def numbers(self, column: str, *, may_be_empty: bool = False) -> FloatArray:
-        """(rows,) finite numbers, NaN for empty cells where these are allowed."""
-        cells = self.columns[column]
-        values = np.array([_number(cell) for cell in cells])
+    def select(self, rows: BoolArray) -> Table:
+        """The table of some of the rows."""
+        columns = {name: cells[rows] for name, cells in self.columns.items()}
+        return self._replace(lines=self.lines[rows], columns=columns)
+
+    def text(self, column: str) -> list[str]:
+        """(rows,) cells without space around them."""
+        return [cell.strip() for cell in self.columns[column]]
+
+    def numbers(self, column: str, *, may_be_missing: bool = False) -> FloatArray:
+        """(rows,) finite numbers, NaN for cells without a number where these are allowed."""
+        cells = self.columns[column].tolist()
+        if self.decimal == ",":
+            cells = [cell.replace(",", ".") for cell in cells]
+        try:
+            if "_" in "".join(cells):  # float() reads 1_000
+                raise ValueError
+            values = np.array([*map(float, cells)])
+        except ValueError:
+            values = np.array([float(cell) if is_number(cell) else np.nan for cell in cells])
         ok = np.isfinite(values)
-        if may_be_empty and not ok.all():
-            ok |= np.array([not cell for cell in cells])
+        if may_be_missing and not ok.all():
+            ok |= np.array([cell.strip().lower() in _MISSING for cell in cells])
+            values[~np.isfinite(values)] = np.nan
         self.check(ok, column, "must be a finite number")
         return values
 
-    def times(self, *, may_repeat: bool = False) -> FloatArray:
-        """(rows,) column `t`, increasing."""
-        times = self.numbers("t")
+    def seconds(self, unit: str | None = None) -> tuple[FloatArray, str]:
+        """(rows,) column `t` in seconds, and what is to be said of its unit ("": nothing).
+
+        `unit`: s, ms, us, ns or iso; None: as the header tells, else found from the cells.
+        """
+        self.require("t")
+        said = unit or self.units.get("t")
+        if said == "iso" or (said is None and not is_number(self.columns["t"][0])):
+            stamps = iso_seconds(self.columns["t"].tolist())
+            if stamps is not None and (said == "iso" or np.isfinite(stamps[0])):
+                self.check(np.isfinite(stamps), "t", "must be a time of ISO 8601")
+                return stamps, "" if said else "times are read as ISO 8601"
+        values, note = self.numbers("t"), ""
+        if said is None:
+            said, note = found_unit(values)
+        times = values * seconds_per(said)
         too_late = f"must be at most {MAX_TIME_S:g} s (looks like milliseconds?)"
         self.check(np.abs(times) <= MAX_TIME_S, "t", too_late)
+        return times, note
+
+    def times(self) -> FloatArray:
+        """(rows,) column `t` in seconds, increasing."""
+        times, _ = self.seconds()
         step = np.diff(times, prepend=-np.inf)
-        ok, must = (step >= 0, "not decrease") if may_repeat else (step > 0, "increase")
-        self.check(ok, "t", f"time must {must} from row to row")
+        self.check(step > 0, "t", "time must increase from row to row")
         return times
 
     def points(self, columns: Iterable[str], most: float = MAX_COORDINATE_M) -> FloatArray:
@@ -75,80 +149,140 @@ class Table(NamedTuple):
         points = {column: self.numbers(column) for column in columns}
         too_far = f"must be at most {most:.0f} m (looks like millimetres?)"
         for column, values in points.items():
+            values *= METRES.get(self.units.get(column, ""), 1.0)
             self.check(np.abs(values) <= most, column, too_far)
         return np.stack([*points.values()], axis=-1)
 
-    def ranges(self, column: str, valid: ArrayLike = 1) -> FloatArray:
-        """(rows,) metres, 0 where the cell is empty or `valid` is 0."""
-        ranges = self.numbers(column, may_be_empty=True)
-        unused = np.isnan(ranges) | np.equal(valid, 0)
-        self.check((ranges > 0) | unused, column, "range must be positive")
-        self.check((ranges <= MAX_RANGE_M) | unused, column, TOO_LONG)
-        return np.where(unused, 0.0, ranges)
-
-    def links(self, ids: Ids, epoch: IntArray | int = 0) -> tuple[IntArray, IntArray]:
-        """Anchor and tag indices (rows,), every link at most once in an `epoch`."""
-        anchor, tag = self.positions("anchor", ids[0]), self.positions("tag", ids[1])
-        numbered = (epoch * len(ids[0]) + anchor) * len(ids[1]) + tag
-        pairs = [*zip(self.columns["anchor"], self.columns["tag"], strict=True)]
-        self.check(is_first(numbered), "tag", "each link may come once at a time", got=pairs)
-        return anchor, tag
-
     def positions(self, column: str, ids: tuple[str, ...]) -> IntArray:
-        """(rows,) where in `ids` the cells of `column` stand."""
+        """(rows,) where in `ids` the cells of `column` stand, -1 for those that are none.
+
+        Ids are text. Where one is not there as it is, capital letters and a ``.0`` that a
+        spreadsheet has put behind a number do not count.
+        """
         index = {name: i for i, name in enumerate(ids)}
-        positions = np.array([index.get(cell.strip(), -1) for cell in self.columns[column]])
-        self.check(positions >= 0, column, f"unknown {column}, must be of {ids!r:.200}")
-        return positions
+        plain: dict[str, int] = {}
+        for i, name in enumerate(ids):
+            plain[_plain(name)] = -1 if _plain(name) in plain else i
+        cells = self.text(column)
+        found = {
+            cell: index[cell] if cell in index else plain.get(_plain(cell), -1)
+            for cell in set(cells)
+        }
+        return np.array([found[cell] for cell in cells], dtype=np.intp)
+
+    def links(self, ids: Ids) -> tuple[IntArray, IntArray]:
+        """Anchor and tag indices (rows,) of known ids, every link at most once."""
+        found = []
+        for column, known in zip(("anchor", "tag"), ids, strict=True):
+            found.append(self.positions(column, known))
+            self.check(found[-1] >= 0, column, f"unknown {column}, must be of {known!r:.200}")
+        pairs = [*zip(self.columns["anchor"], self.columns["tag"], strict=True)]
+        once = is_first(found[0] * len(ids[1]) + found[1])
+        self.check(once, "tag", "each link may come once in the table", got=pairs)
+        return found[0], found[1]
 
 
-def read_table(path: AnyPath) -> Table:
+def read_table(path: AnyPath, source: Source = AS_NAMED) -> Table:
     """The cells of a file with a header.
 
     Raises
     ------
     ValueError
-        If it cannot be read, or a row does not fit the header.
+        If it cannot be read, a row does not fit the header, a column that `source` names is not
+        there, or no row is left.
     """
-    name, lines, rows = os.fspath(path), [], []
-    # A comment is turned into a blank line, an empty row: line numbers stay those of the file.
-    text = ("" if line.lstrip()[:1] in ("", "#") else line for line in _read_lines(name))
-    reader = csv.reader(text, skipinitialspace=True, strict=True)
-    try:
-        for row in filter(None, reader):
-            rows.append(row)
-            lines.append(reader.line_num)
-            if len(row) != len(rows[0]):
-                raise csv.Error(f"must have {len(rows[0])} cells like the header, got {len(row)}")
-    except csv.Error as error:
-        raise ValueError(f"{name}, line {reader.line_num}: {error}") from error
-    if len(rows) < 2:
-        raise ValueError(f"{name}: must have a header and rows, got {len(rows)} lines")
-    header = [cell.strip() for cell in rows[0]]
+    cells = read_cells(os.fspath(path))
+    where = f"{cells.path}, line {cells.header_line}"
+    header, units = [], {}
+    for i, cell in enumerate(cells.header, 1):
+        name, units_of = _name_and_unit(cell)
+        header.append(name or f"(column {i})")
+        units[header[-1]] = units_of
     if not (first := is_first(header)).all():
-        column = header[first.argmin()]
-        raise ValueError(f"{name}, line {lines[0]}: column {column!r} comes twice")
-    columns = dict(zip(header, zip(*rows[1:], strict=True), strict=True))
-    return Table(name, lines[0], lines[1:], columns)
+        name = header[first.argmin()]
+        raise ValueError(f"{where}: column {name!r} comes twice")
+    by_name = dict(zip(header, cells.columns, strict=True))
+    said = {role: _name_and_unit(name) for role, name in source.columns.items()}
+    names = _roles(where, header, {role: name for role, (name, _) in said.items()})
+    units |= {name: unit for name, unit in said.values() if unit}
+    rows = np.ones(len(cells.lines), dtype=bool)
+    for column, want in source.where.items():
+        if (name := names.get(column, column)) not in by_name:
+            raise ValueError(f"{where}: no column {column!r} to choose by, got {header!r:.200}")
+        rows &= np.array([cell.strip() == want for cell in by_name[name]])
+        if not rows.any():
+            got = sorted({cell.strip() for cell in by_name[name]})
+            raise ValueError(f"{where}: no row has {column}={want}, got {got!r:.200}")
+    table = Table(
+        cells.path,
+        cells.header_line,
+        np.array(cells.lines),
+        {role: _column(by_name[name]) for role, name in names.items()},
+        names,
+        {role: units[name] for role, name in names.items() if units[name]},
+        cells.decimal,
+        cells.cut,
+        tuple(names.get(column, column) for column in source.where),
+    )
+    return table if rows.all() else table.select(rows)
 
 
-def _read_lines(path: str) -> list[str]:
-    try:
-        return Path(path).read_text(encoding="utf-8-sig").split("\n")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read, {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: must be UTF-8 text, {error.reason} at {error.start}") from error
+def _name_and_unit(cell: str) -> tuple[str, str]:
+    """``time [ms]`` is ``time`` in ms, ``time_ms`` keeps its name."""
+    cell = cell.strip()
+    unit = _UNIT.search(cell)
+    if unit is None:
+        return cell, ""
+    return (cell, unit[2]) if unit[2] else (cell[: unit.start()], unit[1])
 
 
-def _number(cell: str) -> float:
-    try:
-        return np.nan if "_" in cell or not cell else float(cell)  # float() reads 1_000
-    except ValueError:
-        return np.nan
+def _column(cells: tuple[str, ...]) -> NDArray[np.object_]:
+    column = np.empty(len(cells), dtype=object)
+    column[:] = cells
+    return column
+
+
+def _roles(where: str, header: list[str], columns: dict[str, str]) -> dict[str, str]:
+    """Names in the file by what the columns hold."""
+    if "time" in columns:
+        columns["t"] = columns.pop("time")
+    names: dict[str, str] = {}
+    pattern = columns.pop("*", None)
+    if pattern is not None:
+        before, star, after = pattern.partition("*")
+        if not star:
+            raise ValueError(f"{where}: columns must name * by what has a *, got {pattern!r}")
+        for name in header:
+            if name.startswith(before) and name.endswith(after) and len(name) > len(pattern) - 1:
+                names[name[len(before) : len(name) - len(after)]] = name
+        if not names:
+            raise ValueError(f"{where}: no column is like {pattern!r}, got {header!r:.200}")
+    for role, name in columns.items():
+        if "{" in name:
+            continue  # a pattern of links
+        if name not in header:
+            raise ValueError(f"{where}: missing column {name!r} for {role}, got {header!r:.200}")
+        names[role] = name
+    taken = set(names.values())
+    for role, others in _OTHER_NAMES.items():
+        if role in names or role in header:
+            continue
+        like = [
+            name for name in header if name not in taken and _UNIT.sub("", name.lower()) in others
+        ]
+        if len(like) == 1:
+            names[role] = like[0]
+            taken.add(like[0])
+    # A column whose name another one has taken over stands in brackets.
+    left = [name for name in header if name not in taken]
+    return names | {f"({name})" if name in names else name: name for name in left}
 
 
 def is_first(values: ArrayLike) -> BoolArray:
     """(rows,) False where a value has come before."""
     values, first = np.asarray(values), np.unique(values, return_index=True)[1]
     return np.isin(np.arange(len(values)), first)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"\.0+$", "", name.casefold())

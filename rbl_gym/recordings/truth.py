@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from rbl_gym import motion
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.geometry import rotations
-from rbl_gym.recordings.tables import AnyPath, read_table
+from rbl_gym.recordings.report import Said
+from rbl_gym.recordings.tables import AS_NAMED, AnyPath, Source, Table, read_table
 
 __all__ = ["Truth", "read_truth", "truth_at"]
 
@@ -60,29 +61,67 @@ def truth_at(
     return path.rotation, path.translation, inside & ((gap <= max_gap_s) | (elapsed == 0))
 
 
-def read_truth(path: AnyPath) -> Truth:
+def read_truth(
+    path: AnyPath,
+    source: Source = AS_NAMED,
+    said: Said | None = None,
+    *,
+    run: str | None = None,
+    times: FloatArray | None = None,
+) -> Truth:
     """The reference poses of a file.
+
+    Parameters
+    ----------
+    path, source, said
+        The file, how its columns are named, and who takes down what was found.
+    run
+        Where the file has a column `run`, the one that is meant.
+    times
+        Of a file without times that has one pose: those at which the body stands there.
 
     Raises
     ------
     ValueError
         If the file is not as `read_recording` describes it.
     """
-    table = read_table(path)
+    said = said or Said()
+    table = read_table(path, source)
+    if run is not None and "run" in table.columns:
+        rows = np.array([cell == run for cell in table.text("run")])
+        if not rows.any():
+            raise ValueError(f"{table.path}: has no run {run!r} in column {table.name('run')!r}")
+        table = table.select(rows)
+    rotation, translation, read = _poses(table)
+    said.read(table, (*read, "run"))
+    if "t" not in table.columns and times is not None and len(table.lines) == 1:
+        shape = len(times), 3
+        return Truth(
+            times, np.broadcast_to(rotation, (*shape, 3)), np.broadcast_to(translation, shape)
+        )
+    return Truth(table.times(), rotation, translation)
+
+
+def _poses(table: Table) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+    """Rotations (L, 3, 3), translations (L, 3), and the columns that they are of."""
     if "yaw_deg" in table.columns:
-        table.check_columns(("t", "x", "y", "yaw_deg"), ("z",))
-        yaw = table.numbers("yaw_deg")
+        angles = [a for a in ("roll_deg", "pitch_deg", "yaw_deg") if a in table.columns]
+        places = [axis for axis in "xyz" if axis in table.columns]
+        table.require("x", "y", *(("z", "roll_deg", "pitch_deg") if len(angles) > 1 else ()))
         must = f"must be at most {MAX_YAW_DEG:g} in magnitude"
-        table.check(np.abs(yaw) <= MAX_YAW_DEG, "yaw_deg", must)
-        rotation = rotations.exp(np.radians(yaw)[:, None] * (0.0, 0.0, 1.0))
-        translation = table.points(axis for axis in "xyz" if axis in table.columns)
-        missing = 3 - translation.shape[1]
-        return Truth(table.times(), rotation, np.pad(translation, ((0, 0), (0, missing))))
+        rotation = np.eye(3)
+        for angle in reversed(angles):  # ZYX: about z, then about the new y, then about the new x
+            turn = table.numbers(angle)
+            table.check(np.abs(turn) <= MAX_YAW_DEG, angle, must)
+            axis = np.eye(3)[("roll_deg", "pitch_deg", "yaw_deg").index(angle)]
+            rotation = rotation @ rotations.exp(np.radians(turn)[:, None] * axis)
+        translation = np.pad(table.points(places), ((0, 0), (0, 3 - len(places))))
+        return rotation, translation, ("t", *places, *angles)
 
     names = ("qw", "qx", "qy", "qz")
-    table.check_columns(("t", "x", "y", "z", *names))
+    table.require("x", "y", "z", *names)
     q = np.stack([table.numbers(name) for name in names], axis=-1)
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(q, axis=-1)
     table.check(np.abs(norm - 1) <= 1e-2, "qw", "quaternion norm must be 1 within 0.01", got=norm)
-    return Truth(table.times(), rotations.from_quaternion(q), table.points("xyz"))
+    return rotations.from_quaternion(q), table.points("xyz"), ("t", *"xyz", *names)

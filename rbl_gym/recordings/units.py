@@ -35,12 +35,14 @@ def check_units(
     links: BoolArray,
     anchors: FloatArray,
     tags: FloatArray,
+    anchors_are: str = "stand",
 ) -> None:
     """Raise where ranges (K, M, N), anchors (M, 3) and tags (N, 3) cannot be in one unit.
 
     A range r of a point p obeys ``|r - r'| <= |p - p'| <= r + r'`` for two anchors of one tag and
     for two tags of one anchor; noise adds to the left side. `paths` are the files of the ranges,
-    the anchors and the tags, for the message.
+    the anchors and the tags, for the message. `anchors_are`: they ``"stand"`` around the body, or
+    are ``"carried"`` by another one, which may be far away, or ``"move"`` about these places.
 
     Raises
     ------
@@ -50,14 +52,17 @@ def check_units(
     typical = float(np.median(ranges[links]))
     layout = np.linalg.norm(anchors - anchors.mean(axis=0), axis=-1).mean()
     # A single anchor, or anchors all at one place, say nothing about the scale.
-    if layout > 1e-6 and not 1 / _MAX_SCALE_RATIO <= typical / layout <= _MAX_SCALE_RATIO:
+    scale = typical / layout if layout > 1e-6 and anchors_are == "stand" else 1.0
+    if not 1 / _MAX_SCALE_RATIO <= scale <= _MAX_SCALE_RATIO:
+        hint = " (ranges in cm or mm? say their unit)" if scale > 1 else ""
         raise ValueError(
             f"{paths[0]}: units look inconsistent, the median range is {typical:.4g} m and "
-            f"the anchors lie {layout:.4g} m from their centre"
+            f"the anchors lie {layout:.4g} m from their centre{hint}"
         )
     newest, fresh = _held(times, ranges, links)
     _check_spread(paths[2], tags, anchors, newest, fresh, typical)
-    _check_pairs(paths[1], "anchors", anchors, ranges.swapaxes(1, 2), links.swapaxes(1, 2),
+    if anchors_are != "move":
+        _check_pairs(paths[1], "anchors", anchors, ranges.swapaxes(1, 2), links.swapaxes(1, 2),
                  newest.swapaxes(1, 2), fresh.swapaxes(1, 2), typical)  # fmt: skip
     _check_pairs(paths[2], "tags", tags, ranges, links, newest, fresh, typical)
 

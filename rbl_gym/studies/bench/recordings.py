@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.measurements.ranging import LinkModel
-from rbl_gym.recordings.reading import Recording, read_recording
+from rbl_gym.recordings import Recording, read_recording
 from rbl_gym.studies import replay
 from rbl_gym.studies.bench import figures
 from rbl_gym.studies.bench.worlds import (

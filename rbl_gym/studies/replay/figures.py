@@ -10,7 +10,7 @@ import numpy as np
 from rbl_gym import metrics
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
-from rbl_gym.recordings.reading import Recording
+from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
 from rbl_gym.studies.replay.place import volume_of
 from rbl_gym.studies.replay.settings import Settings

@@ -9,7 +9,7 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import mirror, rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings.reading import Recording
+from rbl_gym.recordings.recording import Recording
 
 # Anchors whose distance from their plane is below this share of their width in it are tried.
 _THICK = 0.5

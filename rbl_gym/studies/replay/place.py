@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.recordings.reading import Recording
+from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.settings import Settings
 
 __all__ = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from rbl_gym.recordings.reading import Recording
+from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.figures import TrackErrors, track_errors, track_figures
 from rbl_gym.studies.replay.place import height_offset
 from rbl_gym.studies.replay.settings import Settings

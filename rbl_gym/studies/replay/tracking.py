@@ -15,7 +15,7 @@ from rbl_gym.estimators import Innovations
 from rbl_gym.estimators.filter import check_takes_noise
 from rbl_gym.geometry.mirror import mirror_pose
 from rbl_gym.measurements import ranging
-from rbl_gym.recordings.reading import Recording
+from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import Reading, Step, innovations_of, stack_beliefs, track_epochs
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
 from rbl_gym.studies.replay.place import (

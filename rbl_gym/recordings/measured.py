@@ -1,0 +1,307 @@
+"""Ranges one by one as a file has them, long or wide, and why some are no measurement."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.recordings.format import Format
+from rbl_gym.recordings.points import Points
+from rbl_gym.recordings.report import Said
+from rbl_gym.recordings.tables import MAX_RANGE_M, METRES, Ids, IntArray, Table, is_first
+
+# A log of which more than this share is no measurement is not what it is taken for.
+_MOST_BAD = 0.2
+_WIDE = "a{anchor}t{tag}"
+
+# Why a range is no link; those of `_FINE` are no fault of the log. What it must be, and where.
+_CAUSES = {
+    "": ("", ""),
+    "empty": ("", "range"),
+    "marked as not valid": ("", "valid"),
+    "repeated": ("each link may come once at a time", "range"),
+    "not a number": ("must be a finite number", "range"),
+    "zero": ("range must be positive", "range"),
+    "negative": ("range must be positive", "range"),
+    "too long": (f"must be at most {MAX_RANGE_M:.0f} m (looks like millimetres?)", "range"),
+    "without a standard deviation": ("must be positive and no longer than a range", "std"),
+    "of an unknown anchor": ("unknown anchor", "anchor"),
+    "of an unknown tag": ("unknown tag", "tag"),
+    "twice with two values": ("each link may come once at a time", "range"),
+    "of an anchor whose place is not known then": ("the anchor's place must be known", "t"),
+}
+_NAMES = [*_CAUSES]
+_FINE = ("", "empty", "marked as not valid", "repeated")
+
+
+class Measured(NamedTuple):
+    """R ranges as they stand in a table: the row and the column of each, its link, its value.
+
+    `cause`: why it is no link, of `_CAUSES`; 0: it is one. Metres; `std` is None where the log
+    has none.
+    """
+
+    row: IntArray
+    column: IntArray
+    anchor: IntArray
+    tag: IntArray
+    range: FloatArray
+    std: FloatArray | None
+    cause: IntArray
+    columns: list[str]
+    std_columns: list[str]
+
+    def drop(self, which: BoolArray, cause: str) -> None:
+        """Give `cause` to these, but for those that have one already."""
+        self.cause[which & (self.cause == 0)] = _NAMES.index(cause)
+
+
+def read_measured(
+    table: Table, anchors: Points | None, tags: Points | None, format: Format, said: Said
+) -> tuple[Measured, Ids]:
+    """The ranges of a table, and the ids of their anchors and tags.
+
+    Raises
+    ------
+    ValueError
+        If columns are missing, or tags or anchors are nowhere told.
+    """
+    pattern = format.of("ranges").columns.get("range", "")
+    if "{" in pattern:
+        return _read_wide(table, anchors, tags, format, said)
+    if table.columns.keys().isdisjoint(("anchor", "tag", "range", "ax")):
+        return _read_wide(table, anchors, tags, format, said)
+    table.require("t", "range")
+    read = {"t", "range", "run"}
+    anchor_ids = _ids_of(table, "anchor", anchors)
+    if anchors is None:
+        table.require("ax", "ay")
+        read |= {"ax", "ay", "az"}
+    ids = anchor_ids, _ids_of(table, "tag", tags)
+    none = np.zeros(len(table.lines), dtype=np.intp)
+    anchor, tag = (
+        table.positions(column, known) if column in table.columns else none
+        for column, known in zip(("anchor", "tag"), ids, strict=True)
+    )
+    read |= {"anchor", "tag"}
+    scale = _scale(table, "range", format, said)
+    values = scale * table.numbers("range", may_be_missing=True)
+    std, std_column = None, next((c for c in ("std", "var") if c in table.columns), "")
+    if std_column:
+        read.add(std_column)
+        std = table.numbers(std_column, may_be_missing=True)
+        with np.errstate(invalid="ignore"):
+            std = scale * (np.sqrt(std) if std_column == "var" else std)
+    rows = np.arange(len(values))
+    measured = Measured(rows, none, anchor, tag, values, std, none.copy(), ["range"], [std_column])
+    if "valid" in table.columns:
+        read.add("valid")
+        valid = table.numbers("valid")
+        table.check(np.isin(valid, (0, 1)), "valid", "must be 0 or 1")
+        measured.drop(valid == 0, "marked as not valid")
+    said.read(table, read)
+    _judge(measured, table)
+    return measured, ids
+
+
+def _ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
+    """Ids of the points of a long table."""
+    if points is None:
+        if column not in table.columns:
+            return ("0",)
+        ids = tuple(dict.fromkeys(table.text(column)))
+        if column == "tag" and len(ids) > 1:
+            raise ValueError(
+                f"{table.path}: ranges of several tags need a table of tags, got {ids!r:.200}"
+            )
+        return ids
+    if column not in table.columns and len(points.ids) > 1:
+        table.require(column)
+    return points.ids
+
+
+def _read_wide(
+    table: Table, anchors: Points | None, tags: Points | None, format: Format, said: Said
+) -> tuple[Measured, Ids]:
+    """A row an epoch, a column a link."""
+    columns = format.of("ranges").columns
+    table.require("t")
+    if anchors is None:
+        raise ValueError(f"{table.path}: columns for links need a table of anchors")
+    pattern = columns.get("range", _WIDE)
+    links, ids = _links_of(table, pattern, anchors.ids, None if tags is None else tags.ids)
+    names = list(links)
+    if not names:
+        raise ValueError(
+            f"{table.path}, line {table.header_line}: must have columns {pattern!r} of "
+            f"{ids!r:.200}, or t, anchor, tag, range; got {[*table.names.values()]!r:.200}"
+        )
+    scale = _scale(table, "range", format, said)
+    rows, width = len(table.lines), len(names)
+    values = scale * np.stack([table.numbers(n, may_be_missing=True) for n in names], axis=1)
+    std, std_names = None, []
+    if "std" in columns:
+        place = _links_of(table, columns["std"], *ids)[0]
+        by_link = {link: name for name, link in place.items()}
+        std_names = [by_link.get(link, "") for link in links.values()]
+        if "" in std_names:
+            name = names[std_names.index("")]
+            raise ValueError(
+                f"{table.path}, line {table.header_line}: no column like {columns['std']!r} "
+                f"for {name!r}"
+            )
+        std = np.stack([table.numbers(n, may_be_missing=True) for n in std_names], axis=1)
+        std = scale * std.ravel()
+    said.read(table, {"t", "run", *names, *std_names})
+    where = np.array([*links.values()], dtype=np.intp)
+    measured = Measured(
+        np.repeat(np.arange(rows), width),
+        np.tile(np.arange(width), rows),
+        np.tile(where[:, 0], rows),
+        np.tile(where[:, 1], rows),
+        values.ravel(),
+        std,
+        np.zeros(rows * width, dtype=np.intp),
+        names,
+        std_names,
+    )
+    _judge(measured, table)
+    return measured, ids
+
+
+def _links_of(
+    table: Table, pattern: str, anchors: tuple[str, ...], tags: tuple[str, ...] | None
+) -> tuple[dict[str, tuple[int, int]], Ids]:
+    """Anchor and tag of the columns that `pattern` names, and the ids."""
+    if "{anchor}" not in pattern or re.sub(r"\{(anchor|tag)\}", "", pattern).count("{"):
+        raise ValueError(f"columns of links must be like 'r_{{anchor}}_{{tag}}', got {pattern!r}")
+    if tags is None:
+        tags = _tags_named(table, pattern, anchors)
+    links: dict[str, tuple[int, int]] = {}
+    for a, anchor in enumerate(anchors):
+        for b, tag in enumerate(tags if "{tag}" in pattern else tags[:1]):
+            name = pattern.replace("{anchor}", anchor).replace("{tag}", tag)
+            if name in links:
+                raise ValueError(f"{table.path}: column {name!r} fits two pairs, use a long table")
+            if name in table.columns:
+                links[name] = a, b
+    if "{tag}" not in pattern and len(tags) > 1:
+        raise ValueError(f"columns {pattern!r} name no tag, and the tags are {tags!r:.200}")
+    return links, (anchors, tags)
+
+
+def _tags_named(table: Table, pattern: str, anchors: tuple[str, ...]) -> tuple[str, ...]:
+    """The one tag of a log without a table of tags."""
+    if "{tag}" not in pattern:
+        return ("0",)
+    found: dict[str, None] = {}
+    for anchor in anchors:
+        parts = pattern.replace("{anchor}", anchor).split("{tag}")
+        like = re.compile("(.+)".join(map(re.escape, parts)))
+        found |= {m[1]: None for name in table.columns if (m := like.fullmatch(name))}
+    if len(found) > 1:
+        raise ValueError(
+            f"{table.path}: ranges of several tags need a table of tags, got {[*found]!r:.200}"
+        )
+    return tuple(found) or ("0",)
+
+
+def _scale(table: Table, column: str, format: Format, said: Said) -> float:
+    """Metres of a unit of the ranges."""
+    told = table.units.get(column, "")
+    if format.unit is None and told in ("cm", "mm"):
+        said.note(table.path, f"ranges are in {told}, as the header tells")
+    return METRES.get(format.unit or told, 1.0)
+
+
+def _judge(measured: Measured, table: Table) -> None:
+    """Find the ranges that are no measurement by themselves."""
+    range, std = measured.range, measured.std
+    if np.isnan(range).any():
+        at = np.flatnonzero(np.isnan(range))
+        empty = np.zeros(len(range), dtype=bool)
+        for c, name in enumerate(measured.columns):
+            some = at[measured.column[at] == c]
+            cells = table.columns[name][measured.row[some]]
+            empty[some] = [not cell.strip() for cell in cells]
+        measured.drop(empty, "empty")
+        measured.drop(np.isnan(range), "not a number")
+    measured.drop(measured.anchor < 0, "of an unknown anchor")
+    measured.drop(measured.tag < 0, "of an unknown tag")
+    measured.drop(range == 0, "zero")
+    measured.drop(range < 0, "negative")
+    measured.drop(range > MAX_RANGE_M, "too long")
+    if std is not None:
+        measured.drop(~((std > 0) & (std <= MAX_RANGE_M)), "without a standard deviation")
+
+
+def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Said) -> None:
+    """Count what is no link; refuse it where `strict` or where it is more than a fifth.
+
+    Raises
+    ------
+    ValueError
+        With file, line and column of the first that is refused.
+    """
+    counts = Counter({_NAMES[c]: int(n) for c, n in enumerate(np.bincount(measured.cause)) if n})
+    said.ranges += len(measured.cause) - counts["empty"]
+    for cause, count in counts.items():
+        if cause:
+            said.drop(cause, count)
+    total = sum(n for cause, n in counts.items() if cause not in ("empty", "marked as not valid"))
+    bad = {cause: n for cause, n in counts.items() if cause not in _FINE}
+    refused = [*bad, *(["repeated"] if counts["repeated"] else [])]
+    if format.strict and refused:
+        raise ValueError(_first(measured, table, ids, refused))
+    if (count := sum(bad.values())) > _MOST_BAD * total:
+        causes = ", ".join(f"{n} {cause}" for cause, n in bad.items())
+        raise ValueError(
+            f"{table.path}: {count} of {total} ranges are no measurement: {causes}; a log with "
+            f"more than a fifth is refused. The first: {_first(measured, table, ids, refused)}"
+        )
+    if shown := {c: n for c, n in counts.items() if c not in ("", "empty", "marked as not valid")}:
+        causes = ", ".join(f"{n} {cause}" for cause, n in shown.items())
+        said.note(table.path, f"{sum(shown.values())} of {total} ranges are left out: {causes}")
+
+
+def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str:
+    """Where the first range with one of these causes stands, what it must be, what came."""
+    found = np.isin(measured.cause, [_NAMES.index(cause) for cause in causes])
+    at = np.flatnonzero(found)[np.argmin(measured.row[found])]
+    cause = _NAMES[measured.cause[at]]
+    must, column = _CAUSES[cause]
+    row = int(measured.row[at])
+    name = {"range": measured.columns, "std": measured.std_columns}.get(column, [column])
+    name = name[measured.column[at]] if len(name) > 1 else name[0]
+    got = repr(table.columns[name][row])
+    if column in ("anchor", "tag"):
+        must += f", must be of {ids[column == 'tag']!r:.200}"
+    if "once" in must:
+        got = f"{got} of {ids[0][measured.anchor[at]]!r} and {ids[1][measured.tag[at]]!r} again"
+    return f"{table.place(row, name)}: {must}, got {got:.80}"
+
+
+def mark_doubles(measured: Measured, epoch: IntArray) -> None:
+    """Find links (R,) that come twice in an epoch, with the same range or with another."""
+    used = np.flatnonzero(measured.cause == 0)
+    if not len(used):
+        return
+    size = measured.anchor.max() + 1, measured.tag.max() + 1
+    key = (epoch[used] * size[0] + measured.anchor[used]) * size[1] + measured.tag[used]
+    order = np.argsort(key, kind="stable")
+    starts = is_first(key[order])
+    if starts.all():
+        return
+    first = np.empty(len(key), dtype=np.intp)
+    first[order] = order[np.flatnonzero(starts)][np.cumsum(starts) - 1]
+    again = first != np.arange(len(key))
+    same = measured.range[used] == measured.range[used][first]
+    double = np.zeros(len(epoch), dtype=bool)
+    double[used] = again & same
+    measured.drop(double, "repeated")
+    double[used] = again & ~same
+    measured.drop(double, "twice with two values")

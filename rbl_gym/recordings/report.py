@@ -1,0 +1,74 @@
+"""What was dropped, sorted, converted and found while a log was read."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections import Counter
+from collections.abc import Iterable
+
+from rbl_gym.recordings.tables import Table
+
+__all__ = ["Report"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What became of the ranges of a log while it was read.
+
+    Attributes
+    ----------
+    ranges
+        How many the log holds, empty cells not counted.
+    dropped
+        How many became no link, by cause.
+    sorted_rows
+        Rows that came after a later one, by a second at most.
+    notes
+        What a reader is to know of it, a sentence each.
+    """
+
+    ranges: int = 0
+    dropped: dict[str, int] = dataclasses.field(default_factory=dict)
+    sorted_rows: int = 0
+    notes: tuple[str, ...] = ()
+
+
+class Said:
+    """Collects a `Report` while files are read."""
+
+    def __init__(self) -> None:
+        self.ranges = 0
+        self.sorted_rows = 0
+        self.dropped: Counter[str] = Counter()
+        self.notes: list[str] = []
+        self._unread: dict[str, tuple[str, set[str]]] = {}
+
+    def note(self, path: str, text: str) -> None:
+        """Take down a sentence on a file; an empty one is none."""
+        if text:
+            self.notes.append(f"{path}: {text}.")
+
+    def drop(self, cause: str, count: int) -> None:
+        """Count ranges that become no link."""
+        if count:
+            self.dropped[cause] += count
+
+    def read(self, table: Table, columns: Iterable[str]) -> None:
+        """Take down which columns of a table are read, and what was wrong with its end."""
+        shown = {table.name(column) for column in columns} | {*table.chosen_by}
+        hidden = {*table.names.values()} - shown
+        path, before = self._unread.get(os.path.realpath(table.path), (table.path, hidden))
+        self._unread[os.path.realpath(table.path)] = path, before & hidden
+        if table.cut:
+            self.note(table.path, f"the last line, {table.cut}, is cut off and is left out")
+
+    def report(self) -> Report:
+        """The report so far."""
+        notes = [*dict.fromkeys(self.notes)]
+        for path, names in self._unread.values():
+            named = [name for name in names if not name.startswith("(column")]
+            if named:
+                some = ", ".join(sorted(named)[:8]) + (", ..." if len(named) > 8 else "")
+                notes.append(f"{path}: columns that are not read: {some}.")
+        return Report(self.ranges, dict(self.dropped), self.sorted_rows, tuple(notes))

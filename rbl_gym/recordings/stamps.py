@@ -1,0 +1,86 @@
+"""Time stamps: their units, found where nobody says them."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+
+# Epochs of a log in this unit are seldom further apart (s), no log starts later (s).
+_LONGEST_STEP_S = {"s": 10.0, "ms": 2.0, "us": 2.0}
+_LATEST_S = 1e11
+# Seconds since 1970 of the years 2001 to 2065: stamps that say their unit by their size.
+_DATES_S = (1e9, 3e9)
+_LONGEST_DATED_STEP_S = 60.0
+# Fewer different times say nothing by their spacing.
+_FEWEST = 4
+_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+
+
+def seconds_per(unit: str) -> float:
+    """What one `unit` of time is in seconds.
+
+    Raises
+    ------
+    ValueError
+        If `unit` is none of s, ms, us, ns.
+    """
+    if unit not in TIME_UNITS:
+        raise ValueError(f"time unit must be one of {[*TIME_UNITS, 'iso']}, got {unit!r}")
+    return TIME_UNITS[unit]
+
+
+def found_unit(stamps: FloatArray) -> tuple[str, str]:
+    """The unit that stamps (K,) are likely in, and a sentence on it where it is not seconds."""
+    distinct = np.unique(stamps)
+    if len(distinct) < 2:
+        return "s", ""
+    step, start = float(np.median(np.diff(distinct))), float(abs(distinct[0]))
+    unit = "ns"
+    for name, scale in TIME_UNITS.items():
+        if _DATES_S[0] <= start * scale <= _DATES_S[1] and step * scale <= _LONGEST_DATED_STEP_S:
+            return name, _words(name, step)
+    if len(distinct) < _FEWEST:
+        return "s", ""
+    for name, scale in TIME_UNITS.items():
+        if step * scale <= _LONGEST_STEP_S.get(name, np.inf) and start * scale <= _LATEST_S:
+            unit = name
+            break
+    if unit == "s" and step >= 2 and (distinct == np.round(distinct)).all():
+        return "s", (
+            f"times are whole numbers, {step:.6g} apart (median), and are taken for seconds; "
+            "say the time unit ms if they are milliseconds"
+        )
+    return unit, _words(unit, step)
+
+
+def _words(unit: str, step: float) -> str:
+    if unit == "s":
+        return ""
+    return (
+        f"times are taken for {_WORDS[unit]}, they are {step:.6g} apart (median); "
+        "a time unit that is said counts instead"
+    )
+
+
+def iso_seconds(cells: list[str]) -> FloatArray | None:
+    """Seconds since 1970 of times of ISO 8601, NaN for those that are none; None: not one is.
+
+    A time without a zone is taken for UTC. Digits beyond the microsecond are dropped.
+    """
+    stamps = np.full(len(cells), np.nan)
+    for i, cell in enumerate(cells):
+        if _ISO.match(cell.strip()):
+            try:
+                when = datetime.fromisoformat(cell.strip())
+            except ValueError:
+                continue
+            when = when.replace(tzinfo=when.tzinfo or UTC)
+            stamps[i] = (when - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds()
+    return None if np.isnan(stamps).all() else stamps

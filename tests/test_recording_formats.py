@@ -1,0 +1,480 @@
+"""Logs as people have them: other names, units, delimiters, dirty ranges, runs, moving anchors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rbl_gym.recordings import Format, Recording, Report, read_recording, read_runs
+from tests.test_recordings import ANCHORS, LONG, TAGS, TRUTH, WIDE, assert_same, write_and_read
+
+
+def write(folder: Path, **texts: str) -> dict[str, Any]:
+    """Files of these texts, by their names."""
+    for name, text in texts.items():
+        (folder / f"{name}.csv").write_text(text, newline="")
+    return {name: folder / f"{name}.csv" for name in texts}
+
+
+def read(folder: Path, ranges: str = LONG, **texts: str) -> Recording:
+    texts = {"ranges": ranges, "anchors": ANCHORS, "tags": TAGS, **texts}
+    return read_recording(**write(folder, **texts))
+
+
+def read_as(folder: Path, ranges: str, **options) -> Recording:
+    files = write(folder, ranges=ranges, anchors=ANCHORS, tags=TAGS)
+    run = options.pop("run", None)
+    return read_recording(**files, run=run, format=Format(**options))
+
+
+def note_of(log: Recording, pattern: str) -> str:
+    found = [note for note in log.report.notes if pattern in note]
+    assert len(found) == 1, log.report.notes
+    return found[0]
+
+
+def many(count: int = 20, step: float = 0.1, **changes: Any) -> str:
+    """A long log of one link, `count` rows; `changes` are cells by row, ``r3="0"``."""
+    rows = [f"{step * k:.6g},A,1,{changes.get(f'r{k}', 2.5)}" for k in range(count)]
+    return "\n".join(["t,anchor,tag,range", *rows, ""])
+
+
+GOOD = "t,anchor,tag,range\n0.0,A,1,2.5\n0.0,A,left,2.25\n0.0,C,1,3.0\n0.1,B,left,1.5\n"
+SPELLINGS = {
+    "semicolons": GOOD.replace(",", ";"),
+    "decimal commas": GOOD.replace(",", ";").replace(".", ","),
+    "tabs": GOOD.replace(",", "\t"),
+    "tabs and decimal commas": GOOD.replace(",", "\t").replace(".", ","),
+    "white space": GOOD.replace(",", "   "),
+    "header in a comment": "# made by a logger, 2024\n#" + GOOD,
+    "header in a comment, spaces": "# " + GOOD.replace(",", " "),
+    "crlf and semicolons": GOOD.replace(",", ";").replace("\n", "\r\n"),
+    "delimiter at the end": GOOD.replace("\n", ",\n"),
+    "delimiter at the end of rows": GOOD.replace("\n", ",\n").replace("range,", "range"),
+    "other names": GOOD.replace("t,anchor,tag,range", "Timestamp,anchor_id,tag_id,distance"),
+    "units in the header": GOOD.replace("t,", "time [s],", 1).replace("range", "range (m)"),
+    "ids as floats": GOOD.replace(",1,", ",1.0,"),
+    "ids in capitals": GOOD.replace("left", "LEFT").replace("A", "a"),
+    "more columns": GOOD.replace("\n", ",-80\n").replace("range,-80", "range,rssi"),
+}
+
+
+@pytest.mark.parametrize("spelling", SPELLINGS)
+def test_spellings_of_one_log(tmp_path, spelling):
+    assert_same(read(tmp_path, SPELLINGS[spelling]), read(tmp_path, GOOD))
+
+
+def test_columns_are_mapped_and_others_are_named_once(tmp_path):
+    text = LONG.replace("t,anchor,tag,range", "time_s,to_id,from_id,range")
+    text = text.replace("\n", ",9,x\n").replace("range,9,x", "range,range_calib,rssi")
+    columns = {"time": "time_s", "anchor": "to_id", "tag": "from_id", "range": "range_calib"}
+    log = read_as(tmp_path, text, columns=columns)
+    np.testing.assert_array_equal(log.links, read(tmp_path).links)
+    np.testing.assert_array_equal(log.ranges[log.links], 9.0)
+    assert note_of(log, "not read").endswith("ranges.csv: columns that are not read: range, rssi.")
+
+
+def test_a_column_that_is_mapped_and_not_there(tmp_path):
+    with pytest.raises(ValueError, match=r"ranges.csv, line 1: missing column 'to' for anchor"):
+        read_as(tmp_path, LONG, columns={"anchor": "to"})
+    with pytest.raises(ValueError, match=r"missing column 't', .* say which it is by columns, t=N"):
+        read(tmp_path, LONG.replace("t,", "when,", 1))
+
+
+def test_wide_columns_by_a_pattern(tmp_path):
+    text = "when,r_A_1,r_A_left,r_C_1,r_B_left,sd_A_1,sd_A_left,sd_C_1,sd_B_left\n"
+    text += "0.0,2.5,2.25,3.0,,.1,.2,.3,\n0.1,,,,1.5,,,,.4\n"
+    columns = {"time": "when", "range": "r_{anchor}_{tag}", "std": "sd_{anchor}_{tag}"}
+    log = read_as(tmp_path, text, columns=columns)
+    assert_same(log._replace(range_std=None), read(tmp_path, WIDE))
+    assert log.range_std is not None
+    np.testing.assert_allclose(log.range_std[0], [[0.1, 0.2], [0, 0], [0.3, 0]])
+    columns["std"] = "s_{anchor}_{tag}"
+    with pytest.raises(ValueError, match=r"line 1: no column like 's_.*' for 'r_A_1'"):
+        read_as(tmp_path, text, columns=columns)
+    columns["range"] = "r_{tag}_{anchor}"
+    with pytest.raises(ValueError, match=r"line 1: must have columns 'r_\{tag\}_\{anchor\}' of"):
+        read_as(tmp_path, text, columns=columns)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@pytest.mark.parametrize("start", [0.0, 1.7e9])
+@pytest.mark.parametrize("step", [0.02, 0.1, 1.0])
+def test_units_of_time(tmp_path, unit, scale, start, step):
+    times = start + step * np.arange(30)
+    rows = [f"{scale * t:.0f},A,1,2.5" if unit != "s" else f"{t},A,1,2.5" for t in times]
+    text = "\n".join(["t,anchor,tag,range", *rows])
+    for options in ({}, {"time_unit": unit}, {"columns": {"time": f"t[{unit}]"}}):
+        log = read_as(tmp_path, text, **options)
+        np.testing.assert_allclose(log.times, times, atol=1e-6)
+        said = any("are taken for" in note for note in log.report.notes)
+        assert said == (unit != "s" and not options)
+
+
+def test_unit_of_time_in_the_header(tmp_path):
+    for head in ("t [ms]", "time_ms", "timestamp(ms)"):
+        text = many(5, 1.0).replace("t,", f"{head},", 1)
+        log = read(tmp_path, text)
+        np.testing.assert_allclose(log.times, 1e-3 * np.arange(5))
+        assert log.report.notes == ()
+
+
+def test_iso_times(tmp_path):
+    stamps = ["2024-05-01T12:00:00Z", "2024-05-01 14:00:00.25+02:00", "2024-05-01T12:00:01,5"]
+    rows = [f"{stamp};A;1;2.5" for stamp in stamps]
+    log = read(tmp_path, "\n".join(["t;anchor;tag;range", *rows]))
+    start = np.datetime64("2024-05-01T12:00:00").astype("datetime64[s]").astype(float)
+    np.testing.assert_allclose(log.times - start, [0.0, 0.25, 1.5], atol=1e-6)
+    with pytest.raises(ValueError, match=r"line 3, column 't': must be a time of ISO .*'x'"):
+        read(tmp_path, f"t,anchor,tag,range\n{stamps[0]},A,1,2\nx,A,1,2\n")
+
+
+def test_whole_seconds_far_apart_are_said(tmp_path):
+    log = read(tmp_path, many(20, 5.0))
+    np.testing.assert_array_equal(log.times, 5.0 * np.arange(20))
+    assert "say the time unit ms" in note_of(log, "whole numbers")
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1), ("cm", 100), ("mm", 1000)])
+def test_units_of_ranges(tmp_path, unit, scale):
+    text = f"t,anchor,tag,range,std\n0,A,1,{2.5 * scale},{0.1 * scale}\n0,B,1,{2 * scale},{scale}\n"
+    for log in (
+        read_as(tmp_path, text, unit=unit),
+        read_as(tmp_path, text.replace("range", f"range [{unit}]")),
+        read_as(tmp_path, text, columns={"range": f"range[{unit}]"}),
+        read_as(tmp_path, text.replace("range", f"range_{unit}")),
+    ):
+        np.testing.assert_allclose(log.ranges[0, :2, 0], [2.5, 2.0])
+        assert log.range_std is not None
+        np.testing.assert_allclose(log.range_std[0, :2, 0], [0.1, 1.0])
+    with pytest.raises(ValueError, match=r"unit must be one of \['m', 'cm', 'mm'\], got 'ft'"):
+        Format(unit="ft")
+
+
+BAD = {"zero": "0.0", "negative": "-3", "not a number": "NaN", "too long": "65535"}
+
+
+@pytest.mark.parametrize("cause", BAD)
+def test_what_is_no_measurement_is_dropped_and_counted(tmp_path, cause):
+    text = many(20, r3=BAD[cause], r7="", r9=BAD[cause])
+    log = read(tmp_path, text)
+    assert log.report.dropped == {"empty": 1, cause: 2}
+    assert log.report.ranges == 19
+    assert note_of(log, "left out").endswith(f"2 of 19 ranges are left out: 2 {cause}.")
+    assert log.links.sum() == 17
+    assert not log.links[[3, 7, 9]].any()
+    with pytest.raises(ValueError, match=rf"ranges.csv, line 5, column 'range': .*{BAD[cause]}"):
+        read_as(tmp_path, text, strict=True)
+
+
+def test_one_zero_in_a_wide_log(tmp_path):
+    text = WIDE.replace("2.25", "0.0") + "".join(f"0.{k},2,2,2,2\n" for k in range(2, 8))
+    log = read(tmp_path, text)
+    assert log.report.dropped == {"empty": 4, "zero": 1}
+    assert not log.links[0, 0, 1]
+    with pytest.raises(ValueError, match=r"line 2, column 'aAtleft': range must be .*, got '0.0'"):
+        read_as(tmp_path, text, strict=True)
+
+
+def test_a_log_that_is_a_fifth_bad_is_read_and_one_that_is_more_is_refused(tmp_path):
+    bad = {f"r{k}": "0" for k in (2, 4)} | {"r5": "-1", "r6": "nan"}
+    assert read(tmp_path, many(20, **bad)).links.sum() == 16
+    message = r"5 of 20 ranges are no measurement: 1 not a number, 3 zero, 1 negative; .* line 4, "
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path, many(20, **bad, r7="0"))
+
+
+def test_unknown_ids(tmp_path):
+    text = many(20) + "1.9,E,1,2\n1.9,A,7,2\n"
+    log = read(tmp_path, text)
+    assert log.report.dropped == {"of an unknown anchor": 1, "of an unknown tag": 1}
+    with pytest.raises(ValueError, match=r"line 22, column 'anchor': unknown anchor, .*, got 'E'"):
+        read_as(tmp_path, text, strict=True)
+
+
+def test_a_range_without_its_standard_deviation(tmp_path):
+    rows = [f"{0.1 * k:.1f},A,1,2,{0.1 if k else 0}\n" for k in range(9)]
+    log = read(tmp_path, "t,anchor,tag,range,std\n" + "".join(rows))
+    assert log.report.dropped == {"without a standard deviation": 1}
+    assert log.range_std is not None
+    np.testing.assert_array_equal(log.range_std > 0, log.links)
+
+
+def test_variances(tmp_path):
+    text = LONG.replace("\n", ",0.04\n").replace("range,0.04", "range,var")
+    log = read(tmp_path, text)
+    assert log.range_std is not None
+    np.testing.assert_allclose(log.range_std[log.links], 0.2)
+
+
+def test_rows_out_of_order_are_sorted_and_counted(tmp_path):
+    lines = many(20).splitlines()
+    lines[4:8] = lines[6], lines[4], lines[7], lines[5]
+    log = read(tmp_path, "\n".join(lines))
+    assert_same(log, read(tmp_path, many(20)))
+    assert log.report.sorted_rows == 2
+    assert "2 rows come after later ones" in note_of(log, "sorted")
+    with pytest.raises(ValueError, match=r"line 6, column 't': time must not fall by more than 0"):
+        read_as(tmp_path, "\n".join(lines), strict=True)
+    lines[9], lines[20] = lines[20], lines[9]
+    with pytest.raises(ValueError, match=r"line 21, column 't': time must not fall .* column run"):
+        read(tmp_path, "\n".join(lines))
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_rows_that_come_twice(tmp_path, wide):
+    text = many(20)
+    if wide:
+        text = text.replace("anchor,tag,range", "aAt1").replace("A,1,", "")
+    row = "1.9,2.5\n" if wide else "1.9,A,1,2.5\n"
+    log = read(tmp_path, text + row)
+    assert_same(log, read(tmp_path, text))
+    assert log.report.dropped == {"repeated": 1}
+    other = read(tmp_path, text + row.replace("2.5", "2.6"))
+    assert_same(other, log)
+    assert "1 twice with two values" in note_of(other, "left out")
+    with pytest.raises(ValueError, match=r"line 22, .* each link may come once .*'A' and '1'"):
+        read_as(tmp_path, text + row, strict=True)
+
+
+def test_coarse_stamps_are_refused(tmp_path):
+    """Ten ranges of a link within each second are no log of one range a second."""
+    rows = "".join(f"{k // 10},A,1,{2 + 0.01 * k}\n" for k in range(40))
+    with pytest.raises(ValueError, match="36 of 40 ranges are no measurement: 36 twice with two"):
+        read(tmp_path, "t,anchor,tag,range\n" + rows)
+
+
+def test_a_last_line_that_is_cut_off(tmp_path):
+    log = read(tmp_path, LONG + "0.2,A")
+    assert_same(log, read(tmp_path))
+    assert "the last line, 6, is cut off" in note_of(log, "cut off")
+    with pytest.raises(ValueError, match=r"ranges.csv, line 6: the last line is cut off"):
+        read_as(tmp_path, LONG + "0.2,A", strict=True)
+
+
+def test_no_header(tmp_path):
+    with pytest.raises(ValueError, match=r"ranges.csv, line 1: must name the columns, got '0.0,A,"):
+        read(tmp_path, LONG.split("\n", 1)[1])
+
+
+def test_points_and_commas_in_one_column(tmp_path):
+    text = many(5).replace(",", ";").replace("0.2;A;1;2.5", "0.2;A;1;2,5")
+    with pytest.raises(ValueError, match=r"ranges.csv, line 4: must have points or commas as dec"):
+        read(tmp_path, text)
+
+
+def test_mac_addresses(tmp_path):
+    anchors = "id,x,y,z\nDE:CA:00:01,0,0,1\n0x1F,4,0,1\n"
+    text = "t,anchor,tag,range\n0,DE:CA:00:01,1,2\n0,0x1f,1,3\n"
+    log = read(tmp_path, text, anchors=anchors)
+    assert log.anchor_ids == ("DE:CA:00:01", "0x1F")
+    np.testing.assert_array_equal(log.ranges[0, :, 0], [2, 3])
+
+
+def runs_text(*names: str) -> str:
+    rows = [f"{name},{row}" for name in names for row in many(5).splitlines()[1:]]
+    return "\n".join(["run,t,anchor,tag,range", *rows, ""])
+
+
+def test_runs(tmp_path):
+    files = write(tmp_path, ranges=runs_text("b", "a"), anchors=ANCHORS, tags=TAGS)
+    runs = read_runs(**files)
+    assert [*runs] == ["b", "a"]
+    for name, log in runs.items():
+        assert_same(log, read_recording(**files, run=name))
+        assert log.links.sum() == 5
+        np.testing.assert_allclose(log.times, 0.1 * np.arange(5))
+    with pytest.raises(ValueError, match=r"has 2 runs, \['b', 'a'\]; read one"):
+        read_recording(**files)
+    with pytest.raises(ValueError, match=r"has no run 'c', got \['b', 'a'\]"):
+        read_recording(**files, run="c")
+    assert [*read_runs(**write(tmp_path, ranges=many(5), anchors=ANCHORS, tags=TAGS))] == [""]
+
+
+def test_truth_of_runs(tmp_path):
+    """One pose of each run, without time: the body stands."""
+    files = write(
+        tmp_path, ranges=runs_text("b", "a"), anchors=ANCHORS, tags=TAGS,
+        truth="run,site,x,y,yaw_deg\na,1,1,2,90\nb,1,3,2,0\n",
+    )  # fmt: skip
+    for name, place in (("a", [1, 2, 0]), ("b", [3, 2, 0])):
+        truth = read_runs(**files)[name].truth
+        assert truth is not None
+        np.testing.assert_array_equal(truth.translation, [place] * 5)
+        np.testing.assert_allclose(truth.times, 0.1 * np.arange(5))
+
+
+def test_one_tag_without_a_table_of_tags(tmp_path):
+    text = "t,anchor,range\n0,A,2\n0,C,3\n"
+    for ranges in (text, text.replace(",range", ",tag,range").replace(",2", ",x,2")
+                   .replace(",3", ",x,3"), "t,aAt7,aCt7\n0,2,3\n"):  # fmt: skip
+        log = read_recording(**write(tmp_path, ranges=ranges, anchors=ANCHORS))
+        np.testing.assert_array_equal(log.tags, np.zeros((1, 3)))
+        np.testing.assert_array_equal(log.ranges, [[[2], [0], [3]]])
+    with pytest.raises(ValueError, match=r"of several tags need a table of tags, got .*left"):
+        read_recording(**write(tmp_path, ranges=LONG, anchors=ANCHORS))
+    with pytest.raises(ValueError, match=r"of several tags need a table of tags, got .*left"):
+        read_recording(**write(tmp_path, ranges=WIDE, anchors=ANCHORS))
+    with pytest.raises(ValueError, match=r"ranges.csv, line 1: missing column 'tag'"):
+        read(tmp_path, text)
+
+
+def test_anchors_beside_the_ranges(tmp_path):
+    text = "t,range,var,anchor_x,anchor_y,anchor\n0.1,2,.01,0,-1,105\n0.2,3,.01,4,2.5,107\n"
+    text += "0.3,2.1,.01,0,-1,105\n"
+    log = read_recording(**write(tmp_path, ranges=text))
+    assert log.anchor_ids == ("105", "107")
+    np.testing.assert_array_equal(log.anchors, [[0, -1, 0], [4, 2.5, 0]])
+    np.testing.assert_array_equal(log.ranges[:, :, 0], [[2, 0], [0, 3], [2.1, 0]])
+    assert "heights" in note_of(log, "they are 0")
+    nameless = "\n".join(line.rsplit(",", 1)[0] for line in text.splitlines())
+    other = read_recording(**write(tmp_path, ranges=nameless))
+    assert other.anchor_ids == ("0 -1 0", "4 2.5 0")
+    np.testing.assert_array_equal(other.ranges, log.ranges)
+
+
+def test_anchors_beside_the_ranges_move(tmp_path):
+    text = "t,anchor,range,ax,ay,az\n0,A,2,0,0,1\n0,B,3,5,5,1\n1,A,2,2,0,1\n2,B,3,5,5,1\n"
+    log = read_recording(**write(tmp_path, ranges=text))
+    want = [[[0, 0, 1], [5, 5, 1]], [[2, 0, 1], [5, 5, 1]], [[2, 0, 1], [5, 5, 1]]]
+    np.testing.assert_allclose(log.anchors, want)
+
+
+def test_anchors_that_move(tmp_path):
+    """Rows of places and times, in any order, between which an anchor moves straight."""
+    anchors = (
+        "anchor,t,x,y,z\nA,10,4,0,1\nA,0,0,0,1\nB,0,4,0,1\nC,0,0,4,2\nC,10,0,4,7\nA,20,4,9,1\n"
+    )
+    rows = "".join(f"{t},A,1,2\n{t},C,1,3\n" for t in (0, 1, 2.5, 5))
+    log = read(tmp_path, "t,anchor,tag,range\n" + rows, anchors=anchors)
+    t = np.array([0, 1, 2.5, 5])
+    fixed = np.zeros(4)
+    np.testing.assert_allclose(log.anchors[:, 0], np.stack([0.4 * t, fixed, fixed + 1], -1))
+    np.testing.assert_allclose(log.anchors[:, 1], np.tile([4, 0, 1], (4, 1)))
+    np.testing.assert_allclose(log.anchors[:, 2], np.stack([fixed, fixed + 4, 2 + 0.5 * t], -1))
+    late = "".join(f"{t},A,1,2\n" for t in (28, 29, 40))
+    gone = read(tmp_path, "t,anchor,tag,range\n" + rows + late, anchors=anchors)
+    assert gone.report.dropped == {"of an anchor whose place is not known then": 1}
+    still = "anchor,t,x,y,z\nA,0,0,0,1\nA,9,0,0,1\nB,0,4,0,1\nC,0,0,4,2\n"
+    np.testing.assert_array_equal(read(tmp_path, anchors=still).anchors, read(tmp_path).anchors)
+    with pytest.raises(ValueError, match=r"anchors.csv, line 8, column 't': anchor 'A' may have"):
+        read(tmp_path, anchors=anchors + "A,10,5,0,1\n")
+    with pytest.raises(ValueError, match=r"tags.csv, line 4, column 'tag': id must be unique"):
+        read(tmp_path, tags="tag,t,x,y,z\n1,0,0,0,0\nleft,0,1,0,0\n1,1,0,0,0\n")
+
+
+def two_bodies(relative: bool, folder: Path) -> tuple[Recording, dict[str, np.ndarray]]:
+    """A wide file with the poses of both bodies, as of two agents; arms of both in one file."""
+    rng = np.random.default_rng(5)
+    times = np.arange(6.0)
+    arms = {"1": rng.normal(0, 0.5, (3, 3)), "2": rng.normal(0, 0.5, (2, 3))}
+    angles = {name: rng.uniform([-5, -5, -180], [5, 5, 180], (6, 3)) for name in "AB"}
+    places = {"A": rng.normal(0, 3, (6, 3)), "B": rng.normal(0, 3, (6, 3)) + [20, 0, 0]}
+    turns = {name: Rotation.from_euler("xyz", angles[name], degrees=True) for name in "AB"}
+    points = {
+        name: np.stack([turns[name].apply(arm) + places[name] for arm in arms[agent]], 1)
+        for name, agent in zip("AB", "12", strict=True)
+    }
+    ranges = np.linalg.norm(points["A"][:, :, None] - points["B"][:, None], axis=-1)
+    pose = [f"{n}_{c}" for n in "AB" for c in ("x", "y", "z", "roll", "pitch", "yaw")]
+    links = [f"r_{i}_{j}" for i in (1, 2, 3) for j in (1, 2)]
+    table = np.column_stack(
+        [times, *(a for n in "AB" for a in (places[n], angles[n])), ranges.reshape(6, -1)]
+    )
+    head = ",".join(["t", *pose, *links])
+    text = "\n".join([head, *(",".join(map(repr, row)) for row in table.tolist())])
+    rows = [f"{agent},{i},{x!r},{y!r},{z!r}" for agent in arms
+            for i, (x, y, z) in enumerate(arms[agent].tolist(), 1)]  # fmt: skip
+    files = write(folder, both=text, arms="\n".join(["agent,antenna,x,y,z", *rows]))
+    columns = {"range": "r_{anchor}_{tag}", "anchors.anchor": "antenna", "tags.tag": "antenna"}
+    for part, name in (("truth", "B"), ("carrier", "A")):
+        columns |= {f"{part}.*": f"{name}_*"}
+        columns |= {f"{part}.{a}_deg": f"{name}_{a}" for a in ("roll", "pitch", "yaw")}
+    log = read_recording(
+        files["both"], files["arms"], files["arms"], files["both"], carrier=files["both"],
+        relative=relative,
+        format=Format(columns=columns, where={"anchors.agent": "1", "tags.agent": "2"}),
+    )  # fmt: skip
+    return log, {**points, **{f"R{n}": turns[n].as_matrix() for n in "AB"}, **places}
+
+
+def test_anchors_on_a_body_that_moves(tmp_path):
+    log, want = two_bodies(False, tmp_path)
+    assert log.anchors.shape == (6, 3, 3)
+    assert log.truth is not None
+    np.testing.assert_allclose(log.truth.rotation, want["RB"], atol=1e-12)
+    tags = np.einsum("kij,nj->kni", log.truth.rotation, log.tags) + log.truth.translation[:, None]
+    distances = np.linalg.norm(log.anchors[:, :, None] - tags[:, None], axis=-1)
+    np.testing.assert_allclose(distances, log.ranges, atol=1e-12)
+    assert not any("not read" in note for note in log.report.notes)
+
+
+def test_ranges_between_two_bodies_seen_from_one(tmp_path):
+    log, want = two_bodies(True, tmp_path)
+    assert log.anchors.shape == (3, 3)
+    assert log.truth is not None
+    want_rotation = np.swapaxes(want["RA"], -1, -2) @ want["RB"]
+    np.testing.assert_allclose(log.truth.rotation, want_rotation, atol=1e-12)
+    tags = np.einsum("kij,nj->kni", log.truth.rotation, log.tags) + log.truth.translation[:, None]
+    distances = np.linalg.norm(log.anchors[:, None] - tags[:, None], axis=-1)
+    np.testing.assert_allclose(distances, log.ranges, atol=1e-12)
+
+
+def test_a_carrier_that_is_nowhere(tmp_path):
+    carrier = TRUTH.replace("\n0,", "\n9,").replace("\n1,", "\n10,")
+    message = r"carrier.csv: the carrier's pose is known at no epoch: ranges 0 to 0.1 s, poses 9"
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path, carrier=carrier)
+    log = read(tmp_path, LONG + "1.5,A,1,2\n", carrier=TRUTH)
+    assert log.report.dropped == {"where the carrier's pose is not known": 1}
+    assert len(log.times) == 2
+    with pytest.raises(ValueError, match="relative needs a carrier"):
+        read_recording(**write(tmp_path, ranges=LONG, anchors=ANCHORS, tags=TAGS), relative=True)
+
+
+def test_heights_that_nobody_tells(tmp_path):
+    log = read(tmp_path, anchors="anchor,x,y\nA,0,0\nB,4,0\nC,0,4\n")
+    np.testing.assert_array_equal(log.anchors[:, 2], 0.0)
+    assert "anchors.csv" in note_of(log, "heights are 0")
+    with pytest.raises(ValueError, match=r"anchors.csv, line 1: missing column 'z'"):
+        read(tmp_path, anchors="anchor,x,y,height\nA,0,0,1\nB,4,0,1\nC,0,4,1\n")
+
+
+def test_a_calibration_without_slopes(tmp_path):
+    log = read(tmp_path, calibration="anchor,tag,bias_m\nA,1,0.5\nC,1,3.5\n")
+    np.testing.assert_allclose(log.ranges[0], [[2.0, 2.25], [0, 0], [0, 0]])
+    assert log.report.dropped == {"not positive once calibrated": 1}
+    assert "1 ranges are not positive" in note_of(log, "calibrated")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"columns": {"lidar.x": "x"}}, "one of the files ranges, anchors, .*, got lidar.x=x"),
+        ({"columns": {"time": ""}}, "columns must be names by what they hold, .*, got time="),
+        (
+            {"time_unit": "min"},
+            r"time_unit must be one of \['s', 'ms', .*, got 'min'",
+        ),
+        ({"where": {"run": "7"}}, r"line 1: no column 'run' to choose by, got \['t', "),
+        ({"where": {"anchor": "Z"}}, r"line 1: no row has anchor=Z, got \['A', 'B', 'C'\]"),
+        ({"columns": {"*": "B_*"}}, r"line 1: no column is like 'B_\*', got \['t', "),
+        ({"columns": {"*": "B_"}}, r"columns must name \* by what has a \*, got 'B_'"),
+        ({"columns": {"range": "r_{tag}"}}, "columns of links must be like .*, got 'r_{tag}'"),
+    ],
+)
+def test_formats_that_do_not_fit(tmp_path, options, message):
+    with pytest.raises(ValueError, match=message):
+        read_as(tmp_path, LONG, **options)
+
+
+def test_a_recording_made_of_arrays_has_an_empty_report(tmp_path):
+    log = write_and_read(tmp_path)
+    bare = Recording(*log[:-1])
+    assert bare.report == Report() == Report(0, {}, 0, ())
+    assert bare.anchors_by_epoch.shape == (2, 3, 3)
+    np.testing.assert_array_equal(bare.anchors_by_epoch[1], bare.anchors)
