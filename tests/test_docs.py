@@ -60,6 +60,16 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
     # What a block registers is forgotten after the test.
     monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
     monkeypatch.chdir(tmp_path)
+    if page.stem == "bags":
+        pytest.importorskip("rosbags", reason="needs the extra bags")
+        from tests import test_bags
+
+        types = test_bags.types_of("ros1")
+        messages = [
+            ("/vicon/body" if topic == "/mocap/pose" else topic, time, message)
+            for topic, time, message in test_bags.flight(types)
+        ]
+        test_bags.write_bag(tmp_path / "flight", "ros1", types, messages)
     monkeypatch.setattr(design, "_GENERATIONS", 4)  # pages show how, not how well
     write_files_that_pages_read(tmp_path)
     names: dict = {}

@@ -1,4 +1,4 @@
-"""The command line: rbl-gym demo, place, train, bench, replay, reproduce, network."""
+"""The command line: rbl-gym demo, place, train, bench, convert, replay, reproduce, network."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rbl_gym import __version__
-from rbl_gym.app import bench_command, learning, replay_command
+from rbl_gym.app import bench_command, convert_command, learning, replay_command
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
@@ -55,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     learning.add_transfer(commands)
     bench_command.add_bench(commands)
     bench_command.add_rerun(commands)
+    convert_command.add_convert(commands)
     replay_command.add_replay(commands)
     _add_reproduce(commands)
     _add_network(commands)

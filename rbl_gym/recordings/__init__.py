@@ -1,6 +1,7 @@
 """Recordings: real measurement logs as arrays."""
 
 from rbl_gym.recordings.align import ALIGNMENTS, Alignment, align_positions, apply_alignment
+from rbl_gym.recordings.bags import convert_bag, list_topics, show_message
 from rbl_gym.recordings.format import Format
 from rbl_gym.recordings.motion_offset import motion_offset
 from rbl_gym.recordings.reading import read_recording, read_runs
@@ -19,10 +20,13 @@ __all__ = [
     "Truth",
     "align_positions",
     "apply_alignment",
+    "convert_bag",
+    "list_topics",
     "motion_offset",
     "read_recording",
     "read_runs",
     "read_truth",
+    "show_message",
     "time_offset",
     "truth_at",
 ]

@@ -1,0 +1,93 @@
+"""The command rbl-gym convert."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from rbl_gym.app.terminal import add_json, progress, write_json
+from rbl_gym.studies.extras import require
+
+_KINDS = {
+    "ranges": "topic=/uwb,anchor=responder_id,tag=requester_id,range=distance; also std, unit, "
+    "tags (ids of the body), anchor_position, tag_position",
+    "truth": "topic=/pose; for /tf parent=FRAME,child=FRAME; also position, orientation",
+    "imu": "topic=/imu",
+    "odometry": "topic=/odom",
+}
+
+
+def add_convert(commands: Any) -> None:
+    """The parser of ``rbl-gym convert``."""
+    convert = commands.add_parser(
+        "convert",
+        help="a bag of ROS 1 or ROS 2, or an MCAP file, as files for replay",
+        description="Write ranges.csv and what else the log holds (anchors, tags, truth, imu, "
+        "odometry). Known message types need no option; see docs/bags.md.",
+    )
+    convert.add_argument(
+        "log", nargs="+", metavar="LOG", help="x.bag ..., a folder of ROS 2, x.db3 or x.mcap"
+    )
+    convert.add_argument("--out", metavar="DIR", help="folder of the files")
+    convert.add_argument(
+        "--list",
+        nargs="?",
+        const="",
+        metavar="TOPIC",
+        help="show the topics, or the fields of a topic, and write nothing",
+    )
+    convert.add_argument("--map", metavar="F", help="TOML: tables ranges, truth, imu, odometry")
+    for kind, text in _KINDS.items():
+        convert.add_argument(
+            f"--{kind}", metavar="KEY=VALUE,...", type=_table, help=f"{text}; or none"
+        )
+    convert.add_argument(
+        "--messages", metavar="DIR", help="PACKAGE/msg/NAME.msg, where the log holds no definitions"
+    )
+    add_json(convert)
+    convert.set_defaults(run=_convert)
+
+
+def _convert(options: argparse.Namespace) -> int:
+    require("rosbags", "bags")
+    from rbl_gym.app import convert_report
+    from rbl_gym.recordings import bag_profiles, bags
+
+    if options.list:
+        fields = bags.show_message(options.log, options.list, options.messages)
+        if write_json({"topic": options.list, "fields": dict(fields)}, options.json):
+            convert_report.print_fields(fields)
+        return 0
+    mapping = bag_profiles.read_mapping(options.map) if options.map else {}
+    for kind in _KINDS:
+        if (table := getattr(options, kind)) is not None:
+            mapping[kind] = {**mapping.get(kind, {}), **table}
+    topics = bags.list_topics(options.log, mapping, options.messages)
+    if options.list is not None:
+        if write_json({"topics": topics}, options.json):
+            convert_report.print_topics(topics)
+        return 0
+    if options.out is None:
+        raise ValueError("--out DIR is missing: the folder of the files (--list only shows topics)")
+    with progress("reading", sum(row["messages"] for row in topics if row["read_as"])) as advance:
+        result = bags.convert_bag(options.log, options.out, mapping, options.messages, advance)
+    if write_json(result, options.json):
+        convert_report.print_convert(result)
+    return 0
+
+
+def _table(text: str) -> dict[str, Any]:
+    """``KEY=VALUE,...``; a part without ``=`` is one more value, the first one a topic."""
+    table: dict[str, Any] = {}
+    key = "topic"
+    for part in text.split(","):
+        name, equals, value = part.partition("=")
+        if equals:
+            key, part = name.strip(), value
+            if not key or key in table:
+                raise argparse.ArgumentTypeError(
+                    f"must be KEY=VALUE,..., each key once, got {text!r}"
+                )
+        values = table.get(key, [])
+        table[key] = [*(values if isinstance(values, list) else [values]), part] if values else part
+    return table

@@ -1,0 +1,230 @@
+"""What is read of a bag: message types that are known, and tables that say more.
+
+A *mapping* is a dictionary of tables, as a TOML file gives it: ``ranges``, ``truth``, ``imu`` and
+``odometry``, each with the topics and where in their messages the values stand
+(`rbl_gym.recordings.bag_fields`). What a table leaves open is filled in from the type of the
+message. The custom types are described at
+
+- https://github.com/ntu-aris/uwb_driver, msg/UwbRange.msg (data set NTU VIRAL),
+- https://github.com/decargroup/miluv, uwb_ros/msg/RangeStamped.msg (data set MILUV).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+Table = Mapping[str, Any]
+
+_EVERYWHERE = ("topic", "time", "time_unit", "where")
+KEYS = {
+    "ranges": (
+        "anchor",
+        "tag",
+        "range",
+        "std",
+        "least",
+        "most",
+        "unit",
+        "tags",
+        "anchor_position",
+        "tag_position",
+    ),
+    "truth": ("position", "orientation", "parent", "child"),
+    "imu": ("angular_velocity", "linear_acceleration"),
+    "odometry": ("velocity", "angular_velocity"),
+}
+NO_PATHS = ("unit", "tags")  # keys that hold no field path
+REQUIRED = {
+    "ranges": ("anchor", "tag", "range"),
+    "truth": ("position",),
+    "imu": ("angular_velocity", "linear_acceleration"),
+    "odometry": ("velocity", "angular_velocity"),
+}
+
+_POSE = {"position": "pose.position", "orientation": "pose.orientation"}
+_POSE_IN_POSE = {"position": "pose.pose.position", "orientation": "pose.pose.orientation"}
+_TYPES: dict[str, dict[str, Table]] = {
+    "ranges": {
+        "uwb_driver/msg/UwbRange": {
+            "anchor": "responder_id",
+            "tag": "{requester_id}.{antenna}",
+            "range": "distance",
+            "anchor_position": "responder_location",
+            "tag_position": "rqst_antenna_offset",
+        },
+        "uwb_ros/msg/RangeStamped": {"anchor": "to_id", "tag": "from_id", "range": "range"},
+        # Anything that measures a distance; a radio only where there is nothing better.
+        "sensor_msgs/msg/Range": {
+            "anchor": "@topic",
+            "tag": "header.frame_id",
+            "range": "range",
+            "least": "min_range",
+            "most": "max_range",
+        },
+    },
+    "truth": {
+        "geometry_msgs/msg/PoseStamped": _POSE,
+        "geometry_msgs/msg/PoseWithCovarianceStamped": _POSE_IN_POSE,
+        "geometry_msgs/msg/PointStamped": {"position": "point"},
+        "geometry_msgs/msg/TransformStamped": {
+            "position": "transform.translation",
+            "orientation": "transform.rotation",
+        },
+        "nav_msgs/msg/Odometry": _POSE_IN_POSE,
+        "tf2_msgs/msg/TFMessage": {
+            "time": "transforms[].header.stamp",
+            "position": "transforms[].transform.translation",
+            "orientation": "transforms[].transform.rotation",
+        },
+    },
+    "imu": {
+        "sensor_msgs/msg/Imu": {
+            "angular_velocity": "angular_velocity",
+            "linear_acceleration": "linear_acceleration",
+        },
+    },
+    "odometry": {
+        "nav_msgs/msg/Odometry": {
+            "velocity": "twist.twist.linear",
+            "angular_velocity": "twist.twist.angular",
+        },
+    },
+}
+# Types that are taken only where a table names their topic: estimates, trees of frames.
+_ONLY_BY_NAME = {"truth": ("nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage")}
+# Where several topics would do: what the documentation of known data sets says.
+_PREFERRED = {
+    "truth": ("/leica/pose/relative", "/*/vrpn_client_node/*/pose"),
+    "imu": ("/imu/imu", "/*/mavros/imu/data_raw"),
+}
+_FRAMES = {  # frame names, by the type of the message
+    "geometry_msgs/msg/TransformStamped": ("header.frame_id", "child_frame_id"),
+    "nav_msgs/msg/Odometry": ("header.frame_id", "child_frame_id"),
+    "tf2_msgs/msg/TFMessage": ("transforms[].header.frame_id", "transforms[].child_frame_id"),
+}
+
+
+class Source(NamedTuple):
+    """One kind of measurement: its topics and where in their messages the values stand."""
+
+    topics: tuple[str, ...]
+    table: dict[str, Any]  # what the mapping says, then what is known of the type
+    given: frozenset[str]  # keys that the mapping says
+
+
+def read_mapping(path: str) -> dict[str, Table]:
+    """The tables of a TOML file.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, or is no TOML.
+    """
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ValueError(f"{path}: must be a TOML file, {error}") from error
+
+
+def check_mapping(mapping: Mapping[str, Any]) -> None:
+    """Raise where a table or a key has no meaning."""
+    for kind, table in mapping.items():
+        if kind not in KEYS:
+            raise ValueError(f"unknown table [{kind}], must be of {[*KEYS]}")
+        if not isinstance(table, Mapping):
+            raise ValueError(f"[{kind}] must be a table of keys and values, got {table!r:.60}")
+        known = [*_EVERYWHERE, *KEYS[kind]]
+        for key in table:
+            if key not in known:
+                raise ValueError(f"[{kind}] unknown key {key!r}, must be of {known}")
+
+
+def sources(
+    topics: Mapping[str, str], mapping: Mapping[str, Table]
+) -> tuple[dict[str, Source], list[str]]:
+    """What to read of the `topics` (name: type), and notes on what was not chosen.
+
+    Raises
+    ------
+    ValueError
+        If a topic that the mapping names is not there, or a value has no place.
+    """
+    found: dict[str, Source] = {}
+    notes: list[str] = []
+    for kind in KEYS:
+        table = dict(mapping.get(kind, {}))
+        wanted = table.pop("topic", None)
+        if wanted == "none":
+            continue
+        if wanted is None:
+            names, note = _candidates(kind, topics)
+            notes += [note] if note else []
+        else:
+            patterns = [wanted] if isinstance(wanted, str) else list(wanted)
+            names = [topic for pattern in patterns for topic in _matching(kind, pattern, topics)]
+        if names:
+            found[kind] = Source(
+                tuple(names), _filled(kind, table, names, topics), frozenset(table)
+            )
+        elif table:
+            raise ValueError(
+                f"[{kind}] topic is missing: none is taken by itself, there are {_listed(topics)}"
+            )
+    return found, notes
+
+
+def _candidates(kind: str, topics: Mapping[str, str]) -> tuple[list[str], str]:
+    """The topics of a known type; of the first such type for ranges, else one topic only."""
+    hidden = _ONLY_BY_NAME.get(kind, ())
+    known = [name for name in _TYPES[kind] if name not in hidden]
+    by_type = {name: [t for t in topics if topics[t] == name] for name in known}
+    if kind == "ranges":
+        return next((names for names in by_type.values() if names), []), ""
+    names = [topic for found in by_type.values() for topic in found]
+    preferred = [
+        topic
+        for pattern in _PREFERRED.get(kind, ())
+        for topic in names
+        if fnmatchcase(topic, pattern)
+    ]
+    if len(names) > 1 and len(preferred) != 1:
+        return [], f"no {kind} written, several topics could be it: {', '.join(names)}"
+    return (preferred or names), ""
+
+
+def _matching(kind: str, pattern: str, topics: Mapping[str, str]) -> list[str]:
+    names = [topic for topic in topics if fnmatchcase(topic, pattern)]
+    if not names:
+        raise ValueError(f"[{kind}] no topic {pattern!r}, there are {_listed(topics)}")
+    return names
+
+
+def _filled(
+    kind: str, table: dict[str, Any], names: Sequence[str], topics: Mapping[str, str]
+) -> dict[str, Any]:
+    """The table with what the type of the message says of it."""
+    types = {topics[name] for name in names}
+    if len(types) > 1:
+        raise ValueError(f"[{kind}] topics must be of one type, got {sorted(types)}")
+    msgtype = types.pop()
+    full = {**_TYPES[kind].get(msgtype, {}), **table}
+    if missing := [key for key in REQUIRED[kind] if not full.get(key)]:
+        raise ValueError(
+            f"[{kind}] topic {names[0]} is of type {msgtype}: say where {', '.join(missing)} stands"
+        )
+    for key, place in zip(("parent", "child"), _FRAMES.get(msgtype, ()), strict=False):
+        if key in full:
+            full["where"] = {**full.get("where", {}), place: full.pop(key)}
+    if msgtype == "tf2_msgs/msg/TFMessage" and len(full.get("where", {})) < 2:
+        raise ValueError(f"[{kind}] {names[0]} holds many frames: give parent and child")
+    if frames := [key for key in ("parent", "child") if key in full]:
+        raise ValueError(f"[{kind}] {frames[0]}: messages of type {msgtype} name no such frame")
+    return full
+
+
+def _listed(topics: Mapping[str, str]) -> str:
+    return ", ".join(topics) or "none"

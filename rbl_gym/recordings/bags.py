@@ -1,0 +1,229 @@
+"""Bags of ROS 1 and ROS 2, and MCAP files, converted to the files of a recording.
+
+Reading is the library rosbags' (extra ``bags``). Definitions of messages that the log carries are
+used: bags of ROS 1 and MCAP carry them, bags of sqlite3 since ROS 2 Iron.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.recordings import bag_fields, bag_profiles, bag_reading
+from rbl_gym.recordings.bag_reading import Advance, AnyPath, Paths, log_name
+from rbl_gym.recordings.bag_tables import Sheet, Tables, make_tables, seconds
+
+__all__ = ["convert_bag", "list_topics", "show_message"]
+
+_FAR_S = 1.0  # stamps that are further from the time of recording are mentioned
+
+
+def convert_bag(
+    log: Paths,
+    out: AnyPath,
+    mapping: Mapping[str, Mapping[str, Any]] | None = None,
+    messages: AnyPath | None = None,
+    advance: Advance = lambda steps: None,
+) -> dict[str, Any]:
+    """Write the ranges of a log, and what goes with them, as the files of a recording.
+
+    Parameters
+    ----------
+    log
+        A bag of ROS 1, or several that follow each other; a folder of ROS 2; a .db3 or .mcap file.
+    out
+        Folder, made where there is none. Written are ranges.csv; truth.csv, imu.csv and
+        odometry.csv where the log has them; anchors.csv and tags.csv where the messages of the
+        ranges hold their places; convert.json, which is what is returned. Metres, seconds, rad/s.
+    mapping
+        Tables ``ranges``, ``truth``, ``imu``, ``odometry``: topics and field paths, see
+        docs/bags.md. What is left out is taken from the types of the messages.
+    messages
+        Folder with ``PACKAGE/msg/NAME.msg``, for logs that do not carry their definitions.
+    advance
+        Called with the number of messages read since the last call.
+
+    Returns
+    -------
+    dict
+        ``kinds`` (of each kind its topics, type, messages, rows, time span, rate, what was dropped
+        and why), ``topics``, ``files``, ``notes``, and ``replay``, the command that follows.
+
+    Raises
+    ------
+    ValueError
+        If the log cannot be read, a topic or field is not there (the message says what is), or no
+        range is left.
+    ImportError
+        Without rosbags.
+    """
+    out = Path(out)
+    with bag_reading.opened(log, messages) as reader:
+        topics = bag_reading.types(reader)
+        with bag_reading.named(log_name(log)):
+            found, notes = _sources(reader, mapping)
+            _check_ranges(found, mapping or {}, topics)
+        listed = _topic_rows(reader, found)
+        read = bag_reading.read_values(reader, log, found, advance)
+    sheets: dict[str, Sheet] = {}
+    kinds: dict[str, dict[str, Any]] = {}
+    for kind, values in read.items():
+        source = values.source
+        with bag_reading.named(f"{log_name(log)}, topic {', '.join(source.topics)}"):
+            made = make_tables(kind, values.rows, source.table, source.given)
+            kinds[kind] = _said(values, made, topics)
+            if not len(made.times_ns) and (kind == "ranges" or kind in (mapping or {})):
+                dropped = [f"{n} dropped, {why}" for why, n in kinds[kind]["dropped"].items()]
+                raise ValueError(f"[{kind}] nothing is left: {'; '.join(dropped) or 'no message'}")
+        notes += made.notes
+        if values.by_recording:
+            notes.append(f"{kind}: the messages hold no stamps, times are those of recording")
+        if len(made.times_ns):
+            sheets |= made.sheets
+        else:
+            notes.append(f"{kind}: no message is left, no file was written")
+    notes += _far_stamps(kinds)
+    if "ranges" in kinds:
+        notes += [_to_write(name, kinds["ranges"]) for name in _POINTS if name not in sheets]
+    result = {
+        "log": [os.fspath(path) for path in bag_reading.all_paths(log)],
+        "topics": listed,
+        "kinds": kinds,
+        "files": _write(out, sheets),
+        "notes": notes,
+        "replay": _replay(out, sheets) if "ranges" in kinds else None,
+    }
+    text = json.dumps(result, indent=1, allow_nan=False) + "\n"
+    (out / "convert.json").write_text(text, encoding="utf-8")
+    return result
+
+
+def list_topics(
+    log: Paths,
+    mapping: Mapping[str, Mapping[str, Any]] | None = None,
+    messages: AnyPath | None = None,
+) -> list[dict[str, Any]]:
+    """The topics of a log: name, type, messages, rate, and what `convert_bag` reads them as.
+
+    Arguments and errors as in `convert_bag`.
+    """
+    with bag_reading.opened(log, messages) as reader, bag_reading.named(log_name(log)):
+        return _topic_rows(reader, _sources(reader, mapping)[0])
+
+
+def show_message(log: Paths, topic: str, messages: AnyPath | None = None) -> list[tuple[str, str]]:
+    """The field paths of a topic with the values of its first message, as text.
+
+    Arguments and errors as in `convert_bag`.
+    """
+    with bag_reading.opened(log, messages) as reader:
+        if topic not in (topics := bag_reading.types(reader)):
+            raise ValueError(f"{log_name(log)}: no topic {topic!r}, there are {', '.join(topics)}")
+        for received in bag_reading.messages(reader, [topic], lambda steps: None):
+            return bag_fields.describe(received.message)
+    raise ValueError(f"{log_name(log)}: topic {topic} has no message")
+
+
+def _sources(
+    reader: Any, mapping: Mapping[str, Mapping[str, Any]] | None
+) -> tuple[dict[str, bag_profiles.Source], list[str]]:
+    mapping = {} if mapping is None else mapping
+    bag_profiles.check_mapping(mapping)
+    return bag_profiles.sources(bag_reading.types(reader), mapping)
+
+
+def _check_ranges(
+    found: Mapping[str, Any], mapping: Mapping[str, Any], topics: Mapping[str, str]
+) -> None:
+    if "ranges" in found or mapping.get("ranges", {}).get("topic") == "none":
+        return
+    raise ValueError(
+        "no topic is of a type of ranges that is known: name it and its fields, as in --ranges "
+        "topic=/uwb,anchor=responder_id,tag=requester_id,range=distance (or --ranges none); there "
+        f"are {', '.join(f'{topic} ({name})' for topic, name in topics.items()) or 'no topics'}"
+    )
+
+
+def _topic_rows(reader: Any, found: Mapping[str, bag_profiles.Source]) -> list[dict[str, Any]]:
+    seconds_long = (reader.end_time - 1 - reader.start_time) * 1e-9 if reader.message_count else 0.0
+    return [
+        {
+            "topic": topic,
+            "type": msgtype,
+            "messages": (count := reader.topics[topic].msgcount),
+            "rate_hz": (count - 1) / seconds_long if count > 1 and seconds_long > 0 else None,
+            "read_as": [kind for kind, source in found.items() if topic in source.topics],
+        }
+        for topic, msgtype in bag_reading.types(reader).items()
+    ]
+
+
+def _said(values: bag_reading.Values, made: Tables, topics: Mapping[str, str]) -> dict[str, Any]:
+    """What convert.json says of a kind."""
+    times = made.times_ns
+    duration = float(times[-1] - times[0]) * 1e-9 if len(times) else 0.0
+    epochs = len(np.unique(times))
+    return {
+        "topics": [*values.source.topics],
+        "type": topics[values.source.topics[0]],
+        "fields": values.source.table,
+        "messages": values.messages,
+        "rows": len(times),
+        "start": seconds(int(times[0])) if len(times) else None,
+        "end": seconds(int(times[-1])) if len(times) else None,
+        "duration_s": duration,
+        "rate_hz": (epochs - 1) / duration if duration > 0 else None,
+        "delay_s": float(np.median(values.delays_ns)) * 1e-9 if values.delays_ns else None,
+        "dropped": dict(values.dropped + made.dropped),
+        **made.facts,
+    }
+
+
+def _far_stamps(kinds: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Clocks that differ: stamps of one kind against the time of recording and the others."""
+    delays = {kind: said["delay_s"] for kind, said in kinds.items() if said["delay_s"] is not None}
+    if not delays or max(delays.values()) - min(delays.values()) <= _FAR_S:
+        return []
+    told = ", ".join(f"{kind} {delay:.3f} s" for kind, delay in delays.items())
+    return [f"clocks differ, stamps are behind the recording by: {told}; time=@bag takes its time"]
+
+
+_POINTS = {"anchors.csv": "anchors", "tags.csv": "tags"}
+
+
+def _to_write(name: str, said: Mapping[str, Any]) -> str:
+    ids = ", ".join(said[_POINTS[name]])
+    frame = "world frame" if name == "anchors.csv" else "body frame"
+    return f"{name} is yours to write: {_POINTS[name][:-1]},x,y,z in metres, {frame}, of {ids}"
+
+
+def _write(out: Path, sheets: Mapping[str, Sheet]) -> dict[str, str]:
+    """The files; those of another conversion must not stay beside them."""
+    made = ("truth.csv", "imu.csv", "odometry.csv")
+    if stale := [name for name in made if name not in sheets and (out / name).exists()]:
+        raise ValueError(
+            f"{out / stale[0]} is there and does not come from this log: "
+            "remove it or choose another folder"
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    for name, sheet in sheets.items():
+        with (out / name).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(sheet.header)
+            writer.writerows(sheet.rows)
+    return {name: os.fspath(out / name) for name in sheets}
+
+
+def _replay(out: Path, sheets: Mapping[str, Sheet]) -> str:
+    words = ["rbl-gym", "replay"]
+    for option in ("ranges", "anchors", "tags", "truth"):
+        if option != "truth" or "truth.csv" in sheets:
+            words += [f"--{option}", os.fspath(out / f"{option}.csv")]
+    return shlex.join(words)
