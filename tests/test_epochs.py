@@ -75,7 +75,7 @@ def test_a_filter_can_be_started_again_at_an_epoch():
     wrong = prior[0], prior[1] + 3.0, prior[2]
     asked = []
 
-    def restart(belief: PoseBelief):
+    def restart(belief: PoseBelief, anchors: np.ndarray):
         asked.append(belief)
         return prior if len(asked) == 1 else None
 

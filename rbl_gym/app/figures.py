@@ -274,8 +274,8 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
         2, 2 if found is not None else 1, width_ratios=[1, 1.2] if found is not None else [1]
     )
     axes = figure.add_subplot(grid[:, 0])
-    axes.plot(*recording.anchors[:, :2].T, "k^", ms=7, label="anchors")
-    for place, name in zip(recording.anchors, recording.anchor_ids, strict=True):
+    axes.plot(*recording.last_anchors[:, :2].T, "k^", ms=7, label="anchors")
+    for place, name in zip(recording.last_anchors, recording.anchor_ids, strict=True):
         axes.annotate(name, place[:2], xytext=(4, 4), textcoords="offset points", fontsize=8)
     if recording.truth is not None and found is not None:
         when = recording.truth.times

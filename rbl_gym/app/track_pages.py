@@ -147,7 +147,7 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         truth = truth[0], truth[1] - origin, truth[2]
     story = Story(
         times,
-        recording.anchors - origin,
+        recording.last_anchors - origin,
         recording.anchor_ids,
         recording.tags,
         truth,

@@ -32,3 +32,8 @@ class Recording(NamedTuple):
         """Anchors (K, M, 3) at every epoch, also of those that stand; a view, not to be written."""
         shape = (len(self.times), *self.anchors.shape[-2:])
         return np.broadcast_to(self.anchors, shape)
+
+    @property
+    def last_anchors(self) -> FloatArray:
+        """Anchors (M, 3) where they stand, or stood at last."""
+        return self.anchors_by_epoch[-1]

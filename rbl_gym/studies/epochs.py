@@ -75,7 +75,7 @@ def track_epochs(
     filter: Filter,
     prior: Prior,
     readings: Iterable[Reading],
-    restart: Callable[[PoseBelief], Prior | None] | None = None,
+    restart: Callable[[PoseBelief, FloatArray], Prior | None] | None = None,
 ) -> Iterator[Step]:
     """Run a filter over epochs, one step after the other.
 
@@ -89,8 +89,8 @@ def track_epochs(
     readings
         What the filter is told, an epoch each.
     restart
-        Called with every belief. Where it returns a prior, the filter starts again from that one
-        and takes the ranges of the same epoch.
+        Called with every belief and the anchors of its epoch. Where it returns a prior, the
+        filter starts again from that one and takes the ranges of the same epoch.
 
     Yields
     ------
@@ -103,7 +103,7 @@ def track_epochs(
             state = filter.predict(state, reading.twist, reading.dt)
         predicted, state = state, _updated(filter, state, reading)
         belief = filter.belief(state)
-        if restart is not None and (other := restart(belief)) is not None:
+        if restart is not None and (other := restart(belief, reading.anchors)) is not None:
             predicted = filter.initial(*other)
             state = _updated(filter, predicted, reading)
             belief = filter.belief(state)

@@ -101,7 +101,8 @@ def stressed(log: Log, condition: str, seed: int) -> Stressed:
         std = (settings.range_std_m or replay.DEFAULT_RANGE_STD_M) / NOISE_FACTOR
         return Stressed(told, dataclasses.replace(settings, range_std_m=std))
     if condition == "anchor-off":
-        anchors = off_by(told.anchors, ANCHOR_ERROR_M, rng)
+        # The same error all the time, of an anchor that moves too.
+        anchors = told.anchors + off_by(np.zeros(told.anchors.shape[-2:]), ANCHOR_ERROR_M, rng)
         return Stressed(told._replace(anchors=anchors), settings)
     if condition == "tag-off":
         return Stressed(told._replace(tags=off_by(told.tags, TAG_ERROR_M, rng)), settings)

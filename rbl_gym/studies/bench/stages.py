@@ -98,7 +98,7 @@ def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> Bench
         lambda name, options: replay.named_filter(told, settings, name, options),
         lambda filter: replay.recording_steps(told, settings, filter),
         figures,
-        log.recording.anchors,
+        log.recording.last_anchors,
         log.recording.tags,
         None,
         (),

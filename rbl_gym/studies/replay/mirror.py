@@ -79,7 +79,8 @@ def other_pose(
         Corners (2, 3) of where the body may be: a pose outside is not counted.
     """
     seen = recording.links.any(axis=0)
-    anchors = recording.anchors[np.flatnonzero(seen.sum(axis=1))]
+    measured = np.flatnonzero(seen.sum(axis=1))
+    anchors = recording.anchors_by_epoch[0][measured]
     tags = recording.tags[np.flatnonzero(seen.sum(axis=0))]
     plane = mirror.plane_of(anchors)
     if plane.width < 1e-6 or plane.thickness > _THICK * plane.width:
@@ -89,6 +90,7 @@ def other_pose(
     if start is None:
         return None
     here = track[0][start], track[1][start]
+    anchors = recording.anchors_by_epoch[start][measured]
     P = np.diag([_START_RAD**2] * 3 + [(_START * size) ** 2] * 3)
     there = mirror.mirror_pose(*here, P, anchors, tags)
     poses = _Two(
@@ -159,7 +161,8 @@ def _update(
     filter: Any, before: Any, recording: Recording, k: int, std: FloatArray | float
 ) -> tuple[Any, FloatArray, FloatArray]:
     """Both states (2,) after epoch `k`, the log evidence of its ranges (Laplace), the cost."""
-    links, ranges, anchors = recording.links[k], recording.ranges[k], recording.anchors
+    links, ranges = recording.links[k], recording.ranges[k]
+    anchors = recording.anchors_by_epoch[k]
     told = np.where(links, std, 1.0)
     law = ranging.LinkNoise(told)
     state = filter.update(before, np.where(links, ranges, 1.0), anchors, links, noise=law)

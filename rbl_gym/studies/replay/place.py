@@ -24,13 +24,14 @@ def origin_of(recording: Recording) -> FloatArray:
     """Where coordinates (3,) are taken from: the origin, or for those of a map the anchors."""
     if np.abs(recording.anchors).max() < _MAP_M:
         return np.zeros(3)
-    return np.round(recording.anchors.mean(axis=0))
+    return np.round(recording.anchors.reshape(-1, 3).mean(axis=0))
 
 
 def reach_of(recording: Recording) -> tuple[FloatArray, FloatArray]:
     """Corners (3,) each of the box that the longest range leaves around the anchors."""
     longest = recording.ranges.max()
-    return recording.anchors.min(axis=0) - longest, recording.anchors.max(axis=0) + longest
+    anchors = recording.anchors.reshape(-1, 3)
+    return anchors.min(axis=0) - longest, anchors.max(axis=0) + longest
 
 
 def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
@@ -49,7 +50,7 @@ def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
     high = [np.inf if x is None else x for x in limits[1::2]]
     if settings.knowledge.below_anchors:
         seen = recording.links.any(axis=(0, 2))
-        mean = float(recording.anchors[seen, 2].mean())
+        mean = float(recording.anchors[..., seen, 2].mean())
         if low[2] >= mean:
             raise ValueError(
                 f"volume must reach below the anchors' mean height of {mean:.4g} m with "
@@ -72,7 +73,7 @@ def has_own_std(recording: Recording, settings: Settings) -> bool:
 
 def height_offset(recording: Recording, settings: Settings) -> float:
     """How far the tags lie below the anchors [m]; a ValueError where that has to be said."""
-    heights = recording.anchors[:, 2]
+    heights = recording.anchors[..., 2]
     if (
         settings.knowledge.planar
         and settings.knowledge.height_offset_m is None

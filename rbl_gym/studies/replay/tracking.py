@@ -109,7 +109,7 @@ def recording_steps(
     volume = volume_of(recording, settings)
     volume = None if volume is None else volume - origin
     prior = _prior(local, settings, volume)
-    restart = None if volume is None else partial(_image_inside, local, volume)
+    restart = None if volume is None else partial(_image_inside, recording.tags, volume)
     for step in track_epochs(filter, prior, _readings(local, settings), restart):
         belief = step.belief
         yield step._replace(belief=belief._replace(translation=belief.translation + origin))
@@ -119,10 +119,11 @@ def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
     """The epochs of a recording, without odometry."""
     own = recording.range_std if has_own_std(recording, settings) else None
     elapsed = np.diff(recording.times, prepend=recording.times[0])
+    anchors = recording.anchors_by_epoch
     for k, dt in enumerate(elapsed):
         yield Reading(
             recording.ranges[k],
-            recording.anchors,
+            anchors[k],
             recording.links[k],
             None if own is None else ranging.LinkNoise(own[k]),
             np.zeros(6) if dt > 0 else None,
@@ -131,12 +132,12 @@ def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
 
 
 def _image_inside(
-    recording: Recording, volume: FloatArray, belief: estimators.PoseBelief
+    tags: FloatArray, volume: FloatArray, belief: estimators.PoseBelief, anchors: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """The mirror image of a belief that is outside the volume, if that is inside; widened."""
     if not is_outside(volume, belief.translation, belief.covariance):
         return None
-    image = mirror_pose(*belief[:3], recording.anchors, recording.tags)
+    image = mirror_pose(*belief[:3], anchors, tags)
     if is_outside(volume, *image[1:]):
         return None
     # Of anchors nearly in a plane the image is near the best pose, not at it.
@@ -232,8 +233,11 @@ def _prior(
     recording: Recording, settings: Settings, volume: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Anywhere among the anchors, turned anyhow; the plane, where there is one, is known."""
-    centre = recording.anchors.mean(axis=0)
-    extent = max(float(np.ptp(recording.anchors, axis=0).max()), 1.0)
+    anchors = recording.anchors_by_epoch[0]
+    centre = anchors.mean(axis=0)
+    # Anchors may stand close together, or on one body.
+    away = float(np.median(recording.ranges[recording.links]))
+    extent = max(float(np.ptp(anchors, axis=0).max()), away, 1.0)
     std = np.array([math.pi] * 3 + [extent] * 3)
     if volume is not None:
         bounded = np.isfinite(volume).all(axis=0)
