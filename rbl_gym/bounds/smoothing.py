@@ -1,0 +1,122 @@
+"""The smoothing Cramer-Rao bound: of every epoch of a log, from all ranges before and after it.
+
+The information about all epochs together is block-tridiagonal. With ``e' = F e + n``, n of
+covariance Q, an interval adds ``F^T Q^-1 F``, ``-F^T Q^-1`` and ``Q^-1`` to the blocks of its two
+ends; ranges and the prior add to the diagonal. The blocks of its inverse are the bounds.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.bounds.pose import range_information
+from rbl_gym.bounds.tridiagonal import inverse_blocks
+from rbl_gym.checks import FloatArray, check_array, kernel
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.motion.kinematics import ProcessNoise, check_process
+from rbl_gym.motion.unknown_twist import WanderingTwist, check_laws
+
+__all__ = ["LEAST_STD", "smoothing_crb"]
+
+# Standard deviation (rad, m, rad/s, m/s) that an interval has at least on every axis: what moves
+# by nothing at all would have infinite information.
+LEAST_STD = 1e-6
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
+
+
+def smoothing_crb(
+    anchors: ArrayLike,
+    tags: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    noise: ranging.NoiseLaw,
+    twists: ArrayLike,
+    dt: ArrayLike,
+    process: ProcessNoise,
+    prior_covariance: ArrayLike,
+    links: ArrayLike | None = None,
+    law: WanderingTwist | None = None,
+) -> FloatArray:
+    """Cramer-Rao bound of the poses of K epochs from the ranges of all of them, at the truth.
+
+    Parameters
+    ----------
+    anchors, tags
+        (M, 3), or (..., K, M, 3) where they move, and (N, 3), metres.
+    rotation, translation
+        True poses (..., K, 3, 3) and (..., K, 3).
+    noise
+        Law of the ranges.
+    twists
+        True twists (..., K - 1, 6) of the intervals between epochs, rad/s and m/s.
+    dt
+        Their lengths, a number or (..., K - 1) seconds.
+    process
+        Noise of the motion.
+    prior_covariance
+        (..., 6, 6), of the pose of the first epoch before its ranges.
+    links
+        (..., K, M, N), True where a range is measured; None: all.
+    law
+        Of a twist that is not known; None: it is.
+
+    Returns
+    -------
+    Covariances (..., K, 6, 6) of the pose error; (..., K, 12, 12) of pose and twist with a law,
+    as of `bounds.twist.posterior_crb_step`.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes or values.
+    """
+    twists = check_array("twists", twists, ("K", 6))
+    dt = np.broadcast_to(check_array("dt", dt, ()), twists.shape[:-1])
+    if (dt < 0).any():
+        raise ValueError(f"dt must not be negative, got {dt.min()}")
+    check_process(process)
+    if law is not None:
+        check_laws(law, process)
+    P = check_array("prior_covariance", prior_covariance, (6, 6))
+    seen = range_information(anchors, tags, rotation, translation, noise, links)
+    n = 6 if law is None else 12
+    F, Q = _transition(twists, dt, process, law)
+    weight, Ft = np.linalg.inv(Q), np.swapaxes(F, -1, -2)
+    batch = np.broadcast_shapes(seen.shape[:-3], F.shape[:-3], P.shape[:-2])
+    K = seen.shape[-3]
+    if F.shape[-3] != K - 1:
+        raise ValueError(
+            f"twists must be of {K - 1} intervals between {K} epochs, got {F.shape[-3]}"
+        )
+    diagonal, above = np.zeros((*batch, K, n, n)), np.zeros((*batch, K, n, n))
+    diagonal[..., :6, :6] = seen
+    diagonal[..., 0, :6, :6] += np.linalg.inv(P)
+    if law is not None:
+        std = np.maximum(law.prior_std(), LEAST_STD)
+        diagonal[..., 0, range(6, 12), range(6, 12)] += std**-2.0
+    diagonal[..., :-1, :, :] += Ft @ weight @ F
+    diagonal[..., 1:, :, :] += weight
+    above[..., :-1, :, :] = -Ft @ weight
+    return inverse_blocks(diagonal, above)
+
+
+def _transition(
+    twist: FloatArray, dt: FloatArray, process: ProcessNoise, law: WanderingTwist | None
+) -> tuple[FloatArray, FloatArray]:
+    """F and Q of intervals of their own lengths (...), as of `bounds.twist.predict_covariance`."""
+    n, dt = 6 if law is None else 12, dt[..., None]
+    F, G = (np.broadcast_to(np.eye(n), (*twist.shape[:-1], n, n)).copy() for _ in range(2))
+    F[..., :3, :3] = _EXP(twist[..., :3] * dt)
+    G[..., :3, :3] = _LEFT_JACOBIAN(twist[..., :3] * dt)
+    Q = np.zeros(F.shape)
+    Q[..., range(6), range(6)] = dt * process.std() ** 2
+    if law is not None:
+        F[..., :6, 6:] = dt[..., None] * G[..., :6, :6]
+        wander, pose, rate = law.std() ** 2, range(6), range(6, 12)
+        Q[..., pose, pose] += dt**3 / 3 * wander
+        Q[..., pose, rate] = Q[..., rate, pose] = dt**2 / 2 * wander
+        Q[..., rate, rate] = dt * wander
+    return F, G @ (Q + LEAST_STD**2 * np.eye(n)) @ np.swapaxes(G, -1, -2)
