@@ -35,6 +35,7 @@ from rbl_gym.estimators.networks.consensus import (
 from rbl_gym.estimators.networks.frames import FrameEstimate, frames
 from rbl_gym.estimators.networks.orientations import chordal_optimum, orientations
 from rbl_gym.estimators.networks.triangle import TriangleFrames, triangle_frames
+from rbl_gym.estimators.smoothing.smoother import smooth
 
 # A filter is known by the `register` at the end of its own module; no list names the modules.
 for _module in walk_packages(__path__, f"{__name__}."):
@@ -73,5 +74,6 @@ __all__ = [
     "orientations",
     "register",
     "ring_least_squares",
+    "smooth",
     "triangle_frames",
 ]

@@ -1,0 +1,216 @@
+"""What a smoother estimates of a log, and the normal equations of one Gauss-Newton step.
+
+The error of an epoch is ``(w, v, extra)``: that of the pose as everywhere, ``Q_hat = exp(w) Q`` and
+``t_hat = t + v``, then estimate less truth of whatever else is estimated per epoch. Constants of
+the log come once. Every factor ties an epoch to itself, to its neighbour and to the constants, so
+that the equations are block-tridiagonal with a border.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from rbl_gym.bounds.tridiagonal import inverse_blocks, solve_blocks
+from rbl_gym.checks import FloatArray, kernel
+from rbl_gym.estimators.costs.map_problem import PoseState, pose_error
+from rbl_gym.geometry import rotations
+
+__all__ = ["Factor", "LogState", "Rows"]
+
+_EXP, _ERROR = kernel(rotations.exp), kernel(rotations.error)
+
+
+class LogState(NamedTuple):
+    """States of the K epochs of a log, and its constants, with leading batch axes.
+
+    Attributes
+    ----------
+    rotation, translation
+        (..., K, 3, 3) and (..., K, 3).
+    extra
+        (..., K, E): first what the law of motion estimates beside the pose, then the biases that
+        drift.
+    constants
+        (..., C): first those of the law of motion, then those of further factors, then the biases
+        that stay.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    extra: FloatArray
+    constants: FloatArray
+
+
+class Rows(NamedTuple):
+    """Whitened residuals of a factor and their derivatives, for least squares.
+
+    Attributes
+    ----------
+    residual
+        (..., J, m) in standard deviations: J = K, of every epoch; or J = K - 1, between neighbours.
+    before
+        (..., J, m, n): derivative by the errors of the epoch, or of the earlier neighbour. The
+        first n errors; by the others it is zero.
+    after
+        The same by those of the later neighbour; None: rows of an epoch alone.
+    constants
+        (..., J, m, c): derivative by the factor's own constants; None: there are none.
+    """
+
+    residual: FloatArray
+    before: FloatArray
+    after: FloatArray | None = None
+    constants: FloatArray | None = None
+
+
+class Factor(Protocol):
+    """Anything that ties epochs to measurements, to their neighbours and to constants.
+
+    Attributes
+    ----------
+    constants_std
+        Standard deviations (c,) of the factor's own constants about zero.
+    """
+
+    @property
+    def constants_std(self) -> FloatArray:
+        """See the class."""
+        ...
+
+    def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
+        """Residuals and derivatives at a state, times (..., K), own constants (..., c)."""
+        ...
+
+
+@dataclass(eq=False)
+class Equations:
+    """Normal equations ``H x = -g`` of a log; `Rows` and the like are added in place.
+
+    Attributes
+    ----------
+    diagonal, above
+        Blocks (..., K, n, n) of the epochs, and of each epoch with the next (the last unused).
+    gradient
+        (..., K, n).
+    border, corner, corner_gradient
+        (..., K, n, c), (..., c, c), (..., c): blocks of the constants.
+    cost
+        (...).
+    """
+
+    diagonal: FloatArray
+    above: FloatArray
+    gradient: FloatArray
+    border: FloatArray
+    corner: FloatArray
+    corner_gradient: FloatArray
+    cost: FloatArray
+
+    @classmethod
+    def empty(cls, batch: tuple[int, ...], epochs: int, n: int, c: int) -> Equations:
+        """Equations that say nothing, of n errors an epoch and c constants."""
+        return cls(
+            np.zeros((*batch, epochs, n, n)), np.zeros((*batch, epochs, n, n)),
+            np.zeros((*batch, epochs, n)), np.zeros((*batch, epochs, n, c)),
+            np.zeros((*batch, c, c)), np.zeros((*batch, c)), np.zeros(batch),
+        )  # fmt: skip
+
+    def add(self, rows: Rows, start: int = 0) -> None:
+        """Half the squares of rows whose own constants begin at `start`."""
+        r, A, B, C = rows
+        J, n = A.shape[-3], A.shape[-1]
+        self.cost += 0.5 * np.einsum("...ij,...ij->...", r, r)
+        At = np.swapaxes(A, -1, -2)
+        self.diagonal[..., :J, :n, :n] += At @ A
+        self.gradient[..., :J, :n] += times(At, r)
+        if B is not None:
+            Bt = np.swapaxes(B, -1, -2)
+            self.diagonal[..., 1:, :n, :n] += Bt @ B
+            self.above[..., :J, :n, :n] += At @ B
+            self.gradient[..., 1:, :n] += times(Bt, r)
+        if C is not None and C.shape[-1]:
+            end = start + C.shape[-1]
+            self.border[..., :J, :n, start:end] += At @ C
+            if B is not None:
+                self.border[..., 1:, :n, start:end] += np.swapaxes(B, -1, -2) @ C
+            flat = C.reshape((*C.shape[:-3], -1, C.shape[-1]))
+            Ct = np.swapaxes(flat, -1, -2)
+            self.corner[..., start:end, start:end] += Ct @ flat
+            self.corner_gradient[..., start:end] += times(Ct, r.reshape((*r.shape[:-2], -1)))
+
+    def add_prior(self, where: slice, value: FloatArray, std: FloatArray) -> None:
+        """Independent priors about zero of some errors of the first epoch, whose value this is."""
+        at = range(where.start, where.stop)
+        self.cost += 0.5 * ((value / std) ** 2).sum(axis=-1)
+        self.diagonal[..., 0, at, at] += std**-2.0
+        self.gradient[..., 0, where] += value / std**2
+
+    def add_constants_prior(self, where: slice, value: FloatArray, std: FloatArray) -> None:
+        """The same of constants."""
+        at = range(where.start, where.stop)
+        self.cost += 0.5 * ((value / std) ** 2).sum(axis=-1)
+        self.corner[..., at, at] += std**-2.0
+        self.corner_gradient[..., where] += value / std**2
+
+    def add_pose_prior(self, state: LogState, prior: PoseState, information: FloatArray) -> None:
+        """A prior (...) of the pose of the first epoch, and its information (..., 6, 6)."""
+        turn = _ERROR(state.rotation[..., 0, :, :], prior.rotation)
+        error, D = pose_error(turn, state.translation[..., 0, :] - prior.translation)
+        pull, Dt = times(information, error), np.swapaxes(D, -1, -2)
+        self.cost += 0.5 * np.einsum("...i,...i->...", error, pull)
+        self.diagonal[..., 0, :6, :6] += Dt @ information @ D
+        self.gradient[..., 0, :6] += times(Dt, pull)
+
+    def step(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The step x (..., K, n) and (..., c), and the decrease (...) of cost that it promises."""
+        n, raise_by = self.gradient.shape[-1], (damping + 1e-14)[..., None]
+        diagonal = self.diagonal.copy()
+        own = np.einsum("...ii->...i", self.diagonal)
+        diagonal[..., range(n), range(n)] += raise_by[..., None] * own + 1e-300
+        right = np.concatenate([-self.gradient[..., None], self.border], axis=-1)
+        found = solve_blocks(diagonal, self.above, right)
+        x, X = found[..., 0], found[..., 1:]
+        c = self.corner.shape[-1]
+        y = np.zeros(self.corner_gradient.shape)
+        if c:
+            corner = self.corner.copy()
+            corner[..., range(c), range(c)] += raise_by * np.einsum("...ii->...i", self.corner)
+            schur = corner - np.einsum("...kia,...kib->...ab", self.border, X)
+            right = self.corner_gradient + np.einsum("...kia,...ki->...a", self.border, x)
+            y = -np.linalg.solve(schur, right[..., None])[..., 0]
+            x = x - np.einsum("...kia,...a->...ki", X, y)
+        decrease = -np.einsum("...ki,...ki->...", self.gradient, x)
+        return x, y, decrease - np.einsum("...a,...a->...", self.corner_gradient, y)
+
+    def covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of every epoch (..., K, n, n), with the constants (..., K, n, c), of these (..., c, c).
+
+        NaN where the equations are not positive definite.
+        """
+        P = inverse_blocks(self.diagonal, self.above)
+        if not self.corner.shape[-1]:
+            return P, self.border, self.corner
+        X = solve_blocks(self.diagonal, self.above, self.border)
+        schur = self.corner - np.einsum("...kia,...kib->...ab", self.border, X)
+        constants = np.linalg.inv(schur)
+        constants = 0.5 * (constants + np.swapaxes(constants, -1, -2))
+        crossed = -X @ constants[..., None, :, :]
+        return P - crossed @ np.swapaxes(X, -1, -2), crossed, constants
+
+
+def moved(state: LogState, x: FloatArray, y: FloatArray) -> LogState:
+    """The state after steps (..., K, n) of the epochs and (..., c) of the constants."""
+    return LogState(
+        _EXP(x[..., :3]) @ state.rotation,
+        state.translation + x[..., 3:6],
+        state.extra + x[..., 6:],
+        state.constants + y,
+    )
+
+
+def times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    """Products (..., m) of matrices (..., m, n) and vectors (..., n)."""
+    return (matrix @ vector[..., None])[..., 0]

@@ -1,0 +1,71 @@
+"""What is known of the body's place at every epoch, as a factor of the smoother."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.estimators.smoothing.equations import LogState, Rows
+
+__all__ = ["Level"]
+
+
+@dataclass(frozen=True)
+class Level:
+    """Soft knowledge of height and tilt: a body that stays about level, at about one height.
+
+    Deviations of different epochs count as independent. With one that lasts, the height or the tilt
+    itself, the belief about that direction is narrower than it should be.
+
+    Parameters
+    ----------
+    height_m, height_std_m
+        Height of the body's origin, and the standard deviation about it; None: unknown.
+    tilt_std_rad
+        Standard deviation of roll and pitch about level, on each of two axes; None: unknown.
+
+    Raises
+    ------
+    ValueError
+        On a deviation that is not positive, or a height without one.
+    """
+
+    height_m: float | None = None
+    height_std_m: float | None = None
+    tilt_std_rad: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.height_m is None) != (self.height_std_m is None):
+            raise ValueError(
+                f"height_m and height_std_m must be given together, got {self.height_m!r} and "
+                f"{self.height_std_m!r}"
+            )
+        for name in ("height_std_m", "tilt_std_rad"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), low=1e-9)
+
+    constants_std = np.zeros(0)
+
+    def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
+        """Rows of the height, and of the level parts of the body's upright axis."""
+        upright = state.rotation[..., :, 2]
+        residuals, rows = [], []
+        if self.height_std_m is not None:
+            A = np.zeros((*upright.shape[:-1], 1, 6))
+            A[..., 5] = 1 / self.height_std_m
+            residuals.append((state.translation[..., 2:] - self.height_m) / self.height_std_m)
+            rows.append(A)
+        if self.tilt_std_rad is not None:
+            # An error w turns the axis u by w x u.
+            A = np.zeros((*upright.shape[:-1], 2, 6))
+            x, y, z = (upright[..., i] / self.tilt_std_rad for i in range(3))
+            A[..., 0, 1], A[..., 0, 2] = z, -y
+            A[..., 1, 0], A[..., 1, 2] = -z, x
+            residuals.append(upright[..., :2] / self.tilt_std_rad)
+            rows.append(A)
+        shape = upright.shape[:-1]
+        residuals = residuals or [np.zeros((*shape, 0))]
+        rows = rows or [np.zeros((*shape, 0, 6))]
+        return Rows(np.concatenate(residuals, axis=-1), np.concatenate(rows, axis=-2))

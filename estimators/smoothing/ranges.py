@@ -1,0 +1,228 @@
+"""Ranges of a log and the biases of their links, as the smoother takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.costs.range_cost import loss_of
+from rbl_gym.estimators.smoothing.equations import Equations, LogState, Rows
+from rbl_gym.measurements.link_bias import LinkBias
+
+# Share of a bias that is new after an interval, at least: two epochs of one time.
+_LEAST_NEW = 1e-12
+
+
+class BiasBlock(NamedTuple):
+    """Biases of one kind: of every link, or one that all have in common.
+
+    Attributes
+    ----------
+    where
+        Their places among the extra states of an epoch, or among the constants.
+    each
+        True: one a link; False: one for all.
+    std
+        Metres.
+    time_s
+        Of the drift; None: constants.
+    """
+
+    where: slice
+    each: bool
+    std: float
+    time_s: float | None
+
+
+def bias_blocks(
+    laws: tuple[LinkBias, ...], links: int, extra: int, constants: int
+) -> tuple[list[BiasBlock], int, int]:
+    """Where the biases of the laws stand, and how many extra states and constants there are.
+
+    Parameters
+    ----------
+    laws, links
+        The biases add up; of so many links.
+    extra, constants
+        How many come before them.
+    """
+    blocks: list[BiasBlock] = []
+    for law in laws:
+        for each, std in ((True, law.std_m), (False, law.common_std_m)):
+            if std == 0:
+                continue
+            size = links if each else 1
+            start = constants if law.time_s is None else extra
+            blocks.append(BiasBlock(slice(start, start + size), each, std, law.time_s))
+            if law.time_s is None:
+                constants += size
+            else:
+                extra += size
+    return blocks, extra, constants
+
+
+def bias_of(blocks: list[BiasBlock], state: LogState, links: int) -> FloatArray:
+    """Biases (..., K, links) of a state, metres: all kinds together."""
+    total = np.zeros((*state.translation.shape[:-1], links))
+    for block in blocks:
+        if block.time_s is None:
+            total += state.constants[..., None, block.where]
+        else:
+            total += state.extra[..., block.where]
+    return total
+
+
+def add_biases(
+    equations: Equations, blocks: list[BiasBlock], state: LogState, times: FloatArray
+) -> None:
+    """The priors of the biases, and their drift: Gauss-Markov processes of the same variance."""
+    for block in blocks:
+        where, std = block.where, block.std
+        if block.time_s is None:
+            equations.add_constants_prior(where, state.constants[..., where], np.asarray(std))
+            continue
+        value, shifted = state.extra[..., where], slice(6 + where.start, 6 + where.stop)
+        equations.add_prior(shifted, value[..., 0, :], np.asarray(std))
+        elapsed = np.diff(times)[..., None] / block.time_s
+        kept, new = np.exp(-elapsed), np.maximum(-np.expm1(-2 * elapsed), _LEAST_NEW)
+        weight = 1 / (new * std**2)
+        residual = value[..., 1:, :] - kept * value[..., :-1, :]
+        equations.cost += 0.5 * (weight * residual**2).sum(axis=(-2, -1))
+        at = range(shifted.start, shifted.stop)
+        equations.diagonal[..., :-1, at, at] += weight * kept**2
+        equations.diagonal[..., 1:, at, at] += weight
+        equations.above[..., :-1, at, at] -= weight * kept
+        equations.gradient[..., :-1, shifted] -= weight * kept * residual
+        equations.gradient[..., 1:, shifted] += weight * residual
+
+
+@dataclass(frozen=True, eq=False)
+class LogRanges:
+    """The ranges that were measured, at most S of an epoch, side by side.
+
+    Attributes
+    ----------
+    link
+        (..., K, S), which of the M N links.
+    ranges, weights
+        (..., K, S), metres and inverse variances; weight 0 where an epoch has fewer.
+    anchors, tags
+        (..., K, S, 3) of each range: world frame, body frame.
+    shape
+        (M, N).
+    blocks
+        Of the biases.
+    """
+
+    link: np.ndarray
+    ranges: FloatArray
+    weights: FloatArray
+    anchors: FloatArray
+    tags: FloatArray
+    shape: tuple[int, int]
+    blocks: list[BiasBlock]
+
+    @classmethod
+    def gathered(
+        cls,
+        ranges: FloatArray,
+        variance: FloatArray,
+        links: BoolArray | None,
+        anchors: FloatArray,
+        tags: FloatArray,
+        blocks: list[BiasBlock],
+    ) -> LogRanges:
+        """Of arrays (..., K, M, N), anchors (..., K or 1, M, 3) and tags (N, 3)."""
+        M, N = ranges.shape[-2:]
+        flat = (*ranges.shape[:-2], M * N)
+        mask = np.broadcast_to(True if links is None else links, ranges.shape)
+        most = max(int(mask.sum(axis=(-2, -1)).max()), 1)
+        # Measured ones first, in their order.
+        link = np.argsort(~mask.reshape(flat), axis=-1, kind="stable")[..., :most]
+
+        def pick(array: FloatArray | BoolArray) -> FloatArray:
+            flattened = np.broadcast_to(array, ranges.shape).reshape(flat)
+            return np.take_along_axis(flattened, link, axis=-1)
+
+        places = np.broadcast_to(anchors, (*flat[:-1], M, 3))
+        places = np.take_along_axis(places, (link // N)[..., None], axis=-2)
+        weights = np.where(pick(mask), 1 / pick(variance), 0.0)
+        tags_of = tags[link % N]
+        return cls(link, pick(ranges), weights, places, tags_of, (M, N), blocks)
+
+    def residual(self, state: LogState) -> tuple[FloatArray, FloatArray]:
+        """Range less prediction (..., K, S) [m], and the derivative (..., K, S, 6) of distances."""
+        turned = np.einsum("...ij,...sj->...si", state.rotation, self.tags)
+        gap = turned + state.translation[..., None, :] - self.anchors
+        distance = np.sqrt(np.einsum("...i,...i->...", gap, gap))
+        unit = gap / np.where(distance > 0, distance, 1.0)[..., None]
+        J = np.concatenate([np.cross(turned, unit), unit], axis=-1)
+        total = np.zeros(distance.shape)
+        for block in self.blocks:
+            values = (
+                state.constants[..., None, block.where]
+                if block.time_s is None
+                else state.extra[..., block.where]
+            )
+            if block.each:
+                values = np.broadcast_to(values, (*self.link.shape[:-1], values.shape[-1]))
+                values = np.take_along_axis(values, self.link, axis=-1)
+            total += values
+        return np.where(self.weights > 0, distance + total - self.ranges, 0.0), J
+
+    def rows(self, state: LogState, loss: FloatArray) -> tuple[Rows, FloatArray]:
+        """Rows of the ranges, by weights that a loss leaves at the state, and its cost (...).
+
+        Derivatives by constants are by all of the log.
+        """
+        residual, J = self.residual(state)
+        cost, share = loss_of(self.weights * residual**2, loss)
+        root = np.sqrt(self.weights * share)
+        before = np.zeros((*residual.shape, 6 + state.extra.shape[-1]))
+        before[..., :6] = J
+        constants = np.zeros((*residual.shape, state.constants.shape[-1]))
+        for block in self.blocks:
+            target, shift = (constants, 0) if block.time_s is None else (before, 6)
+            columns = target[..., block.where.start + shift : block.where.stop + shift]
+            columns[...] = 1.0
+            if block.each:
+                columns[...] = self.link[..., None] == np.arange(columns.shape[-1])
+        before *= root[..., None]
+        constants *= root[..., None]
+        rows = Rows(root * residual, before, None, constants)
+        return rows, cost.sum(axis=(-2, -1))
+
+    def add(self, equations: Equations, state: LogState, loss: FloatArray) -> None:
+        """The cost of the ranges under a loss."""
+        rows, cost = self.rows(state, loss)
+        equations.add(rows)
+        # In place of half the squares: the loss.
+        equations.cost += cost - 0.5 * np.einsum("...ks,...ks->...", rows.residual, rows.residual)
+
+    def consistency(
+        self,
+        state: LogState,
+        loss: FloatArray,
+        covariances: tuple[FloatArray, FloatArray, FloatArray],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Squared residuals (..., K) of the epochs in standard deviations, and what to expect.
+
+        Of a range there is to expect 1 less the share of its variance that the fit explains.
+        """
+        (r, A, _, C), _ = self.rows(state, loss)
+        P, crossed, constants = covariances
+        assert C is not None
+        fitted = np.einsum("...ksi,...kij,...ksj->...ks", A, P, A, optimize=True)
+        fitted += 2 * np.einsum("...ksi,...kia,...ksa->...ks", A, crossed, C, optimize=True)
+        fitted += np.einsum("...ksa,...ab,...ksb->...ks", C, constants, C, optimize=True)
+        return (r**2).sum(axis=-1), (self.weights > 0).sum(axis=-1) - fitted.sum(axis=-1)
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Values (..., K, S) as (..., K, M, N), zero where nothing was measured."""
+        M, N = self.shape
+        full = np.zeros((*values.shape[:-1], M * N))
+        np.put_along_axis(full, self.link, np.where(self.weights > 0, values, 0.0), axis=-1)
+        return full.reshape((*values.shape[:-1], M, N))

@@ -1,0 +1,300 @@
+"""The smoother: all poses of a log at once, each from all ranges before and after it.
+
+Maximum a posteriori over the whole log by Gauss-Newton, damped where the cost would rise. The laws
+are those of the filters: `KnownTwist` that of ``"iekf"``, `UnknownTwist` that of ``"iekf-cv"``, and
+biases of links. Where all is linear it is the smoother of Rauch, Tung and Striebel.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count
+from rbl_gym.estimators.costs.map_problem import PoseState, positive_inverse
+from rbl_gym.estimators.costs.range_cost import SQUARES, huber
+from rbl_gym.estimators.inputs import check_covariance, check_epoch, epoch_variance
+from rbl_gym.estimators.smoothing.equations import Equations, Factor, LogState, moved
+from rbl_gym.estimators.smoothing.motion import Motion
+from rbl_gym.estimators.smoothing.ranges import LogRanges, add_biases, bias_blocks, bias_of
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.measurements.noise_laws import NoiseLaw
+
+__all__ = ["LogModel", "RangeLog", "Smoothed", "smooth"]
+
+# Whitened residual at which Huber's loss turns, where a loss that forgets is to be started.
+_HUBER = 1.5
+# A step is the last one where it promises less decrease of the cost than this.
+_TOLERANCE, _COARSE = 1e-6, 1e-1
+_MOST_DAMPING = 1e12
+
+
+class RangeLog(NamedTuple):
+    """Ranges of a log of K epochs, at any spacing; arrays with leading batch axes.
+
+    Ranges that each have a time of their own are epochs of one link.
+
+    Attributes
+    ----------
+    times
+        (..., K), seconds, that do not decrease.
+    ranges
+        (..., K, M, N), metres.
+    anchors
+        (M, 3), or (..., K, M, 3) where they move or differ between logs, metres.
+    links
+        (..., K, M, N), True where a range was measured; None: all.
+    noise
+        Law of these ranges, such as `rbl_gym.ranging.LinkNoise` with a standard deviation for
+        each of (..., K, M, N); None: the model's.
+    """
+
+    times: ArrayLike
+    ranges: ArrayLike
+    anchors: ArrayLike
+    links: ArrayLike | None = None
+    noise: NoiseLaw | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LogModel:
+    """What a smoother takes for true of a log.
+
+    Parameters
+    ----------
+    tags
+        (N, 3), metres, body frame.
+    noise
+        Law of the ranges; variances are taken at the measured ranges.
+    motion
+        `KnownTwist`, `UnknownTwist`, or any other `Motion`.
+    biases
+        Laws of the links' biases, which add up: constant ones are learned from the whole log.
+    factors
+        Whatever else is known or measured, for instance `Level`.
+    loss
+        Of the ranges' residuals, of `rbl_gym.estimators.costs.range_cost`: squares, or `huber`.
+        One that is not convex is started with Huber's.
+    """
+
+    tags: FloatArray
+    noise: NoiseLaw
+    motion: Motion
+    biases: tuple[LinkBias, ...] = ()
+    factors: tuple[Factor, ...] = ()
+    loss: FloatArray = dataclasses.field(default_factory=lambda: SQUARES)
+
+    def __post_init__(self) -> None:
+        tags = check_array("tags", self.tags, ("N", 3))
+        if tags.ndim != 2:
+            raise ValueError(f"tags must be (N, 3), got shape {tags.shape}")
+        object.__setattr__(self, "tags", tags)
+        for law in self.biases:
+            if not isinstance(law, LinkBias):
+                raise ValueError(f"biases must be a tuple of LinkBias, got {law!r:.80}")
+
+
+class Smoothed(NamedTuple):
+    """The most likely track of a log; arrays with leading batch axes.
+
+    Attributes
+    ----------
+    rotation, translation, covariance
+        Poses of the K epochs: (..., K, 3, 3), (..., K, 3), and (..., K, 6, 6) of the error (w, v).
+    extra, extra_covariance
+        (..., K, e) and (..., K, e, e): what the motion estimates beside the pose, such as the
+        twist of `UnknownTwist`.
+    biases
+        (..., K, M, N), metres: of all links, constant and drifting ones together.
+    constants, constants_covariance
+        (..., c) and (..., c, c): of the motion, of the factors, then the biases that stay.
+    residuals
+        (..., K, M, N), range less its expectation, metres; 0 where nothing was measured.
+    squares, freedom
+        (..., K): squared residuals of an epoch in standard deviations, weighed by the loss, and
+        what to expect of them. Their sums over many epochs have the ratio 1 where all is true.
+    cost
+        (...), minus the logarithm of the posterior density, up to a constant.
+    converged
+        (...), whether the last step was too short to matter.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    covariance: FloatArray
+    extra: FloatArray
+    extra_covariance: FloatArray
+    biases: FloatArray
+    constants: FloatArray
+    constants_covariance: FloatArray
+    residuals: FloatArray
+    squares: FloatArray
+    freedom: FloatArray
+    cost: FloatArray
+    converged: BoolArray
+
+
+def smooth(
+    log: RangeLog,
+    model: LogModel,
+    prior: PoseState | Sequence[ArrayLike],
+    start: Sequence[ArrayLike],
+    iterations: int = 50,
+) -> Smoothed:
+    """The most likely track of a log of ranges, and the covariances of its poses.
+
+    Parameters
+    ----------
+    log
+        What was measured.
+    model
+        What is taken for true.
+    prior
+        Rotation (..., 3, 3), translation (..., 3) and covariance (..., 6, 6) at the first epoch,
+        before its ranges.
+    start
+        Rotations (..., K, 3, 3) and translations (..., K, 3) where Gauss-Newton begins, for
+        instance a filter's track (`causal_track`). It finds the best track near them.
+    iterations
+        At the most.
+
+    Raises
+    ------
+    ValueError
+        On shapes that do not fit, NaN, ranges that are not positive, times that decrease, and
+        where log and prior leave a state without any information.
+    """
+    iterations = check_count("iterations", iterations)
+    problem, state = _checked(log, model, prior, start)
+    losses = [model.loss] if _is_convex(model.loss) else [huber(_HUBER), model.loss]
+    for loss in losses:
+        tolerance = _TOLERANCE if loss is losses[-1] else _COARSE
+        state, equations, converged = problem.minimize(state, loss, iterations, tolerance)
+    covariances = equations.covariances()
+    P, _, constants = covariances
+    if not np.isfinite(P).all():
+        raise ValueError("log and prior must tell of every state, some have no information")
+    squares, freedom = problem.ranges.consistency(state, losses[-1], covariances)
+    e = 6 + len(model.motion.extra_std)
+    spread, shape = problem.ranges.spread, problem.ranges.shape
+    biases = bias_of(problem.ranges.blocks, state, shape[0] * shape[1])
+    return Smoothed(
+        state.rotation, state.translation, P[..., :6, :6],
+        state.extra[..., : e - 6], P[..., 6:e, 6:e],
+        biases.reshape((*biases.shape[:-1], *shape)), state.constants, constants,
+        spread(-problem.ranges.residual(state)[0]), squares, freedom, equations.cost, converged,
+    )  # fmt: skip
+
+
+def _is_convex(loss: FloatArray) -> bool:
+    """Whether a loss has one minimum: squares, or Huber's."""
+    return bool(np.isinf(loss[..., 1:3]).all() and (loss[..., 3:4] == 1).all())
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """All terms of a log: see `smooth`."""
+
+    times: FloatArray
+    ranges: LogRanges
+    motion: Motion
+    factors: tuple[Factor, ...]
+    prior: PoseState
+    information: FloatArray
+
+    def linearize(self, state: LogState, loss: FloatArray) -> Equations:
+        batch, K = state.translation.shape[:-2], state.translation.shape[-2]
+        n = 6 + state.extra.shape[-1]
+        equations = Equations.empty(batch, K, n, state.constants.shape[-1])
+        equations.add_pose_prior(state, self.prior, self.information)
+        std = self.motion.extra_std
+        if len(std):
+            equations.add_prior(slice(6, 6 + len(std)), state.extra[..., 0, : len(std)], std)
+        first = 0
+        for factor in (self.motion, *self.factors):
+            where = slice(first, first + len(factor.constants_std))
+            own = state.constants[..., where]
+            equations.add(factor.linearize(state, self.times, own), first)
+            if where.stop > first:
+                equations.add_constants_prior(where, own, factor.constants_std)
+            first = where.stop
+        add_biases(equations, self.ranges.blocks, state, self.times)
+        self.ranges.add(equations, state, loss)
+        return equations
+
+    def minimize(
+        self, state: LogState, loss: FloatArray, iterations: int, tolerance: float
+    ) -> tuple[LogState, Equations, BoolArray]:
+        """State, equations there, and whether it converged (...), from a start."""
+        equations = self.linearize(state, loss)
+        damping = np.zeros(equations.cost.shape)
+        converged = np.zeros(equations.cost.shape, np.bool_)
+        for _ in range(iterations):
+            x, y, decrease = equations.step(damping)
+            new = moved(state, x, y)
+            cost, equations = equations.cost, self.linearize(new, loss)
+            # What is less than rounding may change: as good as the same.
+            better = (equations.cost <= cost * (1 + 1e-12)) | (np.abs(decrease) < 1e-8)
+            taken = better & ~converged
+            if not taken.all():
+                kept = zip(new, state, (3, 2, 2, 1), strict=True)
+                new = LogState(*(_where(taken, a, b, axes) for a, b, axes in kept))
+                equations = self.linearize(new, loss)
+            state = new
+            # Damping shortens a step by about 1 + damping: a short step alone proves nothing.
+            converged = converged | (better & (decrease * (1 + damping) < tolerance))
+            eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
+            damping = np.where(better, eased, np.clip(10 * damping, 1e-3, _MOST_DAMPING))
+            if converged.all():
+                break
+        return state, equations, converged
+
+
+def _where(taken: BoolArray, a: FloatArray, b: FloatArray, axes: int) -> FloatArray:
+    return np.where(taken.reshape(taken.shape + (1,) * axes), a, b)
+
+
+def _checked(
+    log: RangeLog, model: LogModel, prior: Any, start: Sequence[ArrayLike]
+) -> tuple[_Problem, LogState]:
+    """The problem of arguments that fit, and the state where it starts."""
+    times = check_array("times", log.times, ("K",))
+    if (np.diff(times) < 0).any():
+        raise ValueError("times must not decrease")
+    ranges, anchors, mask = check_epoch(log.ranges, log.anchors, log.links, model.tags)
+    variance = epoch_variance(log.noise, model.noise, ranges, mask)
+    rotation, translation, covariance = prior
+    rotation = rotations.check_rotation("prior rotation", rotation)
+    translation = check_array("prior translation", translation, (3,))
+    covariance = check_covariance(covariance, (6,))
+    Q = rotations.check_rotation("start rotation", start[0])
+    t = check_array("start translation", start[1], ("K", 3))
+    K = times.shape[-1]
+    try:
+        batch = np.broadcast_shapes(
+            times.shape[:-1], ranges.shape[:-3], anchors.shape[:-3], rotation.shape[:-2],
+            translation.shape[:-1], covariance.shape[:-2], Q.shape[:-3], t.shape[:-2],
+        )  # fmt: skip
+        ranges = np.broadcast_to(ranges, (*batch, K, *ranges.shape[-2:]))
+        anchors = np.broadcast_to(anchors, (*batch, K, *anchors.shape[-2:]))
+        Q, t = np.broadcast_to(Q, (*batch, K, 3, 3)), np.broadcast_to(t, (*batch, K, 3))
+    except ValueError as error:
+        raise ValueError(
+            f"log, prior and start must fit {K} times, got ranges {ranges.shape}, anchors "
+            f"{anchors.shape}, start {Q.shape} and {t.shape}, prior {covariance.shape}"
+        ) from error
+    motion, factors = model.motion, model.factors
+    M, N = ranges.shape[-2:]
+    constants = sum(len(factor.constants_std) for factor in (motion, *factors))
+    blocks, extra, constants = bias_blocks(model.biases, M * N, len(motion.extra_std), constants)
+    gathered = LogRanges.gathered(ranges, variance, mask, anchors, model.tags, blocks)
+    state = LogState(Q, t, np.zeros((*batch, K, extra)), np.zeros((*batch, constants)))
+    pose = PoseState(rotation, translation, covariance)
+    information = positive_inverse(covariance)
+    return _Problem(times, gathered, motion, factors, pose, information), state
