@@ -20,6 +20,7 @@ from rbl_gym.estimators.smoothing import (
     Motion,
     RangeLog,
     Rows,
+    Smoothed,
     UnknownTwist,
     causal_track,
     equations,
@@ -110,6 +111,7 @@ def test_as_dense_least_squares_of_all_unknowns():
     x0 = np.concatenate([start.ravel(), np.zeros(links + 1)])
     best = optimize.least_squares(residuals, x0, xtol=1e-12, ftol=1e-14, gtol=1e-10)
     Q, t, twist, drift, stay = unpack(best.x)
+    assert isinstance(found, Smoothed)
     assert found.converged
     np.testing.assert_allclose(found.cost, best.cost, rtol=1e-6)
     np.testing.assert_allclose(found.rotation, Q, atol=1e-5)

@@ -18,7 +18,7 @@ from rbl_gym.measurements import ranging
 from rbl_gym.motion.kinematics import ProcessNoise, check_process
 from rbl_gym.motion.unknown_twist import WanderingTwist, check_laws
 
-__all__ = ["LEAST_STD", "smoothing_crb"]
+__all__ = ["smoothing_crb"]
 
 # Standard deviation (rad, m, rad/s, m/s) that an interval has at least on every axis: what moves
 # by nothing at all would have infinite information.
