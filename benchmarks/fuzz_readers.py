@@ -51,8 +51,10 @@ def run(name: str, seconds: int) -> tuple[dict[str, object], str]:
     """One reader in a process of its own, which libFuzzer ends as it likes."""
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.fuzz_readers", name, "--child", f"--seconds={seconds}"],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        check=False,
+    )
     log = done.stdout.decode(errors="replace")
     runs = [int(n) for n in re.findall(r"#(\d+)", log)]
     edges = [int(n) for n in re.findall(r"cov: (\d+)", log)]

@@ -45,16 +45,23 @@ def measure(m: int, n: int, trials: int, repeats: int, seed: int) -> dict[str, s
     jobs = {"peer": side_by_side.Job(peer, filters.STEPS * PEER_TRIALS)}
     for iterations in ITERATIONS:
         filter = estimators.make(
-            "iekf", tags=world.tags, noise=filters.NOISE, process=filters.PROCESS,
+            "iekf",
+            tags=world.tags,
+            noise=filters.NOISE,
+            process=filters.PROCESS,
             iterations=iterations,
-        )  # fmt: skip
+        )
         prior = filter.initial(start.rotation, start.translation, np.diag([0.02] * 3 + [1.0] * 3))
         run = runner(filter, prior, world.twist, world.ranges, world.anchors)
         check(run(), prior, world, iterations)
         one = runner(
-            filter, PoseState(*(field[0] for field in prior)), world.twist[0],
-            [ranges[0] for ranges in world.ranges], world.anchors[0], belief=True,
-        )  # fmt: skip
+            filter,
+            PoseState(*(field[0] for field in prior)),
+            world.twist[0],
+            [ranges[0] for ranges in world.ranges],
+            world.anchors[0],
+            belief=True,
+        )
         name = f"{iterations} iterations"
         jobs[name] = side_by_side.Job(run, filters.STEPS * trials)
         jobs[f"{name}, one body"] = side_by_side.Job(

@@ -62,8 +62,10 @@ def main() -> None:
                 rows += measure(duel, f"{m}x{n}", options.repeats)
     print(f"{'M x N':<6} {'peer':<30} {'us':>10} {'ours':<24} {'us':>9} {'ratio':>8}")
     for row in rows:
-        print(f"{row['size']:<6} {row['peer']:<30} {row['peer_microseconds']:10.2f} "
-              f"{row['ours']:<24} {row['microseconds']:9.2f} {row['ratio']:8.3g}")  # fmt: skip
+        print(
+            f"{row['size']:<6} {row['peer']:<30} {row['peer_microseconds']:10.2f} "
+            f"{row['ours']:<24} {row['microseconds']:9.2f} {row['ratio']:8.3g}"
+        )
     side_by_side.write(rows, options.json)
 
 

@@ -74,8 +74,10 @@ def print_rows(results: Mapping[str, Mapping[str, Row]], size: str, ours: str, p
     print(f"{size:<7} {ours:<24} {'us':>9} {peer + ' us':>13} {'ratio':>9}")
     for label, rows in results.items():
         for name, row in rows.items():
-            print(f"{label:<7} {name:<24} {row['microseconds']:9.3f} "
-                  f"{row['peer_microseconds']:13.2f} {row['ratio']:9.2f}")  # fmt: skip
+            print(
+                f"{label:<7} {name:<24} {row['microseconds']:9.3f} "
+                f"{row['peer_microseconds']:13.2f} {row['ratio']:9.2f}"
+            )
 
 
 def write(result: Any, path: str | None) -> None:

@@ -90,8 +90,11 @@ def main() -> None:
         if over or seconds > told + 10:
             told = seconds
             rate = done / (time.process_time() - cpu)
-            print(f"{done:,} body steps, next world {index}, {seconds:.0f} s, "
-                  f"{rate:,.0f} per CPU second, peak {memory[-1]:.0f} MiB", flush=True)  # fmt: skip
+            print(
+                f"{done:,} body steps, next world {index}, {seconds:.0f} s, "
+                f"{rate:,.0f} per CPU second, peak {memory[-1]:.0f} MiB",
+                flush=True,
+            )
         if over:
             break
     result = {

@@ -80,9 +80,13 @@ def network(rng: Rng) -> tuple[dict[str, Any], tuple[int, int]]:
 
 
 WORLDS: dict[str, Callable[[Rng], tuple[dict[str, Any], tuple[int, int]]]] = {
-    "Tracking": tracking, "AnchorPlacement": placement, "MobileAnchors": mobile,
-    "AnchorSelection": selection, "BaseStation": base_station, "PlanarNetwork": network,
-}  # fmt: skip
+    "Tracking": tracking,
+    "AnchorPlacement": placement,
+    "MobileAnchors": mobile,
+    "AnchorSelection": selection,
+    "BaseStation": base_station,
+    "PlanarNetwork": network,
+}
 
 
 def run(seed: int, index: int) -> tuple[str, int]:

@@ -21,13 +21,15 @@ from rbl_gym.wrappers import controllers
 TASKS: dict[str, tuple[str, dict[str, Any], controllers.Controller]] = {
     "MobileAnchors, easy, orbit": ("MobileAnchors", {"difficulty": "easy"}, controllers.orbit),
     "MobileAnchors, easy, random": (
-        "MobileAnchors", {"difficulty": "easy"}, controllers.random_velocities,
+        "MobileAnchors",
+        {"difficulty": "easy"},
+        controllers.random_velocities,
     ),
     "MobileAnchors, hard, orbit": ("MobileAnchors", {"difficulty": "hard"}, controllers.orbit),
     "AnchorSelection, k=3, nearest": ("AnchorSelection", {"k": 3}, controllers.nearest),
     "AnchorSelection, k=6, nearest": ("AnchorSelection", {"k": 6}, controllers.nearest),
     "AnchorSelection, k=12": ("AnchorSelection", {"k": 12}, controllers.nearest),
-}  # fmt: skip
+}
 
 
 def main() -> None:

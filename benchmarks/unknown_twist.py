@@ -39,9 +39,11 @@ SENSORS = {
     "gyroscope, speed 0.2 m/s": ut.TwistSensor(0.05, 0.2, "body"),
 }
 OPTIONS = {
-    "turn_rate_rad_s": LAW.turn_rate_rad_s, "speed_m_s": LAW.speed_m_s,
-    "turn_acceleration": LAW.turn_acceleration, "acceleration": LAW.acceleration,
-}  # fmt: skip
+    "turn_rate_rad_s": LAW.turn_rate_rad_s,
+    "speed_m_s": LAW.speed_m_s,
+    "turn_acceleration": LAW.turn_acceleration,
+    "acceleration": LAW.acceleration,
+}
 
 
 def main() -> None:

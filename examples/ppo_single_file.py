@@ -118,8 +118,12 @@ def main() -> None:
     options = parser.parse_args()
     torch.manual_seed(options.seed)
     torch.set_num_threads(1)
-    envs = gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=ENVS, scene="auv_buoys",
-                        autoreset_mode="SameStep")  # fmt: skip
+    envs = gym.make_vec(
+        "rbl_gym:RBL/AnchorPlacement-v0",
+        num_envs=ENVS,
+        scene="auv_buoys",
+        autoreset_mode="SameStep",
+    )
     agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0])
     optimizer = torch.optim.Adam(agent.parameters(), lr=LEARNING_RATE, eps=1e-5)
     observation = torch.as_tensor(envs.reset(seed=options.seed * 1_000_000)[0])
@@ -129,8 +133,11 @@ def main() -> None:
         rollout, observation = collect(envs, agent, observation, returns)
         update(agent, optimizer, rollout, advantages(agent, *rollout[3:], observation))
         if (k + 1) % 50 == 0 or k + 1 == n_updates:
-            print(f"{(k + 1) * ROLLOUT * ENVS:>8,} steps  mean return {np.mean(returns):.4f}  "
-                  f"{time.process_time() - begin:.0f} s of processor time", flush=True)  # fmt: skip
+            print(
+                f"{(k + 1) * ROLLOUT * ENVS:>8,} steps  mean return {np.mean(returns):.4f}  "
+                f"{time.process_time() - begin:.0f} s of processor time",
+                flush=True,
+            )
             returns.clear()
     policy = as_arrays(agent, options.seed)
     policies.save(policy, options.out)
@@ -138,8 +145,10 @@ def main() -> None:
         rl_task("auv_buoys"), {"ppo": policy}, ["corners", "ring"], options.worlds, 0, lambda: None
     )
     for name, row in sorted(result["methods"].items(), key=lambda item: item[1]["loss"]):
-        print(f"{name:12s} score {row['score_m']:.4f} m  normalised {row['normalised']:.3f} "
-              f"({row['normalised_low']:.3f} to {row['normalised_high']:.3f})")  # fmt: skip
+        print(
+            f"{name:12s} score {row['score_m']:.4f} m  normalised {row['normalised']:.3f} "
+            f"({row['normalised_low']:.3f} to {row['normalised_high']:.3f})"
+        )
 
 
 if __name__ == "__main__":

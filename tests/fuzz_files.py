@@ -31,14 +31,18 @@ class Reader(NamedTuple):
 
 ANCHORS = b"anchor,x,y,z\nA,0,0,1\nB,4,0,1\nC,0,4,2\n"
 TAGS = b"tag,x,y,z\n1,0.1,0,0\nleft,-0.1,0.1,0\n"
-LONG = (b"t,anchor,tag,range,std,valid\n0.0,A,1,2.5,0.1,1\n0.0,A,left,2.25,0.1,1\n"
-        b"0.0,B,1,-1,,0\n0.0,C,1,3.0,0.2,1\n0.1,A,1,70000,0,0\n0.1,B,left,1.5,0.1,1\n")  # fmt: skip
+LONG = (
+    b"t,anchor,tag,range,std,valid\n0.0,A,1,2.5,0.1,1\n0.0,A,left,2.25,0.1,1\n"
+    b"0.0,B,1,-1,,0\n0.0,C,1,3.0,0.2,1\n0.1,A,1,70000,0,0\n0.1,B,left,1.5,0.1,1\n"
+)
 WIDE = b"# log\nt,aAt1,aAtleft,aCt1,aBtleft\n0.0,2.5,2.25,3.0,\n0.1,,,,1.5\n"
 TRUTH = b"t,x,y,z,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1,2,2,3,0.6,0,0,0.8\n"
 PLANAR = b"t,x,y,yaw_deg\n0,1,2,90\n1,2,2,180\n"
 CALIBRATION = b"anchor,tag,bias_m,slope,sigma_m\nA,1,0.5,0.25,0.01\nC,1,3.5,0,\n"
-G2O = (b"VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1.0 0.0 0.1 500 0 0 500 0 5000\n# x\n"
-       b"EDGE_SE2 1 7 1.0 0.5 -3.0 500 0 0 500 0 5000\nFIX 0\n")  # fmt: skip
+G2O = (
+    b"VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1.0 0.0 0.1 500 0 0 500 0 5000\n# x\n"
+    b"EDGE_SE2 1 7 1.0 0.5 -3.0 500 0 0 500 0 5000\nFIX 0\n"
+)
 SCENE = {
     "name": "hall",
     "anchors": {"kind": "room", "low": [0, 0, 0.5], "high": [10, 8, 3], "number": 6},
@@ -111,8 +115,10 @@ def _policy_packed() -> bytes:
 
 _json = tuple(json.dumps(scene, indent=1).encode() for scene in (SCENE, SHELL))
 _lines = "".join(json.dumps(RECORD | {"filter": name}) + "\n" for name in ("kf", "iekf")).encode()
-_times = b'{"scene": "u", "scene_hash": "0a", "condition": "nominal", "filter": "kf", ' \
-         b'"microseconds_per_step": 1.5}\n' * 2  # fmt: skip
+_times = (
+    b'{"scene": "u", "scene_hash": "0a", "condition": "nominal", "filter": "kf", '
+    b'"microseconds_per_step": 1.5}\n' * 2
+)
 READERS = {
     "ranges": Reader("ranges.csv", partial(_recording, "ranges"), (LONG, WIDE), NUMBERS + MARKS),
     **{

@@ -53,8 +53,10 @@ def test_yaw_is_the_best_of_all_turns_about_z():
             ((source - source.mean(0)) @ R.T - target + target.mean(0)).ravel()
         )
 
-    best = min((minimize_scalar(cost, bounds=(a, a + 2), method="bounded") for a in (-3, -1, 1)),
-               key=lambda result: result.fun)  # fmt: skip
+    best = min(
+        (minimize_scalar(cost, bounds=(a, a + 2), method="bounded") for a in (-3, -1, 1)),
+        key=lambda result: result.fun,
+    )
     turned = Rotation.from_euler("z", best.x).as_matrix()
     np.testing.assert_allclose(found.rotation, turned, atol=1e-4)
 

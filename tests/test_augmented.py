@@ -335,8 +335,10 @@ def test_states_are_never_changed():
     rng = np.random.default_rng(9)
     anchors, tags, rotation, translation = random_world(rng, 5, 4)
     ranges = simulate(rng, anchors, tags, rotation, translation, NOISE)
-    for filter in (iekf_cv(tags, NOISE, PROCESS, gyro_std_rad_s=0.1),
-                   iekf_bias(tags, NOISE, PROCESS, bias_time_s=1.0)):  # fmt: skip
+    for filter in (
+        iekf_cv(tags, NOISE, PROCESS, gyro_std_rad_s=0.1),
+        iekf_bias(tags, NOISE, PROCESS, bias_time_s=1.0),
+    ):
         state = filter.initial(rotation, translation, 0.01 * np.eye(6))
         state = filter.update(state, ranges, anchors)
         before = [field.copy() for field in state]

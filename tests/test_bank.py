@@ -286,8 +286,9 @@ def test_environments_take_it_by_its_name():
     envs = gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=3, scene="uwb_room",
                         vectorization_mode="vector_entry_point")  # fmt: skip
     envs = VectorEstimatePose(envs, filter="iekf-bank", options=options)
-    env = EstimatePose(gym.make("rbl_gym:RBL/Tracking-v0", scene="uwb_room"), filter="iekf-bank",
-                       options=options)  # fmt: skip
+    env = EstimatePose(
+        gym.make("rbl_gym:RBL/Tracking-v0", scene="uwb_room"), filter="iekf-bank", options=options
+    )
     envs.reset(seed=[4, 5, 6])
     env.reset(seed=5)
     for _ in range(5):

@@ -137,8 +137,9 @@ def test_angles_and_derivatives_at_any_distance(scale):
     far, flat = bearing.linearize(scale * x)
     np.testing.assert_allclose(far, found, rtol=1e-12)
     # A product with 1e-300 loses digits below the smallest normal number.
-    np.testing.assert_allclose(flat * min(scale, 1e290), gradient * min(1, 1e290 / scale),
-                               rtol=1e-9, atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        flat * min(scale, 1e290), gradient * min(1, 1e290 / scale), rtol=1e-9, atol=1e-12
+    )
     if scale < 1e150:
         weights = np.ones((2, 200))
         bent = bearing.curvature(scale * x, weights) * scale * scale

@@ -13,10 +13,9 @@ from rbl_gym import checks
 
 @pytest.mark.parametrize(
     "value",
-    [[[1, 2, 3]], [[True, False, True]], np.ones((4, 2, 3), np.float32),
-     [[9e49, 9e49, 9e49]]],
+    [[[1, 2, 3]], [[True, False, True]], np.ones((4, 2, 3), np.float32), [[9e49, 9e49, 9e49]]],
     ids=["ints", "bools", "batch", "very large"],
-)  # fmt: skip
+)
 def test_good_array_comes_back_as_float64(value):
     got = checks.check_array("x", value, ("M", 3))
     assert got.dtype == np.float64

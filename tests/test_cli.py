@@ -308,8 +308,10 @@ def test_replay_says_which_deviation_of_a_range_it_took(files, capsys):
     assert settings()["range_std_m"] == 0.12
     rows = [["t", "anchor", "tag", "range", "std"]]
     header, first, *_ = csv.reader(Path(files["ranges"]).read_text().splitlines())
-    rows += [[first[0], *name[1:].split("t"), r, 0.05]
-             for name, r in zip(header[1:], first[1:], strict=True)]  # fmt: skip
+    rows += [
+        [first[0], *name[1:].split("t"), r, 0.05]
+        for name, r in zip(header[1:], first[1:], strict=True)
+    ]
     Path(files["ranges"]).write_text("\n".join(",".join(map(str, row)) for row in rows))
     assert settings()["range_std_m"] == "recorded"
     blind = "--filter", "tests.test_cli:blind"

@@ -64,8 +64,9 @@ def test_the_limit_is_the_projection_on_its_branch_in_any_order(basis):
         C = cycle_matrix(edges, n_nodes, basis)
         bound = tol / np.sqrt(consensus.eigenvalues(C)[0]) + 1e-12
         runs = [cycle_iteration(edges, y, n_nodes, C, tol=tol)]
-        runs += [cycle_iteration(edges, y, n_nodes, C, rule, tol=tol)
-                 for rule in consensus.STEP_RULES]  # fmt: skip
+        runs += [
+            cycle_iteration(edges, y, n_nodes, C, rule, tol=tol) for rule in consensus.STEP_RULES
+        ]
         for k, (kappa, loss) in enumerate([(None, 0.0), (None, 0.4), (0.1, 0.0)]):
             rng = np.random.default_rng([seed, k])
             runs.append(cycle_iteration(edges, y, n_nodes, C, kappa, tol=tol, rng=rng, loss=loss,
@@ -227,8 +228,9 @@ def test_a_branch_that_is_known_is_kept_in_any_order():
     branch = np.random.default_rng(0).integers(-2, 3, C.shape[0])
     limit = cycle_projection(C, y, branch)
     for order in consensus.ORDERS:
-        run = cycle_iteration(edges, y, n_nodes, C, order=order, branch=branch,
-                              rng=np.random.default_rng(1))  # fmt: skip
+        run = cycle_iteration(
+            edges, y, n_nodes, C, order=order, branch=branch, rng=np.random.default_rng(1)
+        )
         np.testing.assert_array_equal(run.branch, branch)
         np.testing.assert_allclose(run.psi, limit, atol=1e-10)
 
@@ -294,8 +296,9 @@ def test_accuracy_is_the_bounds_from_5_to_36_loops(trials):
     for loops in (5, 36):
         radius = network2009._default_footprints(network2009.PLACES)[network2009.LOOPS.index(loops)]
         edges = network2009._seen(network2009.PLACES, radius)
-        row = network2009._accuracy(network2009.PLACES, edges, 0.1**0.5, trials,
-                                    np.random.default_rng([0, loops]))  # fmt: skip
+        row = network2009._accuracy(
+            network2009.PLACES, edges, 0.1**0.5, trials, np.random.default_rng([0, loops])
+        )
         assert row["loops"] == loops
         tolerance = 4 * np.sqrt(2 / 9 / trials) + 0.03
         assert row["ratio"]["consensus"] == pytest.approx(1, abs=tolerance)

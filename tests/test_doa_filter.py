@@ -122,8 +122,9 @@ def test_tags_that_were_not_heard_tell_nothing():
     filter, fewer = make(), make(TAGS[:3])
     prior = (rotation, place + 0.1, np.diag([0.01] * 3 + [0.1] * 3))
     heard = np.array([True, True, True, False])
-    masked = filter.update(filter.initial(*prior), np.where(heard, angles, np.nan), place[0] * 0,
-                           heard)  # fmt: skip
+    masked = filter.update(
+        filter.initial(*prior), np.where(heard, angles, np.nan), place[0] * 0, heard
+    )
     alone = fewer.update(fewer.initial(*prior), angles[..., :3], place[0] * 0)
     for got, want in zip(masked, alone, strict=True):
         np.testing.assert_allclose(got, want, atol=1e-9)

@@ -46,8 +46,9 @@ def shell(rng, shape):
 class Run:
     """20 epochs of a batch, and the states of a filter over any part of it."""
 
-    def __init__(self, tags, batch, *, prior=PRIOR, process=PROCESS, noise=NOISE, fixed=False,
-                 lost=()) -> None:  # fmt: skip
+    def __init__(
+        self, tags, batch, *, prior=PRIOR, process=PROCESS, noise=NOISE, fixed=False, lost=()
+    ) -> None:
         rng = np.random.default_rng(3)
         self.laws: dict[str, Any] = {"tags": tags, "noise": noise, "process": process}
         if fixed:
@@ -155,8 +156,9 @@ def test_auto_is_filterpy_for_one_body_and_batched_for_all_else(monkeypatch):
 
 
 def test_filterpy_by_name_refuses_a_batch():
-    filter = estimators.make("kf", tags=bodies.pyramid(), noise=NOISE, process=PROCESS,
-                             engine="filterpy")  # fmt: skip
+    filter = estimators.make(
+        "kf", tags=bodies.pyramid(), noise=NOISE, process=PROCESS, engine="filterpy"
+    )
     state = filter.initial(np.eye(3), np.zeros((4, 3)), np.eye(6))
     with pytest.raises(ValueError, match=r"tracks one body, got a state with leading axes \(4,\)"):
         filter.predict(state, np.zeros(6), 1.0)

@@ -68,8 +68,10 @@ def test_every_loop_gives_it_the_law_of_the_epoch():
     scene = scenes.get({"name": "hall", "steps": 5})
     world = monte_carlo.simulate_trials(scene, 8, np.random.default_rng(0))
     stage = stages.scene_stage({"name": "hall", "steps": 5}, "nominal", 8, 0)
-    for run in (lambda name: monte_carlo.track_trials(world, name, {}).nees,
-                lambda name: stages.run_filter(stage, name, {})[0]["anees"]):  # fmt: skip
+    for run in (
+        lambda name: monte_carlo.track_trials(world, name, {}).nees,
+        lambda name: stages.run_filter(stage, name, {})[0]["anees"],
+    ):
         np.testing.assert_allclose(run(NEW), run("iekf"), rtol=1e-12)
     # Blind to the racks the same filter claims far too much.
     assert monte_carlo.track_trials(world, "iekf", {}).nees.mean() < 9

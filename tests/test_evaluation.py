@@ -38,8 +38,10 @@ SHORT: dict[str, tuple[RlTask, type, tuple[int, ...], str]] = {
 }  # fmt: skip
 MOUNTS = RlTask(
     "RBL/AnchorPlacement-v0",
-    {"scene": "uwb_room", "racks": 1, "mode": "mounts", "n_anchors": 3}, 1, 1,
-)  # fmt: skip
+    {"scene": "uwb_room", "racks": 1, "mode": "mounts", "n_anchors": 3},
+    1,
+    1,
+)
 
 
 def silent() -> None:
@@ -357,13 +359,15 @@ def test_errors_are_one_line(tmp_path, capsys):
         (["evaluate", "selection", "--references", "random,"], "got ''"),
         (["transfer", "mounts", "--references", "ring"], "reference must be one of 'random', 'gr"),
         (["evaluate", "auv_buoys", "--policy", str(good)], "policy 'mine' does not fit"),
-        (["evaluate", "selection", "--policy", str(good), "--policy", str(same)],
-         "two files are named 'mine'"),
+        (
+            ["evaluate", "selection", "--policy", str(good), "--policy", str(same)],
+            "two files are named 'mine'",
+        ),
         (["evaluate", "selection", "--policy", str(broken)], "is no policy of rbl-gym"),
         (["evaluate", "selection", "--policy", str(tmp_path / "no.npz")], "No such file"),
         (["transfer", "mounts", "--policy", str(good)], "policy 'mine' does not fit"),
         (["train", "selection", "--seed", "1000"], "seed must be below 1000"),
-    ):  # fmt: skip
+    ):
         assert main(arguments) == 2
         error = capsys.readouterr().err.strip().splitlines()[-1]
         assert error.startswith("rbl-gym ")

@@ -65,9 +65,10 @@ def test_ranges_localize_where_bearings_alone_do_not(network):
     # Three of four lengths still give the shape, two do not fix it together with its scale.
     one_less = np.where([1, 1, 1, 0], measured, 0)
     np.testing.assert_allclose(
-        frames(SQUARE, bearings, 4, ranges=one_less, range_std_m=0.1).positions, positions,
+        frames(SQUARE, bearings, 4, ranges=one_less, range_std_m=0.1).positions,
+        positions,
         atol=1e-7,
-    )  # fmt: skip
+    )
     with pytest.raises(ValueError, match="1 missing"):
         frames(SQUARE, bearings, 4, ranges=np.where([1, 0, 0, 0], measured, 0), range_std_m=0.1)
 
@@ -88,18 +89,18 @@ def test_errors_reach_the_bound_and_ranges_lower_it(network, trials):
         ranges = np.abs(exact + range_std * rng.standard_normal(len(edges)))
         both = {
             "known": frames(edges, bearings, 14, pair, known),
-            "ranged": frames(edges, bearings, 14, bearing_std_rad=sigma, ranges=ranges,
-                             range_std_m=range_std),
-        }  # fmt: skip
+            "ranged": frames(
+                edges, bearings, 14, bearing_std_rad=sigma, ranges=ranges, range_std_m=range_std
+            ),
+        }
         for name, found in both.items():
             assert found.converged
             off = proj(found.orientations - theta)[1:], (found.positions - positions)[1:].ravel()
             errors[name].append(np.concatenate(off))
     bounds = {
         "known": frame_covariance(positions, edges, sigma, pair),
-        "ranged": frame_covariance(positions, edges, sigma, ranges_of=edges,
-                                   range_std_m=range_std),
-    }  # fmt: skip
+        "ranged": frame_covariance(positions, edges, sigma, ranges_of=edges, range_std_m=range_std),
+    }
     for name, rows in errors.items():
         for part in (slice(13), slice(13, None)):
             square = np.square(rows)[:, part].sum(axis=1)
@@ -138,8 +139,9 @@ def test_jacobians_are_those_of_finite_differences(network):
             proj(predicted(x + step * unit)[which] - predicted(x - step * unit)[which]) / (2 * step)
             for unit in np.eye(len(x))
         ]
-        np.testing.assert_allclose(jacobian(positions, edges).toarray(), np.transpose(columns),
-                                   atol=1e-7)  # fmt: skip
+        np.testing.assert_allclose(
+            jacobian(positions, edges).toarray(), np.transpose(columns), atol=1e-7
+        )
 
 
 def test_one_node_and_two():

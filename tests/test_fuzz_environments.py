@@ -43,8 +43,9 @@ BATCH = {"num_envs": 2, "max_episode_steps": 2, "autoreset_mode": "NextStep"}
 COMMON: dict[str, Any] = {"render_mode": None}
 CASES = [
     pytest.param(name, vector, id=f"{name}-{'vector' if vector else 'scalar'}")
-    for name in WORLDS for vector in (False, True)
-]  # fmt: skip
+    for name in WORLDS
+    for vector in (False, True)
+]
 ACTIONS = [*WRONG, *SIZES, np.zeros(3), np.full((2, 8), np.nan), np.ones((2, 8), complex), 2**70]
 SEEDS = [*WRONG, -1, 2**70, 1.5, float("nan"), [0], [0, -1], ["a", "b"], [None, 1.5], True]
 

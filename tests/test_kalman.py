@@ -231,8 +231,10 @@ def test_scaled_process_noise_and_fixed_weights():
     np.testing.assert_allclose(
         plain.update(state, ranges, anchors).mean, fixed.update(state, ranges, anchors).mean
     )
-    added = [np.diag(f.predict(state, np.zeros(6), 2.0).covariance - state.covariance)
-             for f in (plain, fixed)]  # fmt: skip
+    added = [
+        np.diag(f.predict(state, np.zeros(6), 2.0).covariance - state.covariance)
+        for f in (plain, fixed)
+    ]
     np.testing.assert_allclose(added[0], [2 * 0.02**2] * 9 + [2 * 0.1**2] * 3)
     np.testing.assert_allclose(added[1][:9], 0.25 * added[0][:9])
 

@@ -75,8 +75,10 @@ def test_swaps_come_near_the_best_of_all_and_leave_no_better_neighbour(seed):
     candidates = candidates_of(task, 8, seed)
     found = greedy(task, context, rng(), candidates, swaps=True)
     score = placement.score(task, context, found)
-    best = min(float(placement.score(task, context, candidates[list(three)]))
-               for three in itertools.combinations(range(8), 3))  # fmt: skip
+    best = min(
+        float(placement.score(task, context, candidates[list(three)]))
+        for three in itertools.combinations(range(8), 3)
+    )
     assert best * (1 - 1e-9) <= score < 1.03 * best
     for i, new in itertools.product(range(3), candidates):
         neighbour = found.copy()
@@ -158,8 +160,9 @@ def test_cma_es_is_never_worse_than_its_start(scene):
 @needs("cmaes")
 def test_more_generations_are_never_worse():
     task, context = problem("drone_yard", 3, (2,))
-    scores = [placement.score(task, context, cma_es(task, context, rng(), n, 6))
-              for n in (0, 5, 20)]  # fmt: skip
+    scores = [
+        placement.score(task, context, cma_es(task, context, rng(), n, 6)) for n in (0, 5, 20)
+    ]
     assert (scores[1] <= scores[0]).all()
     assert (scores[2] <= scores[1]).all()
 

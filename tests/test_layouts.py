@@ -130,8 +130,9 @@ def test_the_ring_follows_the_region():
     away = anchors[..., :2] - context.centre[:, None, :2]
     inside = (np.abs(anchors[..., :2]) < 200).all(axis=(-1, -2))
     assert inside.sum() > 5
-    np.testing.assert_allclose(np.linalg.norm(away, axis=-1)[inside],
-                               np.broadcast_to(radius[:, None], (20, 4))[inside])  # fmt: skip
+    np.testing.assert_allclose(
+        np.linalg.norm(away, axis=-1)[inside], np.broadcast_to(radius[:, None], (20, 4))[inside]
+    )
     np.testing.assert_allclose(away[inside].mean(axis=1), 0, atol=1e-9)
 
 

@@ -347,7 +347,7 @@ def test_a_run_that_was_cut_off_goes_on_and_ends_in_the_same_bytes(
     _, whole = bench(tmp_path, *options)
     assert [(r["condition"], r["filter"]) for r in rows(whole)] == [
         (condition, filter) for condition in ("nominal", "nlos") for filter in ("kf", "iekf")
-    ]  # fmt: skip
+    ]
     lines = whole.splitlines(keepends=True)
     # The second record is missing, the last was being written.
     (tmp_path / "cut.jsonl").write_bytes(lines[0] + lines[2] + lines[3][:100])
@@ -357,8 +357,9 @@ def test_a_run_that_was_cut_off_goes_on_and_ends_in_the_same_bytes(
     _, again = bench(tmp_path, *options, name="cut.jsonl")
     assert again == whole
     assert [(task.condition, task.filters) for task in ran] == [
-        ("nominal", ("iekf",)), ("nlos", ("iekf",))
-    ]  # fmt: skip
+        ("nominal", ("iekf",)),
+        ("nlos", ("iekf",)),
+    ]
     # A part of it, and then another filter beside it: nothing is run twice, nothing is dropped.
     ran.clear()
     _, more = bench(tmp_path, "--scenes", short, "--conditions", "nlos", "--filters", "iekf,uc-kf",
@@ -507,8 +508,10 @@ def test_a_recording_is_a_scene(tmp_path, recording, capsys):
 def test_a_recording_has_a_page_without_colours(tmp_path, recording, short):
     pytest.importorskip("plotly", reason="needs the extra viz")
     path = tmp_path / "page.html"
-    for names, words in ((f"{recording}", "a recording of"),
-                         (f"{short},{recording}", "6 trials or a recording of")):  # fmt: skip
+    for names, words in (
+        (f"{recording}", "a recording of"),
+        (f"{short},{recording}", "6 trials or a recording of"),
+    ):
         status, _ = bench(tmp_path, "--scenes", names, "--filters", "iekf,kf", "--fresh",
                           "--conditions", "nominal", "--html", path)  # fmt: skip
         assert status == 0

@@ -33,9 +33,11 @@ def test_joint_information_by_finite_differences(groups):
     anchors, tags, rotation, translation = world(1, 4, 3)
     m, n = len(anchors), len(tags)
     owner = {
-        "link": lambda i, k: i * n + k, "anchor": lambda i, k: i,
-        "tag": lambda i, k: k, "common": lambda i, k: 0,
-    }[groups]  # fmt: skip
+        "link": lambda i, k: i * n + k,
+        "anchor": lambda i, k: i,
+        "tag": lambda i, k: k,
+        "common": lambda i, k: 0,
+    }[groups]
     count = {"link": m * n, "anchor": m, "tag": n, "common": 1}[groups]
     rows = np.zeros((count, m * n))
     for i in range(m):

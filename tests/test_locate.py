@@ -338,8 +338,10 @@ def test_coplanar_tags_have_a_mirror_pose_and_both_are_reported(anchors):
     assert found.alternatives.cost[0] < 1e-9
     assert found.cost < 1e-9
     assert np.isinf(found.alternatives.cost[1:]).all()
-    poses = [(found.rotation, found.translation),
-             (found.alternatives.rotation[0], found.alternatives.translation[0])]  # fmt: skip
+    poses = [
+        (found.rotation, found.translation),
+        (found.alternatives.rotation[0], found.alternatives.translation[0]),
+    ]
     positions = [ranging.tag_positions(rotation, place, tags) for rotation, place in poses]
     np.testing.assert_allclose(positions[0] * [1, 1, -1], positions[1], atol=1e-6)
     assert min(np.abs(rotation - POSE[0]).max() for rotation, _ in poses) < 1e-6

@@ -152,8 +152,9 @@ def test_reaches_the_posterior_bound_and_is_consistent():
     anchors, _, rotation, translation = random_world(rng, 6, 6)
     std = np.array([0.15] * 3 + [0.5] * 3)
     offset = std * rng.standard_normal((trials, 6))
-    ranges = simulate(rng, anchors, tags, np.broadcast_to(rotation, (trials, 3, 3)), translation,
-                      NOISE)  # fmt: skip
+    ranges = simulate(
+        rng, anchors, tags, np.broadcast_to(rotation, (trials, 3, 3)), translation, NOISE
+    )
     filter = make(tags)
     prior = filter.initial(
         rotations.exp(offset[:, :3]) @ rotation, translation + offset[:, 3:], np.diag(std**2)
@@ -232,14 +233,15 @@ def test_prediction_of_a_batch_is_that_of_each_body(batch, shared):
     of = {key: () if key in shared else batch for key in ("state", "twist")}
     A = rng.normal(size=(*of["state"], 6, 6))
     state = filter.initial(
-        rotations.random(rng, of["state"]), rng.normal(size=(*of["state"], 3)),
+        rotations.random(rng, of["state"]),
+        rng.normal(size=(*of["state"], 3)),
         A @ np.swapaxes(A, -1, -2) + np.eye(6),
-    )  # fmt: skip
+    )
     twist = rng.normal(size=(*of["twist"], 6)) * 10.0 ** rng.uniform(-6, 0.5, (*of["twist"], 1))
     got = filter.predict(state, twist, 0.5)
-    everything = PoseState(*(
-        np.broadcast_to(field, (*batch, *field.shape[len(of["state"]):])) for field in state
-    ))  # fmt: skip
+    everything = PoseState(
+        *(np.broadcast_to(field, (*batch, *field.shape[len(of["state"]) :])) for field in state)
+    )
     twists = np.broadcast_to(twist, (*batch, 6))
     for k in np.ndindex(batch):
         want = filter.predict(PoseState(*(field[k] for field in everything)), twists[k], 0.5)

@@ -107,9 +107,7 @@ def test_nees_of_a_batch_is_a_loop():
 def test_mean_angular_error_equals_arccos_where_that_is_safe(seed):
     rng = np.random.default_rng(seed)
     matrix, Q = rng.standard_normal((3, 3)), rotations.random(rng)
-    cosines = [
-        np.dot(matrix[:, k], Q[:, k]) / np.linalg.norm(matrix[:, k]) for k in range(3)
-    ]  # fmt: skip
+    cosines = [np.dot(matrix[:, k], Q[:, k]) / np.linalg.norm(matrix[:, k]) for k in range(3)]
     want = np.mean(np.arccos(np.clip(cosines, -1, 1)))
     np.testing.assert_allclose(metrics.mean_angular_error(matrix, Q), want, atol=1e-7)
 

@@ -406,7 +406,8 @@ BAD_CALLS = {
     "steps half": (motion.constant_twist, (I, O, TWIST, 2.5), "steps must be an int from 1 to"),
     "steps nan": (motion.constant_twist, (I, O, TWIST, np.nan), "steps must be an int from 1 to"),
     "no step": (
-        motion.simulate, (motion.constant_twist(I, O, TWIST, 3), 0.0, motion.ProcessNoise(0.1)),
+        motion.simulate,
+        (motion.constant_twist(I, O, TWIST, 3), 0.0, motion.ProcessNoise(0.1)),
         "dt must be a finite number in",
     ),
     "twist shape": (motion.constant_twist, (I, O, O, 3), "twist must have shape (..., 6), got"),
@@ -430,7 +431,7 @@ BAD_CALLS = {
     "few turns": (motion.recorded, (TIMES, [I] * 2, [O] * 3, 0.5), "rotation must have shape"),
     "many turns": (motion.recorded, (TIMES, [I] * 4, [O] * 3, 0.5), "rotation must have shape"),
     "many places": (motion.recorded, (TIMES, [I] * 3, [O] * 4, 0.5), "translation must have shape"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD_CALLS)

@@ -87,8 +87,10 @@ def test_a_loop_closure_of_little_weight_bends_nothing(tmp_path, capsys):
 
 def test_weights_bend_the_picture_neither(tmp_path):
     path = tmp_path / "a.g2o"
-    path.write_text("EDGE_SE2 0 1 1 0 0 90 0 0 90 0 400\nEDGE_SE2 1 2 1 0 0 90 0 0 90 0 400\n"
-                    "EDGE_SE2 0 2 9 7 0 1e-6 0 0 1e-6 0 400\n")  # fmt: skip
+    path.write_text(
+        "EDGE_SE2 0 1 1 0 0 90 0 0 90 0 400\nEDGE_SE2 1 2 1 0 0 90 0 0 90 0 400\n"
+        "EDGE_SE2 0 2 9 7 0 1e-6 0 0 1e-6 0 400\n"
+    )
     places = network.solve_network(str(path)).positions
     assert places is not None
     np.testing.assert_allclose(places, [[0, 0], [1, 0], [2, 0]], atol=1e-6)
@@ -96,8 +98,10 @@ def test_weights_bend_the_picture_neither(tmp_path):
 
 def test_edges_without_information_where_none_is_needed(tmp_path, capsys):
     path = tmp_path / "a.g2o"
-    loop = [f"EDGE_SE2 {i} {j} 1 0 {y} 1 0 0 1 0 {w}" for i, j, y, w in
-            ((1, 2, 0.1, 4), (2, 3, 0.1, 4), (1, 3, 0.5, 2))]  # fmt: skip
+    loop = [
+        f"EDGE_SE2 {i} {j} 1 0 {y} 1 0 0 1 0 {w}"
+        for i, j, y, w in ((1, 2, 0.1, 4), (2, 3, 0.1, 4), (1, 3, 0.5, 2))
+    ]
     # The edge to node 9 is on no cycle.
     path.write_text("\n".join([*loop, "EDGE_SE2 3 9 1 0 0.7"]))
     result = solved(path, capsys)
@@ -135,9 +139,11 @@ def test_edges_with_no_information_of_theta_are_left_out(tmp_path, capsys):
 def test_skipped_lines_and_large_keys_are_named(tmp_path, capsys):
     path = tmp_path / "a.g2o"
     key = ord("x") * 2**56
-    path.write_text(f"EDGE_SE2 {key} {key + 1} 1 0 0.1 1 0 0 1 0 1\n"
-                    f"EDGE_SE2_XY {key} 3 1 0 1 0 1\n"
-                    "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1\n")  # fmt: skip
+    path.write_text(
+        f"EDGE_SE2 {key} {key + 1} 1 0 0.1 1 0 0 1 0 1\n"
+        f"EDGE_SE2_XY {key} 3 1 0 1 0 1\n"
+        "EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1\n"
+    )
     result = solved(path, capsys)
     assert result["skipped_lines"] == {"EDGE_SE2_XY": 1, "EDGE_SE3:QUAT": 1}
     assert (result["worst_edges"][0]["i"], result["worst_edges"][0]["j"]) == (key, key + 1)

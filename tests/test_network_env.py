@@ -112,8 +112,9 @@ def test_world_i_of_a_vector_is_the_scalar_environment(options, lengths):
         assert vector.observation_space.contains(observation)
         for world, env in enumerate(scalars):
             single, one, terminated, over, told = env.step(actions[world])
-            assert_same({key: value[world] for key, value in observation.items()}, single,
-                        atol=1e-12)  # fmt: skip
+            assert_same(
+                {key: value[world] for key, value in observation.items()}, single, atol=1e-12
+            )
             assert one == pytest.approx(reward[world], abs=1e-12)
             assert type(one) is float
             assert (terminated, over) == (False, truncated[world])
@@ -335,8 +336,9 @@ def test_too_few_steps_show_in_the_belief():
     # A tree alone leaves the other edges far off.
     assert found[5000]["chi_square"].mean() == pytest.approx(1, abs=0.1)
     assert found[0]["chi_square"].mean() > 1.5
-    error = {steps: np.sqrt(np.mean(info["orientation_error_rad"] ** 2))
-             for steps, info in found.items()}  # fmt: skip
+    error = {
+        steps: np.sqrt(np.mean(info["orientation_error_rad"] ** 2)) for steps, info in found.items()
+    }
     assert error[0] > 1.3 * error[5000]
 
 
@@ -352,8 +354,9 @@ def test_options_of_the_consensus_lead_to_one_estimate(kappa, cycles):
     assert told["consensus_converged"]
     np.testing.assert_allclose(found["orientations"], expected["orientations"], atol=1e-7)
     action = np.ones(10, np.float32)
-    np.testing.assert_allclose(env.step(action)[0]["orientations"],
-                               other.step(action)[0]["orientations"], atol=1e-7)  # fmt: skip
+    np.testing.assert_allclose(
+        env.step(action)[0]["orientations"], other.step(action)[0]["orientations"], atol=1e-7
+    )
 
 
 @pytest.mark.parametrize(

@@ -54,8 +54,9 @@ def test_poses_are_those_of_the_sparse_estimator():
         i, j = edges.T
         want = frames(edges, np.column_stack([bearings[i, j], bearings[j, i]]), N,
                       bearing_std_rad=0.03, ranges=lengths[i, j], range_std_m=0.05)  # fmt: skip
-        found = network_poses(links, bearings, lengths, OPEN, theta + 0.1 * (theta != 0),
-                              np.zeros((N, 2)))  # fmt: skip
+        found = network_poses(
+            links, bearings, lengths, OPEN, theta + 0.1 * (theta != 0), np.zeros((N, 2))
+        )
         np.testing.assert_allclose(found.positions, want.positions, atol=1e-6)
         np.testing.assert_allclose(proj(found.orientations - want.orientations), 0, atol=1e-7)
         assert found.chi_square == pytest.approx(want.cost, rel=1e-6)
@@ -74,11 +75,13 @@ def test_a_network_that_is_not_rigid_is_held_by_the_typical_length():
         at = np.concatenate([[[0, 0]], x[N - 1 :].reshape(-1, 2)])
         both = np.column_stack([bearings[i, j], bearings[j, i]])
         apart = np.linalg.norm(at[j] - at[i], axis=1)
-        return np.concatenate([
-            proj(both - true_bearings(at, turned, edges)).ravel() / 0.03,
-            np.where(lengths[i, j] > 0, (apart - lengths[i, j]) / 0.05, 0.0),
-            apart - 3.0,
-        ])  # fmt: skip
+        return np.concatenate(
+            [
+                proj(both - true_bearings(at, turned, edges)).ravel() / 0.03,
+                np.where(lengths[i, j] > 0, (apart - lengths[i, j]) / 0.05, 0.0),
+                apart - 3.0,
+            ]
+        )
 
     start = np.concatenate([theta[1:], places[1:].ravel()])
     want = scipy.optimize.least_squares(off, start, xtol=1e-14, ftol=1e-14, gtol=1e-14)
@@ -117,8 +120,9 @@ def test_the_bound_is_that_of_frames_where_nothing_is_known_beforehand():
     known[0, 2] = known[2, 0] = True
     exact = OPEN._replace(length_std_m=1e-5)
     want = frame_covariance(places, edges, 0.03, known_pair=(0, 2))
-    np.testing.assert_allclose(linked_pose_covariance(places, links, known, exact), want,
-                               atol=1e-5 * want.max())  # fmt: skip
+    np.testing.assert_allclose(
+        linked_pose_covariance(places, links, known, exact), want, atol=1e-5 * want.max()
+    )
 
 
 def test_a_batch_is_its_networks_one_by_one():

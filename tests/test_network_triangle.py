@@ -76,9 +76,11 @@ def test_errors_reach_the_bound_and_the_misfit_has_its_variance():
     turned, seen = measured(sigma, np.random.default_rng(1), trials)
     found = triangle_frames(seen)
     truth = np.swapaxes(turned[:, :1], -1, -2) @ turned
-    error = Rotation.from_matrix(
-        (found.rotation @ np.swapaxes(truth, -1, -2))[:, 1:].reshape(-1, 3, 3)
-    ).as_rotvec().reshape(trials, 6)  # fmt: skip
+    error = (
+        Rotation.from_matrix((found.rotation @ np.swapaxes(truth, -1, -2))[:, 1:].reshape(-1, 3, 3))
+        .as_rotvec()
+        .reshape(trials, 6)
+    )
     bound = bounds.space_orientation_covariance(PLACES, TRIANGLE_EDGES, sigma)
     # In node 0's frame, which is another one in every trial: traces only.
     for node in (slice(0, 3), slice(3, 6)):

@@ -147,10 +147,11 @@ def test_wrong_weights_are_named():
 def test_maximum_likelihood_costs_least():
     one = random_network(80, 8, 0.35, np.random.default_rng(2))
     costs = {
-        method: cost(one.edges, one.y,
-                     orientations(one.edges, one.y, len(one.positions), method=method))
+        method: cost(
+            one.edges, one.y, orientations(one.edges, one.y, len(one.positions), method=method)
+        )
         for method in METHODS
-    }  # fmt: skip
+    }
     assert costs["ml"] <= min(costs.values()) + 1e-9
     assert costs["tree"] > 2 * costs["ml"]
     assert max(costs["chordal"], costs["spectral"]) < 1.2 * costs["ml"]
@@ -161,10 +162,12 @@ def test_errors_of_nodes_have_the_bounds_covariance():
     one = random_network(12, 5, 0.0, rng)
     n_nodes, sigma = len(one.positions), 0.1
     normals = rng.standard_normal((800, len(one.edges)))
-    errors = np.array([
-        orientations(one.edges, one.y + np.sqrt(2) * sigma * row, n_nodes) - one.orientations
-        for row in normals
-    ])  # fmt: skip
+    errors = np.array(
+        [
+            orientations(one.edges, one.y + np.sqrt(2) * sigma * row, n_nodes) - one.orientations
+            for row in normals
+        ]
+    )
     bound = orientation_covariance(one.edges, n_nodes, sigma)
     # 4.5 standard deviations of a sampled covariance, 1 % for the second order.
     scale = np.outer(np.diag(bound), np.diag(bound))

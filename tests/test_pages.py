@@ -141,10 +141,12 @@ def test_a_click_on_a_heading_sorts_and_a_second_one_turns_the_order(tmp_path):
     (seen,) = re.findall('data-seen="(.*?)"', opened(path, script))
     assert seen.split(", ") == [
         "iekf kf uc-kf",
-        "iekf uc-kf kf", "kf uc-kf iekf",  # ratio, up and down
-        "kf uc-kf iekf", "kf uc-kf iekf",  # flips: what is missing comes last either way
+        "iekf uc-kf kf",
+        "kf uc-kf iekf",  # ratio, up and down
+        "kf uc-kf iekf",
+        "kf uc-kf iekf",  # flips: what is missing comes last either way
         "kf iekf uc-kf",
-    ]  # fmt: skip
+    ]
 
 
 @needs_browser
@@ -152,8 +154,10 @@ def test_long_tables_can_be_filtered(tmp_path):
     path = tmp_path / "board.html"
     rows = [[f"f{k}", "yard" if k % 2 else "room"] for k in range(20)]
     page.write(board(["filter", "scene"], rows), str(path))
-    script = ("const f = document.querySelector('input'); f.value = 'YARD f1';"
-              "f.dispatchEvent(new Event('input'));")  # fmt: skip
+    script = (
+        "const f = document.querySelector('input'); f.value = 'YARD f1';"
+        "f.dispatchEvent(new Event('input'));"
+    )
     hidden = re.findall(r"<tr( hidden=\"\")?><td", opened(path, script))
     assert [not mark for mark in hidden] == [k in (1, 11, 13, 15, 17, 19) for k in range(20)]
 

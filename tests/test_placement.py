@@ -103,8 +103,9 @@ def test_poses_are_fixed_and_fill_the_region():
     assert np.abs(offsets).max() <= 1
     assert (np.abs(offsets).max(axis=0) > 0.8).all()
     np.testing.assert_allclose(rotations.log(rotation).shape, (32, 3))
-    np.testing.assert_allclose(rotation @ np.swapaxes(rotation, -1, -2), [np.eye(3)] * 32,
-                               atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        rotation @ np.swapaxes(rotation, -1, -2), [np.eye(3)] * 32, atol=1e-12
+    )
 
 
 @every_task
@@ -240,8 +241,9 @@ def test_information_is_additive_over_the_anchors(kind):
     task = make(kind)
     context, anchors = problem(task, 10, (3,))
     total = placement.information(task, context, anchors)
-    parts = [placement.information(task, context, anchors[:, m : m + 1])
-             for m in range(task.n_anchors)]  # fmt: skip
+    parts = [
+        placement.information(task, context, anchors[:, m : m + 1]) for m in range(task.n_anchors)
+    ]
     np.testing.assert_allclose(total, sum(parts), rtol=1e-9, atol=1e-9 * np.abs(total).max())
     np.testing.assert_allclose(
         placement.score_of(task, np.sum(parts, axis=0)),
@@ -255,8 +257,9 @@ def test_the_order_of_anchors_does_not_matter_and_more_never_hurt(kind):
     task = make(kind)
     context, anchors = problem(task, 11, (4,))
     scores = placement.score(task, context, anchors)
-    shuffled = placement.score(task, context, anchors[:, np.random.default_rng(0).permutation(
-        task.n_anchors)])  # fmt: skip
+    shuffled = placement.score(
+        task, context, anchors[:, np.random.default_rng(0).permutation(task.n_anchors)]
+    )
     np.testing.assert_allclose(shuffled, scores, rtol=1e-9)
     fewer = placement.score(task, context, anchors[:, :-1])
     assert (fewer > scores).all()
@@ -321,8 +324,9 @@ def test_moving_region_racks_and_anchors_together_changes_no_score():
     scores = placement.score(task, context, anchors)
     shift = np.array([3.0, -2, 0.5])
     racks = context.racks + np.concatenate([shift, np.zeros(3)])
-    moved = placement.score(task, Context(context.centre + shift, context.half, racks),
-                            anchors + shift)  # fmt: skip
+    moved = placement.score(
+        task, Context(context.centre + shift, context.half, racks), anchors + shift
+    )
     np.testing.assert_allclose(moved, scores, rtol=1e-9)
 
 

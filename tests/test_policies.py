@@ -54,8 +54,9 @@ def test_files_give_the_same_policy_back(tmp_path, kind, sizes):
     policies.save(policy, path)
     again = policies.load(path)
     assert (again.kind, again.meta) == (kind, policy.meta)
-    for got, want in zip((*again.weights, *again.biases), (*policy.weights, *policy.biases),
-                         strict=True):  # fmt: skip
+    for got, want in zip(
+        (*again.weights, *again.biases), (*policy.weights, *policy.biases), strict=True
+    ):
         np.testing.assert_array_equal(got, want)
     policies.save(again, tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == path.read_bytes()
@@ -70,10 +71,12 @@ def test_a_wrong_observation_is_named():
 def arrays(**changes):
     policy = random_policy()
     good = {
-        "weight_0": policy.weights[0], "bias_0": policy.biases[0],
-        "weight_1": policy.weights[1], "bias_1": policy.biases[1],
+        "weight_0": policy.weights[0],
+        "bias_0": policy.biases[0],
+        "weight_1": policy.weights[1],
+        "bias_1": policy.biases[1],
         "meta": np.array(json.dumps({"kind": "box", "task": "auv_buoys"})),
-    }  # fmt: skip
+    }
     return {key: value for key, value in {**good, **changes}.items() if value is not None}
 
 

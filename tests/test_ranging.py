@@ -312,7 +312,7 @@ def test_only_probabilities_need_uniforms(model, random):
         (LinkModel, {"nlos_bias_m": -1}, "nlos_bias_m must be a finite number in [0, inf]"),
         (LinkModel, {"reach_m": -1}, "reach_m must be a finite number in [0, inf], got -1.0"),
     ],
-)  # fmt: skip
+)
 def test_bad_parameter_is_refused(kind, fields, message):
     with pytest.raises(ValueError, match="^" + re.escape(message)):
         kind(**fields)

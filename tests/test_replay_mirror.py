@@ -60,10 +60,12 @@ def test_a_mirror_pose_is_named_and_the_belief_covers_it(name, anchors):
     assert recording.truth is not None
     assert track.other is not None
     truth = recording.truth.translation
-    nearer = np.minimum(*(
-        np.linalg.norm(pose - truth, axis=-1)
-        for pose in (track.translation, track.other.translation)
-    ))  # fmt: skip
+    nearer = np.minimum(
+        *(
+            np.linalg.norm(pose - truth, axis=-1)
+            for pose in (track.translation, track.other.translation)
+        )
+    )
     assert np.sqrt((nearer[5:] ** 2).mean()) < 0.1
     # A track on the wrong side is told so; no fault of the truth is made up.
     wrong = result["position_rmse_m"] > 0.5
@@ -89,9 +91,10 @@ def test_a_volume_tells_the_sides_apart(name, seed):
 
 @pytest.mark.parametrize("name", ["iekf", "iekf-bank"])
 @pytest.mark.parametrize(
-    ("anchors", "tags"), [(ROOM, SOLID), (ROOM, FLAT), (CEILING, SOLID)],
+    ("anchors", "tags"),
+    [(ROOM, SOLID), (ROOM, FLAT), (CEILING, SOLID)],
     ids=["room", "room, flat body", "ceiling, solid body"],
-)  # fmt: skip
+)
 def test_no_word_where_the_ranges_tell_the_sides_apart(name, anchors, tags):
     for seed in range(3):
         # Under a ceiling a filter that began on the wrong side is told of the better pose.

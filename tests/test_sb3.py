@@ -31,9 +31,8 @@ ENVS: dict[str, tuple[str, dict[str, Any]]] = {
     "mounts": ("RBL/AnchorPlacement-v0", {"scene": "uwb_room", "mode": "mounts"}),
     "mobile": ("RBL/MobileAnchors-v0", {"scene": {"name": "auv_craft", "steps": 6}}),
     "selection": ("RBL/AnchorSelection-v0", {"scene": {"name": "hall", "steps": 6}}),
-    "priced": ("RBL/AnchorSelection-v0",
-               {"mode": "priced", "scene": {"name": "hall", "steps": 6}}),
-}  # fmt: skip
+    "priced": ("RBL/AnchorSelection-v0", {"mode": "priced", "scene": {"name": "hall", "steps": 6}}),
+}
 every_env = pytest.mark.parametrize("kind", ENVS)
 
 
@@ -67,8 +66,10 @@ def test_ppo_learns_2000_steps(kind):
 @pytest.mark.parametrize("kind", ["placement", "mobile"])
 def test_ends_of_episodes_as_scalar_environments_have_them(kind):
     envs = Sb3VecEnv(vector(kind, 2))
-    peers = [(AnchorPlacementEnv if kind == "placement" else MobileAnchorsEnv)(**ENVS[kind][1])
-             for _ in range(2)]  # fmt: skip
+    peers = [
+        (AnchorPlacementEnv if kind == "placement" else MobileAnchorsEnv)(**ENVS[kind][1])
+        for _ in range(2)
+    ]
     envs.seed(5)
     observations = envs.reset()
     for i, peer in enumerate(peers):
@@ -146,9 +147,11 @@ def test_train_twice_gives_the_same_bytes_and_a_small_file(task, kind, tmp_path,
     policy = policies.load(paths[0])
     assert policy.kind == kind
     assert policy.meta == {
-        "task": task, "seed": 0, "steps": 2048,
+        "task": task,
+        "seed": 0,
+        "steps": 2048,
         "command": f"rbl-gym train {task} --steps 2048 --seed 0",
-    }  # fmt: skip
+    }
     if task == "selection-priced":
         arguments = ["evaluate", task, "--worlds", "1", "--references", "random", "--json"]
         assert main([*arguments, "--policy", str(paths[0])]) == 0
@@ -175,8 +178,9 @@ def test_trainings_of_different_seeds_see_different_worlds(monkeypatch):
     seen = []
 
     def make(task, num_envs, autoreset_mode="SameStep"):
-        envs = gym.make_vec(f"rbl_gym:{task.env_id}", num_envs=num_envs,
-                            autoreset_mode=autoreset_mode)  # fmt: skip
+        envs = gym.make_vec(
+            f"rbl_gym:{task.env_id}", num_envs=num_envs, autoreset_mode=autoreset_mode
+        )
         reset = envs.reset
 
         def noted(**arguments):

@@ -231,9 +231,11 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("obstacles.0.low", [5, 2, 0], "obstacles[0]: low must lie below high"),
         ("obstacles.0.name", "rack", "obstacles[0] has an unknown key 'name'"),
         ("obstacles", [{"low": [0, 0, 0], "high": [8, 6, 2]}], "obstacles[0] swallows the whole"),
-        ("obstacles", [{"low": [0, 0, -1], "high": [4, 6, 2]},
-                       {"low": [4, 0, -1], "high": [8, 6, 2]}],
-         "obstacles leave no free place in the region"),
+        (
+            "obstacles",
+            [{"low": [0, 0, -1], "high": [4, 6, 2]}, {"low": [4, 0, -1], "high": [8, 6, 2]}],
+            "obstacles leave no free place in the region",
+        ),
         ("body", {}, "body must have either tags"),
         ("body.tags", [[0, 0, 0]], "body must have either tags"),
         ("body.shape", "sphere", "body.shape must be one of"),
@@ -254,7 +256,7 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("prior.angle", 0, "prior has an unknown key 'angle'"),
         ("name", 3, "name must be a printable text"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_in_a_file_is_named(path, value, message):
     with pytest.raises(ValueError) as error:  # noqa: PT011
         scene_files.of_mapping(changed(path, value))
@@ -288,8 +290,9 @@ def test_what_is_wrong_with_a_named_scene_is_named(arguments, message):
         scene_files.problem(**arguments)
 
 
-@pytest.mark.parametrize(("name", "text"), [("a.toml", "[anchors\n"), ("a.json", "{"),
-                                            ("b.json", "[1]")])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.toml", "[anchors\n"), ("a.json", "{"), ("b.json", "[1]")]
+)
 def test_files_that_cannot_be_read_are_named(tmp_path, name, text):
     path = tmp_path / name
     path.write_text(text)

@@ -146,9 +146,11 @@ def test_scenes_are_hashable_immutable_and_pickle(name):
 # --- overrides --------------------------------------------------------------------------------
 
 KINDS: dict[type, str] = {
-    Box: "box", Walls: "walls", Shell: "shell",
+    Box: "box",
+    Walls: "walls",
+    Shell: "shell",
     **{law: kind for kind, law in ranging.NOISE_LAWS.items()},
-}  # fmt: skip
+}
 
 
 def as_overrides(scene: Scene) -> dict[str, Any]:
@@ -204,7 +206,7 @@ def test_any_scene_may_become_any_other(name):
             {"start_rotation": ((1, 0, 0), (0, 1, 0), (0, 0, 1))},
         ),
     ],
-)  # fmt: skip
+)
 def test_overrides_change_what_they_name_and_nothing_else(overrides, want):
     base, got = scenes.get("uwb_room"), scenes.get({"name": "uwb_room", **overrides})
     for entry in dataclasses.fields(base):
@@ -277,7 +279,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"start_rotation": np.diag([1, 1, -1]).tolist()}, "start_rotation must be a proper rotation"),
     ({"start_rotation": [np.eye(3).tolist()] * 2}, "start_rotation must have no leading axes"),
     ({"noise": {"reference_tag": 6}}, "reference_tag must be below 6 tags, got 6"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("overrides", "message"), REFUSED, ids=lambda x: str(x)[:50])
@@ -291,8 +293,10 @@ def test_bad_override_is_refused(overrides, message):
 
 def longest_range(scene: Scene) -> float:
     """From the farthest corner of the anchors' region to that of the volume, at the start."""
-    corners = [np.array(np.meshgrid(*np.transpose(r.bounds()))).reshape(3, -1).T
-               for r in (scene.anchor_region, scene.volume)]  # fmt: skip
+    corners = [
+        np.array(np.meshgrid(*np.transpose(r.bounds()))).reshape(3, -1).T
+        for r in (scene.anchor_region, scene.volume)
+    ]
     return float(ranging.distances(*corners).max())
 
 

@@ -55,8 +55,9 @@ def test_proj_is_half_open_and_exact_inside():
 
 @every_case
 def test_edge_angles_of_the_reference(case):
-    np.testing.assert_allclose(edge_angles(np.column_stack([case["a"], case["b"]])), case["y"],
-                               atol=1e-12)  # fmt: skip
+    np.testing.assert_allclose(
+        edge_angles(np.column_stack([case["a"], case["b"]])), case["y"], atol=1e-12
+    )
 
 
 def test_exact_bearings_give_differences_of_orientations_and_noise_has_its_variance():
@@ -116,8 +117,9 @@ def test_all_cycles_are_those_of_brute_force():
     rng = np.random.default_rng(5)
     for n_nodes, m in ((3, 3), (4, 6), (5, 8), (5, 9), (6, 9)):
         pairs = np.array(list(itertools.combinations(range(n_nodes), 2)))
-        edges = np.concatenate([[[k, k + 1] for k in range(n_nodes - 1)],
-                                rng.choice(pairs, m - n_nodes + 1)])  # fmt: skip
+        edges = np.concatenate(
+            [[[k, k + 1] for k in range(n_nodes - 1)], rng.choice(pairs, m - n_nodes + 1)]
+        )
         want = set()
         for size in range(2, n_nodes + 1):
             for rows in itertools.combinations(range(m), size):
@@ -170,8 +172,9 @@ def test_trivial_graphs():
         assert cycle_matrix([], 1, basis).shape == (0, 0)
         assert cycle_matrix([[1, 0]], 2, basis).shape == (0, 1)
         assert cycle_matrix([[1, 0], [0, 1]], 2, basis).toarray().tolist() in (
-            [[1.0, 1.0]], [[-1.0, -1.0]],
-        )  # fmt: skip
+            [[1.0, 1.0]],
+            [[-1.0, -1.0]],
+        )
 
 
 @pytest.mark.parametrize(
@@ -209,8 +212,10 @@ def test_wrong_numbers_are_named():
 
 @every_case
 def test_parallel_rigidity_ranks_of_the_reference(case):
-    assert list(rigidity.parallel_rigidity_rank(case["P"], case["E"])) == \
-        case["parallel_rigidity_rank"]  # fmt: skip
+    assert (
+        list(rigidity.parallel_rigidity_rank(case["P"], case["E"]))
+        == case["parallel_rigidity_rank"]
+    )
 
 
 def test_sparse_and_dense_ranks_agree(monkeypatch):
@@ -297,8 +302,10 @@ def test_what_stays_free_in_space():
 
     # Paths: a turn about every edge, and from the second on its length.
     assert [free(n, [[k, k + 1] for k in range(n - 1)]) for n in (2, 3, 4)] == [
-        (1, 1), (3, 2), (5, 3),
-    ]  # fmt: skip
+        (1, 1),
+        (3, 2),
+        (5, 3),
+    ]
     assert free(1, []) == (0, 0)
     assert free(3, [[0, 1], [1, 2], [0, 2]]) == (0, 0)
     # Rings have 4 n measurements for 6 n - 7 unknowns.

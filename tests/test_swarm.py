@@ -56,12 +56,14 @@ def test_no_tag_is_farther_than_the_directions_allow():
     pairs = np.array(list(itertools.combinations(range(4), 2))).T
     lengths = np.linalg.norm(TAGS[pairs[0]] - TAGS[pairs[1]], axis=-1) / unit
     for sigma in (0.0, np.deg2rad(1)):
-        noisy = bearing.simulate(TAGS, rotation, translation, bearing.AngleNoise(max(sigma, 1e-9)),
-                                 rng)  # fmt: skip
+        noisy = bearing.simulate(
+            TAGS, rotation, translation, bearing.AngleNoise(max(sigma, 1e-9)), rng
+        )
         rays = bearing.directions(noisy)
         cosines = np.einsum("bpi,bpi->pb", rays[:, pairs[0]], rays[:, pairs[1]])
-        farthest = swarm._farthest(pairs, np.tile(lengths[:, None], 500), cosines,
-                                   np.full(500, sigma))  # fmt: skip
+        farthest = swarm._farthest(
+            pairs, np.tile(lengths[:, None], 500), cosines, np.full(500, sigma)
+        )
         ratio = farthest.T / (np.linalg.norm(places, axis=-1) / unit)
         # A direction's error is larger than an angle's where it is near the xz plane.
         assert (ratio > 1 - 1e-6).mean() >= (0.99 if sigma else 1)

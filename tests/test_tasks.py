@@ -274,8 +274,9 @@ def test_selection_rewards_and_observations_by_a_separate_filter(mode, seed):
     for k in range(1, 31):
         wanted = [
             *(twin.state.translation - [0, 0, 1.75]) / [17, 8, 1.25],
-            *twin.episode.twists[k - 1][3:] / 2, *twin.common(),
-        ]  # fmt: skip
+            *twin.episode.twists[k - 1][3:] / 2,
+            *twin.common(),
+        ]
         np.testing.assert_allclose(observation, wanted, atol=2e-5)
         if mode == "top-k":
             action = rng.uniform(-1, 1, 12)
@@ -515,11 +516,13 @@ def test_nees_is_six(kind, worlds):
         (MobileAnchorsVectorEnv, "satellite"),
         (AnchorSelectionVectorEnv, "camsap2013"),
         (AnchorSelectionVectorEnv, "auv_buoys"),
-        (AnchorSelectionVectorEnv,
-         {"name": "hall", "volume": {"low": [-17, -8, 1], "high": [17, 8, 1]}}),
+        (
+            AnchorSelectionVectorEnv,
+            {"name": "hall", "volume": {"low": [-17, -8, 1], "high": [17, 8, 1]}},
+        ),
         (AnchorSelectionVectorEnv, scenes.get("uwb_room")),
     ],
-)  # fmt: skip
+)
 def test_other_scenes_give_finite_observations(kind, scene):
     env = kind(4, scene=scene, max_episode_steps=4)
     for step in run(env, 9):
@@ -551,7 +554,7 @@ def test_other_scenes_give_finite_observations(kind, scene):
         (1, {"scene": None}, "scene must be a name or a dict"),
         (1, {"render_mode": "human"}, "render_mode must be None"),
     ],
-)  # fmt: skip
+)
 def test_bad_arguments_are_named(kind, arguments, message):
     for cls in list(CLASSES.values())[kind]:
         with pytest.raises(ValueError, match=message):

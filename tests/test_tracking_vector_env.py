@@ -74,8 +74,9 @@ def test_disabled_refuses_to_step_past_the_end():
 
 
 def test_make_vec_gives_the_native_environment_with_its_arguments():
-    env = gym.make_vec(ID, num_envs=3, scene=short("uwb_room", 50), max_episode_steps=4,
-                       autoreset_mode="SameStep")  # fmt: skip
+    env = gym.make_vec(
+        ID, num_envs=3, scene=short("uwb_room", 50), max_episode_steps=4, autoreset_mode="SameStep"
+    )
     assert isinstance(env.unwrapped, TrackingVectorEnv)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     env.reset(seed=1)

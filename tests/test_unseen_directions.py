@@ -256,11 +256,13 @@ def test_a_planar_robot_with_two_tags_has_a_heading(std_rad, name, options, sear
     heading = rng.uniform(-np.pi, np.pi, 20)
     translation = np.column_stack([rng.uniform([2, 1.5], [6, 4.5], (20, 2)), np.full(20, 1.2)])
     turned = rotations.from_euler_zyx(heading, np.zeros(20), np.zeros(20))
-    guess = rotations.from_euler_zyx(heading + min(std_rad, 0.5) * rng.standard_normal(20),
-                                     np.zeros(20), np.zeros(20))  # fmt: skip
+    guess = rotations.from_euler_zyx(
+        heading + min(std_rad, 0.5) * rng.standard_normal(20), np.zeros(20), np.zeros(20)
+    )
     std = np.array([1e-3, 1e-3, std_rad, 1.0, 1.0, 1e-3])
-    state = filter.initial(guess, translation + std[3:] * rng.standard_normal((20, 3)),
-                           np.diag(std**2))  # fmt: skip
+    state = filter.initial(
+        guess, translation + std[3:] * rng.standard_normal((20, 3)), np.diag(std**2)
+    )
     errors = []
     for k in range(40):
         if k:
@@ -269,8 +271,9 @@ def test_a_planar_robot_with_two_tags_has_a_heading(std_rad, name, options, sear
             translation[:, :2] += WALK * step[:, 1:]
             turned = rotations.from_euler_zyx(heading, np.zeros(20), np.zeros(20))
             state = filter.predict(state, np.zeros(6), DT)
-        state = filter.update(state, simulate(rng, anchors, PAIR, turned, translation, noise),
-                              anchors)  # fmt: skip
+        state = filter.update(
+            state, simulate(rng, anchors, PAIR, turned, translation, noise), anchors
+        )
         belief = filter.belief(state)
         errors.append(metrics.pose_error(belief.rotation, belief.translation, turned, translation))
     assert len(searches) <= 1

@@ -192,8 +192,10 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Step the worlds, estimate, reward; worlds that begin anew forget their estimate."""
         observation, _, terminated, truncated, info = self.env.step(actions)
-        ended, same_step = terminated | truncated, \
-            self.env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP  # fmt: skip
+        ended, same_step = (
+            terminated | truncated,
+            self.env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP,
+        )
         reward = np.zeros(self.num_envs)
         if same_step and ended.any():
             reward[ended] = self._end(info, ended)

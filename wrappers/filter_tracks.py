@@ -79,9 +79,13 @@ def tracks(task: PlacementTask, context: Context) -> Tracks:
     )
     centre, half = (field[..., None, None, :] for field in (context.centre, context.half))
     trajectory = motion.waypoints(
-        rotations.from_quaternion(start[..., :4]), centre + (2 * points - 1) * half,
-        scene.speed_m_s, scene.dt, EPOCHS - 1, scene.spin_rad_s * start[..., 4:7],
-    )  # fmt: skip
+        rotations.from_quaternion(start[..., :4]),
+        centre + (2 * points - 1) * half,
+        scene.speed_m_s,
+        scene.dt,
+        EPOCHS - 1,
+        scene.spin_rad_s * start[..., 4:7],
+    )
     path = motion.simulate(trajectory, scene.dt, scene.process, process)
     twists = np.zeros((*batch, TRACKS, EPOCHS, 6))
     twists[..., 1:, :] = trajectory.twists
@@ -186,9 +190,12 @@ def follow(
     state = filter.initial(course.prior_rotation, course.prior_translation, covariance)
     for k in range(EPOCHS):
         at = simulation.Epoch(
-            course.rotation[..., k, :, :], course.translation[..., k, :], course.twists[..., k, :],
-            course.normals[..., k, :, :], course.uniforms[..., k, :, :, :],
-        )  # fmt: skip
+            course.rotation[..., k, :, :],
+            course.translation[..., k, :],
+            course.twists[..., k, :],
+            course.normals[..., k, :, :],
+            course.uniforms[..., k, :, :, :],
+        )
         if k:
             state = filter.predict(state, at.twist, scene.dt)
         if measures:

@@ -82,8 +82,9 @@ def with_best(
     poses = PoseState(*fields)
     order = np.argsort(-everyone, axis=1)
     poses, everyone = _ordered(poses, everyone, order)
-    gaps = distance(PoseState(*(a[:, :, None] for a in poses)),
-                    PoseState(*(a[:, None] for a in poses)))  # fmt: skip
+    gaps = distance(
+        PoseState(*(a[:, :, None] for a in poses)), PoseState(*(a[:, None] for a in poses))
+    )
     # Of those that are the same the likeliest stays.
     likelier = np.tri(everyone.shape[1], k=-1, dtype=bool) & np.isfinite(everyone)[:, None]
     everyone[((gaps < SAME) & likelier).any(axis=-1)] = -np.inf

@@ -127,9 +127,13 @@ def locate_doa(
         return np.broadcast_to(array, (*batch, *shape)).reshape(-1, *shape)
 
     epoch = DoaEpoch(
-        flat(angles, 2), 1 / noise.variance(flat(angles, 2)), flat(tags, 2),
-        HALF_SPACES[half_space], distance_weight, rng,
-    )  # fmt: skip
+        flat(angles, 2),
+        1 / noise.variance(flat(angles, 2)),
+        flat(tags, 2),
+        HALF_SPACES[half_space],
+        distance_weight,
+        rng,
+    )
     size = _BLOCK if method == "nia" else _BLOCK_OF_STARTS
     blocks = [
         _solve(METHODS[method], _rows(epoch, slice(start, start + size)))

@@ -124,8 +124,11 @@ def network_belief(
     else:
         poses = network_poses(links, bearings, lengths, sensing, orientations, positions)
         orientations, places, chi_square, degrees = (
-            poses.orientations, poses.positions, poses.chi_square, poses.degrees
-        )  # fmt: skip
+            poses.orientations,
+            poses.positions,
+            poses.chi_square,
+            poses.degrees,
+        )
         before = orientations.shape[-1] - 1
         node = np.arange(before)
         rows = np.stack([node, before + 2 * node, before + 2 * node + 1], axis=-1)

@@ -84,8 +84,10 @@ def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
     # The shift keeps the matrix definite.
     low = sp.linalg.eigsh(F, k=1, sigma=-1e-6, v0=start, return_eigenvectors=False)
     if low[0] <= _ZERO * high[0]:
-        raise ValueError(f"cycles must be independent where they are more than {_DENSE}, "
-                         f"got {C.shape[0]} dependent ones")  # fmt: skip
+        raise ValueError(
+            f"cycles must be independent where they are more than {_DENSE}, "
+            f"got {C.shape[0]} dependent ones"
+        )
     return float(low[0]), float(high[0])
 
 
@@ -190,8 +192,10 @@ def _least_norm_columns(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
             if pivots.min() > _ZERO * pivots.max():
                 return C.T @ factors.solve(off)
     if min(C.shape) > _DENSE:
-        raise ValueError(f"cycles must be independent where they are more than {_DENSE}, "
-                         f"got {C.shape[0]} dependent ones")  # fmt: skip
+        raise ValueError(
+            f"cycles must be independent where they are more than {_DENSE}, "
+            f"got {C.shape[0]} dependent ones"
+        )
     return np.linalg.lstsq(C.toarray(), off, rcond=_ZERO)[0]
 
 
@@ -202,9 +206,11 @@ def _solves(C: sp.csr_matrix, x: FloatArray, off: FloatArray) -> bool:
 
 def _contradiction(branch: NDArray[Any]) -> str:
     named = np.rint(branch).astype(int).tolist()
-    return (f"branch: the multiples of 2 pi of dependent cycles contradict each other, got "
-            f"{named!s:.80}; give that of consistent angles psi, rint(C psi / 2 pi), or "
-            "independent cycles")  # fmt: skip
+    return (
+        f"branch: the multiples of 2 pi of dependent cycles contradict each other, got "
+        f"{named!s:.80}; give that of consistent angles psi, rint(C psi / 2 pi), or "
+        "independent cycles"
+    )
 
 
 def cycle_consensus(
@@ -288,8 +294,11 @@ def cycle_iteration(
     """
     edges = check_connected(edges, n_nodes)
     psi = check_edge_angles(y, edges).copy()
-    C = cycle_matrix(edges, n_nodes, check_one_of("cycles", cycles, CYCLES)) \
-        if isinstance(cycles, str) else check_cycles(cycles, edges, n_nodes)  # fmt: skip
+    C = (
+        cycle_matrix(edges, n_nodes, check_one_of("cycles", cycles, CYCLES))
+        if isinstance(cycles, str)
+        else check_cycles(cycles, edges, n_nodes)
+    )
     check_one_of("order", order, ORDERS)
     tol = check_number("tol", tol, low=0.0)
     max_steps = check_count("max_steps", max_steps, least=0)
@@ -335,8 +344,9 @@ def cycle_iteration(
         if kept is not None:
             kept.append(psi.copy())
     consistent = converged or consistent or _consistent(C, reached)
-    return CycleRun(psi, reached, steps, step, converged, consistent,
-                    None if kept is None else np.array(kept))  # fmt: skip
+    return CycleRun(
+        psi, reached, steps, step, converged, consistent, None if kept is None else np.array(kept)
+    )
 
 
 def _consistent(C: sp.csr_matrix, branch: NDArray[Any]) -> bool:
@@ -371,9 +381,12 @@ def _around(sums: FloatArray, target: FloatArray | None) -> FloatArray:
 
 
 def _one_by_one(
-    C: sp.csr_matrix, psi: FloatArray, gain: FloatArray, target: FloatArray | None,
+    C: sp.csr_matrix,
+    psi: FloatArray,
+    gain: FloatArray,
+    target: FloatArray | None,
     turns: NDArray[np.intp],
-) -> None:  # fmt: skip
+) -> None:
     """Each cycle of `turns` in its turn, on the edges as they are by then."""
     for row in turns:
         part = slice(C.indptr[row], C.indptr[row + 1])

@@ -87,8 +87,9 @@ def frames(
     """
     edges = check_connected(edges, n_nodes)
     bearings = check_edge_values("bearings", bearings, edges, 2)
-    measured = _measured(edges, bearings, n_nodes, known_pair, length_m, bearing_std_rad,
-                         ranges, range_std_m)  # fmt: skip
+    measured = _measured(
+        edges, bearings, n_nodes, known_pair, length_m, bearing_std_rad, ranges, range_std_m
+    )
     if n_nodes == 1:
         return FrameEstimate(np.zeros(1), np.zeros((1, 2)), 0.0, True)
     # Of positions in general: the true ones are not known.
@@ -110,8 +111,10 @@ def _measured(
     if (lengths < 0).any():
         raise ValueError(f"ranges must not be negative, got {lengths.min()}")
     if (known is None) == (not lengths.any()) and n_nodes > 1:
-        raise ValueError("one of known_pair and ranges must give the scale, got "
-                         + ("neither" if known is None else "both"))  # fmt: skip
+        raise ValueError(
+            "one of known_pair and ranges must give the scale, got "
+            + ("neither" if known is None else "both")
+        )
     std = 1.0
     if lengths.any():
         std = check_number("range_std_m", range_std, low=1e-12)
@@ -189,8 +192,9 @@ def _joint(measured: _Measured, theta: FloatArray, positions: FloatArray) -> Fra
         step = np.zeros(3 * n_nodes)
         step[free] = scipy.sparse.linalg.spsolve(sp.csc_matrix(damped), J.T @ residual)
         new = theta + step[:n_nodes], positions + step[n_nodes:].reshape(-1, 2)
-        size = max(np.abs(step[:n_nodes]).max(),
-                   np.abs(step[n_nodes:]).max() / np.abs(positions).max())  # fmt: skip
+        size = max(
+            np.abs(step[:n_nodes]).max(), np.abs(step[n_nodes:]).max() / np.abs(positions).max()
+        )
         new_residual = _residuals(measured, *new)
         if (new_cost := float(new_residual @ new_residual)) <= cost:
             (theta, positions), residual, cost = new, new_residual, new_cost

@@ -83,8 +83,9 @@ def orientations(
         raise ValueError(f"options are of the method 'cycle' only, got {sorted(options)}")
     if weights is not None:
         if method not in _WEIGHTED:
-            raise ValueError(f"weights must be None with the method {method!r}, "
-                             f"got {weights!r:.80}")  # fmt: skip
+            raise ValueError(
+                f"weights must be None with the method {method!r}, got {weights!r:.80}"
+            )
         weights = check_weights(weights, edges)
         options = {"weights": weights / weights.max(initial=_SMALLEST)}
     return proj(METHODS[method](edges, y, n_nodes, **options))
@@ -111,8 +112,10 @@ def check_weights(weights: ArrayLike | None, edges: IntArray) -> FloatArray:
         raise ValueError(f"weights must be above 0, got {array[row]:g} at index {row}")
     if len(array) and array.min() < LEAST_WEIGHT * array.max():
         row = int(np.argmin(array))
-        raise ValueError(f"weights must be at least {LEAST_WEIGHT:g} of the largest, "
-                         f"{array.max():g}, got {array[row]:g} at index {row}")  # fmt: skip
+        raise ValueError(
+            f"weights must be at least {LEAST_WEIGHT:g} of the largest, "
+            f"{array.max():g}, got {array[row]:g} at index {row}"
+        )
     return array
 
 
@@ -307,9 +310,11 @@ def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matri
 def _factorised(A: sp.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any:
     """LU of a Hermitian matrix with pivots on its diagonal, of minimum degree or as it is."""
     return scipy.sparse.linalg.splu(
-        sp.csc_matrix(A), permc_spec=order, diag_pivot_thresh=0.0,
+        sp.csc_matrix(A),
+        permc_spec=order,
+        diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
-    )  # fmt: skip
+    )
 
 
 def _gathered(edges: IntArray, values: FloatArray, n_nodes: int) -> FloatArray:

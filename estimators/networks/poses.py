@@ -86,10 +86,14 @@ def network_poses(
     # The mean of the measured and the typical length: one residual stands for both.
     share = np.where(ranged, typical_std**2 / (typical_std**2 + sensing.length_std_m**2), 0.0)
     measured = _Measured(
-        links, bearings, sensing.bearing_std_rad, typical + share * (lengths - typical),
-        information, prior_information(n_nodes, sensing),
+        links,
+        bearings,
+        sensing.bearing_std_rad,
+        typical + share * (lengths - typical),
+        information,
+        prior_information(n_nodes, sensing),
         _NEAREST * typical,
-    )  # fmt: skip
+    )
     theta, places = orientations, _linear_start(measured, orientations, positions)
     damping = np.full(links.shape[:-2], _DAMPING)
     active = np.ones(links.shape[:-2], dtype=np.bool_)
@@ -100,8 +104,10 @@ def network_poses(
         new_theta, new_places = _moved(theta, places, step)
         new_cost, new_slope = _slope(measured, new_theta, new_places)
         better = active & (new_cost <= cost)
-        size = np.maximum(np.abs(step[..., :n_nodes]).max(axis=-1),
-                          np.abs(step[..., n_nodes:]).max(axis=-1) / typical)  # fmt: skip
+        size = np.maximum(
+            np.abs(step[..., :n_nodes]).max(axis=-1),
+            np.abs(step[..., n_nodes:]).max(axis=-1) / typical,
+        )
         theta = np.where(better[..., None], new_theta, theta)
         places = np.where(better[..., None, None], new_places, places)
         slope = np.where(better[..., None], new_slope, slope)
@@ -117,9 +123,12 @@ def network_poses(
 
 
 def _found(
-    measured: _Measured, theta: FloatArray, places: FloatArray, lengths: FloatArray,
+    measured: _Measured,
+    theta: FloatArray,
+    places: FloatArray,
+    lengths: FloatArray,
     of_lengths: FloatArray,
-) -> NetworkPoses:  # fmt: skip
+) -> NetworkPoses:
     free = free_columns(theta.shape[-1])
     covariance = np.linalg.inv(_information(measured, places)[..., free[:, None], free])
     bearings, _ = _residuals(measured, theta, places)

@@ -186,8 +186,10 @@ def _mixture_information(p: float, shift: FloatArray, width: FloatArray) -> Floa
     bell = np.exp(-0.5 * _NODES**2) * step / np.sqrt(2 * np.pi)
     total = np.zeros(len(shift))
     # The mean squared score, over each component of the mixture in turn.
-    for weight, x in ((1 - p, np.broadcast_to(_NODES, (len(shift), len(_NODES)))),
-                      (p, shift + width * _NODES)):  # fmt: skip
+    for weight, x in (
+        (1 - p, np.broadcast_to(_NODES, (len(shift), len(_NODES)))),
+        (p, shift + width * _NODES),
+    ):
         log_ratio = np.log(p / (1 - p)) - np.log(width)
         log_ratio = log_ratio - 0.5 * ((x - shift) / width) ** 2 + 0.5 * x**2
         reflected = 1 / (1 + np.exp(np.clip(-log_ratio, -700, 700)))

@@ -55,9 +55,12 @@ def plane_of(points: ArrayLike) -> Plane:
 
 
 def mirror_pose(
-    rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike, anchors: ArrayLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    covariance: ArrayLike,
+    anchors: ArrayLike,
     tags: ArrayLike,
-) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The image of poses in the plane of the anchors, with its covariance.
 
     The tags are reflected in that plane, and the body is put on them: with S the reflection in

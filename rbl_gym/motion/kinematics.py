@@ -364,8 +364,9 @@ def recorded(
     if times.ndim != 1 or len(times) < 2 or (np.diff(times) <= 0).any():
         raise ValueError("times must be (L,) with L >= 2 and strictly increasing")
     for name, value, shape in (
-        ("rotation", rotation, (len(times), 3, 3)), ("translation", translation, (len(times), 3))
-    ):  # fmt: skip
+        ("rotation", rotation, (len(times), 3, 3)),
+        ("translation", translation, (len(times), 3)),
+    ):
         if value.shape != shape:
             raise ValueError(f"{name} must have shape {shape} as times, got {value.shape}")
     dt = check_number("dt", dt, low=1e-12)

@@ -33,8 +33,12 @@ from rbl_gym.geometry import rotations
 from rbl_gym.motion.kinematics import ProcessNoise, check_process, six
 
 __all__ = [
-    "FRAMES", "TwistSensor", "WanderingPath", "WanderingTwist", "simulate_wandering",
-]  # fmt: skip
+    "FRAMES",
+    "TwistSensor",
+    "WanderingPath",
+    "WanderingTwist",
+    "simulate_wandering",
+]
 
 FRAMES = ("world", "body")
 

@@ -19,9 +19,13 @@ from rbl_gym.networks.graphs import check_connected, incidence
 from rbl_gym.networks.sensing import check_pair, check_positions, directions_of
 
 __all__ = [
-    "bearing_jacobian", "frame_covariance", "orientation_covariance", "range_jacobian",
-    "space_jacobian", "space_orientation_covariance",
-]  # fmt: skip
+    "bearing_jacobian",
+    "frame_covariance",
+    "orientation_covariance",
+    "range_jacobian",
+    "space_jacobian",
+    "space_orientation_covariance",
+]
 
 
 def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
@@ -206,8 +210,9 @@ def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
 def sparse_rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_matrix:
     """The matrix (m, width) of rows with equally many entries (m, k), at columns (m, k)."""
     rows, each = values.shape
-    return sp.csr_matrix((values.ravel(), columns.ravel(), each * np.arange(rows + 1)),
-                         shape=(rows, width))  # fmt: skip
+    return sp.csr_matrix(
+        (values.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(rows, width)
+    )
 
 
 def free_columns(n_nodes: int) -> IntArray:
@@ -251,8 +256,10 @@ def frame_covariance(
     )
     rows: list[Any] = [J]
     if ranges_of is not None:
-        rows.append(range_jacobian(positions, ranges_of)
-                    / check_number("range_std_m", range_std_m, low=1e-12))  # fmt: skip
+        rows.append(
+            range_jacobian(positions, ranges_of)
+            / check_number("range_std_m", range_std_m, low=1e-12)
+        )
     elif known_pair is None:
         raise ValueError("known_pair must be given where there are no ranges, got None")
     free = free_columns(len(positions))
@@ -267,8 +274,9 @@ def frame_covariance(
     values, vectors = np.linalg.eigh(basis.T @ (J.T @ J) @ basis)
     if len(values) and values[0] <= 1e-12 * values[-1]:
         missing = int((values <= 1e-12 * values[-1]).sum())
-        raise ValueError(f"edges must determine all frames, got {missing} directions without "
-                         "information")  # fmt: skip
+        raise ValueError(
+            f"edges must determine all frames, got {missing} directions without information"
+        )
     factor = basis @ vectors / np.sqrt(values)
     return factor @ factor.T
 
@@ -299,8 +307,9 @@ def space_jacobian(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
         apart = positions[j] - positions[i]
         length = float(np.linalg.norm(apart))
         if length == 0:
-            raise ValueError(f"positions must differ along edges, those of nodes {i} and {j} are "
-                             "the same")  # fmt: skip
+            raise ValueError(
+                f"positions must differ along edges, those of nodes {i} and {j} are the same"
+            )
         u = apart / length
         # d u = (I - u u^T) (dp_j - dp_i) / length; a turn w of the observer adds -w x u.
         shift = (np.eye(3) - np.outer(u, u)) / length
@@ -333,6 +342,8 @@ def space_orientation_covariance(
     known = np.vstack([J, scale / np.linalg.norm(scale)])[:, kept]
     values = np.linalg.svd(known, compute_uv=False)
     if values[-1] < 1e-9 * values[0]:
-        raise ValueError("edges must determine all orientations at these positions, got "
-                         f"{int((values < 1e-9 * values[0]).sum())} free motions")  # fmt: skip
+        raise ValueError(
+            "edges must determine all orientations at these positions, got "
+            f"{int((values < 1e-9 * values[0]).sum())} free motions"
+        )
     return sigma**2 * np.linalg.inv(known.T @ known)[3 * (n_nodes - 1) :, 3 * (n_nodes - 1) :]

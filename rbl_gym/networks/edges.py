@@ -30,16 +30,19 @@ def check_edges(edges: ArrayLike, n_nodes: int, name: str = "edges") -> IntArray
     if array.size == 0:
         return np.zeros((0, 2), dtype=np.intp)
     if array.ndim != 2 or array.shape[1] != 2 or array.dtype.kind not in "iu":
-        raise ValueError(f"{name} must be integers of shape (m, 2), got {array.shape} "
-                         f"of {array.dtype}")  # fmt: skip
+        raise ValueError(
+            f"{name} must be integers of shape (m, 2), got {array.shape} of {array.dtype}"
+        )
     array = array.astype(np.intp, copy=False)
     if array.min() < 0 or array.max() >= n_nodes:
         row = int(np.argmax(((array < 0) | (array >= n_nodes)).any(axis=1)))
-        raise ValueError(f"{name} must join nodes 0 to {n_nodes - 1}, got {array[row].tolist()} "
-                         f"at row {row}")  # fmt: skip
+        raise ValueError(
+            f"{name} must join nodes 0 to {n_nodes - 1}, got {array[row].tolist()} at row {row}"
+        )
     loops = array[:, 0] == array[:, 1]
     if loops.any():
         row = int(np.argmax(loops))
-        raise ValueError(f"{name} must join two different nodes, got {array[row].tolist()} "
-                         f"at row {row}")  # fmt: skip
+        raise ValueError(
+            f"{name} must join two different nodes, got {array[row].tolist()} at row {row}"
+        )
     return array

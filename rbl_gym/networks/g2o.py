@@ -80,8 +80,11 @@ def read_graph(path: str | os.PathLike[str]) -> PoseGraph:
     ids = np.array(sorted(joined), dtype=np.int64 if max(joined) < 2**63 else np.uint64)
     index = {int(node): k for k, node in enumerate(ids)}
     edges = np.array([(index[i], index[j]) for i, j in rows.ends], dtype=np.intp)
-    y = edge_angles(np.column_stack([columns["a"], columns["b"]])) if "a" in columns else \
-        proj(columns["dtheta" if "dtheta" in columns else "y"])  # fmt: skip
+    y = (
+        edge_angles(np.column_stack([columns["a"], columns["b"]]))
+        if "a" in columns
+        else proj(columns["dtheta" if "dtheta" in columns else "y"])
+    )
     displacement = np.column_stack([columns["dx"], columns["dy"]]) if "dx" in columns else None
     skipped = dict(rows.skipped)
     if lone := len(rows.vertices - joined):
@@ -98,8 +101,10 @@ def _information(path: str, rows: _Rows) -> FloatArray | None:
         negative = information[:, k, k] < 0
         if negative.any():
             row = int(np.argmax(negative))
-            raise ValueError(f"{path}, line {rows.lines[row]}, column 'I{k + 1}{k + 1}': must not "
-                             f"be negative, got {information[row, k, k]:g}")  # fmt: skip
+            raise ValueError(
+                f"{path}, line {rows.lines[row]}, column 'I{k + 1}{k + 1}': must not "
+                f"be negative, got {information[row, k, k]:g}"
+            )
     return None if np.isnan(information).all() else information
 
 
@@ -122,12 +127,16 @@ def _g2o_rows(path: str) -> _Rows:
         elif tag != "FIX" and tag.startswith(_OTHER):
             skipped[tag] += 1
         elif tag != "FIX":
-            raise ValueError(f"{path}, line {number}: must start with EDGE_SE2 or another name of "
-                             f"g2o, got {tag!r:.40}")  # fmt: skip
+            raise ValueError(
+                f"{path}, line {number}: must start with EDGE_SE2 or another name of "
+                f"g2o, got {tag!r:.40}"
+            )
     if not lines:
         told = ", ".join(f"{n} {tag}" for tag, n in skipped.items())
-        raise ValueError(f"{path}: must have an edge, got none of EDGE_SE2"
-                         + (f"; skipped: {told}" if told else ""))  # fmt: skip
+        raise ValueError(
+            f"{path}: must have an edge, got none of EDGE_SE2"
+            + (f"; skipped: {told}" if told else "")
+        )
     return _Rows(lines, ends, dict(zip(names, np.array(values).T, strict=True)), skipped, vertices)
 
 
@@ -193,8 +202,10 @@ def _node(path: str, line: int, column: str, cell: str) -> int:
             if abs(number) < 2**53 and number == math.floor(number):
                 value = int(number)
     if value is None or not 0 <= value <= _LARGEST_ID:
-        raise ValueError(f"{path}, line {line}, column {column!r}: must be a whole number, not "
-                         f"negative and below 2^64, got {cell:.40}")  # fmt: skip
+        raise ValueError(
+            f"{path}, line {line}, column {column!r}: must be a whole number, not "
+            f"negative and below 2^64, got {cell:.40}"
+        )
     return value
 
 
@@ -214,7 +225,8 @@ def _numbers(path: str, line: int, names: tuple[str, ...], cells: list[str]) -> 
     for name, cell in known.items():
         value = math.nan if without and name in _INFORMATION else _number(cell)
         if math.isinf(value):
-            raise ValueError(f"{path}, line {line}, column {name!r}: must be a finite number, "
-                             f"got {cell!r:.40}")  # fmt: skip
+            raise ValueError(
+                f"{path}, line {line}, column {name!r}: must be a finite number, got {cell!r:.40}"
+            )
         row.append(value)
     return row

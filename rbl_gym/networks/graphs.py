@@ -37,8 +37,9 @@ class SpanningTree(NamedTuple):
 
 def components(edges: ArrayLike, n_nodes: int) -> IntArray:
     """Label (n,) of the connected component of every node."""
-    return csgraph.connected_components(_adjacency(check_edges(edges, n_nodes), n_nodes),
-                                        directed=False)[1].astype(np.intp)  # fmt: skip
+    return csgraph.connected_components(
+        _adjacency(check_edges(edges, n_nodes), n_nodes), directed=False
+    )[1].astype(np.intp)
 
 
 def check_connected(
@@ -61,8 +62,10 @@ def check_connected(
         names = np.arange(n_nodes) if ids is None else np.asarray(ids)
         named = [_name(names[label == part]) for part in order[:3]]
         more = f" and {len(parts) - 3} more" if len(parts) > 3 else ""
-        raise ValueError(f"edges must connect all {n_nodes} nodes, got {len(parts)} components: "
-                         f"{', '.join(named)}{more}")  # fmt: skip
+        raise ValueError(
+            f"edges must connect all {n_nodes} nodes, got {len(parts)} components: "
+            f"{', '.join(named)}{more}"
+        )
     return edges
 
 
@@ -248,8 +251,9 @@ def _paton_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
 def _walked(walks: list[list[tuple[int, int]]], edges: IntArray) -> sp.csr_matrix:
     """Cycle matrix of closed walks, each a list of (node, row of the edge that leaves it)."""
     rows = [row for row, walk in enumerate(walks) for _ in walk]
-    starts, columns = (np.array([step[k] for walk in walks for step in walk], dtype=np.intp)
-                       for k in (0, 1))  # fmt: skip
+    starts, columns = (
+        np.array([step[k] for walk in walks for step in walk], dtype=np.intp) for k in (0, 1)
+    )
     signs = np.where(edges[columns, 0] == starts, 1.0, -1.0)
     return sp.csr_matrix((signs, (rows, columns)), shape=(len(walks), len(edges)))
 
@@ -288,8 +292,10 @@ def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
                 if other == start and rows and row > rows[0]:
                     walks.append(list(zip(nodes, [*rows, row], strict=True)))
                     if len(walks) > _MOST_CYCLES:
-                        raise ValueError(f"edges must have at most {_MOST_CYCLES:,} cycles to "
-                                         "list all of them, got more")  # fmt: skip
+                        raise ValueError(
+                            f"edges must have at most {_MOST_CYCLES:,} cycles to "
+                            "list all of them, got more"
+                        )
                 elif free >> other & 1 and comes_back(other, start, free ^ 1 << other):
                     free ^= 1 << other
                     nodes.append(other)

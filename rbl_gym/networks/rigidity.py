@@ -75,8 +75,10 @@ def check_orientations(edges: ArrayLike, n_nodes: int, measured: str = "bearings
     check_one_of("measured", measured, ("bearings", "ranges", "both"))
     check_connected(edges, n_nodes)
     if measured == "ranges" and n_nodes > 1:
-        raise ValueError("orientations are not localizable from ranges alone: turning a node "
-                         "changes no range; bearings must be measured, got 'ranges'")  # fmt: skip
+        raise ValueError(
+            "orientations are not localizable from ranges alone: turning a node "
+            "changes no range; bearings must be measured, got 'ranges'"
+        )
 
 
 def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
@@ -119,8 +121,10 @@ def check_frames(positions: ArrayLike, edges: ArrayLike) -> None:
     check_connected(edges, len(check_positions(positions)))
     rank, full = parallel_rigidity_rank(positions, edges)
     if rank < full:
-        raise ValueError(f"edges must make the network parallel rigid, rank {full}, "
-                         f"got rank {rank}: {full - rank} missing")  # fmt: skip
+        raise ValueError(
+            f"edges must make the network parallel rigid, rank {full}, "
+            f"got rank {rank}: {full - rank} missing"
+        )
 
 
 def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> None:
@@ -135,8 +139,10 @@ def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> No
     full = J.shape[1] - 3
     missing = _null_dimension(sp.csr_matrix(J)) - 3
     if missing:
-        raise ValueError(f"edges and ranges must determine all frames, rank {full}, "
-                         f"got rank {full - missing}: {missing} missing")  # fmt: skip
+        raise ValueError(
+            f"edges and ranges must determine all frames, rank {full}, "
+            f"got rank {full - missing}: {missing} missing"
+        )
 
 
 def _null_dimension(R: sp.csr_matrix) -> int:
@@ -149,8 +155,9 @@ def _null_dimension(R: sp.csr_matrix) -> int:
     start = np.random.default_rng(0).standard_normal(size)
     while wanted < size - 1:
         # The shift keeps the matrix definite; Lanczos then finds the smallest first.
-        found = scipy.sparse.linalg.eigsh(gram, k=wanted, sigma=-1e-7, v0=start,
-                                          return_eigenvectors=False)  # fmt: skip
+        found = scipy.sparse.linalg.eigsh(
+            gram, k=wanted, sigma=-1e-7, v0=start, return_eigenvectors=False
+        )
         if (free := int((found < _ZERO).sum())) < wanted:
             return free
         wanted *= 4
@@ -227,8 +234,9 @@ def triangle_rotation(
     normal_j = np.cross(_unit("u_jk", u_jk), other)
     for name, normal in (("u_ik", normal_i), ("u_jk", normal_j)):
         if np.linalg.norm(normal) < 1e-9:
-            raise ValueError(f"{name} must not be parallel to the line of sight, the nodes are "
-                             "collinear")  # fmt: skip
+            raise ValueError(
+                f"{name} must not be parallel to the line of sight, the nodes are collinear"
+            )
     return _triad(axis, normal_i) @ _triad(-other, normal_j).T
 
 

@@ -104,8 +104,10 @@ class PlacementTask:
         if not isinstance(self.scene, Scene):
             raise ValueError(f"scene must be a Scene, got {self.scene!r:.80}")
         for name, least, most in (
-            ("n_anchors", 1, _MOST_PLACES), ("racks", 0, MAX_RACKS), ("n_poses", 1, _MOST_PLACES),
-        ):  # fmt: skip
+            ("n_anchors", 1, _MOST_PLACES),
+            ("racks", 0, MAX_RACKS),
+            ("n_poses", 1, _MOST_PLACES),
+        ):
             value = check_count(name, getattr(self, name), least=least, most=most)
             object.__setattr__(self, name, value)
         if not np.ptp(self.scene.volume.bounds(), axis=0).any():
@@ -285,9 +287,13 @@ def _mean_square(
 ) -> FloatArray:
     """Mean (...) of b^2 over poses (..., P, 3, 3), (..., P, 3) with a share (..., P, M)."""
     told = bounds.information_at(
-        anchors[..., None, :, :], tags[..., None, :, :], rotation, places, ranging.law_of(law),
+        anchors[..., None, :, :],
+        tags[..., None, :, :],
+        rotation,
+        places,
+        ranging.law_of(law),
         share[..., None],
-    )  # fmt: skip
+    )
     return _mean_square_of(told + prior[..., None, :, :], rotation, tags)
 
 

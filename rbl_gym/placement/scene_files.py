@@ -31,8 +31,12 @@ from rbl_gym.worlds.scene import Scene
 __all__ = ["Problem", "free_points", "inside", "load", "of_mapping", "problem", "with_anchors"]
 
 REGIONS = {"room": Walls, "box": Box, "shell": Shell}
-BODIES = {"octahedron": bodies.octahedron, "pyramid": bodies.pyramid, "cube": bodies.cube,
-          "plate": lambda size_m: bodies.plate(size_m, size_m)}  # fmt: skip
+BODIES = {
+    "octahedron": bodies.octahedron,
+    "pyramid": bodies.pyramid,
+    "cube": bodies.cube,
+    "plate": lambda size_m: bodies.plate(size_m, size_m),
+}
 # Fewer anchors never tell a pose; three leave its mirror image in their plane.
 MIN_ANCHORS, MAX_ANCHORS = 3, 64
 # Keys of each table of a file; those of [anchors] and [noise] depend on their kind.
@@ -157,13 +161,17 @@ def of_mapping(
         process=ProcessNoise(),
         dt=1.0,
         initial_rotation_rad=math.radians(
-            check_number("prior.rotation_deg", prior.get("rotation_deg", _PRIOR_ROTATION_DEG),
-                         low=1e-6, high=180.0)
+            check_number(
+                "prior.rotation_deg",
+                prior.get("rotation_deg", _PRIOR_ROTATION_DEG),
+                low=1e-6,
+                high=180.0,
+            )
         ),
         initial_translation_m=check_number(
             "prior.position_m", prior.get("position_m", _PRIOR_POSITION_M), low=1e-6
         ),
-    )  # fmt: skip
+    )
     obstacles = _obstacles(tables.get("obstacles", []))
     return _checked(scene, scene.n_anchors, obstacles, region)
 
@@ -218,9 +226,13 @@ def _checked(
         volume = _named("region", Box, low=low, high=high)
     n_anchors = check_n_anchors(n_anchors)
     scene = dataclasses.replace(
-        scene, volume=volume, n_anchors=n_anchors, anchors=None, start_translation=None,
+        scene,
+        volume=volume,
+        n_anchors=n_anchors,
+        anchors=None,
+        start_translation=None,
         obstacles=boxes,
-    )  # fmt: skip
+    )
     _check_region(scene)
     _check_tags(np.asarray(scene.tags))
     _check_obstacles(scene)

@@ -24,10 +24,12 @@ _ELEVATION, _AZIMUTH = 24.0, -58.0  # where space is seen from, degrees
 # Radius that holds 95 % of a Gaussian in space, in standard deviations (chi-square, 3).
 RADIUS_95 = math.sqrt(7.814727903251179)
 # The twelve edges of a box by its corners (z fastest); its faces, four corners each.
-_BOX_EDGES = np.array([(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4),
-                       (1, 5), (2, 6), (3, 7)])  # fmt: skip
-_BOX_FACES = np.array([(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4),
-                       (1, 3, 7, 5)])  # fmt: skip
+_BOX_EDGES = np.array(
+    [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)]
+)
+_BOX_FACES = np.array(
+    [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
+)
 
 
 class Panel:

@@ -83,9 +83,11 @@ def _frame(
     placed = belief is not None and belief.positions is not None
     _legend(source, placed).paint([], upper)
     strips = panels.strips(
-        steps, (limits_of(bands[0], errors[0]),), ("orientation [deg]",),
+        steps,
+        (limits_of(bands[0], errors[0]),),
+        ("orientation [deg]",),
         ("" if belief is None else "error, RMS over the nodes", rf"3$\sigma$ of the {source}"),
-    )  # fmt: skip
+    )
     strips.paint(epochs, errors, bands, lower)
     return picture
 
@@ -176,8 +178,11 @@ def _legend(source: str, placed: bool) -> Panel:
     if source == "belief":
         handles.append(Line2D([], [], color=BELIEF, lw=2.0, label="believed heading"))
     if placed:
-        handles.append(Line2D([], [], color=BELIEF, lw=1.0, marker="x", ms=6,
-                              label=r"believed place, 3$\sigma$"))  # fmt: skip
+        handles.append(
+            Line2D(
+                [], [], color=BELIEF, lw=1.0, marker="x", ms=6, label=r"believed place, 3$\sigma$"
+            )
+        )
     handles.append(Patch(fc=BELIEF, alpha=0.3, label=rf"$\pm$3$\sigma$ of the {source}"))
     panel.figure.legend(handles=handles, loc="center left", bbox_to_anchor=(0.14, 0.5),
                         fontsize=9, frameon=False, labelspacing=0.9)  # fmt: skip

@@ -147,8 +147,11 @@ class _CloseUp:
 
         handles: list[Any] = [Line2D([], [], color=INK, marker="o", ms=4, lw=1.3, label="true")]
         if source == "belief":
-            handles.append(Line2D([], [], color=BELIEF, marker="o", ms=4, lw=1.3, ls=(0, (4, 2)),
-                                  label="believed"))  # fmt: skip
+            handles.append(
+                Line2D(
+                    [], [], color=BELIEF, marker="o", ms=4, lw=1.3, ls=(0, (4, 2)), label="believed"
+                )
+            )
         if source:
             label = "95 % region" if source == "belief" else "95 % region at the bound"
             handles.append(Patch(fc=BELIEF, alpha=0.3, label=label))
@@ -254,8 +257,9 @@ class _Strips:
         if band:
             handles.append(Patch(fc=BELIEF, alpha=0.3, label=band))
         top = 1 - 2.0 / height
-        panel.figure.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.55, top),
-                            ncols=2, **_LEGEND)  # fmt: skip
+        panel.figure.legend(
+            handles=handles, loc="upper center", bbox_to_anchor=(0.55, top), ncols=2, **_LEGEND
+        )
         panel.freeze()
         self._floor = [low for low, _ in limits]
 

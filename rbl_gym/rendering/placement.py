@@ -68,9 +68,12 @@ def _frame(
     _plan(task).paint(context, anchors, places, errors, upper)
     nothing = np.full(len(counts), np.nan)
     strips = panels.strips(
-        task.n_anchors, (limits_of(nothing, scores),), ("tag error [m]",),
-        ("expected tag error, RMS over the region", ""), "anchors placed",
-    )  # fmt: skip
+        task.n_anchors,
+        (limits_of(nothing, scores),),
+        ("tag error [m]",),
+        ("expected tag error, RMS over the region", ""),
+        "anchors placed",
+    )
     strips.paint(counts, scores[None], nothing[None], lower)
     return picture
 
@@ -119,9 +122,11 @@ class _World:
         handles = [
             Line2D([], [], color=ANCHOR, marker="^", ms=8, ls="", label="anchor"),
             Line2D([], [], color=INK, lw=1.2, ls=(0, (4, 2)), label="work region"),
-            *(Line2D([], [], color=colour, marker="o", ms=4.5, ls="", label=name)
-              for colour, name in zip(_COLOURS, _NAMES, strict=True)),
-        ]  # fmt: skip
+            *(
+                Line2D([], [], color=colour, marker="o", ms=4.5, ls="", label=name)
+                for colour, name in zip(_COLOURS, _NAMES, strict=True)
+            ),
+        ]
         panel.figure.legend(handles=handles, loc="lower center", bbox_to_anchor=(0.5, 0.01),
                             ncols=8, columnspacing=0.9, handletextpad=0.2, fontsize=7.5,
                             frameon=False, borderaxespad=0.0)  # fmt: skip
@@ -129,8 +134,10 @@ class _World:
                           ha="center", color="#495057")  # fmt: skip
         panel.freeze()
         self._view, self._floor = view_of(axes), low[2]
-        self._racks = [panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
-                       for _ in range(6 * _boxes(task))]  # fmt: skip
+        self._racks = [
+            panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
+            for _ in range(6 * _boxes(task))
+        ]
         self._stems = panel.line(color="#b4bac0", lw=0.8, ls=(0, (2, 2)))
         self._region = panel.line(color=INK, lw=1.1, ls=(0, (4, 2)))
         self._points = _Points(panel)
@@ -154,8 +161,11 @@ class _World:
         self._region.set_data(*gapped(view(box_edges(low, high))).T)
         self._points.set(view(places), errors)
         self._anchors.set_data(*view(anchors).T)
-        faces = [face for box in context.racks
-                 for face in view(box_faces(box[:3] - box[3:], box[:3] + box[3:]))]  # fmt: skip
+        faces = [
+            face
+            for box in context.racks
+            for face in view(box_faces(box[:3] - box[3:], box[:3] + box[3:]))
+        ]
         for patch, face in zip(self._racks, faces, strict=False):
             patch.set_xy(face)
         artists = [*self._racks[: len(faces)], self._stems, self._region, *self._points.lines]
@@ -180,8 +190,10 @@ class _Plan:
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3, lw=0.5)
         panel.freeze()
-        self._racks = [panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)
-                       for _ in range(_boxes(task))]  # fmt: skip
+        self._racks = [
+            panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)
+            for _ in range(_boxes(task))
+        ]
         self._region = panel.line(axes, color=INK, lw=1.1, ls=(0, (4, 2)))
         self._points = _Points(panel, axes)
         style = {"ls": "", "mec": "white", "mew": 0.8}
