@@ -153,7 +153,7 @@ FAULTS = {
 def test_a_constant_fault_is_hinted(name, step_s):
     truth, words = FAULTS[name]
     stride = round(step_s / 0.05)
-    result = outcome(Truth(*(a[::stride] for a in truth)))
+    result = outcome(Truth(*(a[::stride] for a in truth[:3])))
     assert len(result["notes"]) == 1, result["notes"]
     assert re.search(words, result["notes"][0]), result["notes"]
 

@@ -15,7 +15,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
 from rbl_gym.studies.papers.camsap2013 import Example
-from rbl_gym.studies.replay import Replayed
+from rbl_gym.studies.replay import Replayed, truth_path
 
 COLOURS = {
     "KF": "#d1495b",
@@ -277,10 +277,8 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     axes.plot(*recording.last_anchors[:, :2].T, "k^", ms=7, label="anchors")
     for place, name in zip(recording.last_anchors, recording.anchor_ids, strict=True):
         axes.annotate(name, place[:2], xytext=(4, 4), textcoords="offset points", fontsize=8)
-    if recording.truth is not None and found is not None:
-        when = recording.truth.times
-        during = (when >= track.times[0]) & (when <= track.times[-1])
-        true = recording.truth.translation[during]
+    if found is not None:
+        true = truth_path(recording, track, replayed.settings)
         axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label="truth")
     axes.plot(*track.translation[:, :2].T, color=COLOURS["iterated EKF"], lw=0.8, label="estimate")
     axes.set_aspect("equal", adjustable="box")  # datalim cuts off the label
@@ -289,9 +287,11 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     axes.legend(frameon=False, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
     if found is None:
         return figure
-    curves = (("position error [m]", found.position), ("yaw error [deg]", np.rad2deg(found.yaw)))
+    curves = [("position error [m]", found.position)]
+    if found.yaw is not None:
+        curves.append(("yaw error [deg]", np.rad2deg(found.yaw)))
     for row, (label, values) in enumerate(curves):
-        axes = figure.add_subplot(grid[row, 1])
+        axes = figure.add_subplot(grid[row if len(curves) > 1 else slice(None), 1])
         axes.plot(track.times[found.known], values[found.known], color=COLOURS["UC-KF"], lw=0.7)
         axes.set_ylabel(label)
         axes.set_xlabel("time [s]")

@@ -119,6 +119,27 @@ def _add_biases(group: Any) -> None:
 def _add_comparison(group: Any) -> None:
     _add_number(group, "--yaw-offset-deg", "yaw error = estimate - (truth + offset)")
     _add_number(group, "--truth-gap-s", "longest gap bridged between truth and ranges, default 0.5")
+    group.add_argument(
+        "--truth-exclude",
+        type=_window,
+        action="append",
+        metavar="START:END",
+        help="seconds (of the ranges' clock) in which the truth is wrong: not judged; may be "
+        "given more than once",
+    )
+    group.add_argument(
+        "--time-offset",
+        type=_offset,
+        metavar="S",
+        help="how far the truth's clock is ahead of that of the ranges, seconds; auto: found by "
+        "the motion",
+    )
+    group.add_argument(
+        "--align",
+        choices=("none", "position", "yaw", "se3"),
+        help="estimate the truth's world frame from the matched positions, as evo does; default "
+        "none",
+    )
 
 
 def _add_output(group: Any) -> None:
@@ -178,6 +199,21 @@ def _settings(options: argparse.Namespace) -> Any:
     if biases and name != "iekf-bias":
         raise ValueError(f"{name} knows no biases: --raw and --bias-... are of iekf-bias")
     return replay.Settings.of(**{**given, **biases, "filter": name})
+
+
+def _window(text: str) -> tuple[float, float]:
+    start, _, end = text.partition(":")
+    try:
+        return float(start), float(end)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be START:END in seconds, got {text!r}") from None
+
+
+def _offset(text: str) -> float | str:
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be seconds or auto, got {text!r}") from None
 
 
 def _volume(text: str) -> tuple[float | None, ...]:

@@ -93,29 +93,59 @@ def print_slides2013(result: dict[str, Any]) -> None:
 def print_replay(result: dict[str, Any]) -> None:
     """The figures of a recording, one a line."""
     console = new_console()
+    speed = ""
+    if "microseconds_per_epoch" in result:
+        speed = f", {result['microseconds_per_epoch']:.0f} us an epoch"
     console.print(
         f"{result['epochs']} epochs, {result['links']} ranges in {result['duration_s']:.1f} s, "
-        f"filter {result['settings']['filter']}"
+        f"filter {result['settings']['filter']}{speed}"
     )
     if "epochs_with_truth" not in result:
         console.print("no truth, no errors")
         _print_notes(console, result)
         return
-    console.print(f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth")
+    console.print(compared(result))
     table = new_table()
     for heading in ("error", "RMSE", "median", "p95"):
         table.add_column(heading, justify="left" if heading == "error" else "right")
     axes = result["position_axes"]
     for name, unit, places in (("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2)):
+        if f"{name}_rmse_{unit}" not in result:
+            continue
         label = f"position {axes} (m)" if name == "position" else f"{name} ({unit})"
         values = [result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")]
         table.add_row(label, *(f"{value:.{places}f}" for value in values))
     console.print(table)
+    mean = f"mean yaw error {result['yaw_mean_deg']:.2f} deg, " if "yaw_mean_deg" in result else ""
     console.print(
-        f"mean yaw error {result['yaw_mean_deg']:.2f} deg, NEES per degree of freedom "
-        f"{result['anees']:.2f} (1: honest; above: overconfident)"
+        f"{mean}NEES per degree of freedom {result['anees']:.2f} (1: honest; above: overconfident)"
     )
     _print_notes(console, result)
+
+
+def compared(result: dict[str, Any]) -> str:
+    """How the track of a recording was brought together with its truth, in words."""
+    parts = [
+        f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth "
+        f"({result['truth_format']})"
+    ]
+    if "epochs_excluded" in result:
+        parts.append(f"{result['epochs_excluded']} more are left out (--truth-exclude)")
+    if "time_offset" in result:
+        found = result["time_offset"]
+        parts.append(
+            f"the truth's clock is ahead by {found['offset_s']:.4f} s +- {found['std_s']:.4f} s by "
+            f"the motion (correlation {found['correlation']:.2f})"
+        )
+    elif result["settings"]["time_offset"]:
+        parts.append(f"the truth's clock is ahead by {result['settings']['time_offset']:.10g} s")
+    if "alignment" in result:
+        found = result["alignment"]
+        parts.append(
+            f"the truth is aligned ({found['mode']}): turned by {found['turn_deg']:.2f} deg, its "
+            f"centre moved by {found['shift_m']:.3f} m"
+        )
+    return "; ".join(parts)
 
 
 def _print_notes(console: Any, result: dict[str, Any]) -> None:

@@ -12,8 +12,6 @@ from rbl_gym.estimators import PoseBelief
 from rbl_gym.rendering.drawing import RADIUS_95, round_number
 from rbl_gym.studies.epochs import AxisErrors, axis_errors, nees_interval
 
-FREEDOM = {"xy": 3, "xyz": 6}
-
 
 class Beliefs(NamedTuple):
     """Of K epochs: rotation (K, 3, 3), translation (K, 3), covariance (K, 6, 6); and a colour."""
@@ -36,7 +34,8 @@ class Story(NamedTuple):
     tags
         (N, 3) in the body frame.
     truth
-        Rotation (K, 3, 3) and translation (K, 3), and where they are known (K,); None: nowhere.
+        Rotation (K, 3, 3), or None for positions alone, and translation (K, 3), and where they are
+        known (K,); None: nowhere.
     beliefs
         By the filters' names.
     axes
@@ -47,9 +46,15 @@ class Story(NamedTuple):
     anchors: FloatArray
     names: Sequence[str]
     tags: FloatArray
-    truth: tuple[FloatArray, FloatArray, BoolArray] | None
+    truth: tuple[FloatArray | None, FloatArray, BoolArray] | None
     beliefs: dict[str, Beliefs]
     axes: str = "xyz"
+
+
+def freedom_of(story: Story) -> int:
+    """How many components of the pose are judged."""
+    places, turns = len(story.axes), 1 if story.axes == "xy" else 3
+    return places if story.truth is not None and story.truth[0] is None else places + turns
 
 
 def errors_of(story: Story, belief: Beliefs) -> AxisErrors:
@@ -71,7 +76,7 @@ def chart_limits(story: Story) -> list[tuple[float, float]]:
         values = [np.maximum(np.nan_to_num(size), 3 * std) for size, std in pair]
         limits.append((0.0, 1.15 * float(np.quantile(np.concatenate(values), 0.98))))
     nees = np.concatenate([errors.nees[np.isfinite(errors.nees)] for errors in found])
-    freedom = FREEDOM[story.axes]
+    freedom = freedom_of(story)
     low, high = nees_interval(dof=freedom)
     low, high = min(low, np.quantile(nees, 0.01)), max(high, np.quantile(nees, 0.995))
     return [*limits, (0.7 * max(float(low), 1e-3), 1.5 * float(high))]

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from rbl_gym.app import page, solids
-from rbl_gym.app.story import FREEDOM, Story, chart_limits, enlargement, errors_of
+from rbl_gym.app.story import Story, chart_limits, enlargement, errors_of, freedom_of
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.rendering.drawing import (
@@ -32,10 +32,13 @@ def track_figure(story: Story) -> go.Figure:
     wide = {"type": "scene", "colspan": 3}
     specs: list[Any] = [[wide, None, None, wide, None, None]]
     judged = "yaw" if story.axes == "xy" else "rotation"
+    turn = f"{judged} error (deg)"
+    if story.truth is not None and story.truth[0] is None:
+        turn = f"{judged} (deg): no truth"
     titles = ["in space", _close_title(story)]
     if rows == 2:
         specs.append([{"colspan": 2}, None] * 3)
-        titles += [f"position error {story.axes} (m)", f"{judged} error (deg)", "NEES"]
+        titles += [f"position error {story.axes} (m)", turn, "NEES"]
     shown: Any = make_subplots(
         rows,
         6,
@@ -150,7 +153,7 @@ def _add_still(shown: go.Figure, story: Story) -> None:
 def _add_curves(shown: go.Figure, story: Story) -> None:
     points = _thinned(len(story.times), _POINTS)
     times = solids.numbers(story.times[points], 6)
-    freedom = FREEDOM[story.axes]
+    freedom = freedom_of(story)
     low, high = nees_interval(dof=freedom)
     for name, belief in story.beliefs.items():
         found = errors_of(story, belief)
@@ -224,7 +227,8 @@ def _moving(
     rotation, place = first.rotation[k], first.translation[k]
     if known:
         assert story.truth is not None
-        rotation, place = story.truth[0][k], story.truth[1][k]
+        place = story.truth[1][k]
+        rotation = rotation if story.truth[0] is None else story.truth[0][k]
     body = story.tags @ rotation.T
     traces: list[tuple[Any, tuple[int, int]]] = [
         (

@@ -10,7 +10,7 @@ from plotly.subplots import make_subplots
 
 from rbl_gym.app import page, track_html
 from rbl_gym.app.figures import COLOURS
-from rbl_gym.app.reports import CAMSAP_COLUMNS
+from rbl_gym.app.reports import CAMSAP_COLUMNS, compared
 from rbl_gym.app.story import Beliefs, Story
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
@@ -143,16 +143,15 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
     origin = origin_of(recording)
     places = track.translation - origin
     beliefs = Beliefs(track.rotation, places, track.covariance, COLOURS["iterated EKF"])
-    if truth is not None:
-        truth = truth[0], truth[1] - origin, truth[2]
+    shown = None if truth is None else (truth.rotation, truth.translation - origin, truth.known)
     story = Story(
         times,
         recording.last_anchors - origin,
         recording.anchor_ids,
         recording.tags,
-        truth,
+        shown,
         {settings.filter: beliefs},
-        "xy" if settings.knowledge.planar else "xyz",
+        "xy" if (settings.knowledge.planar if truth is None else truth.planar) else "xyz",
     )
     parts = [*map(page.note, result["notes"]), page.note(_LEGEND)]
     if origin.any():
@@ -166,16 +165,19 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
                 *(result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")),
             ]
             for name, unit in (("position", "m"), ("yaw", "deg"), ("rotation", "deg"))
+            if f"{name}_rmse_{unit}" in result
         ]
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
         parts.append(
             page.note(
-                f"NEES per degree of freedom {result['anees']:.2f} (1: honest); "
-                f"{result['epochs_with_truth']} epochs have truth."
+                f"NEES per degree of freedom {result['anees']:.2f} (1: honest); {compared(result)}."
             )
         )
     parts.append(track_html.anchors_table(story))
-    used = [[name.replace("_", " "), value] for name, value in result["settings"].items()]
+    used = [
+        [name.replace("_", " "), str(value) if isinstance(value, tuple) else value]
+        for name, value in result["settings"].items()
+    ]
     parts.append(page.table("settings", ["setting", "value"], used))
     title = f"{result['epochs']} epochs, {result['links']} ranges, filter {settings.filter}"
     return page.document(f"A recording replayed: {title}", parts)

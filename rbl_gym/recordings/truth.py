@@ -22,13 +22,15 @@ class Truth(NamedTuple):
     """Reference poses of the body, ``p_world = rotation @ p_body + translation``."""
 
     times: FloatArray  # (L,) seconds, strictly increasing
-    rotation: FloatArray  # (L, 3, 3)
+    rotation: FloatArray | None  # (L, 3, 3); None: positions alone
     translation: FloatArray  # (L, 3) metres
+    planar: bool = False  # height, roll and pitch are not known: 0 where they stand
+    form: str = "poses"  # how the file had it, in words
 
 
 def truth_at(
     truth: Truth, times: ArrayLike, max_gap_s: float = 0.5
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[FloatArray | None, FloatArray, BoolArray]:
     """Truth at other times: linear in position, along the geodesic in rotation.
 
     Parameters
@@ -41,7 +43,8 @@ def truth_at(
     Returns
     -------
     rotation, translation
-        (..., K, 3, 3) and (..., K, 3) metres; finite but meaningless where not `valid`.
+        (..., K, 3, 3) and (..., K, 3) metres; finite but meaningless where not `valid`. The
+        rotation is None where the truth has none.
     valid
         (..., K) False outside the truth's time span and inside a gap longer than `max_gap_s`.
 
@@ -56,9 +59,16 @@ def truth_at(
     left = np.clip(np.searchsorted(truth.times, times, side="right") - 1, 0, last)
     right = np.minimum(left + 1, last)
     elapsed, gap = times - truth.times[left], truth.times[right] - truth.times[left]
-    path = motion.interpolate(*truth, times)
+    turned = truth.rotation
+    still = np.broadcast_to(np.eye(3), (len(truth.times), 3, 3))
+    known = still if turned is None else turned
+    path = motion.interpolate(truth.times, known, truth.translation, times)
     inside = (times >= truth.times[0]) & (times <= truth.times[-1])
-    return path.rotation, path.translation, inside & ((gap <= max_gap_s) | (elapsed == 0))
+    return (
+        None if turned is None else path.rotation,
+        path.translation,
+        inside & ((gap <= max_gap_s) | (elapsed == 0)),
+    )
 
 
 def read_truth(

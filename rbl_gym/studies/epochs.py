@@ -259,7 +259,7 @@ class AxisErrors(NamedTuple):
 
 def axis_errors(
     belief: PoseBelief,
-    rotation: FloatArray,
+    rotation: FloatArray | None,
     translation: FloatArray,
     known: BoolArray | None = None,
     planar: bool = False,
@@ -271,18 +271,21 @@ def axis_errors(
     belief
         Arrays (K, ...).
     rotation, translation
-        The truth (K, 3, 3), (K, 3).
+        The truth (K, 3, 3), (K, 3); rotation None: positions alone are judged.
     known
         Epochs (K,) that have truth; None: all.
     planar
         Judge yaw and the position in x and y only.
     """
     turn, move = ([2], [3, 4]) if planar else ([0, 1, 2], [3, 4, 5])
-    axes = turn + move
-    error = metrics.pose_error(belief.rotation, belief.translation, rotation, translation)
+    axes = move if rotation is None else turn + move
+    expected = belief.rotation if rotation is None else rotation
+    error = metrics.pose_error(belief.rotation, belief.translation, expected, translation)
     nees = metrics.nees(error[:, axes], belief.covariance[:, axes][:, :, axes])
     missing = np.zeros(len(error), dtype=np.bool_) if known is None else ~known
     error[missing] = nees[missing] = np.nan
+    if rotation is None:
+        error[:, :3] = np.nan
     std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
     return AxisErrors(
         np.linalg.norm(error[:, move], axis=-1),

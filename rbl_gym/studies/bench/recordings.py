@@ -113,6 +113,8 @@ def recording_errors(log: Log, track: replay.Track) -> figures.BenchErrors:
     """Errors where truth is known, its epochs cut into `SEGMENTS` stretches."""
     found = replay.track_errors(log.recording, track, log.settings)
     assert found is not None
+    if found.rotation is None or found.tags is None:
+        raise ValueError("a recording of the benchmark needs truth with rotations")
     known = np.flatnonzero(found.known)
     count = min(SEGMENTS, len(known))
     length = len(known) // count
@@ -125,5 +127,5 @@ def recording_errors(log: Log, track: replay.Track) -> figures.BenchErrors:
         np.rad2deg(cut(found.rotation)),
         cut(found.tags),
         cut(found.nees),
-        3 if log.settings.knowledge.planar else 6,
+        found.freedom,
     )

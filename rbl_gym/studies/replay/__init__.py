@@ -1,6 +1,14 @@
 """A recording through a filter: the track, its mirror image, errors against the truth, hints."""
 
-from rbl_gym.studies.replay.figures import TrackErrors, track_errors, track_figures, truth_of
+from rbl_gym.studies.replay.figures import track_figures
+from rbl_gym.studies.replay.judging import (
+    Reference,
+    TrackErrors,
+    find_offset,
+    track_errors,
+    truth_of,
+    truth_path,
+)
 from rbl_gym.studies.replay.mirror import Mirror, covering, other_pose
 from rbl_gym.studies.replay.place import height_offset, origin_of, volume_of
 from rbl_gym.studies.replay.settings import (
@@ -31,6 +39,7 @@ __all__ = [
     "Loss",
     "Mirror",
     "Motion",
+    "Reference",
     "Replayed",
     "Settings",
     "Track",
@@ -38,6 +47,7 @@ __all__ = [
     "check_overlap",
     "check_replay",
     "covering",
+    "find_offset",
     "height_offset",
     "named_filter",
     "origin_of",
@@ -50,5 +60,6 @@ __all__ = [
     "track_figures",
     "track_recording",
     "truth_of",
+    "truth_path",
     "volume_of",
 ]

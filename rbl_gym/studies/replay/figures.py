@@ -2,102 +2,32 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from rbl_gym import metrics
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
+from rbl_gym.recordings import apply_alignment
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.judging import (
+    TrackErrors,
+    as_judged,
+    excluded_epochs,
+    in_clock,
+    track_errors,
+    truth_of,
+)
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
 from rbl_gym.studies.replay.place import volume_of
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track, range_std_of
-from rbl_gym.studies.replay.truth import (
-    Judged,
-    check_overlap,
-    fault_hints,
-    judged_of,
-    matched,
-    stamp_hints,
-)
+from rbl_gym.studies.replay.truth import Judged, fault_hints, judged_of, matched, stamp_hints
 
-__all__ = [
-    "TrackErrors",
-    "track_errors",
-    "track_figures",
-    "truth_of",
-]
+__all__ = ["track_figures"]
 
 # The mirror pose is the one meant where its mean square error is below this share of the track's.
 _NEARER = 0.25
-
-
-class TrackErrors(NamedTuple):
-    """Errors where truth exists: mask (K,), distance (m), yaw (rad), rotation angle (rad), NEES.
-
-    `tags`: root mean square over the tags (m).
-    """
-
-    known: np.ndarray
-    position: FloatArray
-    yaw: FloatArray
-    rotation: FloatArray
-    nees: FloatArray
-    tags: FloatArray
-
-
-def truth_of(
-    recording: Recording, track: Track, settings: Settings
-) -> tuple[FloatArray, FloatArray, np.ndarray] | None:
-    """What the estimates are judged by: rotation (K, 3, 3), translation (K, 3), known (K,).
-
-    The recording's truth (`truth.matched`), turned by the offset; planar: its heading alone.
-    """
-    if recording.truth is None:
-        return None
-    gap_s = settings.comparison.truth_gap_s
-    check_overlap(recording.truth, track.times, gap_s)
-    rotation, translation, known = matched(recording.truth, *track[:3], gap_s)
-    return _as_judged(rotation, settings), translation, known
-
-
-def _as_judged(rotation: FloatArray, settings: Settings) -> FloatArray:
-    """Rotations (K, 3, 3) of the truth, turned by the offset; planar: their headings."""
-    offset = rotations.exp([0.0, 0.0, math.radians(settings.comparison.yaw_offset_deg)])
-    if settings.knowledge.planar:
-        heading = np.zeros((len(rotation), 3))
-        heading[:, 2] = rotations.yaw(rotation)
-        rotation = rotations.exp(heading)
-    return offset @ rotation
-
-
-def track_errors(recording: Recording, track: Track, settings: Settings) -> TrackErrors | None:
-    """Errors against the recording's truth, interpolated; None without truth.
-
-    Planar: position in x and y, NEES of (yaw, x, y); the truth's roll and pitch are not read.
-    """
-    truth = truth_of(recording, track, settings)
-    if truth is None:
-        return None
-    expected, translation, known = truth
-    error = metrics.pose_error(track.rotation, track.translation, expected, translation)
-    axes = [2, 3, 4] if settings.knowledge.planar else list(range(6))
-    block = track.covariance[:, axes][:, :, axes]
-    turn = rotations.yaw(track.rotation) - rotations.yaw(expected)
-    place = translation.copy()
-    if settings.knowledge.planar:
-        place[:, 2] = track.translation[:, 2]
-    return TrackErrors(
-        known,
-        np.linalg.norm(error[:, 3 : 5 if settings.knowledge.planar else 6], axis=-1),
-        (turn + np.pi) % (2 * np.pi) - np.pi,
-        np.linalg.norm(error[:, :3], axis=-1),
-        metrics.nees(error[:, axes], block),
-        metrics.tag_error(track.rotation, track.translation, expected, place, recording.tags),
-    )
 
 
 def track_figures(
@@ -126,19 +56,43 @@ def track_figures(
         return result
     known = found.known
     result["epochs_with_truth"] = int(known.sum())
-    result["position_axes"] = "xy" if settings.knowledge.planar else "xyz"
-    yaw = np.rad2deg(found.yaw[known])
-    rotation = np.rad2deg(found.rotation[known])
+    result |= _comparison(recording, track, settings)
     for name, values in (
-        ("position_{}_m", found.position[known]),
-        ("yaw_{}_deg", yaw),
-        ("rotation_{}_deg", rotation),
+        ("position_{}_m", found.position),
+        ("yaw_{}_deg", found.yaw),
+        ("rotation_{}_deg", found.rotation),
     ):
+        if values is None:
+            continue
+        values = values[known] if name.endswith("m") else np.rad2deg(values[known])
         result[name.format("rmse")] = float(np.sqrt(np.mean(values**2)))
         result[name.format("median")] = float(np.median(np.abs(values)))
         result[name.format("p95")] = float(np.quantile(np.abs(values), 0.95))
-    result["yaw_mean_deg"] = float(yaw.mean())
-    result["anees"] = float(found.nees[known].mean() / (3 if settings.knowledge.planar else 6))
+    if found.yaw is not None:
+        result["yaw_mean_deg"] = float(np.rad2deg(found.yaw[known]).mean())
+    result["anees"] = float(found.nees[known].mean() / found.freedom)
+    return result
+
+
+def _comparison(recording: Recording, track: Track, settings: Settings) -> dict[str, Any]:
+    """How track and truth were brought together."""
+    truth = truth_of(recording, track, settings)
+    assert truth is not None
+    assert recording.truth is not None
+    result: dict[str, Any] = {
+        "position_axes": "xy" if truth.planar else "xyz",
+        "truth_format": recording.truth.form,
+    }
+    if settings.comparison.truth_exclude:
+        result["epochs_excluded"] = truth.excluded
+    if settings.comparison.align != "none":
+        result["alignment"] = {
+            "mode": settings.comparison.align,
+            "rotation_vector_deg": np.rad2deg(rotations.log(truth.alignment.rotation)).tolist(),
+            "translation_m": truth.alignment.translation.tolist(),
+            "turn_deg": float(np.rad2deg(truth.alignment.turn_rad)),
+            "shift_m": truth.alignment.shift_m,
+        }
     return result
 
 
@@ -147,7 +101,7 @@ def _notes(
 ) -> dict[str, Any]:
     """The mirror pose, and what a reader is to be warned of, a sentence each."""
     result: dict[str, Any] = {}
-    notes = [f"Note: {hint}." for hint in stamp_hints(track.times, recording.truth)]
+    notes = [f"Note: {hint}." for hint in _stamp_hints(recording, track, settings)]
     count = len(track.times)
     if track.other is not None and np.isfinite(track.other.log_odds[-1]):
         alive = track.other.alive
@@ -172,6 +126,12 @@ def _notes(
     return {**result, "notes": notes}
 
 
+def _stamp_hints(recording: Recording, track: Track, settings: Settings) -> list[str]:
+    # A clock that was brought to the other's has the right unit.
+    truth = None if settings.comparison.time_offset else recording.truth
+    return [*stamp_hints(track.times, truth)]
+
+
 def _nearer(recording: Recording, track: Track, found: TrackErrors, settings: Settings) -> Track:
     """The track, or that of the mirror pose where both are alive and the truth is at that one."""
     if track.other is None:
@@ -194,14 +154,20 @@ def _mirror_note(found: dict[str, Any], count: int) -> str:
 
 
 def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list[str]:
-    truth = recording.truth
-    assert truth is not None
+    reference = truth_of(recording, track, settings)
+    assert reference is not None
+    assert recording.truth is not None
+    truth = in_clock(recording.truth, settings)
+    aligned = truth._replace(
+        translation=apply_alignment(reference.alignment, None, truth.translation)[1]
+    )
 
     def at(late_s: float) -> Judged:
-        moved = truth._replace(times=truth.times - late_s)
+        moved = aligned._replace(times=truth.times - late_s)
         there = matched(moved, *track[:3], settings.comparison.truth_gap_s)
-        return judged_of(there, track, settings.knowledge.planar)
+        return judged_of(there, track, reference.planar, ~excluded_epochs(track.times, settings))
 
-    return fault_hints(
-        at, lambda rotation: _as_judged(rotation, settings), settings.knowledge.planar
-    )
+    def seen(rotation: FloatArray) -> FloatArray:
+        return reference.alignment.rotation @ as_judged(rotation, settings, reference.planar)
+
+    return fault_hints(at, seen, reference.planar)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from rbl_gym.checks import check_number
+from rbl_gym.checks import check_number, check_one_of
 from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.recordings.align import ALIGNMENTS
 
 __all__ = [
     "DEFAULT_RANGE_STD_M",
@@ -115,14 +116,31 @@ class Comparison:
         estimate - (truth + offset).
     truth_gap_s
         Longest gap, of the truth or of the ranges, that is bridged to compare the two.
+    truth_exclude
+        Windows of time, in seconds of the ranges' clock, in which the truth is known to be wrong:
+        pairs of start and end. Their epochs are not judged.
+    time_offset
+        How far the truth's clock is ahead of that of the ranges, seconds; ``"auto"``: found by
+        the motion (`rbl_gym.recordings.motion_offset`).
+    align
+        What of the truth's world frame is estimated from the matched positions
+        (`rbl_gym.recordings.align_positions`): ``"none"``, ``"position"``, ``"yaw"``, ``"se3"``.
     """
 
     yaw_offset_deg: float = 0.0
     truth_gap_s: float = 0.5
+    truth_exclude: tuple[tuple[float, float], ...] = ()
+    time_offset: float | str = 0.0
+    align: str = "none"
 
     def __post_init__(self) -> None:
         check_number("yaw_offset_deg", self.yaw_offset_deg)
         check_number("truth_gap_s", self.truth_gap_s, low=0.0)
+        if self.time_offset != "auto":
+            check_number("time_offset", self.time_offset)
+        check_one_of("align", self.align, ALIGNMENTS)
+        if self.truth_exclude:
+            object.__setattr__(self, "truth_exclude", _windows(self.truth_exclude))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,3 +223,15 @@ def _six_limits(volume: Any) -> tuple[float | None, ...]:
         if low is not None and high is not None and low >= high:
             raise ValueError(f"volume must have {axis}min below {axis}max, got {low:g}, {high:g}")
     return limits
+
+
+def _windows(given: Any) -> tuple[tuple[float, float], ...]:
+    try:
+        windows = tuple((float(start), float(end)) for start, end in given)
+    except (TypeError, ValueError):
+        windows = ((1.0, 0.0),)
+    if not all(start < end for start, end in windows):
+        raise ValueError(
+            f"truth_exclude must be pairs of start and end in seconds, got {given!r:.80}"
+        )
+    return windows

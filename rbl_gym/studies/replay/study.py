@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from rbl_gym.recordings import TimeOffset
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.replay.figures import TrackErrors, track_errors, track_figures
+from rbl_gym.studies.replay.figures import track_figures
+from rbl_gym.studies.replay.judging import (
+    TrackErrors,
+    find_offset,
+    in_clock,
+    track_errors,
+    with_offset,
+)
 from rbl_gym.studies.replay.place import height_offset
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track, recording_filter, track_recording
@@ -48,8 +59,10 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
     offset = height_offset(recording, settings)
     settings = settings.changed(height_offset_m=offset)
     recording_filter(recording, settings)
-    if recording.truth is not None:
-        check_overlap(recording.truth, recording.times, settings.comparison.truth_gap_s)
+    comparison = settings.comparison
+    if recording.truth is not None and comparison.time_offset != "auto":
+        truth = in_clock(recording.truth, settings)
+        check_overlap(truth, recording.times, comparison.truth_gap_s)
     return settings
 
 
@@ -73,6 +86,34 @@ def replay_recording(
         As `check_replay`.
     """
     settings = check_replay(recording, settings)
-    track = track_recording(recording, settings, advance)
+    clock = _Stopwatch(advance)
+    track = track_recording(recording, settings, clock.tick)
+    offset: TimeOffset | None = None
+    if settings.comparison.time_offset == "auto":
+        offset = find_offset(recording, track, settings)
+        settings = with_offset(settings, offset)
     errors = track_errors(recording, track, settings)
-    return Replayed(settings, track, errors, track_figures(recording, track, errors, settings))
+    figures = track_figures(recording, track, errors, settings)
+    figures["microseconds_per_epoch"] = clock.microseconds()
+    if offset is not None:
+        figures["time_offset"] = offset._asdict()
+    return Replayed(settings, track, errors, figures)
+
+
+class _Stopwatch:
+    """Processor time from one epoch to the next, without what `advance` takes."""
+
+    def __init__(self, advance: Callable[[], None]) -> None:
+        self._advance = advance
+        self._spent: list[float] = []
+        self._start = time.process_time()
+
+    def tick(self) -> None:
+        """An epoch is done."""
+        self._spent.append(time.process_time() - self._start)
+        self._advance()
+        self._start = time.process_time()
+
+    def microseconds(self) -> float:
+        """The median: the first epochs may have compiled what they run."""
+        return 1e6 * float(np.median(self._spent))

@@ -30,15 +30,17 @@ _SI = ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds"))
 
 def matched(
     truth: Truth, times: FloatArray, rotation: FloatArray, translation: FloatArray, gap_s: float
-) -> tuple[FloatArray, FloatArray, BoolArray]:
+) -> tuple[FloatArray | None, FloatArray, BoolArray]:
     """The truth at the epochs of a track: rotation (K, 3, 3), translation (K, 3), known (K,).
 
-    Between two of its poses it is interpolated where they are at most `gap_s` apart. A pose of the
-    truth without such a neighbour is compared with the track at its own time: it counts for the
-    epoch that is nearest, moved there as the track moves.
+    The rotation is None where the truth has none. Between two of its poses it is interpolated where
+    they are at most `gap_s` apart. A pose of the truth without such a neighbour is compared with
+    the track at its own time: it counts for the epoch that is nearest, moved there as the track
+    moves.
     """
     turned, moved, known = recordings.truth_at(truth, times, gap_s)
-    turned, moved, known = turned.copy(), moved.copy(), known.copy()
+    turned = None if turned is None else turned.copy()
+    moved, known = moved.copy(), known.copy()
     alone = np.diff(truth.times, prepend=-np.inf, append=np.inf) > gap_s
     at = np.flatnonzero(alone[:-1] & alone[1:])
     after = np.clip(np.searchsorted(times, truth.times[at]), 0, len(times) - 1)
@@ -54,8 +56,9 @@ def matched(
     later = times[after] - truth.times[at] <= truth.times[at] - times[before]
     epoch = np.where(later, after, before)
     path = motion.interpolate(times, rotation, translation, truth.times[at])
-    onward = rotation[epoch] @ np.swapaxes(path.rotation, -1, -2)
-    turned[epoch] = onward @ truth.rotation[at]
+    if turned is not None and truth.rotation is not None:
+        onward = rotation[epoch] @ np.swapaxes(path.rotation, -1, -2)
+        turned[epoch] = onward @ truth.rotation[at]
     moved[epoch] = truth.translation[at] + translation[epoch] - path.translation
     known[epoch] = True
     return turned, moved, known
@@ -77,7 +80,10 @@ def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
             shift
         ):
             side = "ahead" if shift > 0 else "behind"
-            hints = f"; the truth's clock may be {side} by about {abs(shift):.10g} s"
+            hints = (
+                f"; the truth's clock may be {side} by about {abs(shift):.10g} s: "
+                f"see --time-offset ({shift:.10g}, or auto)"
+            )
         raise ValueError(
             f"no epoch has truth: the truth shares no time with the ranges: {where}, "
             f"{apart:.4g} s apart{hints}"
@@ -111,6 +117,7 @@ class Judged(NamedTuple):
     """Estimates and truth (L, ...) at the epochs that have truth, and the beliefs' variances.
 
     `turn_variance`, `place_variance` (L,): traces of the rotation's and of the place's covariance.
+    Without `has_rotation`, the true rotations are those of the estimates and mean nothing.
     """
 
     times: FloatArray
@@ -120,9 +127,13 @@ class Judged(NamedTuple):
     true_translation: FloatArray
     turn_variance: FloatArray
     place_variance: FloatArray
+    has_rotation: bool = True
 
     def excess(self) -> float:
         """Mean squared errors over what the beliefs expect of them: 1 where they are honest."""
+        if not self.has_rotation:
+            place = ((self.translation - self.true_translation) ** 2).sum(axis=-1)
+            return float((place / self.place_variance).mean())
         turn = rotations.error(self.rotation, self.true_rotation)
         place = self.translation - self.true_translation
         turn, place = ((a**2).sum(axis=-1) for a in (turn, place))
@@ -133,7 +144,7 @@ class Judged(NamedTuple):
         turn = rotations.error(self.rotation, self.true_rotation)
         place = self.translation - self.true_translation
         turn_deg, place_m = (np.sqrt((a**2).sum(-1).mean()) for a in (np.rad2deg(turn), place))
-        return f"{place_m:.3g} m and {turn_deg:.3g} deg"
+        return f"{place_m:.3g} m" + (f" and {turn_deg:.3g} deg" if self.has_rotation else "")
 
 
 def fault_hints(
@@ -156,6 +167,8 @@ def fault_hints(
     """
 
     def mended(judged: Judged) -> Judged:
+        if not judged.has_rotation:
+            return judged
         return judged._replace(true_rotation=seen(judged.true_rotation))
 
     as_read = at(0.0)
@@ -201,15 +214,22 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
     Q = judged.true_rotation
     q = rotations.quaternion(Q)
     for text, other in (
-        (
-            "the truth's quaternions look like x, y, z, w under the names w, x, y, z",
-            rotations.from_quaternion(q[..., [3, 0, 1, 2]]),
-        ),
-        (
-            "the truth's quaternions look like w, x, y, z under the names x, y, z, w",
-            rotations.from_quaternion(q[..., [1, 2, 3, 0]]),
-        ),
-        ("the truth's rotations look inverted (from the world to the body)", np.swapaxes(Q, 1, 2)),
+        ()
+        if not judged.has_rotation
+        else (
+            (
+                "the truth's quaternions look like x, y, z, w under the names w, x, y, z",
+                rotations.from_quaternion(q[..., [3, 0, 1, 2]]),
+            ),
+            (
+                "the truth's quaternions look like w, x, y, z under the names x, y, z, w",
+                rotations.from_quaternion(q[..., [1, 2, 3, 0]]),
+            ),
+            (
+                "the truth's rotations look inverted (from the world to the body)",
+                np.swapaxes(Q, 1, 2),
+            ),
+        )
     ):
         yield text, judged._replace(true_rotation=other)
     spread = [np.ptp(a, axis=0).max() for a in (judged.translation, judged.true_translation)]
@@ -234,7 +254,10 @@ def _late(at: Callable[[float], Judged]) -> Iterator[tuple[str, Judged]]:
             best = left, shift, other
     if best is not None and abs(best[1]) > 0.01:
         side = "late" if best[1] > 0 else "early (or the filter lags: see --walk-m)"
-        yield f"the truth's stamps look about {abs(best[1]):.2f} s {side}", best[2]
+        yield (
+            f"the truth's stamps look about {abs(best[1]):.2f} s {side}; see --time-offset",
+            best[2],
+        )
 
 
 def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
@@ -244,15 +267,17 @@ def _frames(judged: Judged, planar: bool) -> Iterator[tuple[str, Judged]]:
     w, u = (1 / np.maximum(a, np.median(a)) for a in (judged.place_variance, judged.turn_variance))
     w, u = w / w.sum(), u / u.sum()
     spread = [a - w @ a for a in (p, q)]
-    turns = np.einsum("k,kij,klj->il", u, judged.rotation, Q)
+    turns = np.einsum("k,kij,klj->il", u, judged.rotation, Q) * judged.has_rotation
     # How much a path tells of a turn, against the rotations: nothing where it goes nowhere.
     trust = np.median(judged.turn_variance) / np.median(judged.place_variance)
     R = rotations.nearest(turns + trust * np.einsum("k,ki,kj->ij", w, *spread))
     shift = w @ (p - q @ R.T)
     yield (
-        f"a constant offset of the truth's world frame, {_words(R, shift)}",
+        f"a constant offset of the truth's world frame, {_words(R, shift)}; see --align",
         judged._replace(true_rotation=R @ Q, true_translation=q @ R.T + shift),
     )
+    if not judged.has_rotation:
+        return
     turned = np.swapaxes(Q, 1, 2)
     C = rotations.nearest(np.einsum("k,kij->ij", u, turned @ judged.rotation))
     arm = w @ (turned @ (p - q)[..., None])[..., 0]
@@ -272,9 +297,18 @@ def _words(rotation: FloatArray, shift: FloatArray) -> str:
     return f"turned by ({turn}) deg about x, y, z and shifted by ({place}) m"
 
 
-def judged_of(truth: tuple[FloatArray, FloatArray, BoolArray], track: Any, planar: bool) -> Judged:
-    """What `fault_hints` reads, of a truth at the epochs of a track; planar: place in x and y."""
+def judged_of(
+    truth: tuple[FloatArray | None, FloatArray, BoolArray],
+    track: Any,
+    planar: bool,
+    counts: BoolArray,
+) -> Judged:
+    """What `fault_hints` reads, of a truth at the epochs of a track that count (K,).
+
+    Planar: place in x and y.
+    """
     rotation, translation, known = truth
+    known = known & counts
     place = translation[known].copy()
     if planar:
         place[:, 2] = track.translation[known, 2]
@@ -283,8 +317,9 @@ def judged_of(truth: tuple[FloatArray, FloatArray, BoolArray], track: Any, plana
         track.times[known],
         track.rotation[known],
         track.translation[known],
-        rotation[known],
+        (track.rotation if rotation is None else rotation)[known],
         place,
         variance[:, 2 if planar else 0 : 3].sum(axis=-1),
         variance[:, 3 : 5 if planar else 6].sum(axis=-1),
+        rotation is not None,
     )

@@ -1,0 +1,250 @@
+"""What a track is judged by, and its errors: the truth in the clock and the frame of the ranges."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import metrics
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry import rotations
+from rbl_gym.recordings import TimeOffset, motion_offset
+from rbl_gym.recordings.align import Alignment, align_positions, apply_alignment
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.recordings.truth import Truth
+from rbl_gym.studies.replay.settings import Settings
+from rbl_gym.studies.replay.tracking import Track
+from rbl_gym.studies.replay.truth import check_overlap, matched
+
+__all__ = ["Reference", "TrackErrors", "find_offset", "track_errors", "truth_of", "truth_path"]
+
+# Offsets that are tried where ranges and truth share time as they are (s).
+_SEARCH_S = 10.0
+# Beliefs wider than so many times the median say little of the motion.
+_WIDE = 5.0
+
+
+class Reference(NamedTuple):
+    """What the estimates of K epochs are judged by.
+
+    Attributes
+    ----------
+    rotation
+        (K, 3, 3); None: positions alone are known.
+    translation
+        (K, 3).
+    known
+        Epochs (K,) that count.
+    planar
+        Height, roll and pitch are not judged.
+    alignment
+        What took the truth's world frame to that of the anchors.
+    excluded
+        Epochs with truth that were left out as they were told to.
+    """
+
+    rotation: FloatArray | None
+    translation: FloatArray
+    known: BoolArray
+    planar: bool
+    alignment: Alignment
+    excluded: int
+
+    @property
+    def turn_axes(self) -> list[int]:
+        """Of the pose error (w, v), the components of the rotation that are judged."""
+        return [] if self.rotation is None else [2] if self.planar else [0, 1, 2]
+
+    @property
+    def place_axes(self) -> list[int]:
+        """Those of the position."""
+        return [3, 4] if self.planar else [3, 4, 5]
+
+    def rotation_or(self, rotation: FloatArray) -> FloatArray:
+        """The rotation (K, 3, 3), or where it is unknown this one."""
+        return rotation if self.rotation is None else self.rotation
+
+
+class TrackErrors(NamedTuple):
+    """Errors of K epochs where truth exists.
+
+    Attributes
+    ----------
+    known
+        Epochs (K,) that count.
+    position
+        Distance (K,), metres.
+    yaw, rotation
+        Radians (K,); None where the truth does not tell.
+    nees
+        (K,), of the `freedom` components that are judged.
+    tags
+        Root mean square (K,) over the tags, metres; None where the truth does not tell.
+    freedom
+        How many of the six components of the pose are judged.
+    """
+
+    known: BoolArray
+    position: FloatArray
+    yaw: FloatArray | None
+    rotation: FloatArray | None
+    nees: FloatArray
+    tags: FloatArray | None
+    freedom: int
+
+
+def find_offset(recording: Recording, track: Track, settings: Settings) -> TimeOffset | None:
+    """How far the truth's clock is ahead of that of the ranges, by the motion; None: no truth.
+
+    Windows that are left out do not count, nor do wide beliefs.
+
+    Raises
+    ------
+    ValueError
+        If the motion does not tell it.
+    """
+    truth = recording.truth
+    if truth is None:
+        return None
+    size = np.trace(track.covariance[:, 3:, 3:], axis1=1, axis2=2)
+    used = ~excluded_epochs(track.times, settings) & (size <= _WIDE**2 * np.median(size))
+    share = truth.times[0] < track.times[-1] and track.times[0] < truth.times[-1]
+    try:
+        return motion_offset(
+            (track.times[used], track.rotation[used], track.translation[used]),
+            truth[:3],
+            _SEARCH_S if share else None,
+            planar=_is_planar(truth, settings),
+            one_frame=settings.comparison.align in ("none", "position"),
+        )
+    except ValueError as error:
+        raise ValueError(f"time_offset 'auto': {error}; give it in seconds") from error
+
+
+def in_clock(truth: Truth, settings: Settings) -> Truth:
+    """The truth with the stamps of the ranges' clock; the settings tell the offset in seconds."""
+    offset = settings.comparison.time_offset
+    return truth._replace(times=truth.times - float(offset)) if offset else truth
+
+
+def truth_of(recording: Recording, track: Track, settings: Settings) -> Reference | None:
+    """What the estimates are judged by; None without truth.
+
+    The recording's truth in the clock of the ranges (`comparison.time_offset`), at the epochs of
+    the track (`truth.matched`), without those that are left out, aligned, and turned by the yaw
+    offset. Planar: its heading alone.
+
+    Raises
+    ------
+    ValueError
+        If no epoch has truth, or the matched positions do not determine the alignment.
+    """
+    if recording.truth is None:
+        return None
+    if settings.comparison.time_offset == "auto":
+        settings = with_offset(settings, find_offset(recording, track, settings))
+    truth, gap_s = in_clock(recording.truth, settings), settings.comparison.truth_gap_s
+    check_overlap(truth, track.times, gap_s)
+    rotation, translation, known = matched(truth, *track[:3], gap_s)
+    planar = _is_planar(truth, settings)
+    out = known & excluded_epochs(track.times, settings)
+    known = known & ~out
+    if not known.any():
+        raise ValueError(
+            f"truth_exclude leaves no epoch with truth: {out.sum()} of {len(known)} had it"
+        )
+    place = translation.copy()
+    if planar:
+        place[:, 2] = track.translation[:, 2]
+    try:
+        alignment = align_positions(place[known], track.translation[known], _mode(settings, planar))
+    except ValueError as error:
+        raise ValueError(f"align {settings.comparison.align!r}: {error}") from error
+    turned = None if rotation is None else as_judged(rotation, settings, planar)
+    turned, place = apply_alignment(alignment, turned, place)
+    return Reference(turned, place, known, planar, alignment, int(out.sum()))
+
+
+def truth_path(recording: Recording, track: Track, settings: Settings) -> FloatArray:
+    """Positions (L, 3) of the truth at its own times during the track, as `truth_of` aligns them.
+
+    Parameters
+    ----------
+    recording, track, settings
+        As of `truth_of`; a recording without truth gives none.
+    """
+    found = truth_of(recording, track, settings)
+    if recording.truth is None or found is None:
+        return np.empty((0, 3))
+    truth = in_clock(recording.truth, settings)
+    during = (truth.times >= track.times[0]) & (truth.times <= track.times[-1])
+    return apply_alignment(found.alignment, None, truth.translation[during])[1]
+
+
+def with_offset(settings: Settings, found: TimeOffset | None) -> Settings:
+    """The settings with an offset that was found."""
+    return settings if found is None else settings.changed(time_offset=found.offset_s)
+
+
+def _mode(settings: Settings, planar: bool) -> str:
+    mode = settings.comparison.align
+    if mode == "se3" and planar:
+        raise ValueError("a plane has no heights to align: take yaw")
+    return mode
+
+
+def _is_planar(truth: Truth, settings: Settings) -> bool:
+    return settings.knowledge.planar or truth.planar
+
+
+def excluded_epochs(times: FloatArray, settings: Settings) -> BoolArray:
+    """Epochs (K,) within the windows that are left out."""
+    out = np.zeros(len(times), dtype=np.bool_)
+    for start, end in settings.comparison.truth_exclude:
+        out |= (times >= start) & (times <= end)
+    return out
+
+
+def as_judged(rotation: FloatArray, settings: Settings, planar: bool) -> FloatArray:
+    """Rotations (K, 3, 3) of the truth, turned by the offset; planar: their headings."""
+    offset = rotations.exp([0.0, 0.0, math.radians(settings.comparison.yaw_offset_deg)])
+    if planar:
+        heading = np.zeros((len(rotation), 3))
+        heading[:, 2] = rotations.yaw(rotation)
+        rotation = rotations.exp(heading)
+    return offset @ rotation
+
+
+def track_errors(recording: Recording, track: Track, settings: Settings) -> TrackErrors | None:
+    """Errors against the recording's truth, interpolated; None without truth.
+
+    Planar, or where the truth has no height: position in x and y, NEES of (yaw, x, y); the
+    truth's roll and pitch are not read. Truth without rotations: position alone.
+    """
+    truth = truth_of(recording, track, settings)
+    if truth is None:
+        return None
+    expected = truth.rotation_or(track.rotation)
+    error = metrics.pose_error(track.rotation, track.translation, expected, truth.translation)
+    axes = truth.turn_axes + truth.place_axes
+    block = track.covariance[:, axes][:, :, axes]
+    yaw = rotation = tags = None
+    if truth.rotation is not None:
+        turn = rotations.yaw(track.rotation) - rotations.yaw(expected)
+        yaw = (turn + np.pi) % (2 * np.pi) - np.pi
+        # A truth of a heading says nothing of roll and pitch.
+        if settings.knowledge.planar or not truth.planar:
+            rotation = np.linalg.norm(error[:, :3], axis=-1)
+            poses: Any = (track.rotation, track.translation, expected, truth.translation)
+            tags = metrics.tag_error(*poses, recording.tags)
+    return TrackErrors(
+        truth.known,
+        np.linalg.norm(error[:, truth.place_axes], axis=-1),
+        yaw,
+        rotation,
+        metrics.nees(error[:, axes], block),
+        tags,
+        len(axes),
+    )
