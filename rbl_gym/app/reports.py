@@ -104,7 +104,8 @@ def print_replay(result: dict[str, Any]) -> None:
         console.print("no truth, no errors")
         _print_notes(console, result)
         return
-    console.print(compared(result))
+    for line in compared(result):
+        console.print(line)
     table = new_table()
     for heading in ("error", "RMSE", "median", "p95"):
         table.add_column(heading, justify="left" if heading == "error" else "right")
@@ -123,29 +124,29 @@ def print_replay(result: dict[str, Any]) -> None:
     _print_notes(console, result)
 
 
-def compared(result: dict[str, Any]) -> str:
-    """How the track of a recording was brought together with its truth, in words."""
+def compared(result: dict[str, Any]) -> list[str]:
+    """How the track of a recording was brought together with its truth, in lines."""
     parts = [
         f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth "
         f"({result['truth_format']})"
     ]
     if "epochs_excluded" in result:
-        parts.append(f"{result['epochs_excluded']} more are left out (--truth-exclude)")
+        parts.append(f"{result['epochs_excluded']} more are left out (truth_exclude)")
     if "time_offset" in result:
         found = result["time_offset"]
         parts.append(
             f"the truth's clock is ahead by {found['offset_s']:.4f} s +- {found['std_s']:.4f} s by "
             f"the motion (correlation {found['correlation']:.2f})"
         )
-    elif result["settings"]["time_offset"]:
-        parts.append(f"the truth's clock is ahead by {result['settings']['time_offset']:.10g} s")
+    elif ahead := result["settings"].get("time_offset"):
+        parts.append(f"the truth's clock is ahead by {ahead:.10g} s (time_offset)")
     if "alignment" in result:
         found = result["alignment"]
         parts.append(
             f"the truth is aligned ({found['mode']}): turned by {found['turn_deg']:.2f} deg, its "
             f"centre moved by {found['shift_m']:.3f} m"
         )
-    return "; ".join(parts)
+    return parts
 
 
 def _print_notes(console: Any, result: dict[str, Any]) -> None:

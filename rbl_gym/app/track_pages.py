@@ -170,7 +170,8 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))
         parts.append(
             page.note(
-                f"NEES per degree of freedom {result['anees']:.2f} (1: honest); {compared(result)}."
+                f"NEES per degree of freedom {result['anees']:.2f} (1: honest); "
+                f"{'; '.join(compared(result))}."
             )
         )
     parts.append(track_html.anchors_table(story))

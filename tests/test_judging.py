@@ -1,0 +1,189 @@
+"""What a replayed track is judged by: truth of positions, in another clock or frame, with holes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym.app import track_pages
+from rbl_gym.app.figures import replay_figure
+from rbl_gym.app.reports import compared, print_replay
+from rbl_gym.geometry import rotations
+from rbl_gym.recordings import Recording, Truth
+from rbl_gym.studies import replay
+
+STD_RAD, STD_M = 0.03, 0.03
+ANCHORS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])
+TAGS = np.array([[0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]])
+
+
+def moving(times):
+    """Poses on a curve that speeds up and slows down, turns and tilts."""
+    turn = np.stack([0.3 * np.sin(0.7 * times), 0.2 * np.cos(times), 0.4 * times], axis=-1)
+    place = np.stack(
+        [3 + 2 * np.sin(0.5 * times), 3 + 1.5 * np.sin(0.8 * times), 1 + 0.4 * np.cos(times)], -1
+    )
+    return rotations.exp(turn), place
+
+
+def pair(truth, seed=0, duration_s=20.0):
+    """A recording with this truth, and an honest track of the curve."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(0, duration_s, 0.1)
+    rotation, place = moving(times)
+    rotation = rotations.exp(STD_RAD * rng.standard_normal(place.shape)) @ rotation
+    place = place + STD_M * rng.standard_normal(place.shape)
+    P = np.diag([STD_RAD**2] * 3 + [STD_M**2] * 3)
+    track = replay.Track(times, rotation, place, np.tile(P, (len(times), 1, 1)))
+    links = np.ones((len(times), 4, 3), bool)
+    ids = tuple("abcd"), tuple("xyz")
+    return Recording(times, 5.0 * links, links, None, ANCHORS, TAGS, *ids, truth), track
+
+
+def replayed(truth, **settings):
+    """As `replay.replay_recording`, of a track that is given."""
+    recording, track = pair(truth)
+    chosen = replay.Settings.of(**settings)
+    found = replay.track_errors(recording, track, chosen)
+    figures = replay.track_figures(recording, track, found, chosen)
+    return recording, replay.Replayed(chosen, track, found, figures)
+
+
+TIMES = np.arange(-1, 22, 0.02)
+ROTATION, PLACE = moving(TIMES)
+TURN = rotations.exp([0.5, -0.4, 1.0])
+SHIFT = np.array([10.0, -4.0, 2.0])
+
+
+@pytest.mark.parametrize(("planar", "freedom"), [(False, 3), (True, 2)])
+def test_truth_of_positions_judges_positions_alone(planar, freedom):
+    truth = Truth(TIMES, None, PLACE * (1, 1, not planar), planar)
+    _, result = replayed(truth)
+    _, whole = replayed(Truth(TIMES, ROTATION, PLACE))
+    assert result.errors.yaw is None
+    assert result.errors.rotation is None
+    assert result.errors.tags is None
+    figures = result.figures
+    assert not [name for name in figures if name.startswith(("yaw", "rotation"))]
+    assert figures["position_rmse_m"] == pytest.approx(STD_M * freedom**0.5, rel=0.1)
+    assert figures["position_axes"] == "xyz"[:freedom]
+    # The mean of 200 epochs of 2 or 3 components: standard deviation 0.07 at most.
+    assert figures["anees"] == pytest.approx(1, abs=0.25)
+    assert figures["notes"] == []
+    if not planar:
+        assert figures["position_rmse_m"] == whole.figures["position_rmse_m"]
+
+
+def test_a_heading_alone_judges_yaw_and_the_plane():
+    heading = rotations.exp(rotations.yaw(ROTATION)[:, None] * (0, 0, 1.0))
+    _, result = replayed(Truth(TIMES, heading, PLACE * (1, 1, 0), planar=True))
+    assert result.errors.freedom == 3
+    assert "rotation_rmse_deg" not in result.figures
+    assert result.figures["yaw_rmse_deg"] == pytest.approx(np.rad2deg(STD_RAD), rel=0.2)
+    assert result.figures["position_rmse_m"] == pytest.approx(STD_M * 2**0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("align", ["position", "yaw", "se3"])
+@pytest.mark.parametrize("with_rotation", [True, False])
+def test_a_frame_of_its_own_is_aligned(align, with_rotation):
+    turn = {"position": np.eye(3), "yaw": rotations.exp([0, 0, 2.0]), "se3": TURN}[align]
+    rotation = turn.T @ ROTATION if with_rotation else None
+    truth = Truth(TIMES, rotation, (PLACE - SHIFT) @ turn)
+    _, result = replayed(truth, align=align)
+    figures = result.figures
+    assert figures["position_rmse_m"] == pytest.approx(STD_M * 3**0.5, rel=0.1)
+    assert figures["anees"] == pytest.approx(1, abs=0.25)
+    assert figures["notes"] == []
+    if with_rotation:
+        assert figures["rotation_rmse_deg"] == pytest.approx(np.rad2deg(STD_RAD) * 3**0.5, rel=0.1)
+    found = figures["alignment"]
+    np.testing.assert_allclose(found["translation_m"], SHIFT, atol=0.1)
+    np.testing.assert_allclose(
+        np.deg2rad(found["rotation_vector_deg"]), rotations.log(turn), atol=0.02
+    )
+    assert found["turn_deg"] == pytest.approx(np.linalg.norm(found["rotation_vector_deg"]))
+    assert f"aligned ({align})" in compared(figures)[-1]
+    # Without it the frame is hinted at, and the way out.
+    notes = replayed(truth)[1].figures["notes"]
+    assert any("world frame" in note and "see --align" in note for note in notes)
+
+
+def test_a_wrong_window_is_left_out_and_counted():
+    wrong = PLACE + ((TIMES > 6.35) & (TIMES < 7.35))[:, None] * (0.8, 0, 0)
+    truth = Truth(TIMES, ROTATION, wrong)
+    _, with_it = replayed(truth)
+    assert with_it.figures["position_rmse_m"] > 0.15
+    _, result = replayed(truth, truth_exclude=[(6.35, 7.35), (12, 12.55)])
+    figures = result.figures
+    assert figures["epochs_excluded"] == 16
+    assert figures["epochs_with_truth"] == 184
+    assert figures["position_rmse_m"] == pytest.approx(STD_M * 3**0.5, rel=0.1)
+    assert "16 more are left out" in compared(figures)[1]
+    with pytest.raises(ValueError, match="truth_exclude leaves no epoch with truth: 200 of 200"):
+        replayed(truth, truth_exclude=[(-5, 100)])
+
+
+def test_a_clock_that_is_ahead():
+    truth = Truth(TIMES + 1.4e9, ROTATION, PLACE)
+    with pytest.raises(ValueError, match=r"ahead by about 1399999999 s: see --time-offset"):
+        replayed(truth)
+    _, result = replayed(truth, time_offset=1.4e9)
+    assert result.figures["position_rmse_m"] == pytest.approx(STD_M * 3**0.5, rel=0.1)
+    assert compared(result.figures)[1] == "the truth's clock is ahead by 1400000000 s (time_offset)"
+
+
+@pytest.mark.parametrize("align", ["none", "se3"])
+@pytest.mark.parametrize("ahead_s", [0.35, 1.4e9])
+@pytest.mark.parametrize("with_rotation", [True, False])
+def test_a_clock_is_found_by_the_motion(align, ahead_s, with_rotation):
+    R = TURN if align == "se3" else np.eye(3)
+    truth = Truth(TIMES + ahead_s, R @ ROTATION if with_rotation else None, PLACE @ R.T)
+    recording, track = pair(truth)
+    chosen = replay.Settings.of(time_offset="auto", align=align)
+    found = replay.find_offset(recording, track, chosen)
+    assert found is not None
+    assert abs(found.offset_s - ahead_s) < 4 * found.std_s
+    assert found.std_s < 0.03
+    errors = replay.track_errors(recording, track, chosen)
+    assert errors is not None
+    assert errors.nees[errors.known].mean() / errors.freedom == pytest.approx(1, abs=0.4)
+
+
+def test_what_cannot_be_compared_is_said():
+    still = Truth(TIMES, None, np.zeros((len(TIMES), 3)))
+    with pytest.raises(ValueError, match=r"time_offset 'auto': .*give it in seconds"):
+        replayed(still, time_offset="auto")
+    with pytest.raises(ValueError, match="align 'se3': the positions do not determine a rotation"):
+        replayed(still, align="se3")
+    with pytest.raises(ValueError, match="align 'se3': a plane has no heights"):
+        replayed(Truth(TIMES, ROTATION, PLACE), align="se3", planar=True, height_offset_m=0.0)
+    for options, message in (
+        ({"align": "sim3"}, "align must be one of"),
+        ({"time_offset": "now"}, "time_offset must be"),
+        ({"truth_exclude": [(3, 2)]}, "truth_exclude must be pairs of start and end"),
+        ({"truth_exclude": [3]}, "truth_exclude must be pairs of start and end"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            replay.Settings.of(**options)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_table_picture_and_page_without_rotations(planar, capsys):
+    pytest.importorskip("plotly")
+    truth = Truth(TIMES + 0.5, None, PLACE * (1, 1, not planar) + (5, 0, 0), planar)
+    recording, result = replayed(truth, align="position", time_offset=0.5)
+    print_replay(result.figures)
+    text = capsys.readouterr().out
+    assert "position xy" in text
+    assert "yaw" not in text
+    figure = replay_figure(recording, result)
+    line = figure.axes[0].lines[1]
+    # The path of the truth is drawn where it was aligned to.
+    np.testing.assert_allclose(line.get_xdata()[0], 3, atol=0.1)
+    html = track_pages.replay_page(recording, result)
+    assert "aligned (position)" in html
+    path = replay.truth_path(recording, result.track, result.settings)
+    np.testing.assert_allclose(path[:, :2], line.get_xydata())
+    reference = replay.truth_of(recording, result.track, result.settings)
+    assert isinstance(reference, replay.Reference)
+    assert reference.turn_axes == []
