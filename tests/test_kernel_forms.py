@@ -120,6 +120,16 @@ def test_ranges_of_an_anchor_on_a_tag(law):
 
 
 @every_batch
+def test_along(batch):
+    rng = np.random.default_rng(0)
+    points = rng.integers(-1, 2, (20, *batch, 6, 3)).astype(float)
+    # Ends that are reached exactly, a leg without a length, and beyond the end.
+    points[0, ..., 3, :] = points[0, ..., 2, :]
+    assert_equal_forms(kinematics._along, points, np.linspace(0, 20, 81))
+    assert_equal_forms(kinematics._along, points[..., :2, :], np.zeros(3))
+
+
+@every_batch
 def test_walk(batch):
     rng = np.random.default_rng(3)
     start = rotations.random(rng, batch), rng.normal(size=(*batch, 3))

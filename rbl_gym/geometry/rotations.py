@@ -263,17 +263,15 @@ def from_quaternion(q: ArrayLike) -> FloatArray:
         If the shape is not (..., 4) or a quaternion is zero or not finite.
     """
     q = check_array("q", q, (4,))
-    norm = np.linalg.norm(q, axis=-1, keepdims=True)
-    if (norm < 1e-12).any():
-        index = tuple(int(i) for i in np.argwhere(norm[..., 0] < 1e-12)[0])
+    norm = np.sqrt(np.einsum("...i,...i->...", q, q))
+    if np.count_nonzero(norm < 1e-12):
+        index = tuple(int(i) for i in np.argwhere(norm < 1e-12)[0])
         raise ValueError(f"q must not be zero, got {q[index].tolist()} at index {index}")
-    w, x, y, z = np.moveaxis(q / norm, -1, 0)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.stack(rows, axis=-1).reshape((*q.shape[:-1], 3, 3))
+    q = q / norm[..., None]
+    w, v = q[..., 0], q[..., 1:]
+    if q.ndim == 1:
+        return _one_series(v, 2 * w, 2.0, 2 * w * w - 1)
+    return _series(v, 2 * w, np.asarray(2.0), 2 * w * w - 1)
 
 
 @checked(yaw=(), pitch=(), roll=())

@@ -48,6 +48,24 @@ def walk(
         translations_after[k, 2] = translation[2] + z
 
 
+@gufunc("(k,d),(t)->(t,d)")
+def along(points: Any, travelled: Any, places: Any) -> None:
+    """Places on a polyline at distances from its start, rising; its end beyond it."""
+    leg, reached, length = -1, 0.0, 0.0
+    for k in range(travelled.shape[0]):
+        while leg < 0 or (travelled[k] >= reached and leg < points.shape[0] - 2):
+            leg += 1
+            length = 0.0
+            for i in range(points.shape[1]):
+                length += (points[leg + 1, i] - points[leg, i]) ** 2
+            length = math.sqrt(length)
+            reached += length
+        share = (travelled[k] - (reached - length)) / max(length, 1e-12)
+        share = min(max(share, 0.0), 1.0)
+        for i in range(points.shape[1]):
+            places[k, i] = points[leg, i] + share * (points[leg + 1, i] - points[leg, i])
+
+
 @gufunc("(m,d),(m,d),()->(m,d)")
 def move(places: Any, velocity: Any, reach: float, moved: Any) -> None:
     """Places after a step of `reach` along each velocity, of which no more than length 1 counts."""

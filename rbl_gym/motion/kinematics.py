@@ -273,37 +273,37 @@ def waypoints(
     speed_m_s = check_number("speed_m_s", speed_m_s, low=0.0)
     dt = check_number("dt", dt, low=1e-12)
     spin = check_array("spin_rad_s", spin_rad_s, (3,))
-    travelled = speed_m_s * dt * np.arange(check_count("steps", steps, most=_MOST_STEPS) + 1)
-    velocity = np.diff(_along(points, travelled), axis=-2) / dt
+    steps = check_count("steps", steps, most=_MOST_STEPS)
+    return between_waypoints(rotation, points, speed_m_s, dt, steps, spin)
+
+
+def between_waypoints(
+    rotation: FloatArray, points: FloatArray, speed_m_s: float, dt: float, steps: int,
+    spin: FloatArray,
+) -> Trajectory:  # fmt: skip
+    """`waypoints`, of what the caller has checked."""
+    places = _along(points, speed_m_s * dt * np.arange(steps + 1))
+    velocity = (places[..., 1:, :] - places[..., :-1, :]) / dt
     batch = np.broadcast_shapes(spin.shape[:-1], velocity.shape[:-2])
-    twists = np.empty((*batch, len(travelled) - 1, 6))
+    twists = np.empty((*batch, steps, 6))
     twists[..., :3], twists[..., 3:] = spin[..., None, :], velocity
     return Trajectory(rotation, points[..., 0, :], twists)
 
 
+@compiled("epoch:along")
 def _along(points: FloatArray, travelled: FloatArray) -> FloatArray:
-    """Places (..., T, 3) on polylines (..., K, 3) at the distances `travelled` (T,), rising.
-
-    The memory runs along the trials.
-    """
-    *batch, n_points, _ = points.shape
-    line = np.ascontiguousarray(points.reshape(-1, n_points, 3).transpose(2, 1, 0))
-    trials = line.shape[-1]
-    step = np.diff(line, axis=1)
-    legs = np.sqrt((step * step).sum(axis=0))
-    reached = np.cumsum(legs, axis=0)
+    """Places (..., T, 3) on polylines (..., K, 3) at the distances `travelled` (T,), rising."""
+    step = np.diff(points, axis=-2)
+    legs = np.linalg.norm(step, axis=-1)
+    reached = np.cumsum(legs, axis=-1)
     # The leg at an epoch is the number of ends reached by then.
-    index = np.searchsorted(travelled, reached) * trials + np.arange(trials)
-    ends = np.bincount(index.ravel(), minlength=(len(travelled) + 1) * trials)
-    leg = np.cumsum(ends.reshape(-1, trials)[:-1], axis=0)
-    at = np.minimum(leg, n_points - 2) * trials + np.arange(trials)
-    fraction = travelled[:, None] - (reached - legs).ravel()[at]
-    fraction /= np.maximum(legs, 1e-12).ravel()[at]
-    np.clip(fraction, 0.0, 1.0, out=fraction)
-    places = np.take(step.reshape(3, -1), at, axis=1)
-    places *= fraction
-    places += np.take(line.reshape(3, -1), at, axis=1)
-    return places.transpose(2, 1, 0).reshape(*batch, len(travelled), 3)
+    leg = (reached[..., None, :] <= travelled[:, None]).sum(axis=-1)
+    leg = np.minimum(leg, legs.shape[-1] - 1)
+    before = np.take_along_axis(reached - legs, leg, axis=-1)
+    length = np.maximum(np.take_along_axis(legs, leg, axis=-1), 1e-12)
+    share = np.clip((travelled - before) / length, 0.0, 1.0)[..., None]
+    start, way = (np.take_along_axis(of_legs, leg[..., None], -2) for of_legs in (points, step))
+    return start + share * way
 
 
 def lawn_mower_points(low: ArrayLike, high: ArrayLike, spacing_m: float) -> FloatArray:

@@ -17,6 +17,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
+from rbl_gym.motion.kinematics import between_waypoints
 from rbl_gym.worlds.scene import Scene
 
 __all__ = [
@@ -224,7 +225,7 @@ def _trajectory(
         lanes = motion.lawn_mower_points(low, high, max(0.2 * float((high - low)[1]), 1e-9))
         points = np.broadcast_to(lanes, (*batch, *lanes.shape))
     spin = scene.spin_rad_s * start[..., 4:7]
-    return motion.waypoints(rotation, points, scene.speed_m_s, scene.dt, steps, spin)
+    return between_waypoints(rotation, points, scene.speed_m_s, scene.dt, steps, spin)
 
 
 def epoch_of(episode: Episode, epoch: int) -> Epoch:
