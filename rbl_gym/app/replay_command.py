@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from rbl_gym.app.reading_options import add_reading, read_runs
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
@@ -27,10 +28,9 @@ def add_replay(commands: Any) -> None:
     replay = commands.add_parser(
         "replay",
         help="a recording of ranges through a filter",
-        description="Track a recorded body; with --truth, the errors. All files are CSV; "
-        "see docs/recordings.md for their columns.",
+        description="Track a recorded body; with --truth, the errors.",
     )
-    _add_files(replay)
+    add_reading(replay)
     _add_knowledge(replay.add_argument_group("what is known of the body's place"))
     _add_filter(replay.add_argument_group("filter"))
     _add_motion(replay.add_argument_group("how the body moves"))
@@ -38,17 +38,6 @@ def add_replay(commands: Any) -> None:
     _add_comparison(replay.add_argument_group("comparison with the truth"))
     _add_output(replay.add_argument_group("output"))
     replay.set_defaults(run=_replay)
-
-
-def _add_files(group: Any) -> None:
-    for name, text in (
-        ("ranges", "t,anchor,tag,range[,std,valid] or t,a0t0,a0t1,..."),
-        ("anchors", "anchor,x,y,z"),
-        ("tags", "tag,x,y,z"),
-    ):
-        group.add_argument(f"--{name}", required=True, metavar="F", help=text)
-    group.add_argument("--truth", metavar="F", help="t,x,y,z,qw,qx,qy,qz or t,x,y[,z],yaw_deg")
-    group.add_argument("--calibration", metavar="F", help="anchor,tag,bias_m,slope")
 
 
 def _add_knowledge(group: Any) -> None:
@@ -153,14 +142,14 @@ def _add_number(group: Any, name: str, text: str) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    from rbl_gym import recordings
     from rbl_gym.studies import replay
 
     check_html(options)
     settings = _settings(options)
-    recording = recordings.read_recording(
-        options.ranges, options.anchors, options.tags, options.truth, options.calibration
-    )
+    runs = read_runs(options)
+    if len(runs) > 1:
+        raise ValueError(f"{options.ranges}: has {len(runs)} runs, {[*runs]!r:.200}; see --run")
+    (recording,) = runs.values()
     # What is wrong is said before the work begins.
     replay.check_replay(recording, settings)
     with progress("replay", len(recording.times)) as advance:

@@ -52,6 +52,7 @@ def track_figures(
         "links": int(recording.links.sum()),
     }
     result |= _notes(recording, track, found, settings)
+    result |= _with_reading(recording, result["notes"])
     if found is None:
         return result
     known = found.known
@@ -94,6 +95,19 @@ def _comparison(recording: Recording, track: Track, settings: Settings) -> dict[
             "shift_m": truth.alignment.shift_m,
         }
     return result
+
+
+def _with_reading(recording: Recording, notes: list[str]) -> dict[str, Any]:
+    """What became of the log while it was read, its notes first."""
+    report = recording.report
+    return {
+        "reading": {
+            "ranges": report.ranges,
+            "dropped": report.dropped,
+            "sorted_rows": report.sorted_rows,
+        },
+        "notes": [*(f"Note: {note}" for note in report.notes), *notes],
+    }
 
 
 def _notes(

@@ -1,0 +1,96 @@
+"""The files of a recording, and how they are written, on the command line."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rbl_gym.recordings import Recording
+
+_FILES = ("ranges", "anchors", "tags", "truth", "calibration", "carrier")
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """The options that `read_runs` reads."""
+    files = parser.add_argument_group("files")
+    for name, text in (
+        ("ranges", "t,anchor,tag,range[,std,valid,run], or t,a0t0,a0t1,..."),
+        ("anchors", "anchor,x,y,z; anchor,t,x,y,z where they move; without it ax,ay,az in ranges"),
+        ("tags", "tag,x,y,z; without it one tag at the body's origin"),
+        ("truth", "t,x,y,z,qw,qx,qy,qz or t,x,y[,z],yaw_deg"),
+        ("calibration", "anchor,tag,bias_m[,slope]"),
+        ("carrier", "poses, as of the truth, of a body that carries the anchors"),
+    ):
+        files.add_argument(f"--{name}", required=name == "ranges", metavar="F", help=text)
+    reading = parser.add_argument_group("reading (see docs/recordings.md)")
+    reading.add_argument(
+        "--columns",
+        type=_pairs,
+        action="append",
+        metavar="WHAT=NAME,...",
+        help="what columns are called: time=time_s,anchor=to_id,range=dist; of another file "
+        "truth.x=px, anchors.anchor=name; wide: range=r_{anchor}_{tag},std=sd_{anchor}_{tag}; "
+        "all that begin so: truth.*=B_*; may be given more than once",
+    )
+    reading.add_argument(
+        "--where",
+        type=_pairs,
+        action="append",
+        metavar="COLUMN=CELL,...",
+        help="rows that are meant: anchors.agent=1,tags.agent=2",
+    )
+    reading.add_argument(
+        "--time-unit",
+        metavar="UNIT",
+        help="of the ranges: s, ms, us, ns or iso; default as the header tells, else found",
+    )
+    reading.add_argument("--unit", metavar="UNIT", help="of the ranges: m, cm or mm; default m")
+    reading.add_argument("--run", dest="which_run", metavar="NAME", help="one of several runs")
+    reading.add_argument(
+        "--relative",
+        action="store_true",
+        help="with --carrier: the pose in the carrier's frame, not in the world",
+    )
+    reading.add_argument(
+        "--strict",
+        action="store_true",
+        help="refuse, by line, what is dropped, sorted or counted otherwise",
+    )
+
+
+def read_runs(options: argparse.Namespace) -> dict[str, Recording]:
+    """The recordings that the options tell, by the names of their runs."""
+    from rbl_gym import recordings
+
+    paths = {name: getattr(options, name) for name in _FILES}
+    how: dict[str, Any] = {
+        "relative": options.relative,
+        "format": recordings.Format(
+            columns=_joined(options.columns),
+            where=_joined(options.where),
+            time_unit=options.time_unit,
+            unit=options.unit,
+            strict=options.strict,
+        ),
+    }
+    if options.which_run is None:
+        return recordings.read_runs(**paths, **how)
+    run = options.which_run
+    return {run: recordings.read_recording(**paths, run=run, **how)}
+
+
+def _pairs(text: str) -> dict[str, str]:
+    """``a=b,c=d`` as a dictionary."""
+    pairs = {}
+    for part in text.split(","):
+        name, equal, value = part.partition("=")
+        if not equal or not name.strip() or not value.strip():
+            raise argparse.ArgumentTypeError(f"must be WHAT=NAME,WHAT=NAME,..., got {text!r}")
+        pairs[name.strip()] = value.strip()
+    return pairs
+
+
+def _joined(given: list[Mapping[str, str]] | None) -> dict[str, str]:
+    return {name: value for pairs in given or () for name, value in pairs.items()}
