@@ -38,6 +38,11 @@ LONG = (
 WIDE = b"# log\nt,aAt1,aAtleft,aCt1,aBtleft\n0.0,2.5,2.25,3.0,\n0.1,,,,1.5\n"
 TRUTH = b"t,x,y,z,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1,2,2,3,0.6,0,0,0.8\n"
 PLANAR = b"t,x,y,yaw_deg\n0,1,2,90\n1,2,2,180\n"
+TUM = b"1.0 1 2 3 0 0 0 1\n# x\n2.0 1 2 3 0 0 0.6 0.8\n"
+EUROC = (b"#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],"
+         b"q_RS_z []\n1403636579000000000,5.5,3.0,1.2,0.6,0.0,0.0,0.8\n"
+         b"1403636579050000000,5.5,3.0,1.2,1.0,0.0,0.0,0.0\n")  # fmt: skip
+PLACES = b"time;pos_x;pos_y;roll [deg];pitch [deg];yaw [rad];z\n0,5;1;2;3;4;1;0\n1;1;2;3;4;1;0\n"
 CALIBRATION = b"anchor,tag,bias_m,slope,sigma_m\nA,1,0.5,0.25,0.01\nC,1,3.5,0,\n"
 G2O = (
     b"VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1.0 0.0 0.1 500 0 0 500 0 5000\n# x\n"
@@ -123,7 +128,8 @@ READERS = {
     "ranges": Reader("ranges.csv", partial(_recording, "ranges"), (LONG, WIDE), NUMBERS + MARKS),
     **{
         part: Reader(f"{part}.csv", partial(_recording, part), seeds, NUMBERS + MARKS)
-        for part, seeds in (("anchors", (ANCHORS,)), ("tags", (TAGS,)), ("truth", (TRUTH, PLANAR)),
+        for part, seeds in (("anchors", (ANCHORS,)), ("tags", (TAGS,)),
+                            ("truth", (TRUTH, PLANAR, TUM, EUROC, PLACES)),
                             ("calibration", (CALIBRATION,)))
     },
     "g2o": Reader("graph.g2o", read_graph, (G2O,), NUMBERS + MARKS),

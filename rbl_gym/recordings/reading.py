@@ -69,8 +69,8 @@ def read_recording(
         Anchors that move have a row for every place and time: ``anchor,t,x,y,z``. Without `tags`
         there is one tag, at the body's origin.
     truth
-        ``t,x,y,z,qw,qx,qy,qz`` or, planar, ``t,x,y[,z],yaw_deg`` with z = 0 where absent.
-        Quaternions may be off unit norm by 0.01 and are normalised.
+        As of `rbl_gym.recordings.read_truth`: ``t,x,y,z,qw,qx,qy,qz``, TUM, EuRoC/ASL, a
+        heading or positions alone.
     calibration
         ``anchor,tag,bias_m[,slope][,sigma_m]``: ``(range - bias) / (1 + slope)`` replaces the
         range of that link and ``std / (1 + slope)`` its std. A corrected range that is not
@@ -177,7 +177,7 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
         if not files.relative:
             log, places = _carried(log, places, frame, said, os.fspath(files.carrier))
         elif poses is not None:
-            poses = _seen_from(frame, poses)
+            poses = _seen_from(frame, poses, os.fspath(files.carrier))
     links = log.ranges > 0
     if not links.any():
         raise ValueError(f"{table.path}: must have an epoch with a link, got none")
@@ -196,6 +196,8 @@ def _carried(
 ) -> tuple[Log, FloatArray]:
     """Anchors (K, M, 3) in the world, and the log without epochs whose carrier is nowhere."""
     rotation, translation, known = truth_at(carrier, log.times, _CARRIER_GAP_S)
+    if rotation is None:
+        raise ValueError(f"{path}: a carrier needs rotations, got positions alone")
     places = np.swapaxes(rotation @ np.swapaxes(arms, -1, -2), -1, -2) + translation[:, None]
     if not known.any():
         spans = [f"{t[0]:.10g} to {t[-1]:.10g} s" for t in (log.times, carrier.times)]
@@ -211,9 +213,13 @@ def _carried(
     return log, places[known]
 
 
-def _seen_from(carrier: Truth, truth: Truth) -> Truth:
+def _seen_from(carrier: Truth, truth: Truth, path: str) -> Truth:
     """Poses in the carrier's frame, where its own are known."""
     rotation, translation, known = truth_at(carrier, truth.times, _CARRIER_GAP_S)
+    if rotation is None:
+        raise ValueError(f"{path}: a carrier needs rotations, got positions alone")
     back = np.swapaxes(rotation, -1, -2)
     shift = (back @ (truth.translation - translation)[..., None])[..., 0]
-    return Truth(truth.times[known], (back @ truth.rotation)[known], shift[known])
+    turned = None if truth.rotation is None else (back @ truth.rotation)[known]
+    planar = truth.planar or carrier.planar
+    return Truth(truth.times[known], turned, shift[known], planar, truth.form)

@@ -36,6 +36,18 @@ def seconds_per(unit: str) -> float:
     return TIME_UNITS[unit]
 
 
+def dated_unit(stamps: FloatArray) -> str | None:
+    """The unit of stamps (K,) that are times since 1970, of the years 2001 to 2065; None: none."""
+    distinct = np.unique(stamps)
+    if len(distinct) < 2:
+        return None
+    step, start = float(np.median(np.diff(distinct))), float(abs(distinct[0]))
+    for name, scale in TIME_UNITS.items():
+        if _DATES_S[0] <= start * scale <= _DATES_S[1] and step * scale <= _LONGEST_DATED_STEP_S:
+            return name
+    return None
+
+
 def found_unit(stamps: FloatArray) -> tuple[str, str]:
     """The unit that stamps (K,) are likely in, and a sentence on it where it is not seconds."""
     distinct = np.unique(stamps)
@@ -43,9 +55,9 @@ def found_unit(stamps: FloatArray) -> tuple[str, str]:
         return "s", ""
     step, start = float(np.median(np.diff(distinct))), float(abs(distinct[0]))
     unit = "ns"
-    for name, scale in TIME_UNITS.items():
-        if _DATES_S[0] <= start * scale <= _DATES_S[1] and step * scale <= _LONGEST_DATED_STEP_S:
-            return name, _words(name, step)
+    dated = dated_unit(stamps)
+    if dated is not None:
+        return dated, _words(dated, step)
     if len(distinct) < _FEWEST:
         return "s", ""
     for name, scale in TIME_UNITS.items():

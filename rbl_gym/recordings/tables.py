@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -182,8 +182,8 @@ class Table(NamedTuple):
         return found[0], found[1]
 
 
-def read_table(path: AnyPath, source: Source = AS_NAMED) -> Table:
-    """The cells of a file with a header.
+def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str] = ()) -> Table:
+    """The cells of a file with a header; `headless` names the columns of a table without one.
 
     Raises
     ------
@@ -191,7 +191,7 @@ def read_table(path: AnyPath, source: Source = AS_NAMED) -> Table:
         If it cannot be read, a row does not fit the header, a column that `source` names is not
         there, or no row is left.
     """
-    cells = read_cells(os.fspath(path))
+    cells = read_cells(os.fspath(path), headless)
     where = f"{cells.path}, line {cells.header_line}"
     header, units = [], {}
     for i, cell in enumerate(cells.header, 1):

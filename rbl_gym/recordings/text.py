@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -34,13 +35,14 @@ def is_number(cell: str) -> bool:
         return False
 
 
-def read_cells(path: str) -> Cells:
+def read_cells(path: str, headless: Sequence[str] = ()) -> Cells:
     """Read a text file: UTF-8 with or without a byte order mark, any line ending.
 
     Cells are separated by commas, semicolons, tabs or, where the header has none of these, by
     white space; with semicolons and tabs, a comma may be the decimal point. Blank lines and lines
     that begin with ``#`` are skipped, unless the first row below holds numbers only a comment can
-    name: then the last comment above it whose cells fit the row is the header.
+    name: then the last comment above it whose cells fit the row is the header. A file of numbers
+    between white space with neither has the names `headless`, if there are as many.
 
     Raises
     ------
@@ -64,7 +66,9 @@ def read_cells(path: str) -> Cells:
                 break
         else:
             row = _split(lines[second], comma) if count == 2 else []
-            if not any(
+            if headless and comma in (None, "\t") and len(header) == len(headless):
+                start, header = first - 1, [*headless]
+            elif not any(
                 not _is_numeric(a) and _is_numeric(b) for a, b in zip(header, row, strict=False)
             ):
                 raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -11,11 +12,21 @@ from rbl_gym import motion
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.report import Said
+from rbl_gym.recordings.stamps import dated_unit
 from rbl_gym.recordings.tables import AS_NAMED, AnyPath, Source, Table, read_table
+from rbl_gym.recordings.text import is_number
 
 __all__ = ["Truth", "read_truth", "truth_at"]
 
 MAX_YAW_DEG = 1e6
+
+# The columns of a file without a header.
+_TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_ANGLES = ("roll", "pitch", "yaw")
+# Words in the names of columns that are no pose.
+_NO_POSE = {"covariance", "cov", "std", "twist", "velocity", "vel", "linear", "angular", "acc",
+            "acceleration", "gyro", "bias"}  # fmt: skip
 
 
 class Truth(NamedTuple):
@@ -81,6 +92,12 @@ def read_truth(
 ) -> Truth:
     """The reference poses of a file.
 
+    Known are TUM (``t x y z qx qy qz qw`` between blanks, no header), EuRoC/ASL (a header that
+    begins with ``#``, nanoseconds, qw first), and tables with a header: ``t,x,y,z,qw,qx,qy,qz``;
+    ``t,x,y,z,roll_deg,pitch_deg,yaw_deg``, turned about z, y and x in this order; ``t,x,y[,z]``
+    with ``yaw_deg`` or without. Angles may be ``_rad``. Columns of messages go by their last word,
+    as in ``pose.position.x``. Quaternions may be off unit norm by 0.01 and are normalised.
+
     Parameters
     ----------
     path, source, said
@@ -90,48 +107,128 @@ def read_truth(
     times
         Of a file without times that has one pose: those at which the body stands there.
 
+    Returns
+    -------
+    Truth
+        Without rotation where the file has positions alone; `planar` where it has no heights.
+
     Raises
     ------
     ValueError
-        If the file is not as `read_recording` describes it.
+        If the file is not as above: it names file, line and column.
     """
     said = said or Said()
-    table = read_table(path, source)
+    table = _known_names(read_table(path, source, _TUM))
     if run is not None and "run" in table.columns:
         rows = np.array([cell == run for cell in table.text("run")])
         if not rows.any():
             raise ValueError(f"{table.path}: has no run {run!r} in column {table.name('run')!r}")
         table = table.select(rows)
-    rotation, translation, read = _poses(table)
-    said.read(table, (*read, "run"))
+    table.require("x", "y")
+    places = [axis for axis in "xyz" if axis in table.columns]
+    rotation, angles = _rotations(table)
+    planar = len(places) == 2
+    translation = np.pad(table.points(places), ((0, 0), (0, 3 - len(places))))
+    said.read(table, ("t", "run", *places, *angles))
+    form = _form(table, len(angles), planar)
     if "t" not in table.columns and times is not None and len(table.lines) == 1:
         shape = len(times), 3
-        return Truth(
-            times, np.broadcast_to(rotation, (*shape, 3)), np.broadcast_to(translation, shape)
-        )
-    return Truth(table.times(), rotation, translation)
+        held = None if rotation is None else np.broadcast_to(rotation, (*shape, 3))
+        return Truth(times, held, np.broadcast_to(translation, shape), planar, form)
+    table.require("t")
+    unit = table.units.get("t")
+    if unit is None and is_number(table.columns["t"][0]):
+        # Poses may be rare: their spacing does not tell seconds from milliseconds.
+        unit = dated_unit(table.numbers("t")) or "s"
+    stamps, _ = table.seconds(unit)
+    table.check(np.diff(stamps, prepend=-np.inf) > 0, "t", "time must increase from row to row")
+    return Truth(stamps, rotation, translation, planar, form)
 
 
-def _poses(table: Table) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
-    """Rotations (L, 3, 3), translations (L, 3), and the columns that they are of."""
-    if "yaw_deg" in table.columns:
-        angles = [a for a in ("roll_deg", "pitch_deg", "yaw_deg") if a in table.columns]
-        places = [axis for axis in "xyz" if axis in table.columns]
-        table.require("x", "y", *(("z", "roll_deg", "pitch_deg") if len(angles) > 1 else ()))
-        must = f"must be at most {MAX_YAW_DEG:g} in magnitude"
-        rotation = np.eye(3)
-        for angle in reversed(angles):  # ZYX: about z, then about the new y, then about the new x
-            turn = table.numbers(angle)
-            table.check(np.abs(turn) <= MAX_YAW_DEG, angle, must)
-            axis = np.eye(3)[("roll_deg", "pitch_deg", "yaw_deg").index(angle)]
-            rotation = rotation @ rotations.exp(np.radians(turn)[:, None] * axis)
-        translation = np.pad(table.points(places), ((0, 0), (0, 3 - len(places))))
-        return rotation, translation, ("t", *places, *angles)
+def _rotations(table: Table) -> tuple[FloatArray | None, tuple[str, ...]]:
+    """Rotations (L, 3, 3), and the columns that they are of; None: positions alone."""
+    found = [name for name in _QUATERNION if name in table.columns]
+    if found:
+        table.require(*_QUATERNION)
+        q = np.stack([table.numbers(name) for name in _QUATERNION], axis=-1)
+        with np.errstate(over="ignore"):
+            norm = np.linalg.norm(q, axis=-1)
+        must = "quaternion norm must be 1 within 0.01"
+        table.check(np.abs(norm - 1) <= 1e-2, "qw", must, got=norm)
+        return rotations.from_quaternion(q), _QUATERNION
+    columns = {}
+    for axis, angle in enumerate(_ANGLES):
+        names = [name for name in (f"{angle}_deg", f"{angle}_rad") if name in table.columns]
+        if len(names) == 1:
+            columns[axis] = names[0]
+        elif angle in table.columns or names:
+            raise ValueError(
+                f"{table.path}, line {table.header_line}: column {angle!r} must tell its unit: "
+                f"call it {angle}_deg or {angle}_rad, got {[*table.names.values()]!r:.200}"
+            )
+    if not columns:
+        return None, ()
+    if len(columns) == 2 or 2 not in columns:
+        table.require(*(f"{angle}_deg" for axis, angle in enumerate(_ANGLES)
+                        if axis not in columns))  # fmt: skip
+    rotation = np.eye(3)
+    for axis in (2, 1, 0):  # about z, then about the new y, then about the new x
+        if (name := columns.get(axis)) is None:
+            continue
+        turn, unit = table.numbers(name), np.pi / 180 if name.endswith("_deg") else 1.0
+        must = f"must be at most {MAX_YAW_DEG:g} deg in magnitude"
+        table.check(np.abs(turn) * unit <= np.radians(MAX_YAW_DEG), name, must)
+        rotation = rotation @ rotations.exp(unit * turn[:, None] * np.eye(3)[axis])
+    return rotation, tuple(columns.values())
 
-    names = ("qw", "qx", "qy", "qz")
-    table.require("x", "y", "z", *names)
-    q = np.stack([table.numbers(name) for name in names], axis=-1)
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(q, axis=-1)
-    table.check(np.abs(norm - 1) <= 1e-2, "qw", "quaternion norm must be 1 within 0.01", got=norm)
-    return rotations.from_quaternion(q), table.points("xyz"), ("t", *"xyz", *names)
+
+def _form(table: Table, angles: int, planar: bool) -> str:
+    """What the file is, in words."""
+    names = [*table.names.values()]
+    known = "TUM" if [*table.columns] == [*_TUM] else "table"
+    if any(name.lower().startswith(("p_rs", "q_rs")) for name in names):
+        known = "EuRoC/ASL"
+    what = {0: "positions", 1: "headings"}.get(angles, "poses")
+    return f"{known}, {what}" + (" in x and y" if planar else "")
+
+
+def _known_names(table: Table) -> Table:
+    """The table with columns of other names under those that are read, where one alone fits."""
+    like: dict[str, list[str]] = {}
+    for name in table.columns:
+        role = _role(name, table.units.get(name, ""))
+        if role is not None and role not in table.columns:
+            like.setdefault(role, []).append(name)
+    new = {names[0]: role for role, names in like.items() if len(names) == 1}
+    return table._replace(
+        columns={new.get(name, name): cells for name, cells in table.columns.items()},
+        names={new.get(role, role): name for role, name in table.names.items()},
+        units={new.get(role, role): unit for role, unit in table.units.items()},
+    )
+
+
+def _role(name: str, unit: str) -> str | None:
+    """What a column of this name holds, if it is read: ``q_RS_w []`` is qw."""
+    words = re.findall(r"[a-z0-9]+", re.sub(r"[\[(].*?[\])]", "", name.lower()))
+    if words[-1:] in (["m"], ["deg"], ["rad"]):
+        unit = words.pop()
+    if not words:
+        return None
+    first, last, before = words[0], words[-1], set(words[:-1])
+    if last in _ANGLES:
+        return f"{last}_{unit}" if unit in ("deg", "rad") else None
+    if len(words) == 1:
+        if last in ("t", "time", "timestamp", "stamp"):
+            return "t"
+        one = re.fullmatch("(q[xyzw])|[pt]([xyz])", last)
+        return None if one is None else one[1] or one[2]
+    if before & _NO_POSE or first in ("v", "b", "a", "w"):
+        return None
+    one = re.fullmatch("q?([xyzw])", last)
+    if one is None:
+        return None
+    if before & {"q", "quat", "quaternion", "orientation", "rotation", "rot"}:
+        return f"q{one[1]}"
+    if before & {"p", "pos", "position", "translation", "t", "place"} and last in "xyz":
+        return last
+    return None
