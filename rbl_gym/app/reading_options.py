@@ -19,7 +19,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         ("ranges", "t,anchor,tag,range[,std,valid,run], or t,a0t0,a0t1,..."),
         ("anchors", "anchor,x,y,z; anchor,t,x,y,z where they move; without it ax,ay,az in ranges"),
         ("tags", "tag,x,y,z; without it one tag at the body's origin"),
-        ("truth", "t,x,y,z,qw,qx,qy,qz or t,x,y[,z],yaw_deg"),
+        ("truth", "TUM, EuRoC/ASL, t,x,y,z,qw,qx,qy,qz, or t,x,y[,z][,yaw_deg]"),
         ("calibration", "anchor,tag,bias_m[,slope]"),
         ("carrier", "poses, as of the truth, of a body that carries the anchors"),
     ):
