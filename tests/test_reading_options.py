@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,6 +125,22 @@ def test_runs_of_one_file(flight, tmp_path, capsys):
     }
     one = replayed(tmp_path, ["--run", "p2"], capsys, **files)
     assert one["position_rmse_m"] < 0.1
+    every = replayed(tmp_path, [], capsys, **files)
+    assert [*every["runs"]] == ["p1", "p2"]
+    for name in ("position_rmse_m", "yaw_median_deg", "anees"):
+        for run in ("p1", "p2"):
+            assert every["runs"][run][name] == one[name], "each run from its own start"
+    together = every["together"]
+    assert (together["epochs"], together["links"], together["epochs_with_truth"]) == (80, 1440, 80)
+    for name in ("position_rmse_m", "yaw_rmse_deg", "anees", "position_p95_m"):
+        assert together[name] == pytest.approx(one[name], rel=0.1 if "p95" in name else 1e-9)
+    arguments = [a for k in files for a in (f"--{k}", str(tmp_path / f"{k}.csv"))]
+    assert main(["replay", *WALK, *arguments]) == 0
+    assert "together" in capsys.readouterr().out
+    assert main(["replay", *arguments, "--plot", str(tmp_path / "x.png")]) != 0
+    assert "has 2, ['p1', 'p2']: choose one by --run" in capsys.readouterr().err
+    assert main(["replay", *arguments, "--filter", "none"]) != 0
+    assert "run 'p1': " in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["replay", "--columns", "time"])
     assert "must be WHAT=NAME,WHAT=NAME,..., got 'time'" in capsys.readouterr().err
@@ -180,7 +197,7 @@ def test_starloc(monkeypatch):
     from rbl_gym.recordings import Format, read_recording
 
     monkeypatch.chdir(DATA / "starloc_two_tags")
-    files = {name: f"{name}.csv" for name in ("anchors", "tags", "truth")}
+    files: dict[str, Any] = {name: f"{name}.csv" for name in ("anchors", "tags", "truth")}
     log = read_recording("uwb.csv", **files, format=Format(columns={"range": "range_calib"}))
     assert log.ranges.shape == (7602, 8, 2)
     assert log.range_std is not None

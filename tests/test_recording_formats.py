@@ -181,7 +181,7 @@ def test_one_zero_in_a_wide_log(tmp_path):
 
 
 def test_a_log_that_is_a_fifth_bad_is_read_and_one_that_is_more_is_refused(tmp_path):
-    bad = {f"r{k}": "0" for k in (2, 4)} | {"r5": "-1", "r6": "nan"}
+    bad: dict[str, Any] = {f"r{k}": "0" for k in (2, 4)} | {"r5": "-1", "r6": "nan"}
     assert read(tmp_path, many(20, **bad)).links.sum() == 16
     message = r"5 of 20 ranges are no measurement: 1 not a number, 3 zero, 1 negative; .* line 4, "
     with pytest.raises(ValueError, match=message):
@@ -406,6 +406,7 @@ def test_anchors_on_a_body_that_moves(tmp_path):
     log, want = two_bodies(False, tmp_path)
     assert log.anchors.shape == (6, 3, 3)
     assert log.truth is not None
+    assert log.truth.rotation is not None
     np.testing.assert_allclose(log.truth.rotation, want["RB"], atol=1e-12)
     tags = np.einsum("kij,nj->kni", log.truth.rotation, log.tags) + log.truth.translation[:, None]
     distances = np.linalg.norm(log.anchors[:, :, None] - tags[:, None], axis=-1)
@@ -417,6 +418,7 @@ def test_ranges_between_two_bodies_seen_from_one(tmp_path):
     log, want = two_bodies(True, tmp_path)
     assert log.anchors.shape == (3, 3)
     assert log.truth is not None
+    assert log.truth.rotation is not None
     want_rotation = np.swapaxes(want["RA"], -1, -2) @ want["RB"]
     np.testing.assert_allclose(log.truth.rotation, want_rotation, atol=1e-12)
     tags = np.einsum("kij,nj->kni", log.truth.rotation, log.tags) + log.truth.translation[:, None]
@@ -426,7 +428,7 @@ def test_ranges_between_two_bodies_seen_from_one(tmp_path):
 
 def test_a_carrier_that_is_nowhere(tmp_path):
     carrier = TRUTH.replace("\n0,", "\n9,").replace("\n1,", "\n10,")
-    message = r"carrier.csv: the carrier's pose is known at no epoch: ranges 0 to 0.1 s, poses 9"
+    message = r"carrier.csv: the carrier's pose is known at no time .* 0 to 0.1 s, its poses 9"
     with pytest.raises(ValueError, match=message):
         read(tmp_path, carrier=carrier)
     log = read(tmp_path, LONG + "1.5,A,1,2\n", carrier=TRUTH)

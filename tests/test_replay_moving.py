@@ -83,3 +83,21 @@ def test_a_flat_array_on_a_body_that_moves_is_planar():
     log = recording(carried, TAGS * (1, 1, 0))
     figures = replay.replay_recording(log, SETTINGS.changed(planar=True)).figures
     assert figures["position_median_m"] < 0.3
+
+
+def test_runs_are_replayed_each_from_its_own_start():
+    """Errors together are those of all epochs; a run without truth counts its epochs alone."""
+    logs = {"a": recording(lambda times: ROOM), "b": recording(swaying, count=30)}
+    logs["none"] = logs["a"]._replace(truth=None)
+    found = replay.replay_runs(logs, SETTINGS)
+    alone = {run: replay.replay_recording(log, SETTINGS) for run, log in logs.items()}
+    for run, one in alone.items():
+        np.testing.assert_array_equal(found.runs[run].track.translation, one.track.translation)
+    together = found.figures["together"]
+    assert (together["epochs"], together["epochs_with_truth"]) == (150, 90)
+    squares = [np.square(one.errors.position) for one in alone.values() if one.errors is not None]
+    rmse = np.sqrt(np.concatenate(squares).mean())
+    assert together["position_rmse_m"] == pytest.approx(rmse)
+    assert isinstance(found, replay.ReplayedRuns)
+    with pytest.raises(ValueError, match="recordings must hold a run, got none"):
+        replay.replay_runs({}, SETTINGS)

@@ -148,7 +148,7 @@ def _replay(options: argparse.Namespace) -> int:
     settings = _settings(options)
     runs = read_runs(options)
     if len(runs) > 1:
-        raise ValueError(f"{options.ranges}: has {len(runs)} runs, {[*runs]!r:.200}; see --run")
+        return _replay_runs(options, runs, settings)
     (recording,) = runs.values()
     # What is wrong is said before the work begins.
     replay.check_replay(recording, settings)
@@ -167,6 +167,22 @@ def _replay(options: argparse.Namespace) -> int:
 
         reports.print_replay(replayed.figures)
         print_files(picture=options.plot, page=options.html)
+    return 0
+
+
+def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any) -> int:
+    from rbl_gym.app import reports
+    from rbl_gym.studies import replay
+
+    if options.plot or options.html:
+        raise ValueError(
+            f"--plot and --html show one run, and {options.ranges} has {len(runs)}, "
+            f"{[*runs]!r:.200}: choose one by --run"
+        )
+    with progress("replay", sum(len(run.times) for run in runs.values())) as advance:
+        replayed = replay.replay_runs(runs, settings, advance)
+    if write_json(replayed.figures, options.json):
+        reports.print_runs(replayed.figures)
     return 0
 
 

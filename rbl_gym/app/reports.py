@@ -124,6 +124,36 @@ def print_replay(result: dict[str, Any]) -> None:
     _print_notes(console, result)
 
 
+def print_runs(result: dict[str, Any]) -> None:
+    """The figures of several runs, a row each, and of all together."""
+    console = new_console()
+    every = {**result["runs"], "together": result["together"]}
+    columns = [
+        (name, places)
+        for name, places in (
+            ("position_rmse_m", 4),
+            ("position_median_m", 4),
+            ("yaw_rmse_deg", 2),
+            ("yaw_mean_deg", 2),
+            ("anees", 2),
+        )
+        if name in result["together"]
+    ]
+    table = new_table()
+    table.add_column("run")
+    for heading in ("epochs", "with truth", *(name.replace("_", " ") for name, _ in columns)):
+        table.add_column(heading, justify="right")
+    for run, one in every.items():
+        cells = [f"{one[name]:.{places}f}" if name in one else "" for name, places in columns]
+        table.add_row(run, str(one["epochs"]), str(one.get("epochs_with_truth", 0)), *cells)
+    console.print(table)
+    notes = [one["notes"] for one in result["runs"].values()]
+    common = [note for note in notes[0] if all(note in others for others in notes)]
+    _print_notes(console, {"notes": common})
+    if own := sum(len(others) > len(common) for others in notes):
+        console.print(f"{own} of {len(notes)} runs have notes of their own: see --run or --json")
+
+
 def compared(result: dict[str, Any]) -> list[str]:
     """How the track of a recording was brought together with its truth, in lines."""
     parts = [

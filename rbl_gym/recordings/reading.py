@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.recordings.calibration import calibrated
 from rbl_gym.recordings.format import Format
 from rbl_gym.recordings.points import read_points
@@ -195,15 +195,8 @@ def _carried(
     log: Log, arms: FloatArray, carrier: Truth, said: Said, path: str
 ) -> tuple[Log, FloatArray]:
     """Anchors (K, M, 3) in the world, and the log without epochs whose carrier is nowhere."""
-    rotation, translation, known = truth_at(carrier, log.times, _CARRIER_GAP_S)
-    if rotation is None:
-        raise ValueError(f"{path}: a carrier needs rotations, got positions alone")
+    rotation, translation, known = _frame_at(carrier, log.times, path)
     places = np.swapaxes(rotation @ np.swapaxes(arms, -1, -2), -1, -2) + translation[:, None]
-    if not known.any():
-        spans = [f"{t[0]:.10g} to {t[-1]:.10g} s" for t in (log.times, carrier.times)]
-        raise ValueError(
-            f"{path}: the carrier's pose is known at no epoch: ranges {spans[0]}, poses {spans[1]}"
-        )
     if not known.all():
         lost = int((log.ranges[~known] > 0).sum())
         said.drop("where the carrier's pose is not known", lost)
@@ -215,11 +208,25 @@ def _carried(
 
 def _seen_from(carrier: Truth, truth: Truth, path: str) -> Truth:
     """Poses in the carrier's frame, where its own are known."""
-    rotation, translation, known = truth_at(carrier, truth.times, _CARRIER_GAP_S)
-    if rotation is None:
-        raise ValueError(f"{path}: a carrier needs rotations, got positions alone")
+    rotation, translation, known = _frame_at(carrier, truth.times, path)
     back = np.swapaxes(rotation, -1, -2)
     shift = (back @ (truth.translation - translation)[..., None])[..., 0]
     turned = None if truth.rotation is None else (back @ truth.rotation)[known]
     planar = truth.planar or carrier.planar
     return Truth(truth.times[known], turned, shift[known], planar, truth.form)
+
+
+def _frame_at(
+    carrier: Truth, times: FloatArray, path: str
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Rotation and translation of the carrier (K, ...), and where they are known."""
+    rotation, translation, known = truth_at(carrier, times, _CARRIER_GAP_S)
+    if rotation is None:
+        raise ValueError(f"{path}: the carrier must have rotations, got positions alone")
+    if not known.any():
+        spans = [f"{t[0]:.10g} to {t[-1]:.10g} s" for t in (times, carrier.times)]
+        raise ValueError(
+            f"{path}: the carrier's pose is known at no time wanted: those are {spans[0]}, its "
+            f"poses {spans[1]}"
+        )
+    return rotation, translation, known

@@ -11,6 +11,7 @@ from rbl_gym.studies.replay.judging import (
 )
 from rbl_gym.studies.replay.mirror import Mirror, covering, other_pose
 from rbl_gym.studies.replay.place import height_offset, origin_of, volume_of
+from rbl_gym.studies.replay.runs import ReplayedRuns, replay_runs
 from rbl_gym.studies.replay.settings import (
     DEFAULT_RANGE_STD_M,
     Biases,
@@ -41,6 +42,7 @@ __all__ = [
     "Motion",
     "Reference",
     "Replayed",
+    "ReplayedRuns",
     "Settings",
     "Track",
     "TrackErrors",
@@ -56,6 +58,7 @@ __all__ = [
     "recording_filter",
     "recording_steps",
     "replay_recording",
+    "replay_runs",
     "track_errors",
     "track_figures",
     "track_recording",

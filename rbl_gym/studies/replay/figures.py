@@ -55,9 +55,13 @@ def track_figures(
     result |= _with_reading(recording, result["notes"])
     if found is None:
         return result
-    known = found.known
-    result["epochs_with_truth"] = int(known.sum())
-    result |= _comparison(recording, track, settings)
+    result["epochs_with_truth"] = int(found.known.sum())
+    return {**result, **_comparison(recording, track, settings), **error_figures(found)}
+
+
+def error_figures(found: TrackErrors) -> dict[str, float]:
+    """Root mean squares, medians and 95 % quantiles of the errors, and the mean NEES."""
+    known, result = found.known, {}
     for name, values in (
         ("position_{}_m", found.position),
         ("yaw_{}_deg", found.yaw),

@@ -1,0 +1,105 @@
+"""Several runs of one log, each replayed from its own start; figures of each and together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.figures import error_figures
+from rbl_gym.studies.replay.judging import TrackErrors
+from rbl_gym.studies.replay.settings import Settings
+from rbl_gym.studies.replay.study import Replayed, check_replay, replay_recording
+
+__all__ = ["ReplayedRuns", "replay_runs"]
+
+
+class ReplayedRuns(NamedTuple):
+    """Runs as a filter saw them.
+
+    Attributes
+    ----------
+    runs
+        Each, by its name.
+    figures
+        Plain numbers: ``"runs"``, the figures of each by its name, and ``"together"``, errors of
+        all epochs that have truth.
+    """
+
+    runs: dict[str, Replayed]
+    figures: dict[str, Any]
+
+
+def replay_runs(
+    recordings: Mapping[str, Recording],
+    settings: Settings,
+    advance: Callable[[], None] = lambda: None,
+) -> ReplayedRuns:
+    """Replay the runs of a log, each from its own start.
+
+    Parameters
+    ----------
+    recordings
+        Of `rbl_gym.recordings.read_runs`.
+    settings
+        How they are filtered.
+    advance
+        Called after every epoch.
+
+    Raises
+    ------
+    ValueError
+        As `replay_recording`, with the name of the run; before any work where it can be known.
+    """
+    if not recordings:
+        raise ValueError("recordings must hold a run, got none")
+    for run, recording in recordings.items():
+        _named(run, lambda recording=recording: check_replay(recording, settings))
+    replayed = {
+        run: _named(run, lambda log=recording: replay_recording(log, settings, advance))
+        for run, recording in recordings.items()
+    }
+    every = [one.figures for one in replayed.values()]
+    together: dict[str, Any] = {
+        name: sum(one[name] for one in every) for name in ("epochs", "links", "duration_s")
+    }
+    found = [one.errors for one in replayed.values() if one.errors is not None]
+    if found:
+        errors = _joined(found)
+        together["epochs_with_truth"] = int(errors.known.sum())
+        axes = {one["position_axes"] for one in every if "position_axes" in one}
+        together["position_axes"] = "xyz" if axes == {"xyz"} else "xy"
+        together |= error_figures(errors)
+    figures = {run: one.figures for run, one in replayed.items()}
+    return ReplayedRuns(replayed, {"runs": figures, "together": together})
+
+
+def _named(run: str, work: Callable[[], Any]) -> Any:
+    try:
+        return work()
+    except ValueError as error:
+        raise ValueError(f"run {run!r}: {error}") from error
+
+
+def _joined(found: list[TrackErrors]) -> TrackErrors:
+    """Errors of several runs as those of one; what one run does not tell is not told."""
+
+    def told(arrays: list[FloatArray | None]) -> FloatArray | None:
+        known = [a for a in arrays if a is not None]
+        return np.concatenate(known) if len(known) == len(arrays) else None
+
+    freedom = np.concatenate([np.full(len(e.known), e.freedom) for e in found])
+    # NEES of runs that are judged by fewer components count as of as many.
+    most = int(freedom.max())
+    return TrackErrors(
+        np.concatenate([e.known for e in found]),
+        np.concatenate([e.position for e in found]),
+        told([e.yaw for e in found]),
+        told([e.rotation for e in found]),
+        np.concatenate([e.nees for e in found]) * most / freedom,
+        told([e.tags for e in found]),
+        most,
+    )
