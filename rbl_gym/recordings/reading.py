@@ -222,7 +222,7 @@ def _frame_at(
     """Rotation and translation of the carrier (K, ...), and where they are known."""
     rotation, translation, known = truth_at(carrier, times, _CARRIER_GAP_S)
     if rotation is None:
-        raise ValueError(f"{path}: the carrier must have rotations, got positions alone")
+        raise ValueError(f"{path}: a carrier needs rotations, got positions alone")
     if not known.any():
         spans = [f"{t[0]:.10g} to {t[-1]:.10g} s" for t in (times, carrier.times)]
         raise ValueError(
