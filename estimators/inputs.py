@@ -132,8 +132,9 @@ def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
 
 
 def are_positive(values: FloatArray) -> bool:
-    """Whether all are positive and finite, without a mask of them: NaN fails both comparisons."""
-    return bool(values.min() > 0 and (np.vdot(values, values) < HUGE or values.max() < HUGE))
+    """Whether all are positive and finite: NaN fails both comparisons."""
+    positive = np.count_nonzero(values > 0) == values.size
+    return positive and bool(np.vdot(values, values) < HUGE or values.max() < HUGE)
 
 
 def epoch_variance(
@@ -168,7 +169,7 @@ def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
         used = links if variance.shape[-1] == links.shape[-1] else links.any(-1, keepdims=True)
         variance = np.where(used, variance, 1.0)
     # False of NaN too.
-    if not variance.min() > 0:
+    if np.count_nonzero(variance > 0) < variance.size:
         raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
     return variance
 

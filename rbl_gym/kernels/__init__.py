@@ -43,6 +43,11 @@ def enabled() -> bool:
     return True
 
 
+def _under_errstate(function: Callable[..., Any], *args: Any) -> Any:
+    with np.errstate(all="ignore"):
+        return function(*args)
+
+
 class Compiled:
     """A function with a textbook form and a kernel, made by `compiled`.
 
@@ -73,22 +78,20 @@ class Compiled:
 
     def __call__(self, *args: Any) -> Any:
         """The kernel or the textbook form of the arguments."""
-        run = self._run
-        if run is None:
-            run = self._run = self.kernel if enabled() else self.textbook
-        if isinstance(run, np.ufunc):
-            # As errstate, in a tenth of its time: what follows calls nothing of ours, so that
-            # only another thread can be in this context already.
-            try:
-                return _QUIET.run(run, *args)
-            except RuntimeError:
-                return self._under_errstate(run, *args)
-        return self._under_errstate(run, *args)
-
-    @staticmethod
-    def _under_errstate(run: Callable[..., Any], *args: Any) -> Any:
-        with np.errstate(all="ignore"):
+        run = self._run or self._choose()
+        try:
             return run(*args)
+        except RuntimeError:
+            # Another thread is in the quiet context; it calls nothing of ours, which could be us.
+            return _under_errstate(self.kernel if enabled() else self.textbook, *args)
+
+    def _choose(self) -> Callable[..., Any]:
+        """The form to run, from the first call on; in a tenth of errstate's time if compiled."""
+        if enabled():
+            self._run = functools.partial(_QUIET.run, self.kernel)
+        else:
+            self._run = functools.partial(_under_errstate, self.textbook)
+        return self._run
 
     def __reduce__(self) -> str:
         return self.__qualname__  # pyright: ignore[reportAttributeAccessIssue]
