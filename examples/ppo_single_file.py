@@ -142,7 +142,7 @@ def main() -> None:
     policy = as_arrays(agent, options.seed)
     policies.save(policy, options.out)
     result = evaluation.evaluate(
-        rl_task("auv_buoys"), {"ppo": policy}, ["corners", "ring"], options.worlds, 0, lambda: None
+        rl_task("auv_buoys"), {"ppo": policy}, ["corners", "ring"], options.worlds, 0
     )
     for name, row in sorted(result["methods"].items(), key=lambda item: item[1]["loss"]):
         print(

@@ -16,6 +16,7 @@ import pytest
 
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
+from rbl_gym.studies.progress import Advance
 
 DATA = Path(__file__).parent / "data"
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,6 +26,16 @@ def needs(*packages: str) -> Any:
     """Marks a test of what these packages are for: extras that need not be installed."""
     missing = [name for name in packages if find_spec(name) is None]
     return pytest.mark.skipif(bool(missing), reason=f"needs {', '.join(missing)}")
+
+
+class Told(Advance):
+    """Listens to a study's `advance`."""
+
+    done = announced = 0
+
+    def __call__(self, steps: int = 1, *, more: int = 0) -> None:
+        self.done += steps
+        self.announced += more
 
 
 def load(name: str) -> Any:

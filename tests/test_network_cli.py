@@ -270,5 +270,5 @@ def test_the_limit_of_all_trials_at_once_is_the_iterations():
 def test_the_same_seed_gives_the_same_figures(small, monkeypatch):
     monkeypatch.setattr(network2009, "BASES", network2009.BASES[:1])
     monkeypatch.setattr(network2009, "LOOPS", network2009.LOOPS[:1])
-    results = [network2009.network_experiment(2, seed, lambda: None) for seed in (3, 3, 4)]
+    results = [network2009.network_experiment(2, seed) for seed in (3, 3, 4)]
     assert results[0] == results[1] != results[2]

@@ -9,14 +9,14 @@ import pytest
 
 from rbl_gym.app.cli import main
 from rbl_gym.placement import scene_files
-from rbl_gym.studies import backends, hard, monte_carlo, network, replay
+from rbl_gym.studies import backends, monte_carlo, network, replay
 from rbl_gym.studies.bench import leaderboard, records, spec_files
 from rbl_gym.studies.learning import evaluation, transfer
 from rbl_gym.studies.learning.rl_tasks import rl_task
 from rbl_gym.studies.papers import camsap2013, doa2019, icassp2013, network_growth, slides2013
 from rbl_gym.studies.placing import accuracy, check, design
 from rbl_gym.worlds import scenes
-from tests.helpers import needs
+from tests.helpers import Told, needs
 from tests.test_epoch_noise import log
 
 
@@ -36,9 +36,9 @@ def timeless(value):
 
 
 def test_demo(capsys, tmp_path):
-    calls = []
-    mine = camsap2013.tracking_experiment(4, 2, lambda: calls.append(1))
-    assert len(calls) == camsap2013.work_units()
+    told = Told()
+    mine = camsap2013.tracking_experiment(4, 2, told)
+    assert told.done == told.announced == 120
     theirs = printed(capsys, "demo", "--trials", "4", "--seed", "2", "--plot", f"{tmp_path}/x.png")
     assert timeless(mine) == timeless(theirs)
     assert {claim["statement"] for claim in mine["claims"]}
@@ -152,14 +152,10 @@ def test_place(capsys, monkeypatch):
 @needs("cmaes")
 def test_transfer_is_layouts_and_bodies_among_them(monkeypatch):
     monkeypatch.setattr(transfer, "_STEPS", 12)
-    task, calls = rl_task("mounts"), []
-    found = transfer.transfer_layouts(
-        task, {}, ["random", "greedy"], 2, 1, 3, lambda: calls.append(1)
-    )
-    assert len(calls) == transfer.transfer_work_units(task, ["random", "greedy"], 0)
-    problem, contexts, layouts = evaluation.layouts_of(
-        task, {}, ["random", "greedy"], 2, 3, lambda: None
-    )
+    task, told = rl_task("mounts"), Told()
+    found = transfer.transfer_layouts(task, {}, ["random", "greedy"], 2, 1, 3, told)
+    assert told.done == told.announced > 2
+    problem, contexts, layouts = evaluation.layouts_of(task, {}, ["random", "greedy"], 2, 3)
     again = transfer.track_layouts(problem, contexts, layouts, ["iekf"], 1, 3)
     assert again["filters"]["iekf"] == found["filters"]["iekf"]
     assert (found["worlds"], found["seed"]) == (2, 3)
@@ -204,4 +200,3 @@ def test_trials_are_a_batch_and_the_bound_is_theirs():
     trace = monte_carlo.track_trials(trials, "iekf", {})
     assert isinstance(trace, monte_carlo.Trace)
     assert trace.nees.shape == (3, 3)
-    assert hard.work_units() > 0

@@ -59,13 +59,23 @@ def test_plain_progress_is_silent_away_from_a_terminal(without_rich, capsys):
 
 def test_plain_progress_counts_on_a_terminal(without_rich, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    with terminal.progress("replay", 1000) as advance:
+    with terminal.progress("replay") as advance:
+        advance(0, more=600)
+        advance(0, more=400)
         for _ in range(1000):
             advance()
     shown = capsys.readouterr().err.split("\r")[1:]
-    assert len(shown) == 100
-    assert shown[0] == "replay 10/1000"
+    assert len(shown) == 101
+    assert shown[1] == "replay 10/1000"
     assert shown[-1] == "replay 1000/1000\n"
+
+
+@needs("rich")
+def test_progress_by_rich_takes_what_is_announced(capsys):
+    with terminal.progress("replay", 3) as advance:
+        advance(0, more=2)
+        advance(4)
+    assert "4/5" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

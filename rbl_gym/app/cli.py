@@ -168,7 +168,7 @@ def _demo(options: argparse.Namespace) -> int:
     from rbl_gym.studies.papers import camsap2013
 
     check_html(options)
-    with progress("tracking", camsap2013.work_units()) as advance:
+    with progress("tracking") as advance:
         result = camsap2013.tracking_experiment(options.trials, options.seed, advance)
     from rbl_gym.app import figures, reports
 
@@ -192,7 +192,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in named if getattr(options, name) is not None}
     if wrong := [name for name in given if name not in experiment.options]:
         raise ValueError(f"{options.experiment} takes no {' and no '.join(wrong)}")
-    with progress(options.experiment, experiment.work_units) as advance:
+    with progress(options.experiment) as advance:
         result = experiment.run(options.trials, options.seed, advance, **given)
     from rbl_gym.app import figures
 
@@ -234,7 +234,7 @@ def _place(options: argparse.Namespace) -> int:
     )
     numbers = numbers or range(problem.task.n_anchors, problem.task.n_anchors + 1)
     scene_files.check_n_anchors(numbers[0])
-    with progress("placing", place.work_units(numbers)) as advance:
+    with progress("placing") as advance:
         placed = place.place_anchors(problem, numbers, options.seed, options.trials, advance)
     if options.plot:
         from rbl_gym.app import figures, place_figures

@@ -113,9 +113,8 @@ def _evaluate(options: argparse.Namespace) -> int:
     task = rl_task(options.task)
     loaded = _policies(options.policy)
     names = _references(options, evaluation.references(task))
-    units = evaluation.work_units(task, names, len(loaded))
     try:
-        with progress(options.task, units) as advance:
+        with progress(options.task) as advance:
             result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)
     except ModuleNotFoundError as error:
         raise MissingExtraError(str(error)) from error
@@ -134,8 +133,7 @@ def _transfer(options: argparse.Namespace) -> int:
     task = rl_task(options.task)
     loaded = _policies(options.policy)
     names = _references(options, transfer.transfer_references(task))
-    units = transfer.transfer_work_units(task, names, len(loaded))
-    with progress(options.task, units) as advance:
+    with progress(options.task) as advance:
         result = transfer.transfer_layouts(
             task, loaded, names, options.worlds, options.repeats, options.seed, advance
         )

@@ -11,14 +11,11 @@ from typing import Any, NamedTuple
 from rbl_gym.studies import hard
 from rbl_gym.studies.papers import camsap2013, doa2019, icassp2013, network2009, slides2013
 
-Advance = Callable[[], None]
-
 
 class Experiment(NamedTuple):
-    """What an experiment shows, its work, its function, and how its result is drawn and printed."""
+    """What an experiment shows, its function, and how its result is drawn and printed."""
 
     summary: str
-    work_units: int
     run: Callable[..., dict[str, Any]]  # of trials, seed, advance; `options` by keyword
     figure: Callable[[dict[str, Any], int], Any]  # of the result and the seed
     show: Callable[[dict[str, Any]], None]
@@ -48,7 +45,6 @@ def experiments() -> dict[str, Experiment]:
     return {
         "camsap2013": Experiment(
             "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), ET-KF's trade",
-            camsap2013.work_units(trade=True),
             lambda trials, seed, advance: camsap2013.tracking_experiment(
                 trials, seed, advance, trade=True
             ),
@@ -57,21 +53,18 @@ def experiments() -> dict[str, Experiment]:
         ),
         "doa2019": Experiment(
             "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
-            doa2019.work_units(),
             doa2019.doa_experiment,
             _drawn("doa_figures", "doa2019_figure"),
             _late("doa_figures", "print_doa2019"),
         ),
         "hard": Experiment(
             "hard conditions: lost and reflected links, wrong starts, outages (docs)",
-            hard.work_units(),
             hard.compare_hard_conditions,
             _drawn("hard_figures", "hard_figure"),
             _late("hard_figures", "print_hard"),
         ),
         "icassp2013": Experiment(
             "static: LS, CLS, Procrustes, ML at reference ranges of 40 to 100 dB (Figs 2 and 3)",
-            icassp2013.work_units(icassp2013.static_settings()),
             lambda *arguments: icassp2013.static_experiment(
                 "icassp2013", icassp2013.static_settings(), *arguments
             ),
@@ -80,14 +73,12 @@ def experiments() -> dict[str, Experiment]:
         ),
         "slides2013": Experiment(
             "5 tags on a rectangular pyramid, 4 anchors: static, and the tracking experiment",
-            slides2013.work_units(),
             slides2013.slides_experiment,
             _drawn("figures", "slides2013_figure"),
             _late("reports", "print_slides2013"),
         ),
         "network2009": Experiment(
             "planar networks: cycle consensus (Figs 3 to 6), convergence, kappa against n",
-            network2009.work_units(),
             network2009.network_experiment,
             _drawn("network2009_figures", "network2009_figure"),
             _late("network2009_figures", "print_network2009"),

@@ -6,12 +6,13 @@ import argparse
 import contextlib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.tables import has_rich
 from rbl_gym.studies.extras import require
+from rbl_gym.studies.progress import Advance
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -48,8 +49,8 @@ def check_html(options: argparse.Namespace) -> None:
 
 
 @contextlib.contextmanager
-def progress(label: str, total: int) -> Iterator[Callable[..., None]]:
-    """A progress bar on standard error; yields the function that advances it (by 1)."""
+def progress(label: str, total: int = 0) -> Iterator[Advance]:
+    """A progress bar on standard error, of `total` steps and those that are announced later."""
     if not has_rich():
         yield from _plain_progress(label, total)
         return
@@ -59,17 +60,22 @@ def progress(label: str, total: int) -> Iterator[Callable[..., None]]:
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(label, total=total)
-        yield lambda steps=1: bar.advance(task, steps)
+
+        def advance(steps: int = 1, *, more: int = 0) -> None:
+            bar.update(task, advance=steps, total=(bar.tasks[task].total or 0) + more)
+
+        yield advance
 
 
-def _plain_progress(label: str, total: int) -> Iterator[Callable[..., None]]:
+def _plain_progress(label: str, total: int) -> Iterator[Advance]:
     """A line that is written over, on a terminal only."""
-    done = shown = 0
+    done, shown = 0, ""
 
-    def advance(steps: int = 1) -> None:
-        nonlocal done, shown
-        done += steps
-        if sys.stderr.isatty() and (percent := 100 * done // max(total, 1)) > shown:
+    def advance(steps: int = 1, *, more: int = 0) -> None:
+        nonlocal done, shown, total
+        done, total = done + steps, total + more
+        percent = f"{100 * done // max(total, 1)} %"
+        if sys.stderr.isatty() and percent != shown:
             shown = percent
             print(f"\r{label} {done}/{total}", end="", file=sys.stderr, flush=True)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,12 +10,12 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.studies import monte_carlo
 from rbl_gym.studies.monte_carlo import SimulatedTrials
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
 __all__ = [
     "compare_hard_conditions",
-    "work_units",
 ]
 
 LINK_SCENES = ("uwb_room", "drone_yard")
@@ -54,19 +53,11 @@ class _Case(NamedTuple):
     back: int
 
 
-def work_units() -> int:
-    """How often `compare_hard_conditions` calls `advance`."""
-    links = len(LINK_SCENES) * len(CONDITIONS) * len(FILTERS)
-    return links + len(STARTS) * sum(len(_start_filters(name)) for name in START_SCENES)
-
-
 def _start_filters(scene: str) -> tuple[str, ...]:
     return (*START_FILTERS, "bank, volume") if scene in _COPLANAR else START_FILTERS
 
 
-def compare_hard_conditions(
-    trials: int, seed: int, advance: Callable[[], None] = lambda: None
-) -> dict[str, Any]:
+def compare_hard_conditions(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
     """All filters under all conditions, and all starts.
 
     Returns
@@ -79,11 +70,14 @@ def compare_hard_conditions(
     ``starts[scene][start][filter]``: share of the trials that are back `AFTER` so many epochs.
     """
     result: dict[str, Any] = {"experiment": "hard", "trials": trials, "seed": seed}
+    links = len(LINK_SCENES) * len(CONDITIONS) * len(FILTERS)
+    starts = len(STARTS) * sum(len(_start_filters(name)) for name in START_SCENES)
+    advance(0, more=links + starts)
     result["links"] = {}
     for i, name in enumerate(LINK_SCENES):
         table = result["links"][name] = {}
-        for k, (condition, links) in enumerate(CONDITIONS.items()):
-            scene = scenes.get({"name": name, "links": links})
+        for k, (condition, model) in enumerate(CONDITIONS.items()):
+            scene = scenes.get({"name": name, "links": model})
             rng = np.random.default_rng([seed, 0, i, k])
             table[condition] = _links(scene, trials, rng, advance)
     result["starts"] = {"after": list(AFTER), "scenes": {}}
@@ -101,9 +95,7 @@ def compare_hard_conditions(
 # --- links ---------------------------------------------------------------------------------------
 
 
-def _links(
-    scene: Scene, count: int, rng: np.random.Generator, advance: Callable[[], None]
-) -> dict[str, Any]:
+def _links(scene: Scene, count: int, rng: np.random.Generator, advance: Advance) -> dict[str, Any]:
     """All filters on the same episodes of one scene and condition."""
     trials = monte_carlo.simulate_trials(scene, count, rng)
     good = np.array([m.links & ~m.nlos for m in trials.measurements])
@@ -184,7 +176,7 @@ def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Cas
     return _Case(simulated._replace(episode=episode), information, back)
 
 
-def _back(case: _Case, label: str, robust: bool, advance: Callable[[], None]) -> dict[str, Any]:
+def _back(case: _Case, label: str, robust: bool, advance: Advance) -> dict[str, Any]:
     """Who is back when, and what a step took."""
     options: dict[str, Any] = {"robust": robust}
     if label == "bank, volume":

@@ -20,6 +20,7 @@ from rbl_gym.placement import layouts, search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.learning.policies import Policy, check_fit
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.wrappers import controllers
 
 __all__ = [
@@ -27,7 +28,6 @@ __all__ = [
     "held_out_returns",
     "layouts_of",
     "references",
-    "work_units",
 ]
 
 # The reference that is one layout for all contexts, and the contexts it is optimised over.
@@ -62,7 +62,7 @@ def evaluate(
     names: list[str],
     worlds: int,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
 ) -> dict[str, Any]:
     """Losses of policies and references on the same `worlds` held-out worlds.
 
@@ -134,13 +134,6 @@ def held_out_returns(task: RlTask, policy: Policy, worlds: int, seed: int) -> di
     return result
 
 
-def work_units(task: RlTask, names: list[str], n_policies: int) -> int:
-    """How often `evaluate` calls `advance`."""
-    known = references(task)
-    refined = task.env_id == "RBL/AnchorPlacement-v0" and task.arguments.get("mode") != "mounts"
-    return len({*names, known[0], known[-1]}) + n_policies * (2 if refined else 1)
-
-
 def _figures(
     loss: FloatArray, random: FloatArray, best: FloatArray, resamples: np.ndarray
 ) -> dict[str, float]:
@@ -177,12 +170,13 @@ def _of_all(
     policies: dict[str, Policy],
     names: list[str],
     seed: int,
-    advance: Callable[[], None],
+    advance: Advance,
     of_reference: Callable[[str, np.random.Generator], FloatArray],
     of_policy: Callable[[Policy], FloatArray],
 ) -> dict[str, FloatArray]:
     """What two functions give of references, each with a generator of its own, and of policies."""
     _check_policies(task, policies)
+    advance(0, more=len(names) + len(policies))
     found = {}
     for name in names:
         rng = np.random.default_rng([seed, references(task).index(name)])
@@ -203,7 +197,7 @@ def _loop_losses(
     names: list[str],
     worlds: int,
     seed: int,
-    advance: Callable[[], None],
+    advance: Advance,
 ) -> dict[str, FloatArray]:
     def reference(name: str, rng: np.random.Generator) -> FloatArray:
         controller = _controllers(task)[name]
@@ -248,10 +242,11 @@ def _placement_losses(
     names: list[str],
     worlds: int,
     seed: int,
-    advance: Callable[[], None],
+    advance: Advance,
 ) -> dict[str, FloatArray]:
     problem, contexts, found = layouts_of(task, policies, names, worlds, seed, advance)
     if task.arguments.get("mode") != "mounts":
+        advance(0, more=len(policies))
         for label in policies:
             rng = np.random.default_rng([seed, len(references(task))])
             found[f"{label} + cma-es"] = _refined(problem, contexts, found[label], rng)
@@ -265,7 +260,7 @@ def layouts_of(
     names: list[str],
     worlds: int,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
 ) -> tuple[PlacementTask, Context, dict[str, FloatArray]]:
     """Layouts of references and policies in held-out contexts.
 

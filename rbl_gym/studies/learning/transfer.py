@@ -7,7 +7,7 @@ the layouts were made for, and the filter's root mean square tag error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.learning import evaluation
 from rbl_gym.studies.learning.policies import Policy
 from rbl_gym.studies.learning.rl_tasks import RlTask
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds.scene import Scene
 
 __all__ = [
@@ -31,7 +32,6 @@ __all__ = [
     "tracking_filters",
     "transfer_layouts",
     "transfer_references",
-    "transfer_work_units",
 ]
 
 # Steps of an episode, of which the first are the filter's settling; way-points of an episode.
@@ -76,7 +76,7 @@ def transfer_layouts(
     worlds: int,
     repeats: int,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
 ) -> dict[str, Any]:
     """Let policies and references place anchors in held-out worlds, and track bodies among them.
 
@@ -91,7 +91,7 @@ def transfer_layouts(
     worlds, repeats, seed
         Held-out worlds, bodies in each, and which.
     advance
-        Called `transfer_work_units` times.
+        Told of each layout, then of each filter and label.
 
     Returns
     -------
@@ -103,11 +103,6 @@ def transfer_layouts(
     return found | {"worlds": worlds, "seed": seed}
 
 
-def transfer_work_units(task: RlTask, names: list[str], n_policies: int) -> int:
-    """How often `transfer_layouts` calls `advance`."""
-    return (len(tracking_filters(task)) + 1) * (len(names) + n_policies)
-
-
 def track_layouts(
     task: PlacementTask,
     contexts: Context,
@@ -115,7 +110,7 @@ def track_layouts(
     filters: list[str],
     repeats: int,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
 ) -> dict[str, Any]:
     """Scores and filter errors of layouts; every layout meets the same bodies.
 
@@ -146,6 +141,7 @@ def track_layouts(
         for label, anchors in layouts.items()
     }
     result: dict[str, Any] = {"steps": _STEPS, "repeats": repeats, "filters": {}}
+    advance(0, more=len(filters) * len(layouts))
     for name in filters:
         rows = {}
         for label, anchors in layouts.items():

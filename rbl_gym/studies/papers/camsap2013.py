@@ -7,7 +7,7 @@ orientation of a mobile rigid body", CAMSAP 2013.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from rbl_gym.estimators import PoseBelief
 from rbl_gym.studies import monte_carlo
 from rbl_gym.studies.epochs import stack_beliefs
 from rbl_gym.studies.monte_carlo import SimulatedTrials, Trace, rms
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.scene import Scene
 
@@ -28,7 +29,6 @@ __all__ = [
     "example",
     "paper_scene",
     "tracking_experiment",
-    "work_units",
 ]
 
 Filters = Mapping[str, tuple[str, dict[str, Any]]]
@@ -88,7 +88,7 @@ def paper_scene() -> Scene:
 def tracking_experiment(
     trials: int,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
     *,
     trade: bool = False,
     world: Scene | None = None,
@@ -117,6 +117,7 @@ def tracking_experiment(
     simulated = monte_carlo.simulate_trials(
         world or paper_scene(), trials, np.random.default_rng([seed, 0])
     )
+    advance(0, more=(len(filters) + 1 + trade * len(THRESHOLDS)) * STEPS)
     traces = {
         label: monte_carlo.track_trials(simulated, name, options, advance)
         for label, (name, options) in filters.items()
@@ -137,12 +138,7 @@ def tracking_experiment(
     return result
 
 
-def work_units(*, trade: bool = False, filters: Filters = FILTERS) -> int:
-    """How often `tracking_experiment` calls `advance`."""
-    return (len(filters) + 1 + (len(THRESHOLDS) if trade else 0)) * STEPS
-
-
-def _trade(trials: SimulatedTrials, advance: Callable[[], None]) -> list[dict[str, float]]:
+def _trade(trials: SimulatedTrials, advance: Advance) -> list[dict[str, float]]:
     rows = []
     for threshold in THRESHOLDS:
         trace = monte_carlo.track_trials(trials, "et-kf", {"threshold": threshold}, advance)

@@ -12,7 +12,6 @@ and ``within_half_metre``, an error of the translation below 0.5 m.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,10 +22,10 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import bearing
 from rbl_gym.studies.monte_carlo import rms
+from rbl_gym.studies.progress import Advance, silent
 
 __all__ = [
     "doa_experiment",
-    "work_units",
 ]
 
 METHODS = {"NIA + UQ": "nia", "ML": "ml", "PSO": "pso", "PSA": "psa"}
@@ -44,14 +43,7 @@ _HALF_METRE = 0.5
 _NEAR = 6.0
 
 
-def work_units() -> int:
-    """How often `doa_experiment` calls `advance`."""
-    return len(SETTINGS) * len(SIGMAS_DEG) * len(METHODS)
-
-
-def doa_experiment(
-    trials: int, seed: int, advance: Callable[[], None] = lambda: None
-) -> dict[str, Any]:
+def doa_experiment(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
     """Every method at every noise of both settings, with the constrained Cramer-Rao bound.
 
     Returns
@@ -66,6 +58,7 @@ def doa_experiment(
     result: dict[str, Any] = {"experiment": "doa2019", "trials": trials, "seed": seed}
     result["table_1"] = TABLE_1
     result["settings"] = {}
+    advance(0, more=len(SETTINGS) * len(SIGMAS_DEG) * len(METHODS))
     for index, label in enumerate(SETTINGS):
         rows = [
             _noise(label, sigma, trials, np.random.default_rng([seed, index, k]), advance)
@@ -85,7 +78,7 @@ def _noise(
     sigma_deg: float,
     trials: int,
     rng: np.random.Generator,
-    advance: Callable[[], None],
+    advance: Advance,
 ) -> dict[str, dict[str, float]]:
     """All methods and the bound at one noise."""
     tags, noise = bodies.doa2019(), bearing.AngleNoise(np.deg2rad(sigma_deg))

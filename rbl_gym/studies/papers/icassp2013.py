@@ -6,7 +6,6 @@ rigid body: rigid body localization", ICASSP 2013.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import ranging
 from rbl_gym.studies.monte_carlo import rms
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds import scenes
 
 __all__ = [
@@ -23,7 +23,6 @@ __all__ = [
     "Setting",
     "static_experiment",
     "static_settings",
-    "work_units",
 ]
 
 METHODS = {
@@ -81,7 +80,7 @@ def static_experiment(
     settings: dict[str, Setting],
     trials: int,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
 ) -> dict[str, Any]:
     """Every method at every reference range of every setting, with the bounds.
 
@@ -103,6 +102,7 @@ def static_experiment(
     figures per reference range and their mean ratio to the bound.
     """
     result: dict[str, Any] = {"experiment": name, "trials": trials, "seed": seed, "settings": {}}
+    advance(0, more=len(settings) * len(REFERENCE_RANGES_DB))
     for index, (label, setting) in enumerate(settings.items()):
         if isinstance(setting.anchors, int):
             rng = np.random.default_rng([seed, index])
@@ -129,11 +129,6 @@ def static_experiment(
     return result
 
 
-def work_units(settings: dict[str, Setting]) -> int:
-    """How often `static_experiment` calls `advance`."""
-    return len(settings) * len(REFERENCE_RANGES_DB)
-
-
 def _columns(rows: list[dict[str, float]]) -> dict[str, Any]:
     return {key: [row[key] for row in rows] for key in rows[0]}
 
@@ -143,7 +138,7 @@ def _epoch(
     db: int,
     trials: int,
     rng: np.random.Generator,
-    advance: Callable[[], None],
+    advance: Advance,
 ) -> dict[str, dict[str, float]]:
     """All methods and bounds at one reference range."""
     scene = scenes.SCENES["icassp2013"]

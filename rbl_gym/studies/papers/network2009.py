@@ -12,7 +12,7 @@ networks of ten nodes uniform in a square.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,11 +27,11 @@ from rbl_gym.networks.bounds import edge_variance
 from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.sensing import check_positions, proj, unit_disk_edges
 from rbl_gym.studies.papers import network_growth
+from rbl_gym.studies.progress import Advance, silent
 
 __all__ = [
     "network_experiment",
     "read_points",
-    "work_units",
 ]
 
 # Node 0, the reference, is the one at the bottom left, as in Fig. 6.
@@ -74,15 +74,10 @@ class DrawnNetwork(NamedTuple):
     y: FloatArray
 
 
-def work_units() -> int:
-    """How often `network_experiment` calls `advance`."""
-    return 4
-
-
 def network_experiment(
     trials: int,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
     *,
     positions: FloatArray | str | None = None,
     footprints: Sequence[float] | None = None,
@@ -95,7 +90,7 @@ def network_experiment(
     trials, seed
         Of Fig. 4 and of three nodes in space.
     advance
-        Called `work_units` times.
+        Told of four steps.
     positions
         (n, 2) fixed points, the first of which is the reference, or a CSV file of them with a
         header x,y; None: `PLACES`.
@@ -131,6 +126,7 @@ def network_experiment(
     )
     if not radii:
         raise ValueError("footprint must be at least one radius, got none")
+    advance(0, more=4)
     graphs = [_seen(places, radius) for radius in radii]
     result: dict[str, Any] = {"experiment": "network2009", "trials": trials, "seed": seed}
     result["networks"] = {

@@ -8,7 +8,6 @@ two papers, the body's size is that of the static paper's.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,13 @@ from rbl_gym.checks import as_tuples
 from rbl_gym.geometry import bodies
 from rbl_gym.studies.papers import camsap2013, icassp2013
 from rbl_gym.studies.papers.icassp2013 import Setting
+from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds.scene import Scene
 
 __all__ = [
     "slides_experiment",
     "slides_scene",
     "slides_settings",
-    "work_units",
 ]
 
 TAGS = bodies.centred([[0, 0, 0], [5, 0, 0], [5, 4, 0], [0, 4, 0], [2.5, 2, 5]])
@@ -46,17 +45,10 @@ def slides_scene() -> Scene:
     return dataclasses.replace(camsap2013.paper_scene(), tags=as_tuples(TAGS))
 
 
-def slides_experiment(
-    trials: int, seed: int, advance: Callable[[], None] = lambda: None
-) -> dict[str, Any]:
+def slides_experiment(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
     """The static experiment, with `camsap2013.tracking_experiment` as its ``"dynamic"``."""
     static = icassp2013.static_experiment("slides2013", slides_settings(), trials, seed, advance)
     dynamic = camsap2013.tracking_experiment(
         trials, seed, advance, world=slides_scene(), filters=FILTERS
     )
     return static | {"dynamic": dynamic | {"experiment": "slides2013, dynamic"}}
-
-
-def work_units() -> int:
-    """How often `slides_experiment` calls `advance`."""
-    return icassp2013.work_units(slides_settings()) + camsap2013.work_units(filters=FILTERS)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +16,7 @@ from rbl_gym.placement.scene_files import Problem
 from rbl_gym.studies.monte_carlo import rms
 from rbl_gym.studies.placing import check
 from rbl_gym.studies.placing.accuracy import accuracy, free_grid, free_sample
+from rbl_gym.studies.progress import Advance, silent
 
 __all__ = [
     "Design",
@@ -24,7 +24,6 @@ __all__ = [
     "design_layout",
     "place_anchors",
     "prediction",
-    "work_units",
 ]
 
 # Poses over which layouts are scored while searching: racks make the score rough.
@@ -72,7 +71,7 @@ class Design(NamedTuple):
 def design_layout(
     problem: Problem,
     seed: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
     smaller: FloatArray | None = None,
 ) -> Design:
     """The best layout of a problem: greedy with swaps, then CMA-ES from it and from the ring.
@@ -169,17 +168,12 @@ class Placed(NamedTuple):
     result: dict[str, Any]
 
 
-def work_units(numbers: range) -> int:
-    """How often `place_anchors` advances."""
-    return len(numbers) * SEARCH_STEPS + 1
-
-
 def place_anchors(
     problem: Problem,
     numbers: range,
     seed: int,
     trials: int,
-    advance: Callable[[], None] = lambda: None,
+    advance: Advance = silent,
 ) -> Placed:
     """Design, predict, compare and check; figures as plain numbers.
 
@@ -195,6 +189,7 @@ def place_anchors(
         Called after every step of the work.
     """
     rows, best, found = [], None, None
+    advance(0, more=len(numbers) * SEARCH_STEPS + 1)
     for number in numbers:
         problem = scene_files.with_anchors(problem, number)
         found = design_layout(problem, seed, advance, best)
