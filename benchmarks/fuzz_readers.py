@@ -18,7 +18,9 @@ import tempfile
 from pathlib import Path
 
 INSTRUMENTED = [
-    "rbl_gym.recordings.reading", "rbl_gym.placement.scene_files", "rbl_gym.networks.g2o",
+    "rbl_gym.recordings.reading", "rbl_gym.recordings.text", "rbl_gym.recordings.tables",
+    "rbl_gym.recordings.truth", "rbl_gym.recordings.writing",
+    "rbl_gym.placement.scene_files", "rbl_gym.networks.g2o",
     "rbl_gym.studies.learning.policies",
     "rbl_gym.studies.bench.records", "rbl_gym.studies.bench.spec_files",
     "csv", "json.decoder", "tomllib", "tomllib._parser",

@@ -15,7 +15,7 @@ import numpy as np
 
 from rbl_gym.networks.g2o import read_graph
 from rbl_gym.placement.scene_files import problem
-from rbl_gym.recordings import read_recording
+from rbl_gym.recordings import read_recording, read_track
 from rbl_gym.studies.bench import records, spec_files
 from rbl_gym.studies.learning import policies
 
@@ -29,6 +29,7 @@ class Reader(NamedTuple):
     words: tuple[bytes, ...]
 
 
+AXES = ("rx", "ry", "rz", "x", "y", "z")
 ANCHORS = b"anchor,x,y,z\nA,0,0,1\nB,4,0,1\nC,0,4,2\n"
 TAGS = b"tag,x,y,z\n1,0.1,0,0\nleft,-0.1,0.1,0\n"
 LONG = (
@@ -42,6 +43,10 @@ TUM = b"1.0 1 2 3 0 0 0 1\n# x\n2.0 1 2 3 0 0 0.6 0.8\n"
 EUROC = (b"#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],"
          b"q_RS_z []\n1403636579000000000,5.5,3.0,1.2,0.6,0.0,0.0,0.8\n"
          b"1403636579050000000,5.5,3.0,1.2,1.0,0.0,0.0,0.0\n")  # fmt: skip
+TRACK = (b"t,x,y,z,qw,qx,qy,qz,"
+         + ",".join(f"cov_{a}_{b}" for i, a in enumerate(AXES) for b in AXES[i:]).encode()
+         + b",nis,dof,rank\n0,1,2,3,1,0,0,0" + b",0.5" * 21 + b",2.5,3,3\n"
+         + b"1,1,2,3,0.6,0,0,0.8" + b",0.5" * 21 + b",1,0,0\n")  # fmt: skip
 PLACES = b"time;pos_x;pos_y;roll [deg];pitch [deg];yaw [rad];z\n0,5;1;2;3;4;1;0\n1;1;2;3;4;1;0\n"
 CALIBRATION = b"anchor,tag,bias_m,slope,sigma_m\nA,1,0.5,0.25,0.01\nC,1,3.5,0,\n"
 G2O = (
@@ -132,6 +137,11 @@ READERS = {
                             ("truth", (TRUTH, PLANAR, TUM, EUROC, PLACES)),
                             ("calibration", (CALIBRATION,)))
     },
+    # A missing NIS is infinite.
+    "track": Reader(
+        "track.csv", lambda path: read_track(path)._replace(nis=None), (TRACK,), NUMBERS + MARKS
+    ),
+    "tum": Reader("track.tum", read_track, (TUM,), NUMBERS + MARKS),
     "g2o": Reader("graph.g2o", read_graph, (G2O,), NUMBERS + MARKS),
     "edges": Reader(
         "graph.csv", read_graph, (b"i,j,dtheta\n0,1,0.5\n1,2,0.1\n", b"i,j,a,b\n0,1,0.5,-2\n"),

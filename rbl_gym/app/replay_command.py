@@ -132,6 +132,11 @@ def _add_comparison(group: Any) -> None:
 
 
 def _add_output(group: Any) -> None:
+    group.add_argument(
+        "--track",
+        metavar="F",
+        help="the track: TUM where F ends in .tum or .txt, else .csv with covariance, NIS and rank",
+    )
     group.add_argument("--plot", metavar="F", help="picture of the track and the errors")
     add_html(group, "3-D page of the track with charts and tables")
     add_json(group)
@@ -142,9 +147,12 @@ def _add_number(group: Any, name: str, text: str) -> None:
 
 
 def _replay(options: argparse.Namespace) -> int:
+    from rbl_gym import recordings
     from rbl_gym.studies import replay
 
     check_html(options)
+    if options.track:
+        recordings.check_track_path(options.track)
     settings = _settings(options)
     runs = read_runs(options)
     if len(runs) > 1:
@@ -154,6 +162,8 @@ def _replay(options: argparse.Namespace) -> int:
     replay.check_replay(recording, settings)
     with progress("replay", len(recording.times)) as advance:
         replayed = replay.replay_recording(recording, settings, advance)
+    if options.track:
+        recordings.write_track(options.track, replay.track_file(recording, replayed.track))
     if options.plot:
         from rbl_gym.app import figures
 
@@ -166,7 +176,7 @@ def _replay(options: argparse.Namespace) -> int:
         from rbl_gym.app import reports
 
         reports.print_replay(replayed.figures)
-        print_files(picture=options.plot, page=options.html)
+        print_files(track=options.track, picture=options.plot, page=options.html)
     return 0
 
 
@@ -174,9 +184,9 @@ def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any) -> int:
     from rbl_gym.app import reports
     from rbl_gym.studies import replay
 
-    if options.plot or options.html:
+    if options.plot or options.html or options.track:
         raise ValueError(
-            f"--plot and --html show one run, and {options.ranges} has {len(runs)}, "
+            f"--plot, --html and --track are of one run, and {options.ranges} has {len(runs)}, "
             f"{[*runs]!r:.200}: choose one by --run"
         )
     with progress("replay", sum(len(run.times) for run in runs.values())) as advance:

@@ -3,34 +3,35 @@
 from rbl_gym.recordings.align import ALIGNMENTS, Alignment, align_positions, apply_alignment
 from rbl_gym.recordings.bags import convert_bag, list_topics, show_message
 from rbl_gym.recordings.format import Format
-from rbl_gym.recordings.inertial import InertialLog, read_inertial, samples_between
 from rbl_gym.recordings.motion_offset import motion_offset
 from rbl_gym.recordings.reading import read_recording, read_runs
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.recordings.report import Report
 from rbl_gym.recordings.time_offset import TimeOffset, time_offset
 from rbl_gym.recordings.truth import Truth, read_truth, truth_at
+from rbl_gym.recordings.writing import TrackFile, check_track_path, read_track, write_track
 
 __all__ = [
     "ALIGNMENTS",
     "Alignment",
     "Format",
-    "InertialLog",
     "Recording",
     "Report",
     "TimeOffset",
+    "TrackFile",
     "Truth",
     "align_positions",
     "apply_alignment",
+    "check_track_path",
     "convert_bag",
     "list_topics",
     "motion_offset",
-    "read_inertial",
     "read_recording",
     "read_runs",
+    "read_track",
     "read_truth",
-    "samples_between",
     "show_message",
     "time_offset",
     "truth_at",
+    "write_track",
 ]

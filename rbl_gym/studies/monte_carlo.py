@@ -15,7 +15,7 @@ from rbl_gym.measurements.noise_laws import WeakenedNoise
 from rbl_gym.studies.epochs import Reading, Step, pose_errors, stack_beliefs, timed, track_epochs
 from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
-from rbl_gym.wrappers.estimate import check_reads, check_takes_obstacles, inertial_options
+from rbl_gym.wrappers.estimate import check_takes_obstacles
 
 __all__ = [
     "SimulatedTrials",
@@ -100,7 +100,7 @@ def bound_of(scene: Scene, episode: simulation.Episode, links: Iterable[BoolArra
         information, _ = scene_bounds.posterior_step(
             scene, at, episode.anchors, measured, information, episode.prior_covariance
         )
-        covariances.append(scene_bounds.pose_covariance(information))
+        covariances.append(np.linalg.inv(information))
     return np.array(covariances)
 
 
@@ -132,10 +132,8 @@ def told_readings(
         if scene.obstacles:
             quality = simulation.link_quality(scene, at, episode.anchors)
             law = WeakenedNoise(told.noise, quality)
-        twist, inertial = (at.twist, at.readings) if epoch else (None, None)
-        readings.append(
-            Reading(measured.ranges, anchors, measured.links, law, twist, told.dt, inertial)
-        )
+        twist = at.twist if epoch else None
+        readings.append(Reading(measured.ranges, anchors, measured.links, law, twist, told.dt))
     return readings
 
 
@@ -148,12 +146,10 @@ def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators
         As `estimators.make`; and for a filter that takes no law of an epoch, in a scene whose
         obstacles give one to every epoch.
     """
-    options = {**inertial_options(name, scene), **options}
     filter = estimators.make(
         name, tags=scene.tags, noise=scene.noise, process=scene.process, **options
     )
     check_takes_obstacles(name, filter, scene)
-    check_reads(name, filter, scene)
     return filter
 
 

@@ -22,6 +22,7 @@ from rbl_gym.studies.replay.settings import (
     Settings,
 )
 from rbl_gym.studies.replay.study import Replayed, check_replay, replay_recording
+from rbl_gym.studies.replay.track_file import epoch_ranks, track_file
 from rbl_gym.studies.replay.tracking import (
     Track,
     named_filter,
@@ -49,6 +50,7 @@ __all__ = [
     "check_overlap",
     "check_replay",
     "covering",
+    "epoch_ranks",
     "find_offset",
     "height_offset",
     "named_filter",
@@ -61,6 +63,7 @@ __all__ = [
     "replay_runs",
     "track_errors",
     "track_figures",
+    "track_file",
     "track_recording",
     "truth_of",
     "truth_path",
