@@ -27,6 +27,7 @@ from rbl_gym.estimators.linear.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.locating.doa import locate_doa
 from rbl_gym.estimators.locating.localization import PoseEstimate, locate, methods
 from rbl_gym.estimators.networks.consensus import (
+    CycleExchange,
     cycle_consensus,
     cycle_iteration,
     cycle_projection,
@@ -47,6 +48,7 @@ __all__ = [
     "AugmentedEkf",
     "AugmentedState",
     "BankState",
+    "CycleExchange",
     "DoaEkf",
     "Filter",
     "FrameEstimate",

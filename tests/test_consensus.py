@@ -10,7 +10,12 @@ import scipy.sparse as sp
 
 from rbl_gym import estimators
 from rbl_gym.estimators.networks import consensus
-from rbl_gym.estimators.networks.consensus import cycle_consensus, cycle_iteration, cycle_projection
+from rbl_gym.estimators.networks.consensus import (
+    CycleExchange,
+    cycle_consensus,
+    cycle_iteration,
+    cycle_projection,
+)
 from rbl_gym.networks.graphs import BASES, cycle_matrix
 from rbl_gym.networks.sensing import proj, random_network
 from rbl_gym.studies.papers import network2009
@@ -68,9 +73,9 @@ def test_the_limit_is_the_projection_on_its_branch_in_any_order(basis):
             cycle_iteration(edges, y, n_nodes, C, rule, tol=tol) for rule in consensus.STEP_RULES
         ]
         for k, (kappa, loss) in enumerate([(None, 0.0), (None, 0.4), (0.1, 0.0)]):
-            rng = np.random.default_rng([seed, k])
-            runs.append(cycle_iteration(edges, y, n_nodes, C, kappa, tol=tol, rng=rng, loss=loss,
-                                        order="asynchronous"))  # fmt: skip
+            exchange = CycleExchange("asynchronous", np.random.default_rng([seed, k]), loss)
+            run = cycle_iteration(edges, y, n_nodes, C, kappa, tol=tol, exchange=exchange)
+            runs.append(run)
         for run in runs:
             assert run.converged
             limit = cycle_projection(C, y, run.branch)
@@ -144,7 +149,7 @@ def test_all_cycles_of_k4_agree_with_the_projection_or_say_that_they_cannot():
     for k in range(80):
         y = proj(rng.normal(0, 0.9, 6))
         order = consensus.ORDERS[k % 10 == 0]
-        run = cycle_iteration(K4, y, 4, "all", order=order, rng=rng)
+        run = cycle_iteration(K4, y, 4, "all", exchange=CycleExchange(order, rng))
         assert np.isfinite(run.psi).all()
         assert run.converged == run.consistent
         if run.consistent:
@@ -185,8 +190,8 @@ def test_a_random_order_that_cannot_come_to_rest_ends():
         if not cycle_iteration(K4, y, 4, C).consistent:
             break
     for order, loss in (("asynchronous", 0.0), ("synchronous", 0.3)):
-        rng = np.random.default_rng(1)
-        run = cycle_iteration(K4, y, 4, C, rng=rng, order=order, loss=loss)
+        exchange = CycleExchange(order, np.random.default_rng(1), loss)
+        run = cycle_iteration(K4, y, 4, C, exchange=exchange)
         assert run.converged == run.consistent
         assert run.steps < 5000
 
@@ -215,7 +220,8 @@ def test_history_begins_with_y_and_lost_messages_do_nothing():
     assert run.history.shape == (run.steps + 1, len(edges))
     np.testing.assert_array_equal(run.history[0], y)
     np.testing.assert_array_equal(run.history[-1], run.psi)
-    lost = cycle_iteration(edges, y, n_nodes, loss=1.0, rng=np.random.default_rng(0), max_steps=5)
+    silence = CycleExchange(rng=np.random.default_rng(0), loss=1.0)
+    lost = cycle_iteration(edges, y, n_nodes, exchange=silence, max_steps=5)
     np.testing.assert_array_equal(lost.psi, y)
     assert not lost.converged
     with pytest.raises(RuntimeError, match="did not converge in 5 steps"):
@@ -228,9 +234,8 @@ def test_a_branch_that_is_known_is_kept_in_any_order():
     branch = np.random.default_rng(0).integers(-2, 3, C.shape[0])
     limit = cycle_projection(C, y, branch)
     for order in consensus.ORDERS:
-        run = cycle_iteration(
-            edges, y, n_nodes, C, order=order, branch=branch, rng=np.random.default_rng(1)
-        )
+        exchange = CycleExchange(order, np.random.default_rng(1))
+        run = cycle_iteration(edges, y, n_nodes, C, exchange=exchange, branch=branch)
         np.testing.assert_array_equal(run.branch, branch)
         np.testing.assert_allclose(run.psi, limit, atol=1e-10)
 
@@ -257,11 +262,14 @@ def test_an_edge_that_comes_twice_was_measured_twice():
         ({"cycles": np.ones((1, 2))}, "a column per edge"),
         ({"cycles": 2 * np.array([[1, 1, -1]])}, "cycles must have entries -1, 0 and 1, got 2"),
         ({"cycles": [[1, 1, 1]]}, "closed walks, got one that is not in row 0"),
-        ({"order": "random"}, "order must be one of"),
-        ({"order": "asynchronous"}, r"rng must be a numpy\.random\.Generator, got None"),
+        ({"exchange": CycleExchange("random")}, "order must be one of"),
+        (
+            {"exchange": CycleExchange("asynchronous")},
+            r"rng must be a numpy\.random\.Generator, got None",
+        ),
         ({"max_steps": -1}, "max_steps must be an int of at least 0, got -1"),
         ({"max_steps": 2.5}, r"max_steps must be an int of at least 0, got 2\.5"),
-        ({"loss": 1.5}, "loss must be"),
+        ({"exchange": CycleExchange(loss=1.5)}, "loss must be"),
         ({"tol": -1.0}, "tol must be"),
         ({"branch": [0.5]}, "branch must be 1 whole numbers"),
         ({"branch": [0, 1]}, "branch must have shape"),

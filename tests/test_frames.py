@@ -84,7 +84,7 @@ def test_errors_reach_the_bound_and_ranges_lower_it(network, trials):
     rng = np.random.default_rng(4)
     errors = {"known": [], "ranged": []}
     for _ in range(trials):
-        bearings = sensing.measure(positions, theta, edges, sigma, rng)
+        bearings = sensing.measure_bearings(positions, theta, edges, sigma, rng)
         # Two nodes are 5 cm apart: one range in thousands comes out below zero.
         ranges = np.abs(exact + range_std * rng.standard_normal(len(edges)))
         both = {

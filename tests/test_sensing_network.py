@@ -66,7 +66,7 @@ def test_exact_bearings_give_differences_of_orientations_and_noise_has_its_varia
     i, j = network.edges.T
     truth = network.orientations[j] - network.orientations[i]
     np.testing.assert_allclose(proj(network.y - truth), 0, atol=1e-12)
-    measured = sensing.measure(*network[:3], 0.2, rng)
+    measured = sensing.measure_bearings(*network[:3], 0.2, rng)
     off = proj(measured - network.bearings)
     assert np.std(off) == pytest.approx(0.2, rel=0.05)
     assert np.var(proj(edge_angles(measured) - truth)) == pytest.approx(2 * 0.2**2, rel=0.1)

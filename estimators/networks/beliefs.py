@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray, check_count
-from rbl_gym.estimators.networks.consensus import cycle_iteration
+from rbl_gym.estimators.networks.consensus import CycleExchange, cycle_iteration
 from rbl_gym.estimators.networks.orientations import along_tree
 from rbl_gym.estimators.networks.poses import network_poses
 from rbl_gym.networks.bounds import Sensing, linked_covariance, linked_to_0
@@ -43,8 +43,8 @@ def check_consensus(cycles: Any, kappa: Any, order: Any, steps: Any) -> Consensu
     steps = check_count("steps", steps, least=0)
     if not isinstance(cycles, str):
         raise ValueError(f"cycles must be a name, got {cycles!r:.80}")
-    cycle_iteration([[0, 1], [1, 2], [0, 2]], np.zeros(3), 3, cycles, kappa, order=order,
-                    rng=np.random.default_rng(0))  # fmt: skip
+    exchange = CycleExchange(order, np.random.default_rng(0))
+    cycle_iteration([[0, 1], [1, 2], [0, 2]], np.zeros(3), 3, cycles, kappa, exchange=exchange)
     return Consensus(cycles, kappa, order, steps)
 
 
@@ -87,9 +87,17 @@ def consensus(
         if options.cycles not in BASES:
             count = cycle_matrix(named, size, options.cycles).shape[0]
         branch = np.zeros(count)
-    run = cycle_iteration(named, y, size, options.cycles, options.kappa, tol=_TOL,
-                          max_steps=options.steps, order=options.order, rng=rng,
-                          branch=branch)  # fmt: skip
+    run = cycle_iteration(
+        named,
+        y,
+        size,
+        options.cycles,
+        options.kappa,
+        tol=_TOL,
+        max_steps=options.steps,
+        exchange=CycleExchange(options.order, rng),
+        branch=branch,
+    )
     theta[near] = proj(along_tree(named, run.psi, size))
     return theta, run.steps, run.converged
 

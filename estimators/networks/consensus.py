@@ -39,6 +39,14 @@ ORDERS = ("synchronous", "asynchronous")
 STEP_RULES = ("theorem", "best", "trace", "rows")
 
 
+class CycleExchange(NamedTuple):
+    """How the cycles talk: in which order, and what is lost on the way."""
+
+    order: str = "synchronous"  # or "asynchronous": one cycle at a time, in random order
+    rng: np.random.Generator | None = None  # source of the order and of losses
+    loss: float = 0.0  # probability that a message is lost: the cycle's turn has no effect
+
+
 class CycleRun(NamedTuple):
     """A run of the cycle iteration."""
 
@@ -250,9 +258,7 @@ def cycle_iteration(
     tol: float = 1e-12,
     max_steps: int = 100_000,
     history: bool = False,
-    order: str = "synchronous",
-    rng: np.random.Generator | None = None,
-    loss: float = 0.0,
+    exchange: CycleExchange | None = None,
     branch: ArrayLike | None = None,
 ) -> CycleRun:
     """The cycle-distributed iteration, (14): ``psi <- psi - kappa C^T proj(C psi)`` from y.
@@ -271,13 +277,8 @@ def cycle_iteration(
         many steps, or where dependent cycles hold each other at errors that no psi takes away.
     history
         Whether to keep all psi on the way.
-    order
-        ``"synchronous"``, or ``"asynchronous"``: one cycle at a time, in random order.
-    rng
-        Source of the order and of losses.
-    loss
-        Probability that a cycle's message is lost on its way around: its turn then passes
-        without effect.
+    exchange
+        Order of the cycles, and losses; None: all at once and without.
     branch
         k (q,) of ``C psi = 2 pi k``, whole numbers, where it is known, for instance from an
         earlier estimate; None: each cycle takes the nearest, at every step.
@@ -299,10 +300,11 @@ def cycle_iteration(
         if isinstance(cycles, str)
         else check_cycles(cycles, edges, n_nodes)
     )
+    order, rng, loss = exchange or CycleExchange()
     check_one_of("order", order, ORDERS)
+    loss = check_number("loss", loss, low=0.0, high=1.0)
     tol = check_number("tol", tol, low=0.0)
     max_steps = check_count("max_steps", max_steps, least=0)
-    loss = check_number("loss", loss, low=0.0, high=1.0)
     one_by_one = order == "asynchronous"
     if one_by_one or loss:
         check_generator("rng", rng)

@@ -32,7 +32,7 @@ from rbl_gym.networks.edges import MOST_NODES, IntArray, check_edges
 from rbl_gym.networks.graphs import components
 
 __all__ = [
-    "SensingNetwork", "directions", "edge_angles", "measure", "measure_in_space", "proj",
+    "SensingNetwork", "directions", "edge_angles", "measure_bearings", "measure_in_space", "proj",
     "random_network", "true_bearings", "unit_disk_edges",
 ]  # fmt: skip
 
@@ -141,7 +141,7 @@ def true_bearings(positions: ArrayLike, orientations: ArrayLike, edges: ArrayLik
     return proj(toward[:, None] + [0.0, np.pi] - turned)
 
 
-def measure(
+def measure_bearings(
     positions: ArrayLike,
     orientations: ArrayLike,
     edges: ArrayLike,
@@ -244,7 +244,7 @@ def random_network(
     positions = positions[keep]
     theta = rng.uniform(-np.pi, np.pi, len(positions))
     theta = proj(theta - theta[0])
-    bearings = measure(positions, theta, edges, bearing_std_rad, rng)
+    bearings = measure_bearings(positions, theta, edges, bearing_std_rad, rng)
     return SensingNetwork(positions, theta, edges, bearings)
 
 

@@ -222,7 +222,7 @@ def draw_network(loops: int, rng: np.random.Generator) -> DrawnNetwork:
             break
     theta = rng.uniform(-np.pi, np.pi, N_NODES)
     theta = proj(theta - theta[0])
-    bearings = sensing.measure(positions, theta, edges, BEARING_STD_RAD, rng)
+    bearings = sensing.measure_bearings(positions, theta, edges, BEARING_STD_RAD, rng)
     return DrawnNetwork(positions, theta, edges, sensing.edge_angles(bearings))
 
 
@@ -272,7 +272,7 @@ def _run(
     n_nodes = len(places)
     theta = rng.uniform(-np.pi, np.pi, n_nodes)
     theta = proj(theta - theta[0])
-    y = sensing.edge_angles(sensing.measure(places, theta, edges, sigma, rng))
+    y = sensing.edge_angles(sensing.measure_bearings(places, theta, edges, sigma, rng))
     C = network_graphs.cycle_matrix(edges, n_nodes)
     run = consensus.cycle_iteration(edges, y, n_nodes, C, history=True)
     assert run.history is not None
@@ -358,9 +358,8 @@ def _asynchronous(
     steps, off = [], []
     for one in samples:
         C = network_graphs.cycle_matrix(one.edges, N_NODES, "paton")
-        run = consensus.cycle_iteration(
-            one.edges, one.y, N_NODES, C, order="asynchronous", rng=rng, loss=loss
-        )
+        exchange = consensus.CycleExchange("asynchronous", rng, loss)
+        run = consensus.cycle_iteration(one.edges, one.y, N_NODES, C, exchange=exchange)
         steps.append(run.steps)
         limit = consensus.cycle_projection(C, one.y, run.branch)
         off.append(float(np.abs(run.psi - limit).max()))
