@@ -30,8 +30,8 @@ GATE = 4.0
 # What the likelihood supposes of refused ranges: this share of all, at any of 10 m (1/m). Without
 # such a constant the deviation that refuses everything would be the likeliest.
 OUTLIER_SHARE, OUTLIER_DENSITY = 0.05, 0.1
-_LOG_USED = np.log((1 - OUTLIER_SHARE) / np.sqrt(2 * np.pi))
-_LOG_REFUSED = np.log(OUTLIER_SHARE * OUTLIER_DENSITY)
+LOG_USED = np.log((1 - OUTLIER_SHARE) / np.sqrt(2 * np.pi))
+LOG_REFUSED = np.log(OUTLIER_SHARE * OUTLIER_DENSITY)
 
 
 class Innovations(NamedTuple):
@@ -128,7 +128,7 @@ def innovations(
     log_det = log_det + np.where(used, np.log(variance), 0.0).sum(axis=-1)
     dof = used.sum(axis=-1)
     refused = links.sum(axis=-1) - dof
-    likelihood = dof * _LOG_USED - 0.5 * (nis + log_det) + refused * _LOG_REFUSED
+    likelihood = dof * LOG_USED - 0.5 * (nis + log_det) + refused * LOG_REFUSED
     std = np.sqrt(variance * (1 + own))
     return Innovations(
         *(np.where(links, a, 0.0).reshape(shape) for a in (v, std, residual)),

@@ -111,6 +111,10 @@ def test_replay_in_one_call_is_the_four():
     figures = replay.track_figures(recording, track, errors, found.settings)
     # What is not the recording's: how fast it went.
     assert found.figures.pop("microseconds_per_epoch") > 0
+    # And what the log says of itself, with a warning where it has to be.
+    assert found.figures.pop("consistency")["residuals"].keys() == {"anchors", "tags", "links"}
+    notes, said = figures.pop("notes"), found.figures.pop("notes")
+    assert said[: len(notes)] == notes
     assert found.figures == figures
     np.testing.assert_array_equal(replay.origin_of(recording), np.zeros(3))
     assert replay.volume_of(recording, settings) is None

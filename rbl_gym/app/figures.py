@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import ScalarFormatter
 
+from rbl_gym.app.consistency import draw_nis
 from rbl_gym.checks import FloatArray
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import nees_interval
@@ -267,11 +268,17 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
 
 @styled
 def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
-    """The track from above with the anchors, and, where truth exists, the errors over time."""
+    """The track from above with the anchors; over time the errors, where truth exists, and NIS."""
     track, found = replayed.track, replayed.errors
-    figure = new_figure(12, 5.2 if found is not None else 6)
+    curves = []
+    if found is not None:
+        curves.append(("position error [m]", found.position))
+        if found.yaw is not None:
+            curves.append(("yaw error [deg]", np.rad2deg(found.yaw)))
+    rows = len(curves) + (track.innovations is not None)
+    figure = new_figure(12, 5.2 if found is None else 6.4)
     grid = figure.add_gridspec(
-        2, 2 if found is not None else 1, width_ratios=[1, 1.2] if found is not None else [1]
+        max(rows, 1), 2 if rows else 1, width_ratios=[1, 1.2][: 2 if rows else 1]
     )
     axes = figure.add_subplot(grid[:, 0])
     axes.plot(*recording.last_anchors[:, :2].T, "k^", ms=7, label="anchors")
@@ -285,15 +292,13 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(frameon=False, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    if found is None:
-        return figure
-    curves = [("position error [m]", found.position)]
-    if found.yaw is not None:
-        curves.append(("yaw error [deg]", np.rad2deg(found.yaw)))
     for row, (label, values) in enumerate(curves):
-        axes = figure.add_subplot(grid[row if len(curves) > 1 else slice(None), 1])
+        assert found is not None
+        axes = figure.add_subplot(grid[row, 1])
         axes.plot(track.times[found.known], values[found.known], color=COLOURS["UC-KF"], lw=0.7)
         axes.set_ylabel(label)
         axes.set_xlabel("time [s]")
         axes.grid(alpha=0.25, lw=0.5)
+    if track.innovations is not None:
+        draw_nis(figure.add_subplot(grid[-1, 1]), replayed)
     return figure

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rbl_gym.app.consistency import print_consistency
 from rbl_gym.app.tables import new_console, new_table
 
 CAMSAP_COLUMNS = (
@@ -102,6 +103,7 @@ def print_replay(result: dict[str, Any]) -> None:
     )
     if "epochs_with_truth" not in result:
         console.print("no truth, no errors")
+        print_consistency(console, result)
         _print_notes(console, result)
         return
     for line in compared(result):
@@ -121,6 +123,7 @@ def print_replay(result: dict[str, Any]) -> None:
     console.print(
         f"{mean}NEES per degree of freedom {result['anees']:.2f} (1: honest; above: overconfident)"
     )
+    print_consistency(console, result)
     _print_notes(console, result)
 
 

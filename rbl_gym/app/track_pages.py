@@ -9,6 +9,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from rbl_gym.app import page, track_html
+from rbl_gym.app.consistency import consistency_parts
 from rbl_gym.app.figures import COLOURS
 from rbl_gym.app.reports import CAMSAP_COLUMNS, compared
 from rbl_gym.app.story import Beliefs, Story
@@ -174,6 +175,7 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
                 f"{'; '.join(compared(result))}."
             )
         )
+    parts += consistency_parts(replayed)
     parts.append(track_html.anchors_table(story))
     used = [
         [name.replace("_", " "), str(value) if isinstance(value, tuple) else value]

@@ -6,6 +6,7 @@ replayed recordings, tracking among designed layouts.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
@@ -134,8 +135,8 @@ def stack_beliefs(beliefs: Iterable[PoseBelief]) -> PoseBelief:
     return PoseBelief(*(np.array(column, dtype=np.float64) for column in columns))
 
 
-# So many epochs at once: their matrices fit into the processor's caches.
-_CHUNK = 128
+# So many epochs of one body at once: their matrices fit into the processor's caches.
+_CHUNK = 256
 
 
 def innovations_of(
@@ -156,7 +157,8 @@ def innovations_of(
     """
     kept: list[Step] = []
     for step in steps:
-        if kept and (len(kept) == _CHUNK or _shapes(step) != _shapes(kept[0])):
+        trials = math.prod(step.belief.translation.shape[:-1])
+        if kept and (len(kept) * trials >= _CHUNK or _shapes(step) != _shapes(kept[0])):
             yield from _innovations(filter, kept, tags, noise)
             kept = []
         kept.append(step)
@@ -177,7 +179,11 @@ def _innovations(
         for k in (0, 1)
     )
     readings = [step.reading for step in steps]
-    ranges, anchors = (np.array([r[k] for r in readings]) for k in (0, 1))
+    ranges = np.array([reading.ranges for reading in readings])
+    trials = ranges.shape[1:-2]
+    anchors = np.array(
+        [np.broadcast_to(r.anchors, (*trials, *r.anchors.shape[-2:])) for r in readings]
+    )
     links = np.array(
         [np.broadcast_to(True if r.links is None else r.links, r.ranges.shape) for r in readings]
     )

@@ -1,5 +1,11 @@
 """A recording through a filter: the track, its mirror image, errors against the truth, hints."""
 
+from rbl_gym.studies.replay.causes import Cause, likely_causes
+from rbl_gym.studies.replay.consistency import (
+    contradicts,
+    nis_curve,
+    residual_tables,
+)
 from rbl_gym.studies.replay.figures import track_figures
 from rbl_gym.studies.replay.judging import (
     Reference,
@@ -36,6 +42,7 @@ from rbl_gym.studies.replay.truth import check_overlap
 __all__ = [
     "DEFAULT_RANGE_STD_M",
     "Biases",
+    "Cause",
     "Comparison",
     "Knowledge",
     "Loss",
@@ -49,11 +56,14 @@ __all__ = [
     "TrackErrors",
     "check_overlap",
     "check_replay",
+    "contradicts",
     "covering",
     "epoch_ranks",
     "find_offset",
     "height_offset",
+    "likely_causes",
     "named_filter",
+    "nis_curve",
     "origin_of",
     "other_pose",
     "range_std_of",
@@ -61,6 +71,7 @@ __all__ = [
     "recording_steps",
     "replay_recording",
     "replay_runs",
+    "residual_tables",
     "track_errors",
     "track_figures",
     "track_file",

@@ -10,6 +10,7 @@ import numpy as np
 
 from rbl_gym.recordings import TimeOffset
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.diagnosis import diagnose
 from rbl_gym.studies.replay.figures import track_figures
 from rbl_gym.studies.replay.judging import (
     TrackErrors,
@@ -97,6 +98,9 @@ def replay_recording(
     figures["microseconds_per_epoch"] = clock.microseconds()
     if offset is not None:
         figures["time_offset"] = offset._asdict()
+    assert track.innovations is not None
+    figures["consistency"], notes = diagnose(recording, settings, track.innovations)
+    figures["notes"] = figures["notes"] + notes
     return Replayed(settings, track, errors, figures)
 
 

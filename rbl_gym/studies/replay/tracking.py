@@ -229,6 +229,11 @@ def _options(settings: Settings) -> dict[str, Any]:
     return {}
 
 
+def start_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What is known before any range: rotation, translation, covariance (6, 6)."""
+    return _prior(recording, settings, volume_of(recording, settings))
+
+
 def _prior(
     recording: Recording, settings: Settings, volume: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:

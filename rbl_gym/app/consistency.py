@@ -1,0 +1,178 @@
+"""What a log says of itself: NIS and residuals, on the terminal, in pictures and in pages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.ticker import NullFormatter, ScalarFormatter
+
+from rbl_gym.app.tables import new_table
+from rbl_gym.studies.replay import Replayed, nis_curve
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Rows of a table on the terminal: of more anchors or tags those with the largest residuals.
+_ROWS = 12
+_HONEST, _BAND = "#1c7ed6", "#868e96"
+_HEADINGS = ("ranges", "mean (m)", "spread (m)", "refused (%)")
+
+
+def print_consistency(console: Any, result: dict[str, Any]) -> None:
+    """NIS and a table of the residuals of anchors and tags; nothing where they were not made."""
+    found = result.get("consistency")
+    if found is None:
+        return
+    console.print(
+        f"NIS per degree of freedom {found['nis_per_dof']:.2f} (1: honest), log-likelihood "
+        f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % refused"
+    )
+    table = new_table("residuals after the update")
+    table.add_column("")
+    for heading in _HEADINGS:
+        table.add_column(heading, justify="right")
+    for kind in ("anchor", "tag"):
+        rows = found["residuals"][f"{kind}s"]
+        if len(rows) > _ROWS:
+            rows = sorted(rows, key=_size, reverse=True)[:_ROWS]
+        for row in rows:
+            table.add_row(f"{kind} {row[kind]}", *_cells(row))
+    console.print(table)
+
+
+def _size(row: dict[str, Any]) -> float:
+    return row["refused_share"] + abs(row["mean_m"] or 0.0) + row["spread_m"]
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    mean = "-" if row["mean_m"] is None else f"{row['mean_m']:+.3f}"
+    return [
+        str(row["ranges"]),
+        mean,
+        f"{row['spread_m']:.3f}",
+        f"{100 * row['refused_share']:.1f}",
+    ]
+
+
+def draw_nis(axes: Axes, replayed: Replayed) -> None:
+    """NIS per degree of freedom over time, with the band of an honest filter."""
+    found = replayed.track.innovations
+    assert found is not None
+    when, ratio, low, high = nis_curve(replayed.track.times, found)
+    axes.fill_between(when, low, high, color="0.85", lw=0, label="95 % of an honest filter")
+    ratio = np.clip(ratio, 1e-3, 1e6)
+    axes.plot(when, ratio, color=_HONEST, lw=0.8)
+    axes.axhline(1.0, color="0.5", lw=0.6)
+    axes.set_yscale("log")
+    axes.set_ylim(min(0.2, ratio.min()), max(5.0, 1.1 * ratio.max()))
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.set_ylabel("NIS / dof")
+    axes.set_xlabel("time [s]")
+    axes.legend(frameon=False, fontsize=7, loc="upper right")
+    axes.grid(alpha=0.25, lw=0.5)
+
+
+def consistency_parts(replayed: Replayed) -> list[str]:
+    """The section of a page: NIS over time, heat maps of the links, tables; none without them."""
+    from rbl_gym.app import page
+
+    found = replayed.figures.get("consistency")
+    if found is None:
+        return []
+    causes = [
+        [cause["text"], cause["nis_per_dof"], 100 * cause["mended"]] for cause in found["causes"]
+    ]
+    headings = ["likely cause", "NIS per dof without it", "of the excess explained (%)"]
+    residuals = found["residuals"]
+    parts = [
+        "<h2>Is the filter at one with its data?</h2>",
+        page.note(
+            "Normalised innovation squared (NIS) per degree of freedom "
+            f"{found['nis_per_dof']:.2f} (1: honest; far above: the filter is told too little "
+            "noise or motion, or wrong places), log-likelihood "
+            f"{found['log_likelihood']:.2f} per range, {100 * found['refused_share']:.1f} % of the "
+            "ranges refused. Residuals are those after the update: mean of the ranges used, spread "
+            "of all (1.48 times the median distance from the median)."
+        ),
+        page.plot(_charts(replayed), "consistency", first=False),
+    ]
+    if causes:
+        parts.append(page.table("likely causes", headings, causes))
+    for kind, names in (("anchors", ["anchor"]), ("tags", ["tag"]), ("links", ["anchor", "tag"])):
+        rows = [
+            [
+                *(row[name] for name in names),
+                row["ranges"],
+                row["mean_m"],
+                row["spread_m"],
+                100 * row["refused_share"],
+            ]
+            for row in residuals[kind]
+        ]
+        parts.append(page.table(f"residuals of {kind}", [*names, *_HEADINGS], rows))
+    return parts
+
+
+def _charts(replayed: Replayed) -> Any:
+    """NIS over time; mean residual and share refused of every link."""
+    from plotly import graph_objects as go
+    from plotly.subplots import make_subplots
+
+    track, found = replayed.track, replayed.track.innovations
+    assert found is not None
+    when, ratio, low, high = nis_curve(track.times, found)
+    when = when - track.times[0]
+    shown = make_subplots(
+        1,
+        3,
+        column_widths=[0.46, 0.27, 0.27],
+        horizontal_spacing=0.1,
+        subplot_titles=["NIS per degree of freedom", "mean residual (m)", "refused (%)"],
+    )
+    for values, fill in ((high, None), (low, "tonexty")):
+        band = {"color": _BAND, "width": 0}
+        shown.add_trace(
+            go.Scatter(x=when, y=values, mode="lines", line=band, fill=fill, hoverinfo="skip"), 1, 1
+        )
+    line = {"color": _HONEST, "width": 1.2}
+    shown.add_trace(go.Scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line), 1, 1)
+    shown.update_yaxes(type="log", row=1, col=1)
+    shown.update_xaxes(title_text="time (s)", title_standoff=4, row=1, col=1)
+    rows = replayed.figures["consistency"]["residuals"]["links"]
+    anchors, tags = (list(dict.fromkeys(row[kind] for row in rows)) for kind in ("anchor", "tag"))
+    mean, refused = np.full((2, len(anchors), len(tags)), np.nan)
+    for row in rows:
+        at = anchors.index(row["anchor"]), tags.index(row["tag"])
+        mean[at] = np.nan if row["mean_m"] is None else row["mean_m"]
+        refused[at] = 100 * row["refused_share"]
+    largest = max(float(np.nanmax(np.abs(mean), initial=0.0)), 0.01)
+    for column, values, scale, ends, place in (
+        (2, mean, "RdBu", (-largest, largest), 0.615),
+        (3, refused, "Reds", (0.0, max(float(np.nanmax(refused, initial=0.0)), 1.0)), 1.0),
+    ):
+        shown.add_trace(
+            go.Heatmap(
+                z=values,
+                x=[f"tag {tag}" for tag in tags],
+                y=[f"anchor {anchor}" for anchor in anchors],
+                colorscale=scale,
+                reversescale=scale == "RdBu",
+                zmin=ends[0],
+                zmax=ends[1],
+                colorbar={"x": place, "thickness": 10, "len": 0.9},
+                hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
+            ),
+            1,
+            column,
+        )
+        shown.update_yaxes(autorange="reversed", row=1, col=column)
+    shown.update_annotations(font_size=13)
+    shown.update_layout(
+        height=max(340, 24 * len(anchors) + 110),
+        template="plotly_white",
+        showlegend=False,
+        margin={"l": 50, "r": 10, "t": 40, "b": 40},
+    )
+    return shown

@@ -1,0 +1,141 @@
+"""What a log says of itself without truth: NIS, residuals of anchors, tags and links."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators import Innovations
+from rbl_gym.estimators.innovation import GATE
+from rbl_gym.recordings.recording import Recording
+
+__all__ = ["contradicts", "nis_curve", "residual_tables"]
+
+# A filter contradicts its data where the normalised innovations squared of a log, or of a tenth of
+# it, are more than so many times what they should be, or so large a share of ranges is refused ...
+MOST_NIS, MOST_REFUSED, _PART = 2.0, 0.2, 0.1
+# ... and chance does not explain it.
+_CHANCE = 1e-6
+_BLOCKS = 20
+# And where the squares of an anchor's or a tag's whitened innovations, none counted beyond a
+# refused one, are on average so large, and so many times what the others have; or more than half
+# of a link's (of so many ranges at least) are beyond two standard deviations.
+_MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
+
+
+def consistency_figures(found: Innovations, recording: Recording) -> dict[str, Any]:
+    """How well a filter foretold a log, in plain numbers.
+
+    Parameters
+    ----------
+    found
+        Of the filter, arrays (K, ...).
+    recording
+        What it was told.
+
+    Returns
+    -------
+    ``nis_per_dof`` (1 where the filter is honest), ``log_likelihood`` (per range),
+    ``refused_share``, ``contradicts``, and the tables of `residual_tables`.
+    """
+    ranges, used = int(recording.links.sum()), int(found.dof.sum())
+    return {
+        "nis_per_dof": float(found.nis.sum() / max(used, 1)),
+        "log_likelihood": float(found.log_likelihood.sum() / ranges),
+        "refused_share": 1 - used / ranges,
+        "contradicts": contradicts(found, recording),
+        "residuals": residual_tables(found, recording),
+    }
+
+
+def contradicts(found: Innovations, recording: Recording) -> bool:
+    """Whether the ranges of a log are not what the filter expects of them."""
+    whole, parts = (_is_strained(*_sums(found, recording, n)) for n in (1, _BLOCKS))
+    if whole[0] or parts.sum() >= max(2, _PART * len(parts)):
+        return True
+    links = recording.links
+    z = np.divide(found.innovation, found.std, out=np.zeros(links.shape), where=links)
+    squares, far = np.minimum(z**2, GATE**2), np.abs(z) > _FAR
+    for other in ((0, 1), (0, 2)):
+        count = links.sum(axis=other)
+        mean = (squares.sum(axis=other) / np.maximum(count, 1))[count >= _FEWEST]
+        if len(mean) and mean.max() > max(_MOST_SQUARE, _BEYOND_OTHERS * np.median(mean)):
+            return True
+    count = links.sum(axis=0)
+    return bool(((far.sum(axis=0) > 0.5 * count) & (count >= _FEWEST)).any())
+
+
+def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatArray, ...]:
+    """NIS, ranges used and refused of so many parts of a log."""
+    links = recording.links.sum(axis=(1, 2))
+    starts = np.unique(np.linspace(0, len(links), blocks, endpoint=False).astype(int))
+    nis, dof, links = (np.add.reduceat(a, starts) for a in (found.nis, found.dof, links))
+    return nis, dof, links - dof
+
+
+def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> FloatArray:
+    by_chance = special.chdtri(np.maximum(dof, 1), _CHANCE)
+    lost = refused > MOST_REFUSED * (dof + refused)
+    # A single range in five may be wrong without a word.
+    return (nis > np.maximum(MOST_NIS * dof, by_chance)) | (lost & (refused > _BLOCKS))
+
+
+def residual_tables(found: Innovations, recording: Recording) -> dict[str, list[dict[str, Any]]]:
+    """Residuals after the update, by anchor, by tag and by link.
+
+    A row has the ids, ``ranges`` (how many), ``mean_m`` of those used, ``spread_m`` of all (1.4826
+    times the median distance from the median: the standard deviation of a Gaussian), and
+    ``refused_share``. What was never measured has no row.
+    """
+    links = recording.links
+    M, N = links.shape[1:]
+    rows: dict[str, list[dict[str, Any]]] = {"anchors": [], "tags": [], "links": []}
+    for m, name in enumerate(recording.anchor_ids):
+        row = _row(found, links, (slice(None), m))
+        rows["anchors"] += [{"anchor": name, **row}] if row else []
+    for n, name in enumerate(recording.tag_ids):
+        row = _row(found, links, (slice(None), slice(None), n))
+        rows["tags"] += [{"tag": name, **row}] if row else []
+    for m, n in np.ndindex(M, N):
+        row = _row(found, links, (slice(None), m, n))
+        ids = {"anchor": recording.anchor_ids[m], "tag": recording.tag_ids[n]}
+        rows["links"] += [{**ids, **row}] if row else []
+    return rows
+
+
+def _row(found: Innovations, links: Any, index: tuple[Any, ...]) -> dict[str, Any]:
+    measured = links[index]
+    count = int(measured.sum())
+    if not count:
+        return {}
+    residual, used = found.residual[index][measured], found.used[index][measured]
+    middle = np.median(residual)
+    return {
+        "ranges": count,
+        "mean_m": float(residual[used].mean()) if used.any() else None,
+        "spread_m": float(1.4826 * np.median(np.abs(residual - middle))),
+        "refused_share": float(1 - used.mean()),
+    }
+
+
+def nis_curve(
+    times: FloatArray, found: Innovations, points: int = 400
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """NIS per degree of freedom over time, in at most so many points.
+
+    Returns
+    -------
+    Times, NIS over degrees of freedom of the epochs about each, and the ends of the interval that
+    holds 95 % of them where the filter is honest.
+    """
+    starts = np.unique(np.linspace(0, len(times), points, endpoint=False).astype(int))
+    starts = starts[starts < len(times)]
+    nis, dof, when = (np.add.reduceat(a, starts) for a in (found.nis, found.dof, times))
+    when = when / np.diff(starts, append=len(times))
+    some = dof > 0
+    when, nis, dof = when[some], nis[some], dof[some]
+    low, high = (special.chdtri(dof, p) / dof for p in (0.975, 0.025))
+    return when, nis / dof, low, high

@@ -1,0 +1,59 @@
+"""What a log says of itself without truth, in figures and in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rbl_gym.estimators import Innovations
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.causes import Cause, likely_causes
+from rbl_gym.studies.replay.consistency import MOST_NIS, MOST_REFUSED, consistency_figures
+from rbl_gym.studies.replay.settings import Settings
+
+# Below this NIS per degree of freedom the filter expects much more scatter than there is.
+_WIDE = 0.25
+
+
+def diagnose(
+    recording: Recording, settings: Settings, found: Innovations
+) -> tuple[dict[str, Any], list[str]]:
+    """Figures as of `consistency_figures`, ``causes`` of a contradiction, and notes.
+
+    Parameters
+    ----------
+    recording, settings
+        What was filtered, and how.
+    found
+        Innovations of the filter, arrays (K, ...).
+    """
+    figures = consistency_figures(found, recording)
+    ratio = figures["nis_per_dof"]
+    if not figures["contradicts"]:
+        notes = []
+        if ratio < _WIDE:
+            notes.append(
+                "Note: the filter expects more scatter than the ranges show (NIS per degree of "
+                f"freedom {ratio:.2f}): right where the errors of a link last, else see --tune."
+            )
+        return {**figures, "causes": []}, notes
+    causes = likely_causes(recording, settings, found)
+    return {**figures, "causes": [cause._asdict() for cause in causes]}, [_warning(figures, causes)]
+
+
+def _warning(figures: dict[str, Any], causes: list[Cause]) -> str:
+    ratio, refused = figures["nis_per_dof"], figures["refused_share"]
+    # Of one link among many neither figure tells.
+    subject = "the filter contradicts its data"
+    if ratio < MOST_NIS and refused < MOST_REFUSED:
+        subject = "a part of the ranges contradicts the filter"
+    text = (
+        f"WARNING: {subject}: NIS per degree of freedom {ratio:.2f} (1: honest), "
+        f"{100 * refused:.0f} % of the ranges refused. "
+    )
+    if not causes:
+        return text + (
+            "No one fault explains it (tried: motion, deviation of the ranges, swaps, places of "
+            "anchors, biases, units). Look at the residuals of anchors, tags and links; see --tune."
+        )
+    named = "; and ".join(cause.text for cause in causes)
+    return f"{text}Likely: {named} (NIS per degree of freedom {causes[-1].nis_per_dof:.2f} then)."

@@ -1,0 +1,152 @@
+"""Logs of one length under many suppositions at once: how likely each makes their ranges."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import estimators, motion
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators import IteratedEkf
+from rbl_gym.measurements.ranging import LinkNoise, RangeNoise
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
+from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
+from rbl_gym.studies.replay.tracking import has_own_std, recording_filter, start_of
+
+# Trials that run at once: more fall out of the processor's caches.
+_TOGETHER = 64
+
+
+class Trial(NamedTuple):
+    """A recording as it is supposed to be, and how it is filtered."""
+
+    recording: Recording
+    settings: Settings
+
+
+class Evidence(NamedTuple):
+    """What B trials make of K epochs.
+
+    Attributes
+    ----------
+    log_likelihood, nis, dof
+        As of `estimators.Innovations`, (B, K).
+    rotation, translation
+        Poses after every epoch, (B, K, 3, 3) and (B, K, 3).
+    residual
+        (B, K, M, N), metres.
+    """
+
+    log_likelihood: FloatArray
+    nis: FloatArray
+    dof: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+    residual: FloatArray
+
+    def part(self, trials: slice) -> Evidence:
+        """What some of the trials make of them."""
+        return Evidence(*(field[trials] for field in self))
+
+    def with_more(self, other: Evidence) -> Evidence:
+        """What these trials and then others make of the same epochs."""
+        return Evidence(*map(np.concatenate, zip(self, other, strict=True)))
+
+
+def evidence(trials: Sequence[Trial]) -> Evidence:
+    """The likelihood of recordings of the same epochs and links, each under its own supposition.
+
+    A trial that cannot be filtered is minus infinity everywhere.
+
+    Parameters
+    ----------
+    trials
+        Their recordings differ in ranges, their deviations, anchors and tags, and in which links
+        count; their settings in whatever they like.
+    """
+    found: list[tuple[FloatArray, ...] | None] = [None] * len(trials)
+    groups: dict[Any, list[int]] = {}
+    for k, trial in enumerate(trials):
+        groups.setdefault(_same_filter(*trial), []).append(k)
+    for members in groups.values():
+        for first in range(0, len(members), _TOGETHER):
+            chosen = members[first : first + _TOGETHER]
+            for k, result in zip(chosen, _tried([trials[k] for k in chosen]), strict=True):
+                found[k] = result
+    return Evidence(*map(np.array, zip(*found, strict=True)))  # pyright: ignore[reportArgumentType]
+
+
+def _same_filter(recording: Recording, settings: Settings) -> tuple[Settings, bytes]:
+    """What trials that run as one have in common: of the iterated EKF each has its own motion."""
+    tags = recording.tags.tobytes()
+    if settings.filter == "iekf":
+        settings, tags = settings.changed(walk_m=0.0, walk_deg=0.0), b""
+    return settings.changed(range_std_m=None, height_offset_m=None), tags
+
+
+def _tried(trials: list[Trial]) -> Iterator[tuple[FloatArray, ...]]:
+    """Results of trials that run as one; alone, where one of them spoils it for all."""
+    try:
+        yield from _together(trials)
+    except (TypeError, ValueError, np.linalg.LinAlgError):
+        if len(trials) > 1:
+            for trial in trials:
+                yield from _tried([trial])
+            return
+        K, shape = len(trials[0].recording.times), trials[0].recording.ranges.shape
+        nothing = np.full((K, 3, 3), np.nan), np.full((K, 3), np.nan), np.full(shape, np.nan)
+        yield np.full(K, -np.inf), np.full(K, np.inf), np.ones(K), *nothing
+
+
+def _together(trials: list[Trial]) -> list[tuple[FloatArray, ...]]:
+    filter = _stacked([recording_filter(*trial) for trial in trials])
+    prior = tuple(map(np.array, zip(*(start_of(*trial) for trial in trials), strict=True)))
+    tags = np.stack([trial.recording.tags for trial in trials])
+    steps = track_epochs(filter, prior, _readings(trials))  # pyright: ignore[reportArgumentType]
+    columns = [
+        (i.log_likelihood, i.nis, i.dof, step.belief.rotation, step.belief.translation, i.residual)
+        for step, i in innovations_of(filter, steps, tags, RangeNoise())
+    ]
+    stacked = [np.stack(column, axis=1) for column in zip(*columns, strict=True)]
+    return list(zip(*stacked, strict=True))
+
+
+def _stacked(filters: list[Any]) -> estimators.Filter:
+    """Filters of one group as one: those that differ in tags and motion with leading axes."""
+    first = filters[0]
+    if len(filters) == 1 or not isinstance(first, IteratedEkf):
+        return first
+    std = np.stack([filter.process.std() for filter in filters])
+    process = motion.ProcessNoise(std[:, :3], std[:, 3:])
+    tags = np.stack([filter.tags for filter in filters])
+    return dataclasses.replace(first, process=process, tags=tags)
+
+
+def _readings(trials: list[Trial]) -> Iterator[Reading]:
+    """The epochs of all trials, (B, ...)."""
+    logs = [trial.recording for trial in trials]
+    times = logs[0].times
+    ranges, links = np.stack([log.ranges for log in logs]), np.stack([log.links for log in logs])
+    anchors = np.stack([log.anchors_by_epoch for log in logs])
+    std = np.stack([std_of(*trial) for trial in trials])
+    for k, dt in enumerate(np.diff(times, prepend=times[0])):
+        yield Reading(
+            np.ascontiguousarray(ranges[:, k]),
+            np.ascontiguousarray(anchors[:, k]),
+            np.ascontiguousarray(links[:, k]),
+            LinkNoise(np.where(links[:, k], std[:, k], 1.0)),
+            np.zeros(6) if dt > 0 else None,
+            dt,
+        )
+
+
+def std_of(recording: Recording, settings: Settings) -> FloatArray:
+    """Standard deviations (K, M, N) of the ranges."""
+    if has_own_std(recording, settings) and recording.range_std is not None:
+        return recording.range_std
+    std = settings.range_std_m or DEFAULT_RANGE_STD_M
+    return np.broadcast_to(np.float64(std), recording.ranges.shape)

@@ -1,0 +1,261 @@
+"""Faults of a log that can be supposed: each is the log as it would be without the fault."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.evidence import Evidence, Trial, std_of
+from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M
+from rbl_gym.studies.replay.tracking import recording_filter
+
+# Anchors or tags beyond so many are not tried in pairs, but for the most contradicted.
+_IN_PAIRS = 12
+_UNITS = ((0.01, "centimetres"), (0.001, "millimetres"), (0.3048, "feet"))
+_WIDER = (3.0, 10.0, 30.0)
+_NOISIER = (1.5, 2.0, 3.0, 5.0, 10.0)
+_BIASES_M = (-1.0, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 1.0, 2.0)
+_HEIGHTS_M = (-2.0, -1.0, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 1.0, 2.0)
+# Links that are contradicted most are tried for a bias of their own.
+_LINKS = 4
+# A walk of zero is taken for this.
+_LEAST_WALK_M, _LEAST_WALK_DEG = 0.03, 2.0
+# So many values are tried between two that were.
+_STEPS = 4
+# Fewest ranges that tell a bias.
+_FEWEST = 6
+# How far an anchor may well be from where it is said to be (m), and so many ranges tell where.
+_MOVED_M, _FIXES = 3.0, 600
+
+
+class Supposition(NamedTuple):
+    """What kind of fault, its words, the log and the settings without it, and what it fits.
+
+    `parameters`: how many numbers were chosen for it; that many more make any log likelier.
+    """
+
+    kind: str
+    text: str
+    trial: Trial
+    parameters: int = 1
+
+
+def first_suppositions(trial: Trial) -> Iterator[Supposition]:
+    """Faults that can be supposed at once."""
+    recording, settings = trial
+    yield from _of_settings(trial)
+    for kind, ids, axis in (
+        ("anchors", recording.anchor_ids, 1),
+        ("tags", recording.tag_ids, 2),
+    ):
+        for i, j in itertools.combinations(_most_active(recording, axis), 2):
+            text = f"{kind} {ids[i]} and {ids[j]} look swapped"
+            changed = _with(trial, _swapped(recording, i, j, axis))
+            yield Supposition(f"{kind}-swapped", text, changed)
+    for scale, unit in _UNITS:
+        shrunk = recording._replace(ranges=scale * recording.ranges)
+        yield Supposition("units", f"the ranges look like {unit}", _with(trial, shrunk))
+        for field in ("anchors", "tags"):
+            changed = recording._replace(**{field: scale * getattr(recording, field)})
+            text = f"the places of the {field} look like {unit}"
+            yield Supposition("units", text, _with(trial, changed))
+    for bias in _BIASES_M:
+        yield _common_bias(trial, bias)
+    if settings.knowledge.planar:
+        for step in _HEIGHTS_M:
+            yield _height(trial, step)
+
+
+def left_out(trial: Trial) -> list[Trial]:
+    """The log without each of the anchors, then without each of the tags."""
+    links = trial.recording.links
+    result = []
+    for axis in (1, 2):
+        for k in range(links.shape[axis]):
+            kept = links.copy()
+            np.moveaxis(kept, axis, 0)[k] = False
+            result.append(_with(trial, trial.recording._replace(links=kept)))
+    return result
+
+
+def second_suppositions(
+    trial: Trial, first: list[Supposition], here: Evidence, without: Evidence
+) -> Iterator[Supposition]:
+    """Faults whose size the first runs tell.
+
+    Parameters
+    ----------
+    trial, first
+        The log, and what was supposed of it.
+    here, without
+        What came out of the log and of those suppositions, and of `left_out`.
+    """
+    recording = trial.recording
+    M, N = shape = recording.links.shape[1:]
+    likelihood = here.log_likelihood.sum(axis=1)
+    for kind, steps, scale_of_none, make in (
+        ("common-bias", _BIASES_M, 0.0, _common_bias),
+        ("height", _HEIGHTS_M, 0.0, _height),
+        ("range-std", _NOISIER, 1.0, _noisier),
+    ):
+        chosen = [k for k, s in enumerate(first) if s.kind == kind]
+        values = [*likelihood[1:][chosen], likelihood[0]]
+        for value in _about([*steps, scale_of_none], values) if chosen else ():
+            yield make(trial, value)
+    for k in range(M + N):
+        # What the poses that the others tell leave of the ranges that were left out.
+        poses = without.rotation[k], without.translation[k]
+        what, ids = ("anchor", recording.anchor_ids) if k < M else ("tag", recording.tag_ids)
+        i = k if k < M else k - M
+        mine = np.zeros(shape, np.bool_)
+        mine[(i, slice(None)) if k < M else (slice(None), i)] = True
+        off = _residual(recording, *poses)[recording.links & mine]
+        if len(off) < _FEWEST or not np.isfinite(off).all():
+            continue
+        if k < M:
+            yield _moved(trial, *poses, i)
+        bias = float(np.median(off))
+        yield _biased(trial, f"{what}-bias", f"the ranges of {what} {ids[i]}", mine, bias)
+    middle = np.zeros(shape)
+    for m, n in zip(*np.nonzero(recording.links.any(axis=0)), strict=True):
+        middle[m, n] = np.median(here.residual[0, recording.links[:, m, n], m, n])
+    worst = np.argsort(-np.abs(middle).ravel())[:_LINKS]
+    for m, n in zip(*np.unravel_index(worst, shape), strict=True):
+        mine = np.zeros(shape, np.bool_)
+        mine[m, n] = True
+        name = f"the ranges from anchor {recording.anchor_ids[m]} to tag {recording.tag_ids[n]}"
+        # A pose that follows the bias hides a part of it.
+        for share in (1.0, 1.4):
+            yield _biased(trial, "link-bias", name, mine, share * float(middle[m, n]))
+
+
+def _with(trial: Trial, recording: Recording) -> Trial:
+    return trial._replace(recording=recording)
+
+
+def _of_settings(trial: Trial) -> Iterator[Supposition]:
+    """Another motion, other noise, another loss."""
+    recording, settings = trial
+
+    def supposed(kind: str, text: str, **fields: float | bool) -> Supposition:
+        return Supposition(kind, text, Trial(recording, settings.changed(**fields)))
+
+    motion = settings.motion
+    if getattr(recording_filter(recording, settings), "twist", None) is not None:
+        for wider in _WIDER:
+            changed = {"accel_m": wider * motion.accel_m, "accel_deg": wider * motion.accel_deg}
+            yield supposed("acceleration", _moves("acceleration", changed), **changed)
+    else:
+        walk = max(motion.walk_m, _LEAST_WALK_M), max(motion.walk_deg, _LEAST_WALK_DEG)
+        for m, deg in (*((f, f) for f in _WIDER), (3, 1), (10, 1), (30, 1), (1, 3), (1, 10)):
+            changed = {"walk_m": m * walk[0], "walk_deg": min(deg * walk[1], 360.0)}
+            yield supposed("walk", _moves("walk", changed), **changed)
+    for more in _NOISIER:
+        yield _noisier(trial, more)
+    if not settings.loss.robust:
+        yield supposed("outliers", "some ranges are far off: leave out --no-robust", robust=True)
+
+
+def _noisier(trial: Trial, more: float) -> Supposition:
+    recording, settings = trial
+    std = settings.range_std_m
+    if std is None and recording.range_std is not None:
+        std = float(np.median(recording.range_std[recording.links]))
+    value = more * (std or DEFAULT_RANGE_STD_M)
+    text = f"the ranges scatter more than they are said to: --range-std-m {value:.2g} or so"
+    return Supposition(
+        "range-std", text, trial._replace(settings=settings.changed(range_std_m=value))
+    )
+
+
+def _moves(what: str, changed: dict[str, float]) -> str:
+    options = " ".join(f"--{name.replace('_', '-')} {value:.3g}" for name, value in changed.items())
+    return f"the body moves more than the {what} allows: {options} or so"
+
+
+def _most_active(recording: Recording, axis: int) -> np.ndarray:
+    """The anchors or tags that are tried in pairs."""
+    other = tuple(k for k in range(3) if k != axis)
+    ranges = recording.links.sum(axis=other)
+    return np.sort(np.argsort(-ranges, kind="stable")[:_IN_PAIRS])
+
+
+def _swapped(recording: Recording, i: int, j: int, axis: int) -> Recording:
+    order = np.arange(recording.links.shape[axis])
+    order[[i, j]] = order[[j, i]]
+    std = recording.range_std
+    return recording._replace(
+        ranges=recording.ranges.take(order, axis),
+        links=recording.links.take(order, axis),
+        range_std=None if std is None else std.take(order, axis),
+    )
+
+
+def _biased(trial: Trial, kind: str, name: str, mine: np.ndarray, bias: float) -> Supposition:
+    recording = trial.recording
+    # A link stays a link.
+    ranges = np.where(mine, np.maximum(recording.ranges - bias, 1e-3), recording.ranges)
+    side = "long" if bias > 0 else "short"
+    changed = recording._replace(ranges=np.where(recording.links, ranges, 0.0))
+    return Supposition(kind, f"{name} look {abs(bias):.2f} m too {side}", _with(trial, changed))
+
+
+def _common_bias(trial: Trial, bias: float) -> Supposition:
+    everything = np.ones(trial.recording.links.shape[1:], np.bool_)
+    return _biased(trial, "common-bias", "all ranges", everything, bias)
+
+
+def _height(trial: Trial, step: float) -> Supposition:
+    offset = (trial.settings.knowledge.height_offset_m or 0.0) + step
+    settings = trial.settings.changed(height_offset_m=offset)
+    text = f"the tags look to be at another height: --height-offset-m {offset:.2f} or so"
+    return Supposition("height", text, trial._replace(settings=settings))
+
+
+def _about(places: list[float], values: list[float]) -> FloatArray:
+    """Places between the neighbours of the one that has the highest value."""
+    order = np.argsort(places)
+    x, y = np.array(places)[order], np.array(values)[order]
+    best = int(np.argmax(y))
+    low, high = x[max(best - 1, 0)], x[min(best + 1, len(x) - 1)]
+    return np.concatenate(
+        [np.linspace(a, b, _STEPS + 2)[1:-1] for a, b in ((low, x[best]), (x[best], high)) if a < b]
+    )
+
+
+def _residual(recording: Recording, rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Ranges (K, M, N) less those of poses (K, ...)."""
+    points = ranging.tag_positions(rotation, translation, recording.tags)
+    return recording.ranges - ranging.distances(recording.anchors, points)
+
+
+def _moved(trial: Trial, rotation: FloatArray, translation: FloatArray, m: int) -> Supposition:
+    """The anchor where the poses that the others tell have it."""
+    recording = trial.recording
+    points = ranging.tag_positions(rotation, translation, recording.tags)
+    place = recording.anchors[..., m, :]
+    start = np.broadcast_to(place, (len(points), 3))[:, None]
+    k, n = np.nonzero(recording.links[:, m])
+    some = slice(None, None, max(1, len(k) // _FIXES))
+    k, n = k[some], n[some]
+    away, ranges = (start - points)[k, n], recording.ranges[k, m, n]
+    std = std_of(*trial)[k, m, n]
+    step = optimize.least_squares(
+        lambda step: np.concatenate(
+            [(np.linalg.norm(away + step, axis=-1) - ranges) / std, step / _MOVED_M]
+        ),
+        np.zeros(3),
+        loss="soft_l1",
+    ).x
+    anchors = recording.anchors.copy()
+    anchors[..., m, :] += step
+    words = ", ".join(f"{x:+.2f}" for x in step)
+    text = f"anchor {recording.anchor_ids[m]} looks to be off: it fits moved by ({words}) m"
+    return Supposition("anchor-moved", text, _with(trial, recording._replace(anchors=anchors)), 3)

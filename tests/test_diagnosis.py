@@ -1,0 +1,192 @@
+"""A filter that contradicts its data: said, with the fault that was put in; honest logs: not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym.estimators import Innovations
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings import Recording
+from rbl_gym.studies import replay
+from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
+from rbl_gym.studies.replay.tracking import start_of
+
+ANCHORS = np.array(
+    [[0, 0, 2.5], [10, 0, 0.5], [10, 8, 3], [0, 8, 0.4], [4, 3, 3], [7, 6, 2.8], [2, 7, 1.2]],
+    dtype=float,
+)
+TAGS = np.array([[0.4, 0, 0], [-0.3, 0.3, 0.1], [0, -0.4, 0.2], [0.1, 0.1, -0.35], [-0.2, -0.2, 0]])
+SETTINGS = replay.Settings.of(range_std_m=0.1, walk_m=0.3, walk_deg=17.0)
+
+
+def walked(seed: int, logs: int = 1, epochs: int = 120, planar: bool = False):
+    """Ranges (logs, epochs, M, N) of bodies that walk as the settings say."""
+    rng = np.random.default_rng(seed)
+    std = np.array([0, 0, 0.3, 0.3, 0.3, 0] if planar else [0.3] * 6)
+    moves = np.sqrt(0.1) * rng.standard_normal((logs, epochs, 6)) * std
+    rotation = np.empty((logs, epochs, 3, 3))
+    rotation[:, 0] = np.eye(3)
+    for k in range(1, epochs):
+        rotation[:, k] = rotations.exp(moves[:, k, :3]) @ rotation[:, k - 1]
+    translation = np.array([5.0, 4.0, 1.5]) + np.cumsum(moves[..., 3:], axis=1)
+    true = ranging.distances(ANCHORS, ranging.tag_positions(rotation, translation, TAGS))
+    return true + 0.1 * rng.standard_normal(true.shape)
+
+
+def recording(ranges, anchors=ANCHORS, tags=TAGS):
+    times = 0.1 * np.arange(len(ranges))
+    ids = tuple(f"A{m}" for m in range(len(anchors))), tuple(f"T{n}" for n in range(len(tags)))
+    links = np.ones(ranges.shape, dtype=bool)
+    return Recording(times, ranges, links, None, anchors, tags, *ids, None)
+
+
+RANGES = walked(1)[0]
+
+
+def only(anchor=slice(None), tag=slice(None)):
+    mask = np.zeros((7, 5))
+    mask[anchor, tag] = 1.0
+    return mask
+
+
+FAULTS = {
+    "nothing": (None, recording(RANGES), {}),
+    "walk": ("walk", recording(RANGES), {"walk_m": 0.02, "walk_deg": 1.0}),
+    "law of an unknown twist": (
+        "acceleration",
+        recording(RANGES),
+        {"filter": "iekf-cv", "walk_m": 0, "walk_deg": 0, "accel_m": 0.01, "accel_deg": 0.5},
+    ),
+    "deviation": ("range-std", recording(RANGES), {"range_std_m": 0.03}),
+    "two anchors": ("anchors-swapped", recording(RANGES[:, [0, 4, 2, 3, 1, 5, 6]]), {}),
+    "two tags": ("tags-swapped", recording(RANGES[..., [3, 1, 2, 0, 4]]), {}),
+    "an anchor": (
+        "anchor-moved",
+        recording(RANGES, ANCHORS + only(2)[:, :1] * [0.8, -0.5, 0.3]),
+        {},
+    ),
+    "all ranges": ("common-bias", recording(RANGES + 0.4), {}),
+    "an anchor's ranges": ("anchor-bias", recording(RANGES + 0.5 * only(3)), {}),
+    "a tag's ranges": ("tag-bias", recording(RANGES + 0.4 * only(tag=2)), {}),
+    "a link": ("link-bias", recording(RANGES + 0.8 * only(3, 1)), {}),
+    "feet": ("units", recording(RANGES / 0.3048), {}),
+    "tags in feet": ("units", recording(RANGES, tags=TAGS / 0.3048), {}),
+    "late ranges": (
+        "outliers",
+        recording(RANGES + 4.0 * (np.random.default_rng(2).random(RANGES.shape) < 0.04)),
+        {"robust": False},
+    ),
+}
+WORDS = {
+    "two anchors": "anchors A1 and A4 look swapped",
+    "two tags": "tags T0 and T3 look swapped",
+    "all ranges": "all ranges look 0.40 m too long",
+    "an anchor's ranges": "the ranges of anchor A3 look 0.5",
+    "a tag's ranges": "the ranges of tag T2 look 0.4",
+    "a link": "the ranges from anchor A3 to tag T1 look 0.8",
+    "an anchor": "anchor A2 looks to be off",
+    "deviation": "--range-std-m 0.1 or so",
+    "walk": "--walk-m 0.3 --walk-deg 20 or so",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_fault_put_in_is_named(fault):
+    kind, log, changed = FAULTS[fault]
+    replayed = replay.replay_recording(log, SETTINGS.changed(**changed))
+    found, notes = replayed.figures["consistency"], replayed.figures["notes"]
+    assert found["contradicts"] == (kind is not None)
+    assert [cause["kind"] for cause in found["causes"]] == [kind] * (kind is not None)
+    if kind is None:
+        assert notes == []
+        assert found["nis_per_dof"] == pytest.approx(1.0, abs=0.1)
+        return
+    cause = found["causes"][0]
+    assert cause["mended"] > 0.8
+    assert 0.7 < cause["nis_per_dof"] < 1.6
+    assert WORDS.get(fault, "") in cause["text"]
+    # Ranges far too long for the room may fit a mirror pose as well.
+    whole = found["nis_per_dof"] > 2 or found["refused_share"] > 0.2
+    subject = "the filter contradicts its data" if whole else "a part of the ranges contradicts"
+    assert notes[-1].startswith(f"WARNING: {subject}")
+    assert cause["text"] in notes[-1]
+
+
+def test_two_faults_are_both_named():
+    log = recording(RANGES[:, [0, 4, 2, 3, 1, 5, 6]])
+    settings = SETTINGS.changed(range_std_m=0.04)
+    found = replay.track_recording(log, settings).innovations
+    assert found is not None
+    causes = replay.likely_causes(log, settings, found)
+    assert all(isinstance(cause, replay.Cause) for cause in causes)
+    assert [cause.kind for cause in causes] == ["anchors-swapped", "range-std"]
+
+
+def test_the_height_of_a_planar_body():
+    log = recording(walked(3, planar=True)[0])
+    # The tags' mean height is 1.49 m, the anchors' 1.91 m.
+    known = SETTINGS.changed(planar=True, height_offset_m=0.42)
+    found = replay.replay_recording(log, known).figures["consistency"]
+    assert not found["contradicts"]
+    found = replay.replay_recording(log, known.changed(height_offset_m=0.0)).figures["consistency"]
+    assert [cause["kind"] for cause in found["causes"]] == ["height"]
+    assert "--height-offset-m 0.4" in found["causes"][0]["text"]
+
+
+def test_noise_that_nothing_explains_has_no_cause():
+    """Each epoch of another place and body: no fault makes sense of that."""
+    log = recording(np.random.default_rng(5).uniform(1, 9, RANGES.shape))
+    figures = replay.replay_recording(log, SETTINGS).figures
+    assert figures["consistency"]["contradicts"]
+    assert all(cause["kind"] == "range-std" for cause in figures["consistency"]["causes"])
+
+
+def test_honest_logs_are_not_doubted():
+    """None of two hundred logs that are as the filter believes is said to contradict it."""
+    ranges = walked(7, logs=200, epochs=40)
+    logs = [recording(r) for r in ranges]
+    filter = replay.recording_filter(logs[0], SETTINGS)
+    prior = tuple(np.broadcast_to(a, (200, *a.shape)) for a in start_of(logs[0], SETTINGS))
+    readings = (
+        Reading(ranges[:, k], ANCHORS, twist=np.zeros(6) if k else None, dt=0.1) for k in range(40)
+    )
+    steps = track_epochs(filter, prior, readings)
+    noise = ranging.RangeNoise(0.1)
+    each = [found for _, found in innovations_of(filter, steps, TAGS, noise)]
+    columns = [np.stack(column, axis=1) for column in zip(*each, strict=True)]
+    doubted = [
+        replay.contradicts(Innovations(*(column[b] for column in columns)), logs[b])
+        for b in range(200)
+    ]
+    assert sum(doubted) == 0
+
+
+def test_residuals_by_anchor_tag_and_link():
+    log = recording(RANGES + 0.8 * only(3, 1))
+    lost = log.links.copy()
+    lost[:, 6] = False
+    lost[:60, 0, 0] = False
+    log = log._replace(links=lost)
+    track = replay.track_recording(log, SETTINGS)
+    found = track.innovations
+    assert found is not None
+    tables = replay.residual_tables(found, log)
+    assert [row["anchor"] for row in tables["anchors"]] == [f"A{m}" for m in range(6)]
+    assert len(tables["tags"]) == 5
+    assert len(tables["links"]) == 30
+    first = tables["links"][0]
+    here = found.residual[60:, 0, 0]
+    assert first["ranges"] == 60
+    assert first["mean_m"] == pytest.approx(here[found.used[60:, 0, 0]].mean())
+    assert first["spread_m"] == pytest.approx(0.1, rel=0.4)
+    late = next(row for row in tables["links"] if (row["anchor"], row["tag"]) == ("A3", "T1"))
+    assert late["refused_share"] == 1.0
+    assert late["mean_m"] is None
+    assert sum(row["ranges"] for row in tables["links"]) == lost.sum()
+    when, ratio, low, high = replay.nis_curve(log.times, found, points=10)
+    assert len(when) == len(ratio) == 10
+    assert when[0] == pytest.approx(log.times[:12].mean())
+    assert ratio[3] == pytest.approx(found.nis[36:48].sum() / found.dof[36:48].sum())
+    assert ((low < 1) & (high > 1)).all()
