@@ -19,6 +19,7 @@ from pathlib import Path
 
 INSTRUMENTED = [
     "rbl_gym.recordings.reading", "rbl_gym.recordings.text", "rbl_gym.recordings.tables",
+    "rbl_gym.recordings.measured", "rbl_gym.recordings.points", "rbl_gym.recordings.stamps",
     "rbl_gym.recordings.truth", "rbl_gym.recordings.writing",
     "rbl_gym.placement.scene_files", "rbl_gym.networks.g2o",
     "rbl_gym.studies.learning.policies",

@@ -15,7 +15,7 @@ import numpy as np
 
 from rbl_gym.networks.g2o import read_graph
 from rbl_gym.placement.scene_files import problem
-from rbl_gym.recordings import read_recording, read_track
+from rbl_gym.recordings import Format, Recording, read_recording, read_runs, read_track
 from rbl_gym.studies.bench import records, spec_files
 from rbl_gym.studies.learning import policies
 
@@ -49,6 +49,30 @@ TRACK = (b"t,x,y,z,qw,qx,qy,qz,"
          + b"1,1,2,3,0.6,0,0,0.8" + b",0.5" * 21 + b",1,0,0\n")  # fmt: skip
 PLACES = b"time;pos_x;pos_y;roll [deg];pitch [deg];yaw [rad];z\n0,5;1;2;3;4;1;0\n1;1;2;3;4;1;0\n"
 CALIBRATION = b"anchor,tag,bias_m,slope,sigma_m\nA,1,0.5,0.25,0.01\nC,1,3.5,0,\n"
+# Logs in other people's ways.
+GERMAN = LONG.replace(b",", b";").replace(b".", b",")
+SPACES = (
+    b"# Time Anchor Tag Distance\n0 A 1 2.5\n20 A left 2.25\n40 B 1 nan\n60 A 1 3\n60 A 1 3\n"
+    b"50 C 1 2\n80 C 1 2\n100 C 1 2\n120 C 1 2"
+)
+ISO = (
+    b"stamp\tanchor_id\ttag_id\trange (cm)\n2024-05-01T12:00:00Z\tA\t1\t250\n"
+    b"2024-05-01 12:00:00.5\tB\tLEFT\t150\n2024-05-01T12:00:00.4+00:00\tb\t1.0\t150\n"
+)
+PATTERN = (
+    b"when,r_A_1,r_A_left,r_C_1,sd_A_1,sd_A_left,sd_C_1,x\n0,250,225,300,9,9,9,\n"
+    b"0.1,200,,0,10,,5,\n0.2,200,200,200,10,9,5,\n0.2,200,200,200,10,9,5,\n"
+)
+RUNS = (
+    b"run,t,anchor,tag,range,x,y,z\na,0,A,1,2,1,1,1\nb,0,A,1,2,1,1,1\na,0.5,A,left,2,1,1,2\n"
+    b"a,1,B,1,3,1,1,1\nb,2,A,1,2,1,1,1\n"
+)
+ALONE = b"t,d,var,ax,ay\n0.1,2955,0.01,-0.02,-0.01\n0.2,1605,0.01,-0.02,2.365\n" \
+        b"0.3,893,0.01,2.385,2.36\n0.4,893,0.01,2.3,2.36\n"  # fmt: skip
+ALONE_IDS = b"time_ms,anchor,d,ax,ay,az\n100,5,2955,1,2,3\n200,5,2955,2,2,3\n300,6,955,4,4,3\n"
+MOVING = b"anchor,t,x,y,z\nA,0,0,0,1\nA,1,0,0.5,1\nB,0,4,0,1\nC,0,0,4,2\nC,2,1,4,2\n"
+CARRIER = b"who,t,A_x,A_y,A_z,A_qw,A_qx,A_qy,A_qz\na,0,1,2,3,1,0,0,0\nb,0,0,0,0,1,0,0,0\n" \
+          b"a,1,2,2,3,0.6,0,0,0.8\n"  # fmt: skip
 G2O = (
     b"VERTEX_SE2 0 0 0 0\nEDGE_SE2 0 1 1.0 0.0 0.1 500 0 0 500 0 5000\n# x\n"
     b"EDGE_SE2 1 7 1.0 0.5 -3.0 500 0 0 500 0 5000\nFIX 0\n"
@@ -96,15 +120,37 @@ JSON = (b"{", b"}", b"[", b"]", b":", b"null", b"NaN", b"Infinity", b"[" * 3000,
         b'"\\ud800"', b'""')  # fmt: skip
 
 
-def _recording(part: str, path: Path) -> Any:
-    files = {"ranges": LONG, "anchors": ANCHORS, "tags": TAGS, "truth": TRUTH,
-             "calibration": CALIBRATION} | {part: None}  # fmt: skip
+def _files(part: str, path: Path, **others: bytes) -> dict[str, Any]:
+    """Good files beside the one that is tried."""
+    files = {"ranges": LONG, "anchors": ANCHORS, "tags": TAGS, **others}
     for name, data in files.items():
         beside = path.with_name(f"good_{name}.csv")
-        if data is not None and not beside.exists():
+        if name != part and not beside.exists():
             beside.write_bytes(data)
-    paths = {name: path.with_name(f"good_{name}.csv") for name in files} | {part: path}
-    return read_recording(**paths)
+    return {name: path.with_name(f"good_{name}.csv") for name in files} | {part: path}
+
+
+def _recording(part: str, path: Path) -> Any:
+    return read_recording(**_files(part, path, truth=TRUTH, calibration=CALIBRATION))
+
+
+def _runs(path: Path) -> Any:
+    return read_runs(**_files("ranges", path), truth=path)
+
+
+def _pattern(path: Path) -> Any:
+    columns = {"time": "when", "range": "r_{anchor}_{tag}", "std": "sd_{anchor}_{tag}"}
+    return read_recording(**_files("ranges", path), format=Format(columns=columns, unit="cm"))
+
+
+def _alone(path: Path) -> Any:
+    return read_recording(path, format=Format(columns={"range": "d[mm]"}))
+
+
+def _carrier(relative: bool, path: Path) -> Any:
+    arms = Format(columns={"carrier.*": "A_*"}, where={"carrier.who": "a"})
+    files = _files("carrier", path, truth=TRUTH)
+    return read_recording(**files, relative=relative, format=arms)
 
 
 def _policy() -> bytes:
@@ -130,10 +176,22 @@ _times = (
     b'"microseconds_per_step": 1.5}\n' * 2
 )
 READERS = {
-    "ranges": Reader("ranges.csv", partial(_recording, "ranges"), (LONG, WIDE), NUMBERS + MARKS),
+    "ranges": Reader(
+        "ranges.csv", partial(_recording, "ranges"), (LONG, WIDE, GERMAN, SPACES, ISO),
+        NUMBERS + MARKS,
+    ),
+    "ranges-pattern": Reader("wide.csv", _pattern, (PATTERN,), NUMBERS + MARKS),
+    "ranges-alone": Reader("alone.csv", _alone, (ALONE, ALONE_IDS), NUMBERS + MARKS),
+    "runs": Reader("runs.csv", _runs, (RUNS,), NUMBERS + MARKS),
+    **{
+        f"carrier-{where}": Reader(
+            "carrier.csv", partial(_carrier, where == "relative"), (CARRIER,), NUMBERS + MARKS
+        )
+        for where in ("world", "relative")
+    },
     **{
         part: Reader(f"{part}.csv", partial(_recording, part), seeds, NUMBERS + MARKS)
-        for part, seeds in (("anchors", (ANCHORS,)), ("tags", (TAGS,)),
+        for part, seeds in (("anchors", (ANCHORS, MOVING)), ("tags", (TAGS,)),
                             ("truth", (TRUTH, PLANAR, TUM, EUROC, PLACES)),
                             ("calibration", (CALIBRATION,)))
     },
@@ -180,10 +238,27 @@ def check(name: str, data: bytes, folder: Path) -> str:
         assert any(file in text for file in files), f"does not name the file: {text}"
         return re.sub(r"\d+", "0", text.replace(str(folder), ""))
     assert _is_finite(found), "read numbers that are none"
+    for log in found.values() if isinstance(found, dict) else [found]:
+        if isinstance(log, Recording):
+            check_log(log)
     return "read"
 
 
+def check_log(log: Recording) -> None:
+    """A recording is in order, and every range of the file is a link or counted as none."""
+    assert (np.diff(log.times) > 0).all()
+    np.testing.assert_array_equal(log.links, log.ranges > 0)
+    assert log.links.any()
+    assert log.ranges.max() <= 1e4
+    if log.range_std is not None:
+        np.testing.assert_array_equal(log.links, log.range_std > 0)
+    lost = sum(count for cause, count in log.report.dropped.items() if cause != "empty")
+    assert log.report.ranges == log.links.sum() + lost, log.report
+
+
 def _is_finite(found: Any) -> bool:
+    if isinstance(found, dict):
+        found = tuple(found.values())
     if isinstance(found, tuple):
         return all(map(_is_finite, found))
     if isinstance(found, np.ndarray) and found.dtype.kind == "f":

@@ -7,9 +7,12 @@ was found.
 from __future__ import annotations
 
 import random
+from typing import Any
 
 import pytest
 
+from rbl_gym.recordings import Format, read_recording
+from tests import fuzz_files
 from tests.fuzz_files import READERS, check
 
 MUTANTS = 150  # of each good file; docs/fuzzing.md says for how many it was run
@@ -59,3 +62,48 @@ def test_no_file_at_all(name, tmp_path):
             b'{"a":' * 100_000, b"a = " + b"[" * 100_000, b"9" * 5000, b"a," * 200_000]  # fmt: skip
     for one in data:
         check(name, one, tmp_path)
+
+
+NAMES_OF_COLUMNS = ("t", "time", "anchor", "tag", "range", "std", "valid", "ax", "ay", "run", "*")
+CELLS = (
+    "A", "1", "left", "t", "anchor", "tag", "range", "std", "valid", "x", "y", "z", "id", "t[ms]",
+    "range[mm]", "*", "r*", "*e", "a{anchor}t{tag}", "{tag}", "{anchor}", "{anchor}{tag}", "{x}",
+    "[s]", "", " ", "(", "[", "{anchor",
+)  # fmt: skip
+
+
+def test_formats(tmp_path):
+    """Good files, read in any way that options can say."""
+    rng = random.Random(0)
+    seeds = [*READERS["ranges"].seeds, fuzz_files.RUNS, fuzz_files.ALONE, fuzz_files.PATTERN]
+    beside = {"anchors": fuzz_files.ANCHORS, "tags": fuzz_files.TAGS, "truth": fuzz_files.TRUTH}
+    for name, data in beside.items():
+        (tmp_path / f"{name}.csv").write_bytes(data)
+    read = 0
+
+    def some(most: int) -> dict[str, str]:
+        prefixes = ("", "", "", "anchors.", "tags.", "truth.", "carrier.", "a.", ".")
+        return {
+            rng.choice(prefixes) + rng.choice(NAMES_OF_COLUMNS): rng.choice(CELLS)
+            for _ in range(rng.choice((0, 0, most)))
+        }
+
+    for _ in range(600):
+        (tmp_path / "ranges.csv").write_bytes(rng.choice(seeds))
+        options: dict[str, Any] = {
+            "columns": some(2), "where": some(1), "strict": rng.random() < 0.2,
+            "time_unit": rng.choice((None, None, "s", "ms", "ns", "iso", "h")),
+            "unit": rng.choice((None, None, "m", "cm", "mm", "ft")),
+        }  # fmt: skip
+        parts = ["ranges", *(name for name in beside if rng.random() < 0.7)]
+        files: dict[str, Any] = {part: tmp_path / f"{part}.csv" for part in parts}
+        try:
+            log = read_recording(**files, format=Format(**options))
+        except ValueError:
+            continue
+        except BaseException as error:
+            error.add_note(f"{options} of {files}")
+            raise
+        fuzz_files.check_log(log)
+        read += 1
+    assert read > 20
