@@ -151,6 +151,9 @@ def test_units_of_ranges(tmp_path, unit, scale):
         np.testing.assert_allclose(log.ranges[0, :2, 0], [2.5, 2.0])
         assert log.range_std is not None
         np.testing.assert_allclose(log.range_std[0, :2, 0], [0.1, 1.0])
+    own = read_as(tmp_path, text.replace("std", "std [m]"), unit=unit).range_std
+    assert own is not None
+    np.testing.assert_allclose(own[0, :2, 0], [0.1 * scale, scale])
     with pytest.raises(ValueError, match=r"unit must be one of \['m', 'cm', 'mm'\], got 'ft'"):
         Format(unit="ft")
 
@@ -451,6 +454,13 @@ def test_a_calibration_without_slopes(tmp_path):
     np.testing.assert_allclose(log.ranges[0], [[2.0, 2.25], [0, 0], [0, 0]])
     assert log.report.dropped == {"not positive once calibrated": 1}
     assert "1 ranges are not positive" in note_of(log, "calibrated")
+
+
+def test_units_of_the_header_that_are_none(tmp_path):
+    with pytest.raises(ValueError, match=r"line 1, column 'time_m': unit must be one of \['s', "):
+        read(tmp_path, LONG.replace("t,", "time_m,", 1))
+    with pytest.raises(ValueError, match=r"line 1, column 'range': unit must be one of \['m', "):
+        read(tmp_path, LONG.replace("range", "range [s]", 1))
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,8 @@ def read_measured(
         read.add(std_column)
         std = table.numbers(std_column, may_be_missing=True)
         with np.errstate(invalid="ignore"):
-            std = scale * (np.sqrt(std) if std_column == "var" else std)
+            std = np.sqrt(std) if std_column == "var" else std
+        std *= METRES[table.unit(std_column, METRES)] if table.units.get(std_column) else scale
     rows = np.arange(len(values))
     measured = Measured(rows, none, anchor, tag, values, std, none.copy(), ["range"], [std_column])
     if "valid" in table.columns:
@@ -212,8 +213,8 @@ def _tags_named(table: Table, pattern: str, anchors: tuple[str, ...]) -> tuple[s
 
 def _scale(table: Table, column: str, format: Format, said: Said) -> float:
     """Metres of a unit of the ranges."""
-    told = table.units.get(column, "")
-    if format.unit is None and told in ("cm", "mm"):
+    told = "" if format.unit else table.unit(column, METRES)
+    if told in ("cm", "mm"):
         said.note(table.path, f"ranges are in {told}, as the header tells")
     return METRES.get(format.unit or told, 1.0)
 

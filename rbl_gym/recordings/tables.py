@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.recordings.stamps import found_unit, iso_seconds, seconds_per
+from rbl_gym.recordings.stamps import TIME_UNITS, found_unit, iso_seconds, seconds_per
 from rbl_gym.recordings.text import is_number, read_cells
 
 AnyPath = str | os.PathLike[str]
@@ -83,6 +83,16 @@ class Table(NamedTuple):
         """File, line and column in words."""
         return f"{self.path}, line {self.lines[row]}, column {self.name(column)!r}"
 
+    def unit(self, column: str, known: Iterable[str]) -> str:
+        """The unit of a column that the header tells, one of `known`; "" where it tells none."""
+        unit = self.units.get(column, "")
+        if unit and unit not in known:
+            raise ValueError(
+                f"{self.path}, line {self.header_line}, column {self.name(column)!r}: unit must be "
+                f"one of {[*known]}, got {unit!r}"
+            )
+        return unit
+
     def check(self, ok: BoolArray, column: str, must: str, got: Any = None) -> None:
         """Raise at the first row where `ok` is False; `got` replaces the cells in the message."""
         if not ok.all():
@@ -123,7 +133,7 @@ class Table(NamedTuple):
         `unit`: s, ms, us, ns or iso; None: as the header tells, else found from the cells.
         """
         self.require("t")
-        said = unit or self.units.get("t")
+        said = unit or self.unit("t", TIME_UNITS) or None
         if said == "iso" or (said is None and not is_number(self.columns["t"][0])):
             stamps = iso_seconds(self.columns["t"].tolist())
             if stamps is not None and (said == "iso" or np.isfinite(stamps[0])):
@@ -149,7 +159,7 @@ class Table(NamedTuple):
         points = {column: self.numbers(column) for column in columns}
         too_far = f"must be at most {most:.0f} m (looks like millimetres?)"
         for column, values in points.items():
-            values *= METRES.get(self.units.get(column, ""), 1.0)
+            values *= METRES[self.unit(column, METRES) or "m"]
             self.check(np.abs(values) <= most, column, too_far)
         return np.stack([*points.values()], axis=-1)
 
