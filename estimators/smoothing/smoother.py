@@ -30,8 +30,8 @@ __all__ = ["LogModel", "RangeLog", "Smoothed", "smooth"]
 
 # Whitened residual at which Huber's loss turns, where a loss that forgets is to be started.
 _HUBER = 1.5
-# A step is the last one where it promises less decrease of the cost than this.
-_TOLERANCE, _COARSE = 1e-6, 1e-1
+# A step is the last one where it promises less decrease of the cost than this, per epoch.
+_TOLERANCE, _COARSE = 1e-7, 1e-3
 _MOST_DAMPING = 1e12
 
 
@@ -248,7 +248,8 @@ class _Problem:
                 equations = self.linearize(new, loss)
             state = new
             # Damping shortens a step by about 1 + damping: a short step alone proves nothing.
-            converged = converged | (better & (decrease * (1 + damping) < tolerance))
+            most = tolerance * state.translation.shape[-2]
+            converged = converged | (better & (decrease * (1 + damping) < most))
             eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
             damping = np.where(better, eased, np.clip(10 * damping, 1e-3, _MOST_DAMPING))
             if converged.all():
