@@ -35,6 +35,7 @@ def add_replay(commands: Any) -> None:
     _add_filter(replay.add_argument_group("filter"))
     _add_motion(replay.add_argument_group("how the body moves"))
     _add_biases(replay.add_argument_group("biases of the links (filter iekf-bias)"))
+    _add_smoothing(replay.add_argument_group("the smoothed track"))
     _add_comparison(replay.add_argument_group("comparison with the truth"))
     _add_output(replay.add_argument_group("output"))
     replay.set_defaults(run=_replay)
@@ -103,6 +104,21 @@ def _add_biases(group: Any) -> None:
         action="store_true",
         help="ranges of radios that nobody calibrated: iekf-bias learns the biases that stay",
     )
+
+
+def _add_smoothing(group: Any) -> None:
+    group.add_argument(
+        "--smooth",
+        action="store_true",
+        default=None,
+        help="the most likely track of the whole log beside the causal one",
+    )
+    _add_number(group, "--smooth-accel-m", "change of the speed (m/s) after 1 s, default 0.2")
+    _add_number(group, "--smooth-accel-deg", "of the turn rate (deg/s) after 1 s, default 15")
+    _add_number(group, "--smooth-bias-std-m", "of a link's bias that drifts, default 0.06")
+    _add_number(group, "--smooth-bias-time-s", "how long that lasts, default 3")
+    _add_number(group, "--smooth-constant-m", "of a link's bias that stays, default 0.1")
+    _add_number(group, "--smooth-common-m", "of what those have in common, default 0.2")
 
 
 def _add_comparison(group: Any) -> None:

@@ -101,6 +101,13 @@ def print_replay(result: dict[str, Any]) -> None:
         f"{result['epochs']} epochs, {result['links']} ranges in {result['duration_s']:.1f} s, "
         f"filter {result['settings']['filter']}{speed}"
     )
+    if "smoothed" in result:
+        fit = result["smoothed"]
+        unsettled = "" if fit["converged"] else ", NOT converged"
+        console.print(
+            f"smoothed in {fit['seconds']:.1f} s{unsettled}, NIS per degree of freedom "
+            f"{fit['nis']:.2f}"
+        )
     if "epochs_with_truth" not in result:
         console.print("no truth, no errors")
         print_consistency(console, result)
@@ -108,10 +115,17 @@ def print_replay(result: dict[str, Any]) -> None:
         return
     for line in compared(result):
         console.print(line)
+    _print_errors(console, "error", result, result["position_axes"])
+    if "smoothed" in result:
+        _print_errors(console, "smoothed", result["smoothed"], result["position_axes"])
+    print_consistency(console, result)
+    _print_notes(console, result)
+
+
+def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -> None:
     table = new_table()
-    for heading in ("error", "RMSE", "median", "p95"):
-        table.add_column(heading, justify="left" if heading == "error" else "right")
-    axes = result["position_axes"]
+    for heading in (title, "RMSE", "median", "p95"):
+        table.add_column(heading, justify="left" if heading == title else "right")
     for name, unit, places in (("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2)):
         if f"{name}_rmse_{unit}" not in result:
             continue
@@ -123,8 +137,6 @@ def print_replay(result: dict[str, Any]) -> None:
     console.print(
         f"{mean}NEES per degree of freedom {result['anees']:.2f} (1: honest; above: overconfident)"
     )
-    print_consistency(console, result)
-    _print_notes(console, result)
 
 
 def print_runs(result: dict[str, Any]) -> None:

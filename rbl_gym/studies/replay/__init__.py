@@ -26,7 +26,9 @@ from rbl_gym.studies.replay.settings import (
     Loss,
     Motion,
     Settings,
+    Smoothing,
 )
+from rbl_gym.studies.replay.smoothing import SmoothedRecording, smooth_recording
 from rbl_gym.studies.replay.study import Replayed, check_replay, replay_recording
 from rbl_gym.studies.replay.track_file import epoch_ranks, track_file
 from rbl_gym.studies.replay.tracking import (
@@ -52,6 +54,8 @@ __all__ = [
     "Replayed",
     "ReplayedRuns",
     "Settings",
+    "SmoothedRecording",
+    "Smoothing",
     "Track",
     "TrackErrors",
     "check_overlap",
@@ -72,6 +76,7 @@ __all__ = [
     "replay_recording",
     "replay_runs",
     "residual_tables",
+    "smooth_recording",
     "track_errors",
     "track_figures",
     "track_file",

@@ -21,10 +21,11 @@ from rbl_gym.studies.replay.judging import (
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
 from rbl_gym.studies.replay.place import volume_of
 from rbl_gym.studies.replay.settings import Settings
+from rbl_gym.studies.replay.smoothing import SmoothedRecording
 from rbl_gym.studies.replay.tracking import Track, range_std_of
 from rbl_gym.studies.replay.truth import Judged, fault_hints, judged_of, matched, stamp_hints
 
-__all__ = ["track_figures"]
+__all__ = ["smoothed_figures", "track_figures"]
 
 # The mirror pose is the one meant where its mean square error is below this share of the track's.
 _NEARER = 0.25
@@ -57,6 +58,17 @@ def track_figures(
         return result
     result["epochs_with_truth"] = int(found.known.sum())
     return {**result, **_comparison(recording, track, settings), **error_figures(found)}
+
+
+def smoothed_figures(smoothed: SmoothedRecording, found: TrackErrors | None) -> dict[str, Any]:
+    """The figures of a smoothed track, and of its errors where there are any."""
+    fit = smoothed.found
+    return {
+        "seconds": smoothed.seconds,
+        "converged": bool(fit.converged),
+        "nis": float(fit.squares.sum() / fit.freedom.sum()),
+        "mean_bias_m": fit.biases.mean(axis=0).tolist(),
+    } | ({} if found is None else error_figures(found))
 
 
 def error_figures(found: TrackErrors) -> dict[str, float]:

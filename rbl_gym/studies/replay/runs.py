@@ -73,6 +73,9 @@ def replay_runs(
         axes = {one["position_axes"] for one in every if "position_axes" in one}
         together["position_axes"] = "xyz" if axes == {"xyz"} else "xy"
         together |= error_figures(errors)
+    smoothed = [one.smoothed_errors for one in replayed.values() if one.smoothed_errors is not None]
+    if smoothed:
+        together["smoothed"] = error_figures(_joined(smoothed))
     figures = {run: one.figures for run, one in replayed.items()}
     return ReplayedRuns(replayed, {"runs": figures, "together": together})
 

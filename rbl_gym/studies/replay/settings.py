@@ -17,6 +17,7 @@ __all__ = [
     "Loss",
     "Motion",
     "Settings",
+    "Smoothing",
 ]
 
 DEFAULT_RANGE_STD_M = 0.12
@@ -144,6 +145,38 @@ class Comparison:
 
 
 @dataclasses.dataclass(frozen=True)
+class Smoothing:
+    """The smoothed track, beside the causal one, and its laws.
+
+    Parameters
+    ----------
+    smooth
+        Whether to find it.
+    smooth_accel_m, smooth_accel_deg
+        The twist is unknown, and wanders: by how much speed (m/s) and turn rate (deg/s) change in
+        1 s.
+    smooth_bias_std_m, smooth_bias_time_s
+        Of every link's bias that drifts, as of `rbl_gym.measurements.link_bias.LinkBias`.
+    smooth_constant_m, smooth_common_m
+        Standard deviations of every link's bias that stays, and of what they have in common.
+    """
+
+    smooth: bool = False
+    smooth_accel_m: float = 0.2
+    smooth_accel_deg: float = 15.0
+    smooth_bias_std_m: float = 0.06
+    smooth_bias_time_s: float = 3.0
+    smooth_constant_m: float = 0.1
+    smooth_common_m: float = 0.2
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            if field.name != "smooth":
+                low = 1e-9 if field.name.endswith("_s") else 0.0
+                check_number(field.name, getattr(self, field.name), low=low)
+
+
+@dataclasses.dataclass(frozen=True)
 class Settings:
     """How a recording is filtered.
 
@@ -157,7 +190,7 @@ class Settings:
     range_std_m
         Standard deviation of a range; None: the recording's own where it has one, else
         `DEFAULT_RANGE_STD_M`, which covers link biases that change with the pose.
-    motion, biases, loss, knowledge, comparison
+    motion, biases, loss, knowledge, comparison, smoothing
         The rest, by subject.
 
     Examples
@@ -173,6 +206,7 @@ class Settings:
     loss: Loss = Loss()
     knowledge: Knowledge = Knowledge()
     comparison: Comparison = Comparison()
+    smoothing: Smoothing = Smoothing()
 
     def __post_init__(self) -> None:
         if self.range_std_m is not None:

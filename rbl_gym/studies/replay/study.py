@@ -11,7 +11,7 @@ import numpy as np
 from rbl_gym.recordings import TimeOffset
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.diagnosis import diagnose
-from rbl_gym.studies.replay.figures import track_figures
+from rbl_gym.studies.replay.figures import smoothed_figures, track_figures
 from rbl_gym.studies.replay.judging import (
     TrackErrors,
     find_offset,
@@ -21,6 +21,7 @@ from rbl_gym.studies.replay.judging import (
 )
 from rbl_gym.studies.replay.place import height_offset
 from rbl_gym.studies.replay.settings import Settings
+from rbl_gym.studies.replay.smoothing import SmoothedRecording, smooth_recording
 from rbl_gym.studies.replay.tracking import Track, recording_filter, track_recording
 from rbl_gym.studies.replay.truth import check_overlap
 
@@ -40,12 +41,16 @@ class Replayed(NamedTuple):
         Against the recording's truth; None without one.
     figures
         Plain numbers: what `rbl-gym replay --json` writes.
+    smoothed, smoothed_errors
+        The smoothed track and its errors, where `Smoothing.smooth` asks for it.
     """
 
     settings: Settings
     track: Track
     errors: TrackErrors | None
     figures: dict[str, Any]
+    smoothed: SmoothedRecording | None = None
+    smoothed_errors: TrackErrors | None = None
 
 
 def check_replay(recording: Recording, settings: Settings) -> Settings:
@@ -101,7 +106,12 @@ def replay_recording(
     assert track.innovations is not None
     figures["consistency"], notes = diagnose(recording, settings, track.innovations)
     figures["notes"] = figures["notes"] + notes
-    return Replayed(settings, track, errors, figures)
+    if not settings.smoothing.smooth:
+        return Replayed(settings, track, errors, figures)
+    smoothed = smooth_recording(recording, settings, track)
+    smoothed_errors = track_errors(recording, smoothed.track, settings)
+    figures["smoothed"] = smoothed_figures(smoothed, smoothed_errors)
+    return Replayed(settings, track, errors, figures, smoothed, smoothed_errors)
 
 
 class _Stopwatch:

@@ -1,0 +1,154 @@
+"""A recording through the smoother: every pose from all ranges, those after it too."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym import estimators
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators import smoothing
+from rbl_gym.estimators.costs.range_cost import SQUARES, huber
+from rbl_gym.measurements import ranging
+from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.motion.unknown_twist import WanderingTwist
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.epochs import stack_beliefs
+from rbl_gym.studies.replay.mirror import covering
+from rbl_gym.studies.replay.place import has_own_std, origin_of
+from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
+from rbl_gym.studies.replay.tracking import Track, recording_filter, recording_steps, start_of
+
+__all__ = ["SmoothedRecording", "smooth_recording"]
+
+# Huber's threshold: what is left of real ranges has heavier tails than noise.
+_HUBER = 1.0
+# Squared residuals beyond this multiple of what is to be expected: the start had lost its way.
+_LOST = 2.0
+# Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
+_ANY_TURN, _ANY_SPEED = 1.0, 3.0
+# Memory (bytes) that blocks of all epochs may take.
+_MOST_MEMORY = 8e9
+
+
+class SmoothedRecording(NamedTuple):
+    """The smoothed track of a recording.
+
+    Attributes
+    ----------
+    track
+        Beliefs of every epoch.
+    found
+        Of `estimators.smooth`, in coordinates of `origin_of`.
+    seconds
+        Processor time that it took.
+    """
+
+    track: Track
+    found: smoothing.Smoothed
+    seconds: float
+
+
+def smooth_recording(recording: Recording, settings: Settings, track: Track) -> SmoothedRecording:
+    """The most likely track of a recording, from its causal track on.
+
+    Where the fit says that the causal track had lost its way, a track filtered backwards in time
+    and a body at rest are tried as starts too; the most likely result counts.
+
+    Parameters
+    ----------
+    recording, settings
+        What is smoothed, and how.
+    track
+        Of `track_recording`.
+
+    Raises
+    ------
+    ValueError
+        If blocks of all epochs and links do not fit into memory.
+    """
+    _check_size(recording, settings)
+    began = time.process_time()
+    origin = origin_of(recording)
+    local = recording._replace(anchors=recording.anchors - origin)
+    rotation, translation, covariance = start_of(recording, settings)
+    prior = rotation, translation - origin, covariance
+    own = has_own_std(recording, settings)
+    noise = (
+        ranging.LinkNoise(recording.range_std) if own and recording.range_std is not None else None
+    )
+    log = smoothing.RangeLog(local.times, local.ranges, local.anchors, local.links, noise)
+    model, best = model_of(recording, settings), None
+    for rotation, translation in _starts(recording, settings, track):
+        found = estimators.smooth(log, model, prior, (rotation, translation - origin))
+        if best is None or found.cost < best.cost:
+            best = found
+        if best.converged and best.squares.sum() < _LOST * best.freedom.sum():
+            break
+    assert best is not None
+    poses = best.rotation, best.translation + origin, best.covariance
+    if track.other is not None:
+        poses = (*poses[:2], covering(track.other, poses))
+    smoothed = Track(recording.times, *poses, other=track.other)
+    return SmoothedRecording(smoothed, best, time.process_time() - began)
+
+
+def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
+    """What the settings take for true of a recording."""
+    laws, planar = settings.smoothing, settings.knowledge.planar
+    turn, shift = ((0, 0, 1), (1, 1, 0)) if planar else ((1, 1, 1), (1, 1, 1))
+    wander = WanderingTwist(
+        tuple(_ANY_TURN * axis for axis in turn),
+        tuple(_ANY_SPEED * axis for axis in shift),
+        tuple(math.radians(laws.smooth_accel_deg) * axis for axis in turn),
+        tuple(laws.smooth_accel_m * axis for axis in shift),
+    )
+    return smoothing.LogModel(
+        recording.tags,
+        ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M),
+        smoothing.UnknownTwist(wander),
+        (
+            LinkBias(laws.smooth_constant_m, None, laws.smooth_common_m),
+            LinkBias(laws.smooth_bias_std_m, laws.smooth_bias_time_s),
+        ),
+        loss=huber(_HUBER) if settings.loss.robust else SQUARES,
+    )
+
+
+def _starts(
+    recording: Recording, settings: Settings, track: Track
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Tracks to start from, the likeliest to be near first."""
+    yield track.rotation, track.translation
+    times = recording.times
+    moving = recording.anchors.ndim == 3
+    backwards = recording._replace(
+        times=times[-1] + times[0] - times[::-1],
+        ranges=recording.ranges[::-1],
+        links=recording.links[::-1],
+        range_std=None if recording.range_std is None else recording.range_std[::-1],
+        anchors=recording.anchors[::-1] if moving else recording.anchors,
+        truth=None,
+    )
+    filter = recording_filter(backwards, settings)
+    steps = recording_steps(backwards, settings, filter)
+    belief = stack_beliefs(step.belief for step in steps)
+    yield belief.rotation[::-1], belief.translation[::-1]
+    rotation, translation, _ = start_of(recording, settings)
+    K = len(times)
+    yield np.broadcast_to(rotation, (K, 3, 3)), np.broadcast_to(translation, (K, 3))
+
+
+def _check_size(recording: Recording, settings: Settings) -> None:
+    K, M, N = recording.ranges.shape
+    drifting = settings.smoothing.smooth_bias_std_m > 0
+    memory = 5 * 8 * K * (12 + drifting * M * N) ** 2
+    if memory > _MOST_MEMORY:
+        raise ValueError(
+            f"smoothing {K} epochs with drifting biases of {M * N} links would take "
+            f"{memory / 1e9:.0f} GB: set smooth_bias_std_m to 0, or smooth shorter logs"
+        )

@@ -1,0 +1,177 @@
+"""Recordings through the smoother."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rbl_gym import motion, recordings
+from rbl_gym.app.cli import main
+from rbl_gym.geometry import bodies
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings import Recording, Truth
+from rbl_gym.studies import replay
+
+REAL = Path(__file__).parents[2] / "shared" / "data"
+LIAS, LABYRINTH = REAL / "lias_planar", REAL / "labyrinth_single_tag"
+ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0], [8, 3, 0.5]])
+TAGS = bodies.octahedron(0.8)
+SMOOTH = replay.Settings.of(
+    walk_m=0.4,
+    walk_deg=20.0,
+    range_std_m=0.05,
+    smooth=True,
+    smooth_accel_m=0.3,
+    smooth_bias_std_m=0.02,
+)
+
+
+def recording(move=lambda times: ROOM, tags=TAGS, biases=0.0, count=60, shift=0.0) -> Recording:
+    """A body that turns and flies through a room, its anchors at ``move(times)``."""
+    rng = np.random.default_rng(1)
+    twists = motion.constant_twist(np.eye(3), [2, 2, 1.2], [0.0, 0, 0.3, 0.4, 0.1, 0], count - 1)
+    path = motion.simulate(twists, 0.1, motion.ProcessNoise())
+    times = 0.1 * np.arange(count)
+    anchors = np.array(move(times))
+    points = ranging.tag_positions(path.rotation, path.translation, tags)
+    exact = ranging.distances(anchors, points)
+    off = biases * rng.standard_normal(exact.shape[1:])
+    ranges = exact + off + 0.05 * rng.standard_normal(exact.shape)
+    ids = tuple(map(str, range(len(ROOM)))), tuple(map(str, range(len(tags))))
+    truth = Truth(times, path.rotation, path.translation + shift)
+    return Recording(times, ranges, ranges > 0, None, anchors + shift, tags, *ids, truth)
+
+
+def swaying(times: np.ndarray) -> np.ndarray:
+    """Each anchor on a circle of 1 m."""
+    phase = times[:, None] + np.arange(len(ROOM))
+    return ROOM + np.stack([np.cos(phase), np.sin(phase), np.zeros_like(phase)], axis=-1)
+
+
+def test_smoothed_is_nearer_than_causal_and_honest():
+    replayed = replay.replay_recording(recording(biases=0.05), SMOOTH)
+    smoothed = replayed.figures["smoothed"]
+    assert isinstance(replayed.smoothed, replay.SmoothedRecording)
+    assert smoothed["converged"]
+    for name in ("position_rmse_m", "rotation_rmse_deg"):
+        assert smoothed[name] < 0.8 * replayed.figures[name]
+    assert 0.3 < smoothed["anees"] < 2
+    found = np.array(smoothed["mean_bias_m"])
+    np.testing.assert_allclose(found, replayed.smoothed.found.biases.mean(axis=0))
+    assert (
+        "smoothed" not in replay.replay_recording(recording(), SMOOTH.changed(smooth=False)).figures
+    )
+
+
+def test_moving_anchors_and_coordinates_of_a_map():
+    near = replay.replay_recording(recording(swaying), SMOOTH)
+    assert near.figures["smoothed"]["position_rmse_m"] < 0.05
+    far = replay.replay_recording(recording(swaying, shift=4e5), SMOOTH)
+    assert near.smoothed is not None
+    assert far.smoothed is not None
+    np.testing.assert_allclose(
+        far.smoothed.track.translation - 4e5, near.smoothed.track.translation, atol=1e-4
+    )
+
+
+def test_a_start_that_lost_its_way_is_replaced():
+    log, settings = recording(), SMOOTH
+    track = replay.track_recording(log, settings)
+    good = replay.smooth_recording(log, settings, track)
+    # Behind the wall, upside down.
+    turned = track.rotation @ np.diag([1.0, -1.0, -1.0])
+    lost = track._replace(rotation=turned, translation=track.translation + [0, -30.0, 0])
+    found = replay.smooth_recording(log, settings, lost)
+    np.testing.assert_allclose(found.found.cost, good.found.cost, rtol=1e-6)
+    np.testing.assert_allclose(found.track.translation, good.track.translation, atol=1e-3)
+
+
+def test_what_does_not_fit_into_memory_is_refused():
+    log = recording(count=40)
+    track = replay.track_recording(log, SMOOTH)
+    long = log._replace(
+        times=np.arange(400000.0),
+        ranges=np.broadcast_to(log.ranges[0], (400000, 6, 6)),
+        links=np.broadcast_to(True, (400000, 6, 6)),
+    )
+    with pytest.raises(ValueError, match="smooth_bias_std_m"):
+        replay.smooth_recording(long, SMOOTH, track)
+
+
+@pytest.mark.parametrize(
+    "options", [{"smooth_accel_m": -1.0}, {"smooth_bias_time_s": 0.0}, {"smooth_common_m": np.nan}]
+)
+def test_laws_that_cannot_be_are_named(options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        replay.Smoothing(**options)
+
+
+def table(path: Path, header: str, rows) -> str:
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return str(path)
+
+
+def test_the_command_prints_both_tracks(tmp_path, capsys):
+    log = recording(count=20)
+    links = np.ndenumerate(log.ranges)
+    files = {
+        "ranges": table(
+            tmp_path / "r.csv", "t,anchor,tag,range",
+            [(round(0.1 * k, 3), m, n, r) for (k, m, n), r in links],
+        ),
+        "anchors": table(tmp_path / "a.csv", "anchor,x,y,z", [(i, *a) for i, a in enumerate(ROOM)]),
+        "tags": table(tmp_path / "t.csv", "tag,x,y,z", [(i, *c) for i, c in enumerate(TAGS)]),
+    }  # fmt: skip
+    command = ["replay", *(part for name, file in files.items() for part in (f"--{name}", file))]
+    assert main([*command, "--smooth", "--smooth-accel-m", "0.3", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["settings"]["smooth_accel_m"] == 0.3
+    assert result["smoothed"]["nis"] < 1
+    assert main([*command, "--smooth"]) == 0
+    assert "smoothed" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not LABYRINTH.is_dir(), reason=f"the recording is not at {LABYRINTH}")
+def test_one_tag_and_one_range_at_a_time_of_a_real_robot():
+    """At most 0.10 m from ranges alone, without a calibration."""
+    data = np.genfromtxt(LABYRINTH / "ranges.csv", delimiter=",", names=True)
+    place = np.genfromtxt(LABYRINTH / "truth.csv", delimiter=",", names=True)
+    ids, first, link = np.unique(data["anchor"], return_index=True, return_inverse=True)
+    K = len(data)
+    anchors = np.zeros((len(ids), 3))
+    anchors[:, 0], anchors[:, 1] = data["anchor_x"][first], data["anchor_y"][first]
+    ranges = np.zeros((K, len(ids), 1))
+    ranges[np.arange(K), link, 0] = data["range"]
+    true = np.column_stack([place["x"], place["y"], np.zeros(len(place))])
+    truth = Truth(place["t"], np.tile(np.eye(3), (len(place), 1, 1)), true)
+    names = tuple(str(int(i)) for i in ids)
+    log = Recording(
+        data["t"], ranges, ranges > 0, None, anchors, np.zeros((1, 3)), names, ("0",), truth
+    )
+    figures = replay.replay_recording(log, replay.Settings.of(planar=True, smooth=True)).figures
+    assert figures["smoothed"]["position_rmse_m"] <= 0.10
+    assert figures["smoothed"]["position_rmse_m"] < 0.5 * figures["position_rmse_m"]
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not LIAS.is_dir(), reason=f"the recording is not at {LIAS}")
+@pytest.mark.parametrize(
+    ("calibration", "limits"),
+    [(LIAS / "calibration_8_14.csv", (0.028, 3.35)), (None, (0.042, 4.2))],
+    ids=["calibrated", "raw"],
+)
+def test_a_real_planar_recording(calibration, limits):
+    log = recordings.read_recording(
+        LIAS / "dynamic_fast_ranges.csv", LIAS / "anchors_8_14.csv", LIAS / "tags_8_14.csv",
+        LIAS / "dynamic_fast_truth.csv", calibration,
+    )  # fmt: skip
+    settings = replay.Settings.of(
+        planar=True, height_offset_m=0.08, yaw_offset_deg=7.0, smooth=True
+    )
+    figures = replay.replay_recording(log, settings).figures["smoothed"]
+    assert figures["position_rmse_m"] <= limits[0]
+    assert figures["yaw_rmse_deg"] <= limits[1]
+    assert 0.5 < figures["anees"] < 2.5
