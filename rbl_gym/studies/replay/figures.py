@@ -25,7 +25,7 @@ from rbl_gym.studies.replay.smoothing import SmoothedRecording
 from rbl_gym.studies.replay.tracking import Track, range_std_of
 from rbl_gym.studies.replay.truth import Judged, fault_hints, judged_of, matched, stamp_hints
 
-__all__ = ["smoothed_figures", "track_figures"]
+__all__ = ["track_figures"]
 
 # The mirror pose is the one meant where its mean square error is below this share of the track's.
 _NEARER = 0.25
