@@ -81,6 +81,8 @@ def left_out(trial: Trial) -> list[Trial]:
         for k in range(links.shape[axis]):
             kept = links.copy()
             np.moveaxis(kept, axis, 0)[k] = False
+            # Without its only one nothing is left to look at.
+            kept = kept if kept.any() else links
             result.append(_with(trial, trial.recording._replace(links=kept)))
     return result
 
