@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -53,10 +55,10 @@ def test_yaw_is_the_best_of_all_turns_about_z():
             ((source - source.mean(0)) @ R.T - target + target.mean(0)).ravel()
         )
 
-    best = min(
-        (minimize_scalar(cost, bounds=(a, a + 2), method="bounded") for a in (-3, -1, 1)),
-        key=lambda result: result.fun,
-    )
+    tried: list[Any] = [
+        minimize_scalar(cost, bounds=(a, a + 2), method="bounded") for a in (-3, -1, 1)
+    ]
+    best = min(tried, key=lambda result: result.fun)
     turned = Rotation.from_euler("z", best.x).as_matrix()
     np.testing.assert_allclose(found.rotation, turned, atol=1e-4)
 
@@ -81,6 +83,7 @@ def test_rotations_go_with_the_world_frame():
     found = align_positions(source, target)
     Q = rotations.random(np.random.default_rng(0), (50,))
     moved, places = apply_alignment(found, Q, source)
+    assert moved is not None
     np.testing.assert_allclose(moved, found.rotation @ Q, atol=1e-12)
     point = np.array([0.3, -0.2, 0.1])
     # A point of the body is where the transform takes it.

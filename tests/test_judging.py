@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,7 @@ def pair(truth, seed=0, duration_s=20.0):
     return Recording(times, 5.0 * links, links, None, ANCHORS, TAGS, *ids, truth), track
 
 
-def replayed(truth, **settings):
+def replayed(truth, **settings) -> tuple[Recording, Any]:
     """As `replay.replay_recording`, of a track that is given."""
     recording, track = pair(truth)
     chosen = replay.Settings.of(**settings)
@@ -177,7 +179,7 @@ def test_table_picture_and_page_without_rotations(planar, capsys):
     assert "position xy" in text
     assert "yaw" not in text
     figure = replay_figure(recording, result)
-    line = figure.axes[0].lines[1]
+    line: Any = figure.axes[0].lines[1]
     # The path of the truth is drawn where it was aligned to.
     np.testing.assert_allclose(line.get_xdata()[0], 3, atol=0.1)
     html = track_pages.replay_page(recording, result)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,13 @@ def write_and_read(folder: Path, ranges: str | bytes = LONG, **texts: str | byte
     for name, text in texts.items():
         data = text.encode() if isinstance(text, str) else text
         (folder / f"{name}.csv").write_bytes(data)
-    return read_recording(**{name: folder / f"{name}.csv" for name in texts})
+    files: dict[str, Any] = {name: folder / f"{name}.csv" for name in texts}
+    return read_recording(**files)
+
+
+def poses_at(*args: Any, **options: Any) -> Any:
+    """`truth_at` of a truth with rotations."""
+    return truth_at(*args, **options)
 
 
 def assert_same(got: Recording, want: Recording) -> None:
@@ -118,14 +125,16 @@ def test_calibration_makes_no_links(tmp_path):
 
 
 def test_truth_files(tmp_path):
-    truth = write_and_read(tmp_path, truth=TRUTH.replace("0.6,0,0,0.8", "0.603,0,0,0.804")).truth
+    truth: Any = write_and_read(
+        tmp_path, truth=TRUTH.replace("0.6,0,0,0.8", "0.603,0,0,0.804")
+    ).truth
     assert truth is not None
     np.testing.assert_array_equal(truth.times, [0, 1])
     np.testing.assert_array_equal(truth.translation, [[1, 2, 3], [2, 2, 3]])
     want = Rotation.from_quat([[0, 0, 0, 1], [0, 0, 0.8, 0.6]]).as_matrix()
     np.testing.assert_allclose(truth.rotation, want, atol=1e-15)
 
-    planar = write_and_read(tmp_path, truth=PLANAR).truth
+    planar: Any = write_and_read(tmp_path, truth=PLANAR).truth
     assert planar is not None
     np.testing.assert_array_equal(planar.translation, [[1, 2, 0], [2, 2, 0]])
     np.testing.assert_allclose(rotations.yaw(planar.rotation), [np.pi / 2, np.pi], atol=1e-15)
@@ -283,7 +292,7 @@ def test_one_anchor_has_no_scale(tmp_path):
 
 
 @pytest.fixture
-def truth() -> Truth:
+def truth() -> Any:
     rng = np.random.default_rng(3)
     times = np.array([0.0, 0.3, 0.5, 2.0, 2.1])
     return Truth(times, rotations.random(rng, (5,)), rng.normal(size=(5, 3)))
@@ -291,7 +300,7 @@ def truth() -> Truth:
 
 def test_truth_at_is_slerp_and_linear(truth):
     times = np.linspace(0.0, 2.1, 97)
-    rotation, translation, valid = truth_at(truth, times, max_gap_s=2.0)
+    rotation, translation, valid = poses_at(truth, times, max_gap_s=2.0)
     want = Slerp(truth.times, Rotation.from_matrix(truth.rotation))(times).as_matrix()
     np.testing.assert_allclose(rotation, want, atol=1e-12)
     for axis in range(3):
@@ -301,7 +310,7 @@ def test_truth_at_is_slerp_and_linear(truth):
 
 
 def test_truth_at_its_own_times(truth):
-    rotation, translation, valid = truth_at(truth, truth.times)
+    rotation, translation, valid = poses_at(truth, truth.times)
     np.testing.assert_allclose(rotation, truth.rotation, atol=1e-12)
     np.testing.assert_array_equal(translation, truth.translation)
     assert valid.all(), "a pose at the edge of a gap is not inside it"
@@ -309,7 +318,7 @@ def test_truth_at_its_own_times(truth):
 
 def test_truth_at_gaps_and_span(truth):
     times = [-0.1, 0.0, 0.4, 0.51, 1.9, 2.05, 2.1, 2.2]
-    rotation, translation, valid = truth_at(truth, times)
+    rotation, translation, valid = poses_at(truth, times)
     np.testing.assert_array_equal(valid, [False, True, True, False, False, True, True, False])
     assert np.isfinite(rotation).all()
     assert np.isfinite(translation).all()
@@ -318,10 +327,10 @@ def test_truth_at_gaps_and_span(truth):
 
 def test_truth_at_broadcasts_and_takes_one_pose(truth):
     times = np.linspace(-0.5, 2.5, 12)
-    for got, want in zip(truth_at(truth, times.reshape(3, 4)), truth_at(truth, times), strict=True):
+    for got, want in zip(poses_at(truth, times.reshape(3, 4)), poses_at(truth, times), strict=True):
         np.testing.assert_array_equal(got.reshape(want.shape), want)
     single = Truth(*(field[:1] for field in truth[:3]))
-    rotation, _, valid = truth_at(single, [-1.0, 0.0, 1.0])
+    rotation, _, valid = poses_at(single, [-1.0, 0.0, 1.0])
     np.testing.assert_array_equal(valid, [False, True, False])
     np.testing.assert_allclose(rotation, np.broadcast_to(truth.rotation[0], (3, 3, 3)), atol=1e-15)
 
@@ -387,7 +396,7 @@ def test_real_recording():
     assert step.max() == pytest.approx(0.26, abs=0.005)
 
     assert log.truth is not None
-    rotation, translation, valid = truth_at(log.truth, log.times)
+    rotation, translation, valid = poses_at(log.truth, log.times)
     assert valid.all()
     # The motion-capture body is upside down and turned by 7 degrees against the tag table.
     yaw = rotations.yaw(rotation) + np.radians(7)

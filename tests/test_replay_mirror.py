@@ -126,7 +126,7 @@ def test_one_range_at_a_time():
     judge = replay.recording_filter(recording, settings)
     P = np.broadcast_to(1e-3 * np.eye(6), (count, 6, 6))
     assert whole.truth is not None
-    poses = whole.truth.rotation, whole.truth.translation, P
+    poses: Any = (whole.truth.rotation, whole.truth.translation, P)
     other = replay.other_pose(recording, judge, None, poses)
     assert other is not None
     assert other.alive[-10:].all()

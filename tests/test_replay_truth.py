@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -67,10 +68,12 @@ def test_truth_at_1_hz_is_compared_at_its_own_poses(start_s, count):
 
 def test_sparse_poses_are_compared_exactly_and_dense_ones_as_they_were():
     dense, sparse = moving(0.02, 5.0), moving(1.0, 10.0, 6.03)
-    truth = Truth(*(np.concatenate(pair) for pair in zip(dense, sparse, strict=True)))
+    times, rotation, place = (np.concatenate(pair) for pair in zip(dense, sparse, strict=True))
+    truth = Truth(times, rotation, place)
     times, rotation, place = moving(0.1)
-    turned, moved, known = matched(truth, times, rotation, place, 0.5)
-    old = recordings.truth_at(truth, times, 0.5)
+    found: Any = matched(truth, times, rotation, place, 0.5)
+    turned, moved, known = found
+    old: Any = recordings.truth_at(truth, times, 0.5)
     np.testing.assert_array_equal(turned[old[2]], old[0][old[2]])
     np.testing.assert_array_equal(moved[old[2]], old[1][old[2]])
     np.testing.assert_array_equal(np.flatnonzero(known & ~old[2]), [60, 70, 80, 90])
@@ -152,14 +155,16 @@ FAULTS = {
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_constant_fault_is_hinted(name, step_s):
     truth, words = FAULTS[name]
-    stride = round(step_s / 0.05)
-    result = outcome(Truth(*(a[::stride] for a in truth[:3])))
+    assert truth.rotation is not None
+    some = slice(None, None, round(step_s / 0.05))
+    result = outcome(Truth(truth.times[some], truth.rotation[some], truth.translation[some]))
     assert len(result["notes"]) == 1, result["notes"]
     assert re.search(words, result["notes"][0]), result["notes"]
 
 
 def test_two_faults_are_both_hinted():
     truth = transformed((0, 0, 0.6), (1, 2, 0))
+    assert truth.rotation is not None
     q = np.roll(rotations.quaternion(truth.rotation), -1, axis=-1)
     notes = outcome(truth._replace(rotation=rotations.from_quaternion(q)))["notes"]
     assert len(notes) == 1

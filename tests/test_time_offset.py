@@ -163,13 +163,14 @@ def test_motion_that_tells_nothing_is_refused():
     with pytest.raises(ValueError, match="no time offset by the motion"):
         motion_offset(track(times, 0.0), still)
     with pytest.raises(ValueError, match="must last"):
-        motion_offset(track(times, 0.0), tuple(part[:3] for part in still))
+        motion_offset(track(times, 0.0), (still[0][:3], still[1][:3], still[2][:3]))
 
 
 def test_a_gyroscope_against_motion_capture():
     if not DATA.exists():
         pytest.skip("the data sets are not here")
     truth = read_truth(DATA / "truth.csv")
+    assert truth.rotation is not None
     imu = np.genfromtxt(DATA / "imu.csv", delimiter=",", skip_header=1)
     twist = motion.twists_between(truth.rotation, truth.translation, np.diff(truth.times))
     when = 0.5 * (truth.times[1:] + truth.times[:-1])

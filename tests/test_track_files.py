@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from rbl_gym.studies import replay
 COUNT = 7
 
 
-def track(seed=0):
+def track(seed=0) -> Any:
     rng = np.random.default_rng(seed)
     L = rng.standard_normal((COUNT, 6, 6))
     return TrackFile(
@@ -40,7 +41,7 @@ def track(seed=0):
 def test_a_csv_holds_all_of_a_track(tmp_path):
     want = track()
     write_track(tmp_path / "track.csv", want)
-    got = read_track(tmp_path / "track.csv")
+    got: Any = read_track(tmp_path / "track.csv")
     for name in ("times", "translation", "nis", "dof", "rank"):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
     np.testing.assert_allclose(got.rotation, want.rotation, atol=1e-15)
@@ -63,7 +64,7 @@ def test_tum_is_eight_numbers_between_blanks(ending, tmp_path):
     np.testing.assert_array_equal(table[:, 1:4], want.translation)
     turned = Rotation.from_quat(table[:, 4:]).as_matrix()
     np.testing.assert_allclose(turned, want.rotation, atol=1e-14)
-    got = read_track(path)
+    got: Any = read_track(path)
     np.testing.assert_allclose(got.rotation, want.rotation, atol=1e-14)
     assert got[3:] == (None,) * 4
     assert read_truth(path).form == "TUM, poses"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -58,7 +60,7 @@ FILES = {
 )
 def test_forms_of_poses(form, text, tmp_path):
     (tmp_path / "truth.txt").write_text(text, newline="")
-    found = read_truth(tmp_path / "truth.txt")
+    found: Any = read_truth(tmp_path / "truth.txt")
     assert found.form == form
     assert not found.planar
     # Stamps of nanoseconds since 1970 are good to half a microsecond.
@@ -79,7 +81,7 @@ def test_forms_of_poses(form, text, tmp_path):
 )  # fmt: skip
 def test_positions_and_headings(header, columns, form, planar, heading, tmp_path):
     (tmp_path / "truth.csv").write_text(header + "\n" + rows(TIMES, columns))
-    found = read_truth(tmp_path / "truth.csv")
+    found: Any = read_truth(tmp_path / "truth.csv")
     assert found.form == form
     assert found.planar == planar
     np.testing.assert_array_equal(found.translation, PLACES * (1, 1, not planar))
@@ -97,7 +99,7 @@ def test_columns_are_mapped_and_what_is_not_read_is_named(tmp_path):
     path.write_text("when,east,north,up,x\n" + rows(TIMES, PLACES, [7, 7, 7]))
     said = Said()
     names = {"time": "when", "x": "east", "y": "north", "z": "up"}
-    found = read_truth(path, Source(names), said)
+    found: Any = read_truth(path, Source(names), said)
     np.testing.assert_array_equal(found.translation, PLACES)
     assert isinstance(found, Truth)
     path.write_text("t,x,y,z,speed\n" + rows(TIMES, PLACES, [7, 7, 7]))

@@ -286,7 +286,9 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
         axes.annotate(name, place[:2], xytext=(4, 4), textcoords="offset points", fontsize=8)
     if found is not None:
         true = truth_path(recording, track, replayed.settings)
-        axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label="truth")
+        align = replayed.settings.comparison.align
+        label = "truth" if align == "none" else f"truth, aligned ({align})"
+        axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label=label)
     axes.plot(*track.translation[:, :2].T, color=COLOURS["iterated EKF"], lw=0.8, label="estimate")
     axes.set_aspect("equal", adjustable="box")  # datalim cuts off the label
     axes.set_xlabel("x [m]")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -237,8 +237,9 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
         # A truth of a heading says nothing of roll and pitch.
         if settings.knowledge.planar or not truth.planar:
             rotation = np.linalg.norm(error[:, :3], axis=-1)
-            poses: Any = (track.rotation, track.translation, expected, truth.translation)
-            tags = metrics.tag_error(*poses, recording.tags)
+            tags = metrics.tag_error(
+                track.rotation, track.translation, expected, truth.translation, recording.tags
+            )
     return TrackErrors(
         truth.known,
         np.linalg.norm(error[:, truth.place_axes], axis=-1),
