@@ -483,6 +483,22 @@ def test_anchors_that_move_and_places_that_nobody_knows(tmp_path):
         recordings.convert_bag(log, tmp_path / "c")
 
 
+def test_anchors_that_move_come_back_as_a_recording(tmp_path):
+    """0.1 m/s along x, for 10 s."""
+    messages, types = [], types_of("mcap")
+    for topic, time, message in flight(types):
+        if topic == "/uwb_endorange_info" and message.responder_id == 103:
+            message.responder_location.x += 1e-10 * (time - 5_000_000 - T0)
+        messages.append((topic, time, message))
+    log = write_bag(tmp_path / "moving", "mcap", types, messages)
+    recordings.convert_bag(log, tmp_path)
+    files = (tmp_path / f"{name}.csv" for name in ("ranges", "anchors", "tags"))
+    anchors = recordings.read_recording(*files).anchors
+    want = np.tile(ROOM, (101, 1, 1))
+    want[:, 3, 0] = 0.01 * np.arange(101)
+    np.testing.assert_allclose(anchors, want, atol=1e-6)
+
+
 def test_clocks_that_differ_and_stamps_that_are_missing(tmp_path):
     types = types_of("ros1")
     messages = [
