@@ -242,7 +242,7 @@ def test_the_batched_engine_keeps_the_digits_of_a_vague_prior(tags, scale):
     ranges = rng.uniform(12, 18, (9, 7, len(tags)))
     root = rng.standard_normal((9, 12, 12))
     prior = scale * (root @ root.swapaxes(-1, -2) + np.eye(12))
-    epoch = engines.Epoch(ranges, anchors, tags, np.ones((9, 7, 1)))
+    epoch = engines.LinearEpoch(ranges, anchors, tags, np.ones((9, 7, 1)))
     want = exact_posterior(prior, information(epoch.statistic())[0])
     _, got = engines.Batched.update(rng.standard_normal((9, 12)), prior, epoch)
     np.testing.assert_array_equal(got, got.swapaxes(-1, -2))

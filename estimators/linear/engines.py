@@ -46,7 +46,7 @@ class Motion(NamedTuple):
     rate: FloatArray
 
 
-class Epoch(NamedTuple):
+class LinearEpoch(NamedTuple):
     """One epoch, checked: what the linear update reads.
 
     Attributes
@@ -78,7 +78,9 @@ class Batched:
         return predict_mean(mean, twist, dt), predict_covariance(P, twist, dt, rate)
 
     @staticmethod
-    def update(mean: FloatArray, P: FloatArray, epoch: Epoch) -> tuple[FloatArray, FloatArray]:
+    def update(
+        mean: FloatArray, P: FloatArray, epoch: LinearEpoch
+    ) -> tuple[FloatArray, FloatArray]:
         """Mean and covariance after an epoch."""
         P = update_covariance(P, *epoch[1:])
         return update_mean(mean, P, *epoch), P
@@ -174,7 +176,9 @@ class FilterPy:
         return cls._result(kf)
 
     @classmethod
-    def update(cls, mean: FloatArray, P: FloatArray, epoch: Epoch) -> tuple[FloatArray, FloatArray]:
+    def update(
+        cls, mean: FloatArray, P: FloatArray, epoch: LinearEpoch
+    ) -> tuple[FloatArray, FloatArray]:
         """As `Batched.update`, by filterpy's own gain and Joseph form."""
         kf = cls._filter(mean, P)
         z, H = compress(*epoch, mean)

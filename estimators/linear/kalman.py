@@ -28,7 +28,7 @@ from rbl_gym.estimators.inputs import (
     epoch_variance,
     plain,
 )
-from rbl_gym.estimators.linear.engines import ENGINES, Epoch, Motion, engine_for
+from rbl_gym.estimators.linear.engines import ENGINES, LinearEpoch, Motion, engine_for
 from rbl_gym.estimators.linear.least_squares import unvec, vec
 from rbl_gym.estimators.linear.squared_range import geometric_rank
 from rbl_gym.estimators.linear.unitary import (
@@ -190,7 +190,7 @@ class KalmanFamily:
             check_batches(state=state.mean.shape[:-1], ranges=ranges.shape[:-2])
         if mask is not None:
             weights = np.where(mask, weights, 0.0)
-        epoch = Epoch(ranges, anchors, self.tags, weights)
+        epoch = LinearEpoch(ranges, anchors, self.tags, weights)
         engine = engine_for(
             self.engine,
             state=state.mean.shape[:-1],
@@ -250,7 +250,7 @@ def _is_vague(P: FloatArray, anchors: FloatArray, vague_entry: float) -> BoolArr
 
 
 def _no_constraint(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: LinearEpoch
 ) -> KalmanState:
     return posterior
 
@@ -264,13 +264,13 @@ def _project(posterior: KalmanState, where: BoolArray) -> KalmanState:
 
 
 def _always(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: LinearEpoch
 ) -> KalmanState:
     return _project(posterior, np.ones(posterior.mean.shape[:-1], bool))
 
 
 def _above_threshold(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: LinearEpoch
 ) -> KalmanState:
     matrix = unvec(posterior.mean[..., :9])
     defect = np.swapaxes(matrix, -1, -2) @ matrix - np.eye(3)
@@ -278,7 +278,7 @@ def _above_threshold(
 
 
 def _newton(
-    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: Epoch
+    family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: LinearEpoch
 ) -> KalmanState:
     """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
 

@@ -32,7 +32,7 @@ def decoupled_fit(
     mean, covariance
         Prior (..., 12) and (..., 12, 12).
     ranges, anchors, tags, weights
-        Of an epoch (`engines.Epoch`), weights (..., M, 1) common to all tags.
+        Of an epoch (`engines.LinearEpoch`), weights (..., M, 1) common to all tags.
 
     Returns
     -------

@@ -25,7 +25,7 @@ from rbl_gym.checks import (
 from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.linear.least_squares import RETRACTIONS
 from rbl_gym.estimators.linear.squared_range import Statistic, statistic
-from rbl_gym.estimators.locating.locators import METHODS, Epoch, Fit
+from rbl_gym.estimators.locating.locators import METHODS, Fit, StaticEpoch
 from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, no_alternatives
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.ranging import NoiseLaw
@@ -150,7 +150,7 @@ def locate(
     return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9], np.zeros(batch, int))
 
 
-def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:
+def _solve(fit: Callable[[StaticEpoch], Fit], epoch: StaticEpoch) -> tuple[np.ndarray, ...]:
     """The fields of a `PoseEstimate` (alternatives as three) for one block of trials."""
     found = fit(epoch)
     rotation, translation = found.rotation, found.translation
@@ -174,7 +174,7 @@ def _solve(fit: Callable[[Epoch], Fit], epoch: Epoch) -> tuple[np.ndarray, ...]:
 
 
 def _range_cost_of(
-    epoch: Epoch, rotation: FloatArray, translation: FloatArray, known: BoolArray
+    epoch: StaticEpoch, rotation: FloatArray, translation: FloatArray, known: BoolArray
 ) -> FloatArray:
     """Half the sum of squared whitened range residuals (B,), infinite where no pose is known."""
     turned = epoch.tags @ np.swapaxes(rotation, -1, -2)
@@ -193,9 +193,9 @@ def _rank_of_tags(tags: FloatArray) -> np.ndarray:
     return np.array([3, 5, 6, 6])[spans]
 
 
-def _rows(epoch: Epoch, rows: slice) -> Epoch:
+def _rows(epoch: StaticEpoch, rows: slice) -> StaticEpoch:
     """Some of the trials."""
-    return Epoch(
+    return StaticEpoch(
         epoch.ranges[rows],
         epoch.anchors[rows],
         epoch.tags[rows],
@@ -213,7 +213,7 @@ def _epoch(
     noise: NoiseLaw,
     mask: BoolArray | None,
     tag_std_m: float,
-) -> tuple[Epoch, tuple[int, ...]]:
+) -> tuple[StaticEpoch, tuple[int, ...]]:
     """One flat batch of all leading axes, and the shape it had."""
     variance = check_variance(noise.variance(ranges, mask), mask)
     squared = check_variance(noise.squared_range_variance(ranges, mask), mask)
@@ -232,7 +232,9 @@ def _epoch(
         weights = np.where(mask, weights, 0.0)
         flat_mask = flat(mask)
     stat = statistic(flat(ranges), flat(anchors), flat(tags), flat(1 / squared), flat_mask)
-    return Epoch(flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m), batch
+    return StaticEpoch(
+        flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m
+    ), batch
 
 
 # Rank of the anchors and of the tags that the squared-range methods stand on.
@@ -258,7 +260,7 @@ def methods() -> list[str]:
     return sorted({*METHODS, *(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))})
 
 
-def _method(name: str) -> Callable[[Epoch], Fit]:
+def _method(name: str) -> Callable[[StaticEpoch], Fit]:
     if isinstance(name, str) and name in METHODS:
         return METHODS[name]
     for entry in entry_points(group=ENTRY_POINT_GROUP):

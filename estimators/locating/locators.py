@@ -1,4 +1,4 @@
-"""The methods of `locate`: functions of a flat `Epoch` (one batch axis) that return a `Fit`."""
+"""The methods of `locate`: functions of a flat `StaticEpoch` that return a `Fit`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
 
-class Epoch(NamedTuple):
+class StaticEpoch(NamedTuple):
     """Checked arrays of B trials: ranges (B, M, N), anchors (B, M, 3), tags (B, N, 3).
 
     `weights` (B, M, N) are inverse variances of the ranges, 0 where a link is missing;
@@ -57,7 +57,7 @@ class Fit(NamedTuple):
     iterations: np.ndarray | None = None
 
 
-def _ls(epoch: Epoch) -> Fit:
+def _ls(epoch: StaticEpoch) -> Fit:
     matrix, translation = least_squares.linear_fit(epoch.stat)
     rotation = _nearest(matrix)
     pinv = np.swapaxes(state_jacobian(rotation), -1, -2) * np.array([0.5] * 3 + [1.0] * 3)[:, None]
@@ -65,7 +65,7 @@ def _ls(epoch: Epoch) -> Fit:
     return _linear(rotation, translation, covariance, matrix)
 
 
-def _ls_projected(epoch: Epoch) -> Fit:
+def _ls_projected(epoch: StaticEpoch) -> Fit:
     matrix, _ = least_squares.linear_fit(epoch.stat)
     rotation = _nearest(matrix)
     translation = least_squares.translation_fit(epoch.stat, rotation)
@@ -80,7 +80,7 @@ def _ls_projected(epoch: Epoch) -> Fit:
     return _linear(rotation, translation, _propagated(T, epoch.stat))
 
 
-def _cls(epoch: Epoch) -> Fit:
+def _cls(epoch: StaticEpoch) -> Fit:
     rotation, translation = least_squares.points_fit(epoch.stat)
     # Unweighted fit of points: (J^T J)^-1 (sum J_n^T S_n J_n) (J^T J)^-1, S_n = G_n^-1.
     regular = bounds.information_rank(epoch.stat.G) == 3
@@ -96,7 +96,7 @@ def _cls(epoch: Epoch) -> Fit:
     return _linear(rotation, translation, spread @ middle @ spread)
 
 
-def _procrustes(epoch: Epoch) -> Fit:
+def _procrustes(epoch: StaticEpoch) -> Fit:
     first, _ = least_squares.points_fit(epoch.stat)
     first = np.where(np.isfinite(first), first, np.eye(3))[:, None]
     net = np.broadcast_to(ROTATION_NET, (len(first), 24, 3, 3))
@@ -107,13 +107,13 @@ def _procrustes(epoch: Epoch) -> Fit:
     return _linear(rotation, translation, covariance)
 
 
-def _ml(epoch: Epoch) -> Fit:
+def _ml(epoch: StaticEpoch) -> Fit:
     cost = _range_cost(epoch)
     rotation, translation = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
     return _from_solution(*maximum_likelihood(cost, rotation, translation, epoch.tag_std_m))
 
 
-def _two_step(epoch: Epoch) -> Fit:
+def _two_step(epoch: StaticEpoch) -> Fit:
     rotation, translation = least_squares.points_fit(epoch.stat)
     usable = are_finite(translation, 1)
     solution = minimize(
@@ -133,13 +133,13 @@ def _two_step(epoch: Epoch) -> Fit:
     )
 
 
-def _robust(epoch: Epoch) -> Fit:
+def _robust(epoch: StaticEpoch) -> Fit:
     cost = _range_cost(epoch)
     start = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
     return _from_solution(*robust(cost, *start))
 
 
-def _range_cost(epoch: Epoch) -> RangeCost:
+def _range_cost(epoch: StaticEpoch) -> RangeCost:
     return RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags)
 
 
@@ -192,7 +192,7 @@ def covariance_of(hessian: FloatArray) -> FloatArray:
     return bounds.symmetric(inverse / outer)
 
 
-METHODS: dict[str, Callable[[Epoch], Fit]] = {
+METHODS: dict[str, Callable[[StaticEpoch], Fit]] = {
     "ls": _ls,
     "ls-projected": _ls_projected,
     "cls": _cls,
