@@ -9,7 +9,7 @@ import pytest
 
 from rbl_gym import bounds, estimators, metrics, motion
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
-from rbl_gym.estimators.iekf import doa_filter, manifold
+from rbl_gym.estimators.iekf import doa_filter, manifold, vague_start
 from rbl_gym.estimators.iekf.manifold import PoseState
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import bearing, ranging
@@ -303,3 +303,13 @@ def test_angles_to_two_tags_run_on_too(searches):
     found = told.update(vague, angles, station, ranges=ranges)
     assert searches == [6]
     assert np.linalg.norm(found.translation - pose[1], axis=-1).max() < 0.3
+
+
+def test_a_held_axis_may_round_below_zero():
+    """Rotations to start from, about the axes that are uncertain; a held one is left alone."""
+    covariance = np.diag([-1e-22, 0.0, 1.0, 1, 1, 1])[None, None]
+    prior = PoseState(np.eye(3)[None, None], np.zeros((1, 1, 3)), covariance)
+    turns = rotations.log(vague_start.spread(prior))
+    assert np.isfinite(turns).all()
+    np.testing.assert_allclose(turns[..., :2], 0.0, atol=1e-9)
+    assert np.ptp(turns[..., 2]) > 3

@@ -104,7 +104,8 @@ def net_of_starts(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
 def spread(prior: PoseState) -> FloatArray:
     """Rotations (K, 24, 3, 3) around priors (K, 1), on each axis as far as it is uncertain."""
     values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
-    reach = np.minimum(np.sqrt(values) / VAGUE_ROTATION_RAD, 1.0)
+    # An axis that is held has a variance that rounds to less than zero.
+    reach = np.minimum(np.sqrt(np.maximum(values, 0.0)) / VAGUE_ROTATION_RAD, 1.0)
     shape = (vectors * reach[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return rotations.exp((_NET @ shape)[:, 0]) @ prior.rotation
 
