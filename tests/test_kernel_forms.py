@@ -408,3 +408,22 @@ def test_places_on_walls(batch):
     actions = actions.reshape(-1, *(1 for _ in batch), 3) * np.ones((*batch, 1))
     assert_equal_forms(regions._place_on_walls, actions, low, high)
     assert_equal_forms(regions._project_on_walls, 0.7 + 3.1 * actions, low, high)
+
+
+@every_batch
+@pytest.mark.parametrize("n", [1, 3, 6])
+def test_regular_inverse(batch, n):
+    rng = np.random.default_rng(n)
+    root = rng.standard_normal((50, *batch, n, n)) * 10.0 ** rng.integers(-1, 2, n)[:, None]
+    matrix = root @ np.swapaxes(root, -1, -2)
+    matrix[0, ..., -1, :] = matrix[0, ..., :, -1] = 0.0
+    matrix[1, ..., 0, 0] *= -1
+    matrix[2, ..., -1, -1] = np.nan
+    got, regular = assert_equal_forms(pose.regular_inverse, matrix, 1e-7)
+    assert not regular[:2].any()
+    assert regular[2].all()
+    assert np.isnan(got[:3]).all()
+    unit = got[3:] @ matrix[3:]
+    np.testing.assert_allclose(
+        unit[regular[3:]], np.broadcast_to(np.eye(n), unit.shape)[regular[3:]], atol=1e-6
+    )

@@ -24,7 +24,6 @@ from rbl_gym.checks import (
 )
 from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.linear.least_squares import RETRACTIONS
-from rbl_gym.estimators.linear.squared_range import Statistic, statistic
 from rbl_gym.estimators.locating.locators import METHODS, Fit, StaticEpoch
 from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, no_alternatives
 from rbl_gym.measurements import ranging
@@ -145,9 +144,14 @@ def locate(
     ]
     if method in _NEEDS and not all(np.isfinite(block[1]).all() for block in blocks):
         _check_geometry(method, anchors, tags)
-    fields = [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
-    fields = [field.reshape((*batch, *field.shape[1:])) for field in fields]
+    fields = joined(blocks, batch)
     return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9], np.zeros(batch, int))
+
+
+def joined(blocks: list[tuple[np.ndarray, ...]], batch: tuple[int, ...]) -> list[np.ndarray]:
+    """The fields of all blocks of trials, with the leading axes that the trials had."""
+    fields = blocks[0] if len(blocks) == 1 else map(np.concatenate, zip(*blocks, strict=True))
+    return [field.reshape((*batch, *field.shape[1:])) for field in fields]
 
 
 def _solve(fit: Callable[[StaticEpoch], Fit], epoch: StaticEpoch) -> tuple[np.ndarray, ...]:
@@ -200,7 +204,7 @@ def _rows(epoch: StaticEpoch, rows: slice) -> StaticEpoch:
         epoch.anchors[rows],
         epoch.tags[rows],
         epoch.weights[rows],
-        Statistic._make(field[rows] for field in epoch.stat),
+        epoch.squared_weights[rows],
         epoch.tag_std_m,
         epoch.retraction,
     )
@@ -222,19 +226,20 @@ def _epoch(
         ranges.shape[:-2], anchors.shape[:-2], tags.shape[:-2], variance.shape[:-2], *masks
     )
 
-    def flat(array: Any) -> Any:
-        shape = array.shape[-2:]
-        return np.broadcast_to(array, (*batch, *shape)).reshape(-1, *shape)
+    def flat(array: Any, shape: tuple[int, ...]) -> Any:
+        if array.shape != (*batch, *shape):
+            array = np.broadcast_to(array, (*batch, *shape))
+        return array.reshape(-1, *shape)
 
-    weights = np.broadcast_to(1 / variance, (*batch, *ranges.shape[-2:]))
-    flat_mask = None
+    links, tag_rows = ranges.shape[-2:], tags.shape[-2:]
+    weights, squared_weights = 1 / variance, 1 / squared
     if mask is not None:
-        weights = np.where(mask, weights, 0.0)
-        flat_mask = flat(mask)
-    stat = statistic(flat(ranges), flat(anchors), flat(tags), flat(1 / squared), flat_mask)
-    return StaticEpoch(
-        flat(ranges), flat(anchors), flat(tags), flat(weights), stat, tag_std_m
-    ), batch
+        weights, squared_weights = (np.where(mask, w, 0.0) for w in (weights, squared_weights))
+    epoch = StaticEpoch(
+        flat(ranges, links), flat(anchors, anchors.shape[-2:]), flat(tags, tag_rows),
+        flat(weights, links), flat(squared_weights, squared_weights.shape[-2:]), tag_std_m,
+    )  # fmt: skip
+    return epoch, batch
 
 
 # Rank of the anchors and of the tags that the squared-range methods stand on.

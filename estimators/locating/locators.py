@@ -8,12 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym import bounds
+from rbl_gym.bounds.pose import regular_inverse
 from rbl_gym.checks import BoolArray, FloatArray, are_finite
 from rbl_gym.estimators.costs.levenberg_marquardt import Solution
 from rbl_gym.estimators.costs.map_problem import minimize
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.linear import least_squares
-from rbl_gym.estimators.linear.squared_range import Statistic, information
+from rbl_gym.estimators.linear.squared_range import Statistic, information, statistic
 from rbl_gym.estimators.linear.unitary import state_jacobian
 from rbl_gym.estimators.locating.maximum_likelihood import (
     Alternatives,
@@ -25,22 +26,30 @@ from rbl_gym.estimators.locating.robust_location import robust
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
+# Determinant from which a matrix of a unit diagonal has no eigenvalue below 1e-12.
+_REGULAR = 1e-12 * 6**5
+
 
 class StaticEpoch(NamedTuple):
     """Checked arrays of B trials: ranges (B, M, N), anchors (B, M, 3), tags (B, N, 3).
 
     `weights` (B, M, N) are inverse variances of the ranges, 0 where a link is missing;
-    `stat` is the statistic of the squared ranges; `tag_std_m` that of the tags' places;
-    `retraction` that of Newton's method in ``procrustes``.
+    `squared_weights` those of the squared ranges, (B, M, 1) where common to the tags;
+    `tag_std_m` that of the tags' places; `retraction` that of Newton's method in ``procrustes``.
     """
 
     ranges: FloatArray
     anchors: FloatArray
     tags: FloatArray
     weights: FloatArray
-    stat: Statistic
+    squared_weights: FloatArray
     tag_std_m: float
     retraction: str = "exponential"
+
+    @property
+    def stat(self) -> Statistic:
+        """The statistic of the squared ranges."""
+        return statistic(self.ranges, self.anchors, self.tags, self.squared_weights)
 
 
 class Fit(NamedTuple):
@@ -58,33 +67,36 @@ class Fit(NamedTuple):
 
 
 def _ls(epoch: StaticEpoch) -> Fit:
-    matrix, translation = least_squares.linear_fit(epoch.stat)
+    stat = epoch.stat
+    matrix, translation = least_squares.linear_fit(stat)
     rotation = _nearest(matrix)
     pinv = np.swapaxes(state_jacobian(rotation), -1, -2) * np.array([0.5] * 3 + [1.0] * 3)[:, None]
-    covariance = _propagated(pinv, epoch.stat)
+    covariance = _propagated(pinv, stat)
     return _linear(rotation, translation, covariance, matrix)
 
 
 def _ls_projected(epoch: StaticEpoch) -> Fit:
-    matrix, _ = least_squares.linear_fit(epoch.stat)
+    stat = epoch.stat
+    matrix, _ = least_squares.linear_fit(stat)
     rotation = _nearest(matrix)
-    translation = least_squares.translation_fit(epoch.stat, rotation)
+    translation = least_squares.translation_fit(stat, rotation)
     # w = Jq^+ dq, v = dt + K (dq - Jq w), K = I_tt^-1 I_tq of the linear information.
     J = state_jacobian(rotation)[:, :9, :3]
-    info, _ = information(epoch.stat)
+    info, _ = information(stat)
     K = np.linalg.solve(least_squares.loaded(info[:, 9:, 9:]), info[:, 9:, :9])
     T = np.zeros((len(rotation), 6, 12))
     T[:, :3, :9] = 0.5 * np.swapaxes(J, -1, -2)
     T[:, 3:, :9] = K - K @ J @ T[:, :3, :9]
     T[:, 3:, 9:] = np.eye(3)
-    return _linear(rotation, translation, _propagated(T, epoch.stat))
+    return _linear(rotation, translation, _propagated(T, stat))
 
 
 def _cls(epoch: StaticEpoch) -> Fit:
-    rotation, translation = least_squares.points_fit(epoch.stat)
+    stat = epoch.stat
+    rotation, translation = least_squares.points_fit(stat)
     # Unweighted fit of points: (J^T J)^-1 (sum J_n^T S_n J_n) (J^T J)^-1, S_n = G_n^-1.
-    regular = bounds.information_rank(epoch.stat.G) == 3
-    safe = np.where(regular[..., None, None], epoch.stat.G, np.eye(3))
+    regular = bounds.information_rank(stat.G) == 3
+    safe = np.where(regular[..., None, None], stat.G, np.eye(3))
     known = np.broadcast_to(regular, epoch.tags.shape[:-1])[..., None, None]
     J = (
         bounds.tag_jacobian(np.where(np.isfinite(rotation), rotation, np.eye(3)), epoch.tags)
@@ -97,12 +109,13 @@ def _cls(epoch: StaticEpoch) -> Fit:
 
 
 def _procrustes(epoch: StaticEpoch) -> Fit:
-    first, _ = least_squares.points_fit(epoch.stat)
+    stat = epoch.stat
+    first, _ = least_squares.points_fit(stat)
     first = np.where(np.isfinite(first), first, np.eye(3))[:, None]
     net = np.broadcast_to(ROTATION_NET, (len(first), 24, 3, 3))
     starts = np.concatenate([first, net], axis=1)
-    rotation, translation = least_squares.procrustes_fit(epoch.stat, starts, epoch.retraction)
-    G = np.broadcast_to(epoch.stat.G, (*epoch.tags.shape[:2], 3, 3))
+    rotation, translation = least_squares.procrustes_fit(stat, starts, epoch.retraction)
+    G = np.broadcast_to(stat.G, (*epoch.tags.shape[:2], 3, 3))
     covariance = covariance_of(bounds.lift(bounds.tag_jacobian(rotation, epoch.tags), G))
     return _linear(rotation, translation, covariance)
 
@@ -178,17 +191,20 @@ def _propagated(T: FloatArray, stat: Statistic) -> FloatArray:
 
 def covariance_of(hessian: FloatArray) -> FloatArray:
     """Inverse of information (..., 6, 6); what nothing determines gets 1e12 of the rest."""
+    inverse, regular = regular_inverse(hessian, _REGULAR)
+    if not regular.all():
+        inverse[~regular] = _wide_covariance(hessian[~regular])
+    return inverse
+
+
+def _wide_covariance(hessian: FloatArray) -> FloatArray:
+    """`covariance_of` by eigenvalues, none below 1e-12 of a matrix with a unit diagonal."""
     scale = np.sqrt(np.maximum(np.diagonal(hessian, axis1=-2, axis2=-1), 0.0))
     largest = scale.max(axis=-1, keepdims=True)
     scale = np.where(scale > 1e-9 * largest, scale, np.where(largest > 0, largest, 1.0))
     outer = scale[..., :, None] * scale[..., None, :]
-    scaled = hessian / outer
-    singular = bounds.information_rank(scaled, 1e-12) < hessian.shape[-1]
-    inverse = np.linalg.inv(np.where(singular[..., None, None], np.eye(6), scaled))
-    if singular.any():
-        values, vectors = np.linalg.eigh(scaled[singular])
-        transposed = np.swapaxes(vectors, -1, -2)
-        inverse[singular] = (vectors / np.maximum(values, 1e-12)[..., None, :]) @ transposed
+    values, vectors = np.linalg.eigh(hessian / outer)
+    inverse = vectors / np.maximum(values, 1e-12)[..., None, :] @ np.swapaxes(vectors, -1, -2)
     return bounds.symmetric(inverse / outer)
 
 

@@ -300,19 +300,37 @@ def inverted(information: FloatArray, more: str) -> FloatArray:
 
 def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.ndarray:
     """Number (...) of directions an information matrix (..., n, n) determines, free of units."""
-    scale = np.sqrt(np.maximum(np.diagonal(information, axis1=-2, axis2=-1), 0.0))
-    scale = np.where(scale > 0, scale, 1.0)
-    scaled = information / (scale[..., :, None] * scale[..., None, :])
     n = information.shape[-1]
     # With a unit diagonal no eigenvalue exceeds n: a determinant bounds the smallest one, and
     # spares most matrices the eigenvalues.
-    rank = np.full(scaled.shape[:-2], n)
-    with np.errstate(divide="ignore"):  # of zeros, on the way to their determinant
-        determinant = np.linalg.det(scaled)
-    open_ = np.asarray(determinant <= 2 * tolerance * n ** (n - 1))
+    _, regular = regular_inverse(information, 2 * tolerance * n ** (n - 1))
+    rank, open_ = np.full(information.shape[:-2], n), ~np.asarray(regular)
     if open_.any():
-        rank[open_] = (np.linalg.eigvalsh(scaled[open_]) > tolerance).sum(axis=-1)
+        scale = np.sqrt(np.maximum(np.diagonal(information[open_], axis1=-2, axis2=-1), 0.0))
+        scale = np.where(scale > 0, scale, 1.0)
+        scaled = information[open_] / (scale[..., :, None] * scale[..., None, :])
+        rank[open_] = (np.linalg.eigvalsh(scaled) > tolerance).sum(axis=-1)
     return rank
+
+
+@compiled("pose_bound:regular_inverse")
+def regular_inverse(matrix: FloatArray, least: float) -> tuple[FloatArray, BoolArray]:
+    """Inverse of symmetric matrices (..., n, n), and whether (...) each is regular for certain.
+
+    That is, positive definite and, scaled to a unit diagonal, of a determinant above `least`. Of
+    others the inverse is NaN; one that holds NaN counts as regular, and is NaN too.
+    """
+    n, diagonal = matrix.shape[-1], np.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(diagonal <= 0, 1.0, diagonal))
+    outer = scale[..., :, None] * scale[..., None, :]
+    unit = matrix / outer
+    known = np.isfinite(unit).all(axis=(-2, -1), keepdims=True)
+    safe = np.where(known, unit, np.eye(n))
+    good = (np.linalg.eigvalsh(safe)[..., :1, None] > 0) & (
+        np.linalg.det(safe)[..., None, None] > least
+    )
+    inverse = symmetric(np.linalg.inv(np.where(good, safe, np.eye(n))) / outer)
+    return np.where(good & known, inverse, np.nan), (good | ~known)[..., 0, 0]
 
 
 def symmetric(matrix: FloatArray) -> FloatArray:

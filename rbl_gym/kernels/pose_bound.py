@@ -14,8 +14,11 @@ from rbl_gym.kernels import rotations
 from rbl_gym.kernels.epoch import tag_position
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import (
+    cholesky,
     cholesky6,
     factor_semidefinite,
+    fill,
+    invert_factored,
     invert_factored6,
 )
 from rbl_gym.kernels.noise_laws import reference_of, weight
@@ -250,3 +253,26 @@ def _add_angle_information(
             a - translation[0], b - translation[1], c - translation[2], xx, xy, xz, yy, yz, zz,
         )  # fmt: skip
     _mirror_upper(information)
+
+
+@gufunc("(n,n),()->(n,n),()", "fffb")
+def regular_inverse(matrix: Any, least: float, inverse: Any, regular: Any) -> None:
+    """The inverse, NaN where with a unit diagonal the determinant would be below `least`."""
+    n = matrix.shape[0]
+    scale, unit, L = np.empty(n), np.empty((n, n)), np.empty((n, n))
+    for i in range(n):
+        scale[i] = 1.0 if matrix[i, i] <= 0 else math.sqrt(matrix[i, i])
+        for j in range(i + 1):
+            unit[i, j] = matrix[i, j] / (scale[i] * scale[j])
+    good, determinant = cholesky(unit, L), 1.0
+    for i in range(n):
+        determinant /= L[i, i] * L[i, i]
+    # A NaN stays one.
+    regular[0] = determinant != determinant or (good and determinant > least)
+    if not regular[0]:
+        fill(math.nan, inverse)
+        return
+    invert_factored(L, inverse)
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] /= scale[i] * scale[j]
