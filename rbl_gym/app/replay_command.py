@@ -151,7 +151,8 @@ def _add_output(group: Any) -> None:
     group.add_argument(
         "--track",
         metavar="F",
-        help="the track: TUM where F ends in .tum or .txt, else .csv with covariance, NIS and rank",
+        help="the track, with --smooth the smoothed one: TUM where F ends in .tum or .txt, else "
+        ".csv with covariance, NIS and rank",
     )
     group.add_argument("--plot", metavar="F", help="picture of the track and the errors")
     add_html(group, "3-D page of the track with charts and tables")
@@ -179,7 +180,8 @@ def _replay(options: argparse.Namespace) -> int:
     with progress("replay", len(recording.times)) as advance:
         replayed = replay.replay_recording(recording, settings, advance)
     if options.track:
-        recordings.write_track(options.track, replay.track_file(recording, replayed.track))
+        best = replayed.track if replayed.smoothed is None else replayed.smoothed.track
+        recordings.write_track(options.track, replay.track_file(recording, best))
     if options.plot:
         from rbl_gym.app import figures
 

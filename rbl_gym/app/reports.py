@@ -181,7 +181,7 @@ def compared(result: dict[str, Any]) -> list[str]:
         found = result["time_offset"]
         parts.append(
             f"the truth's clock is ahead by {found['offset_s']:.4f} s +- {found['std_s']:.4f} s by "
-            f"the motion, with what the filter lags (correlation {found['correlation']:.2f})"
+            f"the motion of the {found['track']} track (correlation {found['correlation']:.2f})"
         )
     elif ahead := result["settings"].get("time_offset"):
         parts.append(f"the truth's clock is ahead by {ahead:.10g} s (time_offset)")

@@ -94,21 +94,26 @@ def replay_recording(
     settings = check_replay(recording, settings)
     clock = _Stopwatch(advance)
     track = track_recording(recording, settings, clock.tick)
+    smoothed: SmoothedRecording | None = None
+    if settings.smoothing.smooth:
+        smoothed = smooth_recording(recording, settings, track)
     offset: TimeOffset | None = None
     if settings.comparison.time_offset == "auto":
-        offset = find_offset(recording, track, settings)
+        # A smoothed track does not lag.
+        best = track if smoothed is None else smoothed.track
+        offset = find_offset(recording, best, settings)
         settings = with_offset(settings, offset)
     errors = track_errors(recording, track, settings)
     figures = track_figures(recording, track, errors, settings)
     figures["microseconds_per_epoch"] = clock.microseconds()
     if offset is not None:
-        figures["time_offset"] = offset._asdict()
+        lags = smoothed is None
+        figures["time_offset"] = {**offset._asdict(), "track": "causal" if lags else "smoothed"}
     assert track.innovations is not None
     figures["consistency"], notes = diagnose(recording, settings, track.innovations)
     figures["notes"] = figures["notes"] + notes
-    if not settings.smoothing.smooth:
+    if smoothed is None:
         return Replayed(settings, track, errors, figures)
-    smoothed = smooth_recording(recording, settings, track)
     smoothed_errors = track_errors(recording, smoothed.track, settings)
     figures["smoothed"] = smoothed_figures(smoothed, smoothed_errors)
     return Replayed(settings, track, errors, figures, smoothed, smoothed_errors)
