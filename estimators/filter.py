@@ -52,7 +52,11 @@ class Filter(Protocol):
         ...
 
     def predict(self, state: Any, twist: ArrayLike, dt: float) -> Any:
-        """State after `dt` seconds of the twist (..., 6)."""
+        """State after `dt` seconds of the twist (..., 6).
+
+        A filter with the attribute ``reads = "inertial"`` takes the readings (..., S, 6) of an
+        inertial sensor in that time in place of it.
+        """
         ...
 
     def update(
@@ -111,8 +115,8 @@ def make(
     ----------
     name
         ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
-        ``"iekf-bias"``, ``"iekf-bank"``; one that a package offers by the entry-point group
-        ``rbl_gym.filters``; or ``"package.module:factory"``, which is imported.
+        ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; one that a package offers by the
+        entry-point group ``rbl_gym.filters``; or ``"package.module:factory"``, which is imported.
     tags
         (N, 3), places on the body, metres, body frame.
     noise
@@ -187,6 +191,11 @@ def check_takes_noise(name: str, filter: Filter, why: str) -> None:
         f"filter {name!r} must take update(state, ranges, anchors, links=None, noise=None), "
         f"because {why}; its update takes ({', '.join(parameters)})"
     )
+
+
+def reads(filter: Filter) -> str:
+    """What the `predict` of a filter is told: the ``"twist"``, or ``"inertial"`` readings."""
+    return getattr(filter, "reads", "twist")
 
 
 def inverse(matrix: FloatArray) -> FloatArray:

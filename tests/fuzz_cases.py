@@ -9,6 +9,7 @@ import numpy as np
 
 from rbl_gym import bounds, estimators, metrics, motion, placement
 from rbl_gym.bounds import doa, links
+from rbl_gym.estimators.filter import reads
 from rbl_gym.geometry import bodies, obstacles, regions, rotations
 from rbl_gym.measurements import bearing, ranging
 from rbl_gym.networks import bounds as network_bounds
@@ -111,7 +112,10 @@ for _name in estimators.names():
     _state = _filter.initial(Q, T, P)
     _ranges = {**EPOCH, "ranges": RANGES[:, :5], "links": np.ones((5, 5), dtype=np.bool_)}
     case(_filter.initial, _name, **POSE, covariance=P)
-    case(_filter.predict, _name, state=_state, twist=TWIST, dt=0.1)
+    if reads(_filter) == "twist":
+        case(_filter.predict, _name, state=_state, twist=TWIST, dt=0.1)
+    else:
+        case(_filter.predict, _name, state=_state, readings=np.ones((10, 6)), dt=0.1)
     case(_filter.update, _name, state=_state, **_ranges)
 case(sensing.proj, angle=T)
 case(sensing.unit_disk_edges, positions=NET.positions, radius_m=2.0)

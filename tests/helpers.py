@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym.geometry import rotations
+from rbl_gym import estimators, motion
+from rbl_gym.estimators.filter import reads
+from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies.progress import Advance
 
@@ -36,6 +38,13 @@ class Told(Advance):
     def __call__(self, steps: int = 1, *, more: int = 0) -> None:
         self.done += steps
         self.announced += more
+
+
+def twist_filters() -> list[str]:
+    """Names of the filters whose `predict` is told a twist, not the readings of a sensor."""
+    laws = {"noise": ranging.RangeNoise(0.1), "process": motion.ProcessNoise(0.1, 0.1)}
+    made = ((n, estimators.make(n, tags=bodies.pyramid(1.0), **laws)) for n in estimators.names())
+    return [name for name, filter in made if reads(filter) == "twist"]
 
 
 def load(name: str) -> Any:

@@ -8,6 +8,7 @@ import pytest
 from rbl_gym import estimators, motion
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import ranging
+from tests.helpers import twist_filters
 
 TAGS = bodies.pyramid()
 ANCHORS = np.array([[0, 0, 0], [9, 0, 1], [0, 9, 2], [9, 9, 3.0]])
@@ -94,7 +95,7 @@ def test_epochs(name, changes, message):
         filter.update(filter.initial(**GOOD_PRIOR), **epoch)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", twist_filters())
 @pytest.mark.parametrize(
     ("twist", "dt", "message"),
     [

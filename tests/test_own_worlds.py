@@ -11,7 +11,7 @@ import pytest
 from rbl_gym import estimators, motion
 from rbl_gym.measurements.ranging import LinkNoise, RangeNoise
 from rbl_gym.worlds import scenes
-from tests.helpers import random_world
+from tests.helpers import random_world, twist_filters
 
 B, M, N = 5, 4, 5
 
@@ -115,7 +115,7 @@ def test_what_does_not_fit_is_named(change, message):
         step({**worlds(), **change}, False)
 
 
-@pytest.mark.parametrize("name", [name for name in estimators.names() if name != "iekf"])
+@pytest.mark.parametrize("name", [name for name in twist_filters() if name != "iekf"])
 def test_the_other_filters_and_scenes_refuse_a_process_of_each_trial(name):
     world = worlds()
     process = motion.ProcessNoise(world["rotation_rad"], 0.1)

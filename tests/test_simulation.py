@@ -98,9 +98,8 @@ def test_same_seed_gives_the_same_bytes_and_another_seed_others(name):
     scene = change(name, links=BAD_LINKS)
     first, second, other = draw(scene, 5), draw(scene, 5), draw(scene, 6)
     for a, b in zip(first, second, strict=True):
-        assert a is not None
-        assert b is not None
-        assert a.tobytes() == b.tobytes()
+        assert (a is None) == (b is None)
+        assert a is None or a.tobytes() == b.tobytes()
     assert first.normals.tobytes() != other.normals.tobytes()
     assert first.rotation.tobytes() != other.rotation.tobytes() or name == "icassp2013"
 
@@ -122,9 +121,8 @@ def test_every_array_of_a_batch_has_the_stated_shape(name, batch):
         "normals": (8, *links),
         "uniforms": (8, 2, *links),
     }
-    assert {key: value.shape for key, value in episode._asdict().items()} == {
-        key: (*batch, *shape) for key, shape in shapes.items()
-    }
+    found = {key: value.shape for key, value in episode._asdict().items() if value is not None}
+    assert found == {key: (*batch, *shape) for key, shape in shapes.items()}
 
 
 @pytest.mark.parametrize("name", NAMES)

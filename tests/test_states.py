@@ -10,12 +10,12 @@ import pytest
 from rbl_gym import estimators, motion
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import bearing, ranging
-from tests.helpers import simulate
+from tests.helpers import simulate, twist_filters
 
 TAGS = bodies.pyramid(1.0)
 NOISE, PROCESS = ranging.RangeNoise(0.05), motion.ProcessNoise(0.05, 0.1)
 FILTERS = [
-    *((name, {}) for name in estimators.names()),
+    *((name, {}) for name in twist_filters()),
     ("iekf", {"robust": True}),
     ("iekf-bank", {"robust": True}),
     ("uc-kf", {"coupled": True}),

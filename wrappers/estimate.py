@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +15,7 @@ from gymnasium.utils import RecordConstructorArgs
 from rbl_gym import estimators, metrics, rendering
 from rbl_gym.checks import check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
-from rbl_gym.estimators.filter import check_takes_noise
+from rbl_gym.estimators.filter import check_takes_noise, factory_of, reads
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.noise_laws import WeakenedNoise
 from rbl_gym.worlds.scene import Scene
@@ -29,7 +30,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Turns measurements into a pose belief, and the belief into the reward.
 
     Wraps an environment whose observation has `ranges`, `links`, `anchors` and `twist` (in
-    scenes with obstacles `quality`), and whose unwrapped form has a `scene`
+    scenes with obstacles `quality`, in those with an inertial sensor `inertial`, which
+    ``"iekf-imu"`` reads), and whose unwrapped form has a `scene`
     (`RBL/Tracking-v0`); or `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter
     ``"iekf"``). For vector environments: `VectorEstimatePose`.
 
@@ -107,7 +109,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step the environment, predict with its twist, update with its ranges."""
         observation, _, terminated, truncated, info = self.env.step(action)
-        self._state = self._filter.predict(self._state, observation["twist"], self._scene.dt)
+        told = observation[reads(self._filter)]
+        self._state = self._filter.predict(self._state, told, self._scene.dt)
         belief = self._update(observation)
         info = self._judged(belief, info)
         reward = -math.log(info["score_m"]) if self._reward == "belief" else -info["tag_error_m"]
@@ -158,10 +161,33 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
     if isinstance(law, AngleNoise):
         told = {"measurement": "doa", **told}
     filter = estimators.make(
-        name, tags=np.asarray(scene.tags), noise=law, process=scene.process, **told
+        name,
+        tags=np.asarray(scene.tags),
+        noise=law,
+        process=scene.process,
+        **{**inertial_options(name, scene), **told},
     )
     check_takes_obstacles(name, filter, scene)
+    check_reads(name, filter, scene)
     return filter
+
+
+def inertial_options(name: str, scene: Scene) -> dict[str, Any]:
+    """What a filter is told that asks for an inertial sensor, in a scene that has one."""
+    if scene.inertial is None:
+        return {}
+    asked = inspect.signature(factory_of(name)).parameters
+    known = {"inertial": scene.inertial, "speed_m_s": scene.speed_std_m_s}
+    return known if "inertial" in asked else {}
+
+
+def check_reads(name: str, filter: Filter, scene: Scene) -> None:
+    """A ValueError where a filter reads an inertial sensor that the scene does not have."""
+    if reads(filter) == "inertial" and scene.inertial is None:
+        raise ValueError(
+            f"filter {name!r} reads an inertial sensor, scene {scene.name!r} has none: give it "
+            'one, scene={"name": ..., "inertial": "consumer"}'
+        )
 
 
 def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -186,7 +212,7 @@ def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:
 
 def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What a filter reads of an observation."""
-    keys = "ranges", "links", "quality", "anchors", "angles", "station", "twist"
+    keys = "ranges", "links", "quality", "anchors", "angles", "station", "twist", "inertial"
     return {key: observation[key] for key in keys if key in observation}
 
 

@@ -14,7 +14,7 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
 from rbl_gym.estimators import Filter
-from rbl_gym.estimators.filter import check_takes_noise
+from rbl_gym.estimators.filter import check_takes_noise, reads
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.wrappers.estimate import make_filter
 from rbl_gym.wrappers.filter_tracks import check_determined, track_error
@@ -28,6 +28,8 @@ def filter_of(env: Any, name: str, options: Mapping[str, Any] | None) -> Filter:
     if not isinstance(task, PlacementTask):
         raise ValueError(f"env must be RBL/AnchorPlacement-v0, got {env.unwrapped}")
     filter = make_filter(env, task.scene, name, options)
+    if reads(filter) != "twist":
+        raise ValueError(f"filter must be one that is told the twist, got {name!r}")
     if task.racks:
         check_takes_noise(name, filter, "the racks give every epoch its own noise")
     check_determined(task, name, filter)

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from rbl_gym import metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.estimators import PoseBelief
+from rbl_gym.estimators.filter import reads
 from rbl_gym.wrappers.estimate import (
     OBSERVATIONS,
     REWARDS,
@@ -120,7 +121,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         state = self._state if everywhere else _rows(self._state, moved)
         if not everywhere:
             measured = {key: value[moved] for key, value in measured.items()}
-        state = self._filter.predict(state, measured["twist"], self._scene.dt)
+        state = self._filter.predict(state, measured[reads(self._filter)], self._scene.dt)
         state = update(self._filter, state, measured, self._scene)
         self._put(state, moved)
 

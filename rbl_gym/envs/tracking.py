@@ -48,6 +48,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     | `anchors` | (M, 3) | float64 | places of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
     | `quality` | (M,) | float64 | share of a link's information that an anchor's sight of the body leaves: 1 in sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
+    | `inertial` | (S, 6) | float64 | readings of the inertial sensor in that interval, in the body frame: angular velocity (rad/s) and specific force (m/s^2) of S samples; zeros at epoch 0. Only in scenes with such a sensor |
 
     ## Reward
     ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square
@@ -62,7 +63,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     ## Info
     `rotation`, `translation`: the true pose; `nlos`: which ranges came over a reflected path
-    (where ranges are observed); `epoch`; `score_m`: b (with ``reward="bound"``).
+    (where ranges are observed); `epoch`; `score_m`: b (with ``reward="bound"``). With an inertial
+    sensor `velocity` (3,), m/s, and `inertial_bias` (6,).
 
     ## Episode end
     Never terminates; truncates after `scene.steps` steps (`env.spec.max_episode_steps` says how
@@ -173,10 +175,14 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
             self._shoot(at, observation["links"])
         observation["anchors"] = self._anchors.copy()
         observation["twist"] = at.twist.copy()
+        if at.readings is not None and at.velocity is not None and at.bias is not None:
+            observation["inertial"] = at.readings.copy()
+            info["velocity"], info["inertial_bias"] = at.velocity.copy(), at.bias.copy()
         return observation, info, reward
 
     def _shoot(self, at: simulation.Epoch, links: np.ndarray) -> None:
-        bound = None if self._information is None else np.linalg.inv(self._information)[None]
+        known = self._information
+        bound = None if known is None else scene_bounds.pose_covariance(known)[None]
         world = links.view(np.bool_)[None], self._anchors[None], at.rotation[None]
         shot = rendering.shot(*world, at.translation[None], bound)
         self.film.take([self._epoch], shot)  # pyright: ignore[reportOptionalMemberAccess]
@@ -240,6 +246,9 @@ def observation_space(scene: Scene) -> spaces.Dict:
     # Ten standard deviations of the drawn turn rate; an orbit of 1 m is the tightest.
     twist[:3] = np.maximum(twist[:3], max(10 * scene.spin_rad_s, np.pi / scene.dt, scene.speed_m_s))
     twist[3:] = np.maximum(twist[3:], scene.speed_m_s) + 1e-9
+    if scene.inertial is not None:
+        # The twist is told with the process noise in it.
+        twist += 10 * scene.process.std() / math.sqrt(scene.dt)
     low, high = np.tile(low, (scene.n_anchors, 1)), np.tile(high, (scene.n_anchors, 1))
     keys: dict[str, spaces.Space[Any]] = {
         "anchors": spaces.Box(low, high, dtype=np.float64),
@@ -249,6 +258,10 @@ def observation_space(scene: Scene) -> spaces.Dict:
     }
     if scene.obstacles:
         keys["quality"] = spaces.Box(0.0, 1.0, (scene.n_anchors,), np.float64)
+    if scene.inertial is not None:
+        limits = scene.inertial.gyro_limit_rad_s, scene.inertial.accel_limit_m_s2
+        limit = np.tile(np.repeat(limits, 3), (scene.inertial.samples(scene.dt), 1))
+        keys["inertial"] = spaces.Box(-limit, limit, dtype=np.float64)
     return spaces.Dict(keys)
 
 

@@ -62,7 +62,8 @@ class TrackingVectorEnv(BatchEnv):
         self._episodes = EpisodeStore(self.scene, num_envs)
         self._anchors = np.empty((num_envs, self.scene.n_anchors, 3))
         self._prior_covariance = np.empty((num_envs, 6, 6))
-        self._information = np.empty((num_envs, 6, 6))
+        size = scene_bounds.information_size(self.scene)
+        self._information = np.empty((num_envs, size, size))
         self._score_m = np.empty(num_envs)
         self._seen: tuple[simulation.Epoch, dict[str, np.ndarray]] | None = None
 
@@ -105,6 +106,8 @@ class TrackingVectorEnv(BatchEnv):
     def _observe(self) -> dict[str, np.ndarray]:
         at, told = self._look()
         seen = {key: field for key, field in told.items() if key != "nlos"}
+        if at.readings is not None:
+            seen["inertial"] = at.readings.copy()
         return {**seen, "anchors": self._anchors.copy(), "twist": at.twist}
 
     def _inform(self) -> dict[str, np.ndarray]:
@@ -115,13 +118,16 @@ class TrackingVectorEnv(BatchEnv):
             "epoch": self._epochs.copy(),
             "nlos": told["nlos"],
         }
+        if at.velocity is not None and at.bias is not None:
+            info["velocity"], info["inertial_bias"] = at.velocity.copy(), at.bias.copy()
         if self.reward_mode == "bound":
             info["score_m"] = self._score_m.copy()
         return info
 
     def _shot(self) -> tuple[Any, None]:
         at, told = self._look()
-        bound = np.linalg.inv(self._information) if self.reward_mode == "bound" else None
+        known = self._information if self.reward_mode == "bound" else None
+        bound = None if known is None else scene_bounds.pose_covariance(known)
         links = told["links"].view(np.bool_)
         return rendering.shot(links, self._anchors, at.rotation, at.translation, bound), None
 

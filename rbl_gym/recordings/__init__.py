@@ -3,6 +3,7 @@
 from rbl_gym.recordings.align import ALIGNMENTS, Alignment, align_positions, apply_alignment
 from rbl_gym.recordings.bags import convert_bag, list_topics, show_message
 from rbl_gym.recordings.format import Format
+from rbl_gym.recordings.inertial import InertialLog, read_inertial, samples_between
 from rbl_gym.recordings.motion_offset import motion_offset
 from rbl_gym.recordings.reading import read_recording, read_runs
 from rbl_gym.recordings.recording import Recording
@@ -15,6 +16,7 @@ __all__ = [
     "ALIGNMENTS",
     "Alignment",
     "Format",
+    "InertialLog",
     "Recording",
     "Report",
     "TimeOffset",
@@ -26,10 +28,12 @@ __all__ = [
     "convert_bag",
     "list_topics",
     "motion_offset",
+    "read_inertial",
     "read_recording",
     "read_runs",
     "read_track",
     "read_truth",
+    "samples_between",
     "show_message",
     "time_offset",
     "truth_at",

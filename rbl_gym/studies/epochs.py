@@ -18,6 +18,7 @@ from scipy import special
 from rbl_gym import metrics
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, Innovations, PoseBelief, innovations
+from rbl_gym.estimators.filter import reads
 from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
 
 __all__ = [
@@ -53,6 +54,9 @@ class Reading(NamedTuple):
         passed, as at the first epoch.
     dt
         Length of that interval, seconds.
+    inertial
+        Readings (..., S, 6) of an inertial sensor in that interval, for a filter that takes them
+        in place of the twist.
     """
 
     ranges: FloatArray
@@ -61,6 +65,7 @@ class Reading(NamedTuple):
     noise: NoiseLaw | None = None
     twist: FloatArray | None = None
     dt: float = 0.0
+    inertial: FloatArray | None = None
 
 
 class Step(NamedTuple):
@@ -100,8 +105,13 @@ def track_epochs(
     """
     state = filter.initial(*prior)
     for reading in readings:
-        if reading.twist is not None:
-            state = filter.predict(state, reading.twist, reading.dt)
+        told = reading.twist
+        if reads(filter) == "inertial":
+            if told is not None and reading.inertial is None:
+                raise ValueError("the filter reads an inertial sensor, and there is none here")
+            told = reading.inertial
+        if told is not None:
+            state = filter.predict(state, told, reading.dt)
         predicted, state = state, _updated(filter, state, reading)
         belief = filter.belief(state)
         if restart is not None and (other := restart(belief, reading.anchors)) is not None:

@@ -15,7 +15,7 @@ from rbl_gym.measurements.noise_laws import WeakenedNoise
 from rbl_gym.studies.epochs import Reading, Step, pose_errors, stack_beliefs, timed, track_epochs
 from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
-from rbl_gym.wrappers.estimate import check_takes_obstacles
+from rbl_gym.wrappers.estimate import check_reads, check_takes_obstacles, inertial_options
 
 __all__ = [
     "SimulatedTrials",
@@ -100,7 +100,7 @@ def bound_of(scene: Scene, episode: simulation.Episode, links: Iterable[BoolArra
         information, _ = scene_bounds.posterior_step(
             scene, at, episode.anchors, measured, information, episode.prior_covariance
         )
-        covariances.append(np.linalg.inv(information))
+        covariances.append(scene_bounds.pose_covariance(information))
     return np.array(covariances)
 
 
@@ -132,8 +132,10 @@ def told_readings(
         if scene.obstacles:
             quality = simulation.link_quality(scene, at, episode.anchors)
             law = WeakenedNoise(told.noise, quality)
-        twist = at.twist if epoch else None
-        readings.append(Reading(measured.ranges, anchors, measured.links, law, twist, told.dt))
+        twist, inertial = (at.twist, at.readings) if epoch else (None, None)
+        readings.append(
+            Reading(measured.ranges, anchors, measured.links, law, twist, told.dt, inertial)
+        )
     return readings
 
 
@@ -146,10 +148,12 @@ def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators
         As `estimators.make`; and for a filter that takes no law of an epoch, in a scene whose
         obstacles give one to every epoch.
     """
+    options = {**inertial_options(name, scene), **options}
     filter = estimators.make(
         name, tags=scene.tags, noise=scene.noise, process=scene.process, **options
     )
     check_takes_obstacles(name, filter, scene)
+    check_reads(name, filter, scene)
     return filter
 
 

@@ -58,7 +58,8 @@ def check_filter(
     ----------
     make_filter
         Called as ``make_filter(tags=..., noise=..., process=...)``; the same that is registered
-        or named by an entry point of the group ``rbl_gym.filters``.
+        or named by an entry point of the group ``rbl_gym.filters``. One whose attribute `reads` is
+        ``"inertial"`` is told the readings of a default `InertialSensor` in place of twists.
     skip
         Checks to leave out, by the names below.
     seed
@@ -127,18 +128,20 @@ def _filter_interface(make_filter: Any, rng: np.random.Generator) -> None:
 
 def _filter_shapes(make_filter: Any, rng: np.random.Generator) -> None:
     for batch in ((), (3,), (2, 2)):
-        epochs = draw_epochs(rng, batch, 2)
-        belief = _beliefs(_made(make_filter), epochs)[-1]
+        filter = _made(make_filter)
+        belief = _beliefs(filter, _drawn(filter, rng, batch, 2))[-1]
         check_shapes("belief", belief, batch, ("rotation", "translation", "covariance", "matrix"))
 
 
 def _filter_pose(make_filter: Any, rng: np.random.Generator) -> None:
-    for belief in _beliefs(_made(make_filter), draw_epochs(rng, (8,), 4)):
+    filter = _made(make_filter)
+    for belief in _beliefs(filter, _drawn(filter, rng, (8,), 4)):
         check_pose("belief", belief)
 
 
 def _filter_batching(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), draw_epochs(rng, (4,), 3)
+    filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (4,), 3)
     together = _beliefs(filter, epochs)[-1]
     for index in range(4):
         alone = _beliefs(filter, trial(epochs, index))[-1]
@@ -152,7 +155,8 @@ def _filter_batching(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_purity(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 2)
+    filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (3,), 2)
     anchors, links = ANCHORS, np.ones(epochs.ranges.shape[1:], dtype=np.bool_)
     links[..., 0, 0] = False
     prior = tuple(array.copy() for array in epochs.prior)
@@ -163,16 +167,16 @@ def _filter_purity(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_determinism(make_filter: Any, rng: np.random.Generator) -> None:
-    epochs = draw_epochs(rng, (3,), 3)
     filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (3,), 3)
     first = _beliefs(filter, epochs)[-1]
     for label, other in (("a second run", filter), ("a filter made alike", _made(make_filter))):
         check_same(f"{label} must give the same bytes", first, _beliefs(other, epochs)[-1], 0.0)
 
 
 def _filter_pickling(make_filter: Any, rng: np.random.Generator) -> None:
-    epochs = draw_epochs(rng, (3,), 2)
     filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (3,), 2)
     state = call("initial", filter.initial, *epochs.prior)
     copies = []
     for label, thing in (("filter", filter), ("state", state)):
@@ -187,12 +191,15 @@ def _filter_pickling(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 3)
-    turn, shift = moved_world(rng)
+    filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (3,), 3)
+    # The sensor moves with the body, and gravity is vertical in both worlds.
+    sensed = _reads_sensor(filter)
+    turn, shift = moved_world(rng, level=sensed)
     both = np.kron(np.eye(2), turn)
     rotation, translation, covariance = epochs.prior
     elsewhere = epochs._replace(
-        twists=epochs.twists @ both.T,
+        twists=epochs.twists if sensed else epochs.twists @ both.T,
         prior=(turn @ rotation, translation @ turn.T + shift, both @ covariance @ both.T),
     )
     expected = moved(_beliefs(filter, epochs)[-1], turn, shift)
@@ -201,7 +208,8 @@ def _filter_invariance(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 1)
+    filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (3,), 1)
     anchors, ranges = ANCHORS, epochs.ranges[0]
     state = call("initial", filter.initial, *epochs.prior)
 
@@ -216,7 +224,8 @@ def _filter_links(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 2)
+    filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (3,), 2)
     links = np.ones(epochs.ranges.shape[1:], dtype=np.bool_)
     links[..., 1, 0] = False
     state = call("initial", filter.initial, *epochs.prior)
@@ -243,12 +252,15 @@ def _filter_noise(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
-    filter, epochs = _made(make_filter), draw_epochs(rng, (3,), 1)
+    filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (3,), 1)
     state = call("initial", filter.initial, *epochs.prior)
     calls = {
         "initial": (filter.initial, ("rotation", "translation", "covariance"), epochs.prior),
         "predict": (
-            lambda twist: filter.predict(state, twist, DT), ("twist",), (epochs.twists[0],)
+            lambda twist: filter.predict(state, twist, DT),
+            ("readings" if _reads_sensor(filter) else "twist",),
+            (epochs.twists[0],),
         ),
         "update": (
             lambda ranges, anchors: filter.update(state, ranges, anchors),
@@ -260,8 +272,9 @@ def _filter_nan(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
-    epochs = draw_epochs(rng, (_TRIALS,), _EPOCHS)
-    beliefs = _beliefs(_made(make_filter), epochs)
+    filter = _made(make_filter)
+    epochs = _drawn(filter, rng, (_TRIALS,), _EPOCHS)
+    beliefs = _beliefs(filter, epochs)
     check_nees(beliefs, epochs.rotation, epochs.translation)
     last = (epochs.rotation[-1], epochs.translation[-1], TAGS)
     found = metrics.tag_error(beliefs[-1].rotation, beliefs[-1].translation, *last)
@@ -272,6 +285,15 @@ def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
         f"after {_EPOCHS} epochs the tags must be nearer to the truth than before the first, got "
         f"{np.median(found):.3g} m, of the prior {np.median(prior):.3g} m",
     )
+
+
+def _reads_sensor(filter: Any) -> bool:
+    """Whether `predict` is told inertial readings in place of the twist."""
+    return getattr(filter, "reads", "twist") == "inertial"
+
+
+def _drawn(filter: Any, rng: np.random.Generator, batch: tuple[int, ...], count: int) -> Epochs:
+    return draw_epochs(rng, batch, count, _reads_sensor(filter))
 
 
 def _made(make_filter: Callable[..., Any], noise: ranging.NoiseLaw = NOISE) -> Any:

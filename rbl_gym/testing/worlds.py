@@ -12,13 +12,14 @@ import numpy as np
 from rbl_gym import metrics, motion
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import bodies, rotations
-from rbl_gym.measurements import ranging
+from rbl_gym.measurements import inertial, ranging
 
 # Neither coplanar, nor when any one of them is left out.
 ANCHORS = np.array([[-6, -5, 0.5], [6, -5, 4], [6, 5, 0], [-6, 5, 3.5], [0, -6, 2], [1, 6, 5.0]])
 TAGS = bodies.octahedron(1.0)
 NOISE, PROCESS = ranging.RangeNoise(0.05), motion.ProcessNoise(0.1, 0.1)
 DT = 0.1
+SENSOR = inertial.InertialSensor()
 _PRIOR_STD = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
 # Results of one computation in another order may differ by so much, in units of themselves.
 _SAME = 1e-6
@@ -28,7 +29,10 @@ _FIELDS = ("rotation", "translation", "covariance")
 
 
 class Epochs(NamedTuple):
-    """A batch of bodies over some epochs, (K, B, ...) but for the prior (B, ...)."""
+    """A batch of bodies over some epochs, (K, B, ...) but for the prior (B, ...).
+
+    `twists` is what `predict` is told: twists (K, B, 6), or inertial readings (K, B, S, 6).
+    """
 
     rotation: FloatArray
     translation: FloatArray
@@ -37,16 +41,22 @@ class Epochs(NamedTuple):
     prior: tuple[FloatArray, FloatArray, FloatArray]
 
 
-def draw_epochs(rng: np.random.Generator, batch: tuple[int, ...], count: int) -> Epochs:
-    """Bodies that drift and turn among `ANCHORS`, their ranges, and a prior drawn around them."""
+def draw_epochs(
+    rng: np.random.Generator, batch: tuple[int, ...], count: int, sensed: bool = False
+) -> Epochs:
+    """Bodies that drift and turn among `ANCHORS`, their ranges, and a prior drawn around them.
+
+    `sensed`: they carry an inertial sensor, and the process noise does not move them.
+    """
     twists = np.zeros((*batch, count, 6))
     twists[..., 1:, :] = 0.5 * rng.standard_normal((*batch, 1, 6))
     start = rotations.random(rng, batch), rng.uniform(-2, 2, (*batch, 3))
     # No motion leads to the first epoch: its twist is of no interval.
-    path = motion.simulate(
-        motion.Trajectory(*start, twists[..., 1:, :]), DT, PROCESS,
-        rng.standard_normal((*batch, count - 1, 6)),
-    )  # fmt: skip
+    trajectory = motion.Trajectory(*start, twists[..., 1:, :])
+    normals = None if sensed else rng.standard_normal((*batch, count - 1, 6))
+    path = motion.simulate(trajectory, DT, PROCESS, normals)
+    if sensed:
+        twists = _sensed(rng, path, twists)
     ranges = ranging.simulate(
         ANCHORS, TAGS, path.rotation, path.translation, NOISE, rng
     ).ranges  # fmt: skip
@@ -58,6 +68,25 @@ def draw_epochs(rng: np.random.Generator, batch: tuple[int, ...], count: int) ->
         for array in (path.rotation, path.translation, twists, ranges)
     )
     return Epochs(rotation, translation, twists, measured, prior)
+
+
+def _sensed(rng: np.random.Generator, path: motion.Path, twists: FloatArray) -> FloatArray:
+    """Readings (..., K, S, 6) of the interval that ends at each epoch; zeros at the first."""
+    *batch, count, _ = twists.shape
+    first = np.zeros((*batch, 1, SENSOR.samples(DT), 6))
+    if count == 1:
+        return first
+    step = DT / SENSOR.samples(DT)
+    # Within an interval the turn goes on about the same axis of the world.
+    middle = step * (np.arange(SENSOR.samples(DT)) + 0.5)[:, None]
+    turns = rotations.exp(middle * twists[..., 1:, None, :3])
+    at = turns @ path.rotation[..., :-1, None, :, :]
+    rate = (np.swapaxes(at, -1, -2) @ twists[..., 1:, None, :3, None])[..., 0]
+    force = inertial.specific_force(at, np.zeros(3))
+    rate, force = (field.reshape((*batch, -1, 3)) for field in (rate, force))
+    read = inertial.simulate(SENSOR, rate, force, rng, step).readings
+    read = read.reshape((*batch, count - 1, -1, 6))
+    return np.concatenate([first, read], axis=-3)
 
 
 def require(condition: Any, message: str) -> None:
@@ -90,9 +119,12 @@ def take(pose: Any, index: int) -> dict[str, FloatArray]:
     return {name: np.asarray(getattr(pose, name))[index] for name in _FIELDS}
 
 
-def moved_world(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """A turn (3, 3) and a shift (3,) of the world."""
-    return rotations.random(rng), np.array([30.0, -20.0, 10.0])
+def moved_world(rng: np.random.Generator, level: bool = False) -> tuple[FloatArray, FloatArray]:
+    """A turn (3, 3), about the vertical alone if `level`, and a shift (3,) of the world."""
+    turn = rotations.random(rng)
+    if level:
+        turn = rotations.exp(rotations.log(turn) * np.array([0.0, 0.0, 1.0]))
+    return turn, np.array([30.0, -20.0, 10.0])
 
 
 def moved(pose: Any, turn: FloatArray, shift: FloatArray) -> dict[str, FloatArray]:

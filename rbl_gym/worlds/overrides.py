@@ -10,6 +10,9 @@ from rbl_gym.checks import check_one_of
 from rbl_gym.geometry.regions import REGIONS, Box
 from rbl_gym.measurements.noise_laws import NOISE_FORMS, NOISE_LAWS
 
+# Fields that take a name or a dict as they are.
+_READ_BY_THEMSELVES = ("inertial",)
+
 
 def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
     """A copy of a frozen dataclass with other fields; nested ones take mappings of their own.
@@ -35,7 +38,9 @@ def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
         if key not in fields:
             raise ValueError(f"{path} has no field {key!r}; it has {', '.join(sorted(fields))}")
         old = getattr(base, key)
-        if isinstance(value, Mapping):
+        if key in _READ_BY_THEMSELVES:
+            values[key] = value
+        elif isinstance(value, Mapping):
             values[key] = _nested(old, value, f"{path}.{key}")
         elif dataclasses.is_dataclass(old) and not dataclasses.is_dataclass(value):
             raise ValueError(f"{path}.{key} must be a dict of its fields, got {value!r:.80}")

@@ -19,6 +19,7 @@ from rbl_gym.checks import (
 from rbl_gym.geometry import rotations
 from rbl_gym.geometry.obstacles import Obstacles, check_obstacles
 from rbl_gym.geometry.regions import REGIONS, Box, Region
+from rbl_gym.measurements import inertial
 from rbl_gym.measurements.ranging import NOISE_LAWS, LinkModel, NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -81,6 +82,10 @@ class Scene:
         ``"drawn"``: the prior mean is drawn around the true pose at epoch 0. ``"start"``: the
         prior is exact one step before epoch 0, as wide as stated, and predicted once (the
         tracking paper).
+    inertial
+        Inertial sensor on the body, which is then read between epochs: an `InertialSensor`, a
+        name or a dict as `measurements.inertial.sensor` takes it; None: there is none. With one
+        the body moves smoothly, as `worlds.inertial_motion` describes.
     """
 
     name: str
@@ -108,6 +113,7 @@ class Scene:
     start_translation: tuple[float, float, float] | None = None
     start_volume: Box | None = None
     prior: str = "drawn"
+    inertial: inertial.InertialSensor | None = None
 
     def __post_init__(self) -> None:
         for name, kinds in _FIELD_KINDS.items():
@@ -150,6 +156,11 @@ class Scene:
                 f"anchors must hold n_anchors = {self.n_anchors} places, got {len(self.anchors)}"
             )
         self._check_trajectory()
+        if self.inertial is not None:
+            object.__setattr__(self, "inertial", inertial.sensor(self.inertial))
+            self.inertial.samples(self.dt)
+            if self.prior == "start":
+                raise ValueError("prior must be 'drawn' in a scene with an inertial sensor")
         if self.anchors is not None and self.anchor_speed_m_s > 0:
             moved = np.abs(self.anchor_region.project(np.array(self.anchors)) - self.anchors)
             if moved.max() > 1e-6:
@@ -192,6 +203,12 @@ class Scene:
         covariance = np.diag(np.square(std))
         covariance.flags.writeable = False
         return covariance
+
+    @functools.cached_property
+    def speed_std_m_s(self) -> float:
+        """Standard deviation of the body's velocity per axis, where nothing else is known of it."""
+        speed = max(self.speed_m_s, float(np.linalg.norm(self.twist[3:])))
+        return max(speed / math.sqrt(3), 1e-3)
 
     @property
     def steps_of_motion(self) -> int:

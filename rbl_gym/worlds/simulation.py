@@ -18,6 +18,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
 from rbl_gym.motion.kinematics import between_waypoints
+from rbl_gym.worlds import inertial_motion
 from rbl_gym.worlds.scene import Scene
 
 __all__ = [
@@ -45,6 +46,10 @@ class Episode(NamedTuple):
     normals, uniforms
         Random numbers of the ranges (..., T + 1, M, N); of the links (..., T + 1, 2, M, N) or
         None where they need none.
+    velocity, readings, bias
+        Of a scene with an inertial sensor, else None: true velocity (..., T + 1, 3); readings
+        (..., T + 1, S, 6) of the interval that ends at each epoch, zero at epoch 0; the sensor's
+        biases (..., T + 1, 6) at the epochs.
     prior_rotation, prior_translation, prior_covariance
         Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
     anchors
@@ -56,6 +61,9 @@ class Episode(NamedTuple):
     twists: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
+    velocity: FloatArray | None
+    readings: FloatArray | None
+    bias: FloatArray | None
     prior_rotation: FloatArray
     prior_translation: FloatArray
     prior_covariance: FloatArray
@@ -63,13 +71,16 @@ class Episode(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An episode at one epoch: the first five fields of `Episode` without their time axis."""
+    """An episode at one epoch: the first eight fields of `Episode` without their time axis."""
 
     rotation: FloatArray
     translation: FloatArray
     twist: FloatArray
     normals: FloatArray
     uniforms: FloatArray | None
+    velocity: FloatArray | None = None
+    readings: FloatArray | None = None
+    bias: FloatArray | None = None
 
 
 class Motion(NamedTuple):
@@ -137,10 +148,11 @@ def _links(scene: Scene) -> int:
     return scene.n_anchors * len(scene.tags)
 
 
-def _normal_sizes(scene: Scene) -> tuple[int, int, int, int]:
-    """Normals of the start, the process, the ranges, the random twists."""
+def _normal_sizes(scene: Scene) -> tuple[int, int, int, int, int]:
+    """Normals of the start, the process, the ranges, the random twists, the inertial sensor."""
     held = -(-scene.steps_of_motion // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
-    return _START_NORMALS, 6 * scene.steps_of_motion, (scene.steps + 1) * _links(scene), held
+    ranges, felt = (scene.steps + 1) * _links(scene), inertial_motion.normals_of(scene)
+    return _START_NORMALS, 6 * scene.steps_of_motion, ranges, held, felt
 
 
 def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
@@ -153,13 +165,21 @@ def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
 def build_episode(scene: Scene, draws: Draws) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, _, held = _split(draws.normals, _normal_sizes(scene))
+    start, process, _, held, felt = _split(draws.normals, _normal_sizes(scene))
     places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = scene.steps_of_motion
-    path = motion.simulate(trajectory, scene.dt, scene.process, process.reshape((*batch, steps, 6)))
+    process = process.reshape((*batch, steps, 6))
     twists = np.zeros((*batch, scene.steps + 1, 6))
-    twists[..., scene.steps + 1 - steps :, :] = trajectory.twists
+    inertial = (None, None, None)
+    if scene.inertial is not None:
+        track = inertial_motion.fly(scene, trajectory, process, felt)
+        path = motion.Path(track.rotation, track.translation)
+        twists[..., 1:, :] = track.twists
+        inertial = track.velocity, track.readings, track.bias
+    else:
+        path = motion.simulate(trajectory, scene.dt, scene.process, process)
+        twists[..., scene.steps + 1 - steps :, :] = trajectory.twists
     offset = start[..., 7:]
     covariance = scene.prior_covariance
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
@@ -185,7 +205,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
         anchors = np.full((*batch, scene.n_anchors, 3), scene.anchors)
     covariance = np.full((*batch, 6, 6), covariance)
     random = of_ranges(scene, draws)
-    return Episode(*path, twists, *random, *prior, covariance, anchors)
+    return Episode(*path, twists, *random, *inertial, *prior, covariance, anchors)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
@@ -230,12 +250,20 @@ def _trajectory(
 
 def epoch_of(episode: Episode, epoch: int) -> Epoch:
     """Views of an episode at one epoch, the same for the whole batch."""
+    inertial = (None, None, None)
+    if episode.velocity is not None:
+        inertial = (
+            episode.velocity[..., epoch, :],
+            episode.readings[..., epoch, :, :],  # pyright: ignore[reportOptionalSubscript]
+            episode.bias[..., epoch, :],  # pyright: ignore[reportOptionalSubscript]
+        )
     return Epoch(
         episode.rotation[..., epoch, :, :],
         episode.translation[..., epoch, :],
         episode.twists[..., epoch, :],
         episode.normals[..., epoch, :, :],
         None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
+        *inertial,
     )
 
 

@@ -1,0 +1,248 @@
+"""A body whose heading nobody knows: several filters side by side, weighed by their likelihood.
+
+Gravity gives roll and pitch at once; the yaw shows in the ranges, of one tag only as it moves. The
+hypotheses start at headings around the circle; each epoch multiplies their weights by its
+likelihood. What cannot be any more is left out, what has become one is merged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, check_array, check_count
+from rbl_gym.estimators.costs.bias_cost import AugmentedState
+from rbl_gym.estimators.filter import Filter, PoseBelief, reads, register
+from rbl_gym.estimators.iekf.augmented import AugmentedEkf
+from rbl_gym.estimators.iekf.inertial import InertialEkf
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.estimators.innovation import innovations
+from rbl_gym.estimators.inputs import check_epoch, epoch_variance
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements.inertial import InertialSensor
+from rbl_gym.measurements.inertial import sensor as sensor_of
+from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
+from rbl_gym.motion.kinematics import ProcessNoise
+
+# Hypotheses with less than this share of the weight have lost.
+_LOST = 1e-8
+# Nearer to the leader than so many of its standard deviations, squared and over six states, a
+# hypothesis is the same.
+_SAME = 0.3
+
+
+class HeadingState(NamedTuple):
+    """Hypotheses (..., H): the fields of `AugmentedState`, and the logarithms of their weights."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    extra: FloatArray
+    covariance: FloatArray
+    log_weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class HeadingBank:
+    """Filters that start at several headings.
+
+    Parameters
+    ----------
+    filter
+        What each hypothesis runs.
+    headings
+        How many, around the circle or, where the prior knows the yaw to better than that, over
+        five of its standard deviations.
+    """
+
+    filter: AugmentedEkf
+    headings: int = 12
+
+    @property
+    def reads(self) -> str:
+        """What `predict` is told: as of the filter."""
+        return reads(self.filter)
+
+    def __post_init__(self) -> None:
+        check_count("headings", self.headings, least=2)
+
+    def initial(
+        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
+    ) -> HeadingState:
+        """State of a prior of the pose; the covariance (..., 6, 6) says how open the yaw is.
+
+        Raises
+        ------
+        ValueError
+            As `IteratedEkf.initial`.
+        """
+        start = self.filter.initial(rotation, translation, covariance)
+        std = np.sqrt(start.covariance[..., 2, 2])[..., None]
+        spacing = np.minimum(5 * std, 2 * math.pi) / self.headings
+        yaw = spacing * (np.arange(self.headings) - 0.5 * (self.headings - 1))
+        log_weights = -0.5 * (yaw / std) ** 2
+        turn = rotations.exp(yaw[..., None] * np.array([0.0, 0.0, 1.0]))
+        n = start.covariance.shape[-1]
+        # The yaw of a hypothesis is known to its share of the spread; the rest follows.
+        scale = np.ones((*std.shape[:-1], n))
+        scale[..., 2] = np.minimum(0.7 * spacing / std, 1.0)[..., 0]
+        P = start.covariance * scale[..., :, None] * scale[..., None, :]
+        batch = (*start.translation.shape[:-1], self.headings)
+
+        def each(field: FloatArray, trailing: int) -> FloatArray:
+            field = np.expand_dims(field, -1 - trailing)
+            return np.broadcast_to(field, (*batch, *field.shape[field.ndim - trailing :])).copy()
+
+        return HeadingState(
+            turn @ start.rotation[..., None, :, :], each(start.translation, 1),
+            each(start.extra, 1), each(P, 2), _normal(np.broadcast_to(log_weights, batch)),
+        )  # fmt: skip
+
+    def predict(self, state: HeadingState, twist: ArrayLike, dt: Any) -> HeadingState:
+        """State after `dt` seconds, as that of the filter, of all hypotheses.
+
+        Parameters
+        ----------
+        state, dt
+            The state, and seconds.
+        twist
+            What the filter reads: a twist (..., 6), or inertial readings (..., S, 6).
+        """
+        told, shape = ("readings", ("S", 6)) if self.reads == "inertial" else ("twist", (6,))
+        twist = np.expand_dims(check_array(told, twist, shape), -1 - len(shape))
+        steps = np.expand_dims(np.asarray(dt), -2) if np.ndim(dt) else dt
+        moved: AugmentedState = self.filter.predict(_filtered(state), twist, steps)  # pyright: ignore[reportArgumentType]
+        return HeadingState(*moved, state.log_weights)
+
+    def update(
+        self,
+        state: HeadingState,
+        ranges: ArrayLike,
+        anchors: ArrayLike,
+        links: ArrayLike | None = None,
+        noise: NoiseLaw | None = None,
+    ) -> HeadingState:
+        """As that of the filter, of all hypotheses, which are weighed, merged and dropped."""
+        pose = self.filter.pose
+        measured, places, mask = check_epoch(ranges, anchors, links, pose.tags)
+        variance = epoch_variance(noise, pose.noise, measured, mask)
+        std = np.sqrt(np.broadcast_to(variance, measured.shape))
+        # An axis for the hypotheses.
+        measured, places, std = (a[..., None, :, :] for a in (measured, places, std))
+        mask, law = None if mask is None else mask[..., None, :, :], LinkNoise(std)
+        before = _filtered(state)
+        after = self.filter.update(before, measured, places, mask, law)
+        told = innovations(self.filter, before, after, measured, places, pose.tags, law, mask)
+        return _pruned(HeadingState(*after, _normal(state.log_weights + told.log_likelihood)))
+
+    def belief(self, state: HeadingState) -> PoseBelief:
+        """The likeliest pose, with a covariance that covers the others by their weights."""
+        best = np.argmax(state.log_weights, axis=-1)
+        weights = np.exp(state.log_weights)[..., None, None]
+
+        def leading(field: FloatArray, trailing: int) -> FloatArray:
+            index = best.reshape(*best.shape, *[1] * (trailing + 1))
+            return np.take_along_axis(field, index, axis=-1 - trailing).squeeze(-1 - trailing)
+
+        rotation, translation = leading(state.rotation, 2), leading(state.translation, 1)
+        turn = rotations.error(rotation[..., None, :, :], state.rotation)
+        gap = np.concatenate([turn, translation[..., None, :] - state.translation], axis=-1)
+        spread = state.covariance[..., :6, :6] + gap[..., :, None] * gap[..., None, :]
+        return PoseBelief(rotation, translation, (weights * spread).sum(axis=-3), rotation.copy())
+
+    def leader(self, state: HeadingState) -> AugmentedState:
+        """The likeliest hypothesis."""
+        best = np.argmax(state.log_weights, axis=-1)[..., None]
+        return AugmentedState(
+            *(
+                np.take_along_axis(field, best.reshape(*best.shape, *[1] * n), -1 - n).squeeze(
+                    -1 - n
+                )
+                for field, n in zip(state[:4], (2, 1, 1, 2), strict=True)
+            )
+        )
+
+
+def _filtered(state: HeadingState) -> AugmentedState:
+    return AugmentedState(*state[:4])
+
+
+def _normal(log_weights: FloatArray) -> FloatArray:
+    """Weights that add up to 1."""
+    log_weights = log_weights - log_weights.max(axis=-1, keepdims=True)
+    return log_weights - np.log(np.exp(log_weights).sum(axis=-1, keepdims=True))
+
+
+def _pruned(state: HeadingState) -> HeadingState:
+    """One body's state without what has lost or has become the leader; a batch keeps its shape."""
+    if state.log_weights.ndim > 1 or len(state.log_weights) == 1:
+        return state
+    best = int(np.argmax(state.log_weights))
+    turn = rotations.error(state.rotation, state.rotation[best])
+    gap = np.concatenate([turn, state.translation - state.translation[best]], axis=-1)
+    scaled = np.linalg.solve(state.covariance[best, :6, :6], gap[..., None])
+    same = np.einsum("hi,hi->h", gap, scaled[..., 0]) < 6 * _SAME
+    kept = (state.log_weights > math.log(_LOST)) & ~same
+    kept[best] = True
+    if kept.all():
+        return state
+    weights = state.log_weights.copy()
+    weights[best] = np.log(np.exp(weights[same]).sum())
+    return HeadingState(*(field[kept] for field in state[:4]), _normal(weights[kept]))
+
+
+def iekf_imu(
+    tags: FloatArray,
+    noise: NoiseLaw,
+    process: ProcessNoise,
+    iterations: int = 4,
+    robust: bool = False,
+    inertial: str | Mapping[str, Any] | InertialSensor = "consumer",
+    speed_m_s: float = 1.0,
+    gravity_tilt_rad: float = 0.0,
+    bias_std_m: float = 0.0,
+    common_std_m: float = 0.0,
+    drift_std_m: float = 0.0,
+    drift_time_s: float = 20.0,
+    headings: int = 1,
+) -> Filter:
+    """The filter ``"iekf-imu"``: pose, velocity and the biases of an inertial sensor.
+
+    Parameters
+    ----------
+    tags, noise, iterations, robust
+        As `IteratedEkf`.
+    process
+        Not used: what moves the body is measured.
+    inertial
+        As `measurements.inertial.sensor` takes it.
+    speed_m_s, gravity_tilt_rad
+        As `InertialEkf`.
+    bias_std_m, common_std_m
+        Biases of the links that stay: of each, and one that all have in common, metres.
+    drift_std_m, drift_time_s
+        Biases of the links that drift, and in what time; as `LinkBias`. 0: there are none.
+    headings
+        1, or how many hypotheses of the heading there are at the start.
+    """
+    biases = []
+    if bias_std_m or common_std_m:
+        biases.append(LinkBias(bias_std_m, None, common_std_m))
+    if drift_std_m:
+        biases.append(LinkBias(drift_std_m, drift_time_s))
+    filter = InertialEkf(
+        IteratedEkf(tags, noise, process, iterations, robust),
+        biases=tuple(biases),
+        inertial=sensor_of(inertial),
+        speed_m_s=speed_m_s,
+        gravity_tilt_rad=gravity_tilt_rad,
+    )
+    return filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
+
+
+register("iekf-imu", iekf_imu)

@@ -1,0 +1,186 @@
+"""Smooth motion: what an inertial sensor on a body feels along a path.
+
+A path of poses at times has no acceleration. Two curves give it one: cubic splines through the
+poses (`through`), and uniform cubic B-splines that poses only pull on (`bspline`), in the
+cumulative form on SO(3) (Sommer et al., CVPR 2020), which round the corners of a polyline.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, check_array, check_number, kernel
+from rbl_gym.geometry import rotations
+
+__all__ = ["SmoothMotion", "bspline", "from_function", "through"]
+
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _ERROR = kernel(rotations.exp), kernel(rotations.error)
+
+
+class SmoothMotion(NamedTuple):
+    """A body at some times (..., T).
+
+    Attributes
+    ----------
+    rotation, translation, velocity
+        (..., T, 3, 3), (..., T, 3) metres, (..., T, 3) m/s.
+    turn_rate
+        (..., T, 3) rad/s in the body frame.
+    acceleration
+        (..., T, 3) m/s^2 in the world frame.
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+    velocity: FloatArray
+    turn_rate: FloatArray
+    acceleration: FloatArray
+
+
+def bspline(
+    rotation: ArrayLike, translation: ArrayLike, spacing_s: float, times: ArrayLike
+) -> SmoothMotion:
+    """A uniform cubic B-spline of poses: it starts at the first, and passes near the others.
+
+    Position, velocity and acceleration are continuous, as are rotation, turn rate and its
+    derivative; what the poses do at a constant twist, it does too.
+
+    Parameters
+    ----------
+    rotation, translation
+        Control poses (..., K, 3, 3), (..., K, 3), K >= 2, turns of less than 180 degrees apart.
+    spacing_s
+        Seconds between them; the first is at 0.
+    times
+        (T,) seconds from 0 to ``(K - 2) spacing_s``.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, or times outside.
+    """
+    R = rotations.check_rotation("rotation", rotation)
+    p = check_array("translation", translation, ("K", 3))
+    spacing_s = check_number("spacing_s", spacing_s, low=1e-9)
+    times = check_array("times", times, ("T",))
+    count = p.shape[-2]
+    if R.ndim < 3 or R.shape[-3] != count or count < 2:
+        raise ValueError(
+            f"rotation and translation must hold the same 2 poses or more, got {R.shape} and "
+            f"{p.shape}"
+        )
+    at = times / spacing_s
+    if times.ndim != 1 or at.min() < 0 or at.max() > count - 2 + 1e-9:
+        raise ValueError(
+            f"times must be (T,) from 0 to {(count - 2) * spacing_s:g}, got {times.min():g} to "
+            f"{times.max():g}"
+        )
+    # One more pose before the first, so that the curve starts there.
+    p = np.concatenate([2 * p[..., :1, :] - p[..., 1:2, :], p], axis=-2)
+    turns = _ERROR(R[..., 1:, :, :], R[..., :-1, :, :])
+    before = _EXP(-turns[..., :1, :]) @ R[..., :1, :, :]
+    R = np.concatenate([before, R], axis=-3)
+    turns = np.concatenate([turns[..., :1, :], turns], axis=-2)
+    moves = np.diff(p, axis=-2)
+    # Of the four poses around a time the first is i.
+    i = np.clip(np.floor(at).astype(int), 0, max(count - 3, 0))
+    u = (at - i)[:, None]
+    shares = (5 + 3 * u - 3 * u**2 + u**3, 1 + 3 * u + 3 * u**2 - 2 * u**3, u**3)
+    rates = (3 - 6 * u + 3 * u**2, 3 + 6 * u - 6 * u**2, 3 * u**2)
+    changes = (6 * u - 6, 6 - 12 * u, 6 * u)
+    Q, place = R[..., i, :, :], p[..., i, :]
+    turn_rate = speed = acceleration = np.zeros_like(place)
+    for k in range(3):
+        # The last control may be missing where its share is 0.
+        j = np.minimum(i + k, count - 1)
+        turn, move = turns[..., j, :], moves[..., j, :]
+        step = _EXP(shares[k] / 6 * turn)
+        Q = step @ Q
+        turn_rate = rates[k] / 6 * turn + (step @ turn_rate[..., None])[..., 0]
+        place = place + shares[k] / 6 * move
+        speed = speed + rates[k] / 6 * move
+        acceleration = acceleration + changes[k] / 6 * move
+    turn_rate = (np.swapaxes(Q, -1, -2) @ turn_rate[..., None])[..., 0]
+    return SmoothMotion(
+        Q, place, speed / spacing_s, turn_rate / spacing_s, acceleration / spacing_s**2
+    )
+
+
+def through(
+    times: ArrayLike, rotation: ArrayLike, translation: ArrayLike, at: ArrayLike
+) -> SmoothMotion:
+    """Cubic splines through the poses of one body: continuous to the second derivative.
+
+    What noise the poses have, the accelerations have many times.
+
+    Parameters
+    ----------
+    times, rotation, translation
+        Known poses: (K,) seconds, increasing, K >= 2; (K, 3, 3) and (K, 3).
+    at
+        Times (T,) between the first and the last.
+
+    Raises
+    ------
+    ValueError
+        On wrong shapes, times that do not increase, and times outside.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    times, at = check_array("times", times, ("K",)), check_array("at", at, ("T",))
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, ("K", 3))
+    count = len(times)
+    if times.ndim != 1 or count < 2 or (np.diff(times) <= 0).any():
+        raise ValueError("times must be (K,) with K >= 2 and strictly increasing")
+    if rotation.shape != (count, 3, 3) or translation.shape != (count, 3):
+        raise ValueError(
+            f"rotation and translation must be of {count} times, got {rotation.shape} and "
+            f"{translation.shape}"
+        )
+    if at.ndim != 1 or at.min() < times[0] or at.max() > times[-1]:
+        raise ValueError(f"at must lie in [{times[0]:g}, {times[-1]:g}], got {at.min():g}")
+    line, turning = (
+        CubicSpline(times, translation),
+        RotationSpline(times, Rotation.from_matrix(rotation)),
+    )
+    return SmoothMotion(turning(at).as_matrix(), line(at), line(at, 1), turning(at, 1), line(at, 2))
+
+
+def from_function(
+    pose: Callable[[FloatArray], tuple[ArrayLike, ArrayLike]], at: ArrayLike, step_s: float = 1e-3
+) -> SmoothMotion:
+    """The motion of a smooth function of time, by central differences of fourth order.
+
+    Parameters
+    ----------
+    pose
+        From times (T,) to a rotation (..., T, 3, 3) and a translation (..., T, 3).
+    at
+        Times (T,), seconds.
+    step_s
+        Of the differences: errors grow with its fourth power, those of rounding with 1 / step^2.
+
+    Raises
+    ------
+    ValueError
+        On what is no pose.
+    """
+    at = check_array("at", at, ("T",))
+    step_s = check_number("step_s", step_s, low=1e-9)
+    near = [pose(at + k * step_s) for k in (-2, -1, 0, 1, 2)]
+    R = np.stack([rotations.check_rotation("rotation", one[0]) for one in near])
+    p = np.stack([check_array("translation", one[1], ("T", 3)) for one in near])
+    first = np.array([1, -8, 0, 8, -1]) / (12 * step_s)
+    second = np.array([-1, 16, -30, 16, -1]) / (12 * step_s**2)
+    turns = _ERROR(np.swapaxes(R[2], -1, -2) @ R, np.eye(3))
+    return SmoothMotion(
+        R[2], p[2], np.tensordot(first, p, 1), np.tensordot(first, turns, 1),
+        np.tensordot(second, p, 1),
+    )  # fmt: skip

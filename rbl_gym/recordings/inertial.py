@@ -1,0 +1,113 @@
+"""The log of an inertial sensor: read, checked for its units, cut at the times of epochs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_number, check_one_of
+from rbl_gym.measurements.inertial import GRAVITY_M_S2
+from rbl_gym.recordings.tables import AnyPath, Source, read_table
+
+__all__ = ["InertialLog", "read_inertial", "samples_between"]
+
+_COLUMNS = ("t", "wx", "wy", "wz", "ax", "ay", "az")
+TURN_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
+FORCE_UNITS = {"m/s^2": 1.0, "g": GRAVITY_M_S2}
+# No sensor on a body turns as fast; a median force outside of these is no force under gravity.
+_MAX_RATE, _FORCE = 150.0, (0.3, 4.0)
+
+
+class InertialLog(NamedTuple):
+    """Readings of an inertial sensor: times (K,), and (K, 6) in rad/s and m/s^2, as it sits."""
+
+    times: FloatArray
+    readings: FloatArray
+
+
+def read_inertial(
+    path: AnyPath,
+    *,
+    columns: Mapping[str, str] | None = None,
+    turn_unit: str = "rad/s",
+    force_unit: str = "m/s^2",
+) -> InertialLog:
+    """The log of an inertial sensor: a table with the columns t, wx, wy, wz, ax, ay, az.
+
+    Parameters
+    ----------
+    path
+        A text file with a header; further columns do not matter.
+    columns
+        Name here -> name in the file, where these differ: ``{"wx": "gyro_x"}``.
+    turn_unit, force_unit
+        ``"rad/s"`` or ``"deg/s"``, ``"m/s^2"`` or ``"g"``: what the file has.
+
+    Raises
+    ------
+    ValueError
+        On a cell that is no number, times that do not increase (by file, line and column), a
+        column that is not there, and readings that cannot be in these units.
+    """
+    turn = TURN_UNITS[check_one_of("turn_unit", turn_unit, list(TURN_UNITS))]
+    force = FORCE_UNITS[check_one_of("force_unit", force_unit, list(FORCE_UNITS))]
+    for name in columns or {}:
+        check_one_of("columns", name, list(_COLUMNS))
+    table = read_table(path, Source(dict(columns or {})))
+    table.require(*_COLUMNS)
+    times = table.times()
+    values = [table.numbers(name) for name in _COLUMNS[1:]]
+    readings = np.stack(values, axis=-1) * np.repeat([turn, force], 3)
+    fastest = float(np.quantile(np.linalg.norm(readings[:, :3], axis=-1), 0.99))
+    if fastest > _MAX_RATE:
+        raise ValueError(
+            f"{table.path}: angular velocities of {fastest:.3g} rad/s, of a log in {turn_unit} "
+            "(looks like deg/s? say turn_unit='deg/s')"
+        )
+    usual = float(np.median(np.linalg.norm(readings[:, 3:], axis=-1))) / GRAVITY_M_S2
+    if not _FORCE[0] < usual < _FORCE[1]:
+        raise ValueError(
+            f"{table.path}: the median specific force is {usual:.3g} g, of a log in {force_unit} "
+            f"(looks like {'g, or gravity was taken off' if usual < 1 else 'm/s^2'}?)"
+        )
+    return InertialLog(times, readings)
+
+
+def samples_between(
+    log: InertialLog, start_s: float, end_s: float, max_gap_s: float = 0.1
+) -> tuple[FloatArray, FloatArray]:
+    """Readings (S, 6) between two times, and the seconds (S,) for which each of them counts.
+
+    A reading counts from half way to the one before until half way to the next.
+
+    Parameters
+    ----------
+    log, start_s, end_s
+        The log, and two times on its clock, the second not before the first.
+    max_gap_s
+        Time without a reading that is bridged, or that may lie outside the log.
+
+    Raises
+    ------
+    ValueError
+        If the times are not in order, or the log has a longer gap there.
+    """
+    start_s = check_number("start_s", start_s)
+    end_s = check_number("end_s", end_s, low=start_s)
+    max_gap_s = check_number("max_gap_s", max_gap_s, low=0.0)
+    times = log.times
+    middle = 0.5 * (times[1:] + times[:-1])
+    first, last = np.searchsorted(middle, [start_s, end_s])
+    edges = np.concatenate([[start_s], middle[first:last], [end_s]])
+    # The readings within, and those on both sides.
+    near = times[max(np.searchsorted(times, start_s, side="right") - 1, 0) :]
+    near = near[: np.searchsorted(near, end_s) + 1]
+    gap = max(float(np.diff(near).max(initial=0.0)), times[0] - start_s, end_s - times[-1])
+    if gap > max_gap_s:
+        raise ValueError(
+            f"log must have readings from {start_s:g} to {end_s:g} s, {gap:.3g} s of them are "
+            f"missing, more than max_gap_s = {max_gap_s:g}"
+        )
+    return log.readings[first : last + 1], np.diff(edges)
