@@ -108,7 +108,7 @@ def test_the_fault_put_in_is_named(fault):
     assert 0.7 < cause["nis_per_dof"] < 1.6
     assert WORDS.get(fault, "") in cause["text"]
     # Ranges far too long for the room may fit a mirror pose as well.
-    whole = found["nis_per_dof"] > 2 or found["refused_share"] > 0.2
+    whole = found["nis_per_dof"] > 1.5 or found["refused_share"] > 0.2
     subject = "the filter contradicts its data" if whole else "a part of the ranges contradicts"
     assert notes[-1].startswith(f"WARNING: {subject}")
     assert cause["text"] in notes[-1]

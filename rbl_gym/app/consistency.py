@@ -21,6 +21,8 @@ _HEADINGS = ("ranges", "mean (m)", "spread (m)", "refused (%)")
 
 def print_consistency(console: Any, result: dict[str, Any]) -> None:
     """NIS and a table of the residuals of anchors and tags; nothing where they were not made."""
+    if "tuned" in result:
+        console.print(tuned_text(result["tuned"]))
     found = result.get("consistency")
     if found is None:
         return
@@ -39,6 +41,15 @@ def print_consistency(console: Any, result: dict[str, Any]) -> None:
         for row in rows:
             table.add_row(f"{kind} {row[kind]}", *_cells(row))
     console.print(table)
+
+
+def tuned_text(found: dict[str, Any]) -> str:
+    """What was tuned, as options that can be repeated."""
+    return (
+        f"tuned on {found['epochs']} epochs of the first {found['seconds']:.1f} s: "
+        f"{found['options']} (log-likelihood per range {found['log_likelihood']:.3f}, with the "
+        f"settings given {found['log_likelihood_before']:.3f})"
+    )
 
 
 def _size(row: dict[str, Any]) -> float:
@@ -86,6 +97,7 @@ def consistency_parts(replayed: Replayed) -> list[str]:
     ]
     headings = ["likely cause", "NIS per dof without it", "of the excess explained (%)"]
     residuals = found["residuals"]
+    tuned = replayed.figures.get("tuned")
     parts = [
         "<h2>Is the filter at one with its data?</h2>",
         page.note(
@@ -98,6 +110,8 @@ def consistency_parts(replayed: Replayed) -> list[str]:
         ),
         page.plot(_charts(replayed), "consistency", first=False),
     ]
+    if tuned is not None:
+        parts.append(page.note(f"{tuned_text(tuned)}.".capitalize()))
     if causes:
         parts.append(page.table("likely causes", headings, causes))
     for kind, names in (("anchors", ["anchor"]), ("tags", ["tag"]), ("links", ["anchor", "tag"])):

@@ -34,6 +34,7 @@ def add_replay(commands: Any) -> None:
     _add_knowledge(replay.add_argument_group("what is known of the body's place"))
     _add_filter(replay.add_argument_group("filter"))
     _add_motion(replay.add_argument_group("how the body moves"))
+    _add_tuning(replay.add_argument_group("settings by the likelihood of the log"))
     _add_biases(replay.add_argument_group("biases of the links (filter iekf-bias)"))
     _add_smoothing(replay.add_argument_group("the smoothed track"))
     _add_comparison(replay.add_argument_group("comparison with the truth"))
@@ -89,6 +90,16 @@ def _add_motion(group: Any) -> None:
         "--accel-deg",
         "filter iekf-cv: of the turn rate (deg/s) after 1 s, default 30",
     )
+
+
+def _add_tuning(group: Any) -> None:
+    group.add_argument(
+        "--tune",
+        action="store_true",
+        help="choose --range-std-m and the motion (--walk-..., of an estimated twist --accel-...) "
+        "by the likelihood of the log's first part; the truth is not looked at",
+    )
+    _add_number(group, "--tune-s", "length of that part, default 20; tunes as --tune does")
 
 
 def _add_biases(group: Any) -> None:
@@ -172,13 +183,18 @@ def _replay(options: argparse.Namespace) -> int:
         recordings.check_track_path(options.track)
     settings = _settings(options)
     runs = read_runs(options)
-    if len(runs) > 1:
-        return _replay_runs(options, runs, settings)
-    (recording,) = runs.values()
     # What is wrong is said before the work begins.
-    replay.check_replay(recording, settings)
+    for recording in runs.values() if len(runs) == 1 else ():
+        replay.check_replay(recording, settings)
+    tuned = _tuned(options, runs, settings)
+    settings = settings if tuned is None else tuned.settings
+    if len(runs) > 1:
+        return _replay_runs(options, runs, settings, tuned)
+    (recording,) = runs.values()
     with progress("replay", len(recording.times)) as advance:
         replayed = replay.replay_recording(recording, settings, advance)
+    if tuned is not None:
+        replayed.figures["tuned"] = tuned.figures()
     if options.track:
         best = replayed.track if replayed.smoothed is None else replayed.smoothed.track
         recordings.write_track(options.track, replay.track_file(recording, best))
@@ -198,7 +214,19 @@ def _replay(options: argparse.Namespace) -> int:
     return 0
 
 
-def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any) -> int:
+def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
+    """What the longest run tells of the settings, where that is asked for."""
+    if not options.tune and options.tune_s is None:
+        return None
+    from rbl_gym.studies import replay
+
+    longest = max(runs.values(), key=lambda run: len(run.times))
+    length = {} if options.tune_s is None else {"seconds": options.tune_s}
+    with progress("tune", replay.TUNING_ROUNDS) as advance:
+        return replay.tune(longest, settings, advance=advance, **length)
+
+
+def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any, tuned: Any) -> int:
     from rbl_gym.app import reports
     from rbl_gym.studies import replay
 
@@ -209,6 +237,8 @@ def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any) -> int:
         )
     with progress("replay", sum(len(run.times) for run in runs.values())) as advance:
         replayed = replay.replay_runs(runs, settings, advance)
+    if tuned is not None:
+        replayed.figures["tuned"] = tuned.figures()
     if write_json(replayed.figures, options.json):
         reports.print_runs(replayed.figures)
     return 0

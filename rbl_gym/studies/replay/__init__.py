@@ -40,9 +40,11 @@ from rbl_gym.studies.replay.tracking import (
     track_recording,
 )
 from rbl_gym.studies.replay.truth import check_overlap
+from rbl_gym.studies.replay.tuning import TUNING_ROUNDS, Tuned, tune
 
 __all__ = [
     "DEFAULT_RANGE_STD_M",
+    "TUNING_ROUNDS",
     "Biases",
     "Cause",
     "Comparison",
@@ -58,6 +60,7 @@ __all__ = [
     "Smoothing",
     "Track",
     "TrackErrors",
+    "Tuned",
     "check_overlap",
     "check_replay",
     "contradicts",
@@ -83,5 +86,6 @@ __all__ = [
     "track_recording",
     "truth_of",
     "truth_path",
+    "tune",
     "volume_of",
 ]

@@ -78,9 +78,11 @@ def likely_causes(recording: Recording, settings: Settings, found: Innovations) 
         # Schwarz's criterion: numbers that were fitted have their price.
         price = 0.5 * np.log(trial.recording.links.sum())
         fitted = np.array([supposition.parameters for supposition in suppositions])
+        density = np.log([supposition.scale for supposition in suppositions])
         likelihood = tried.log_likelihood.sum(axis=1) - price * fitted
+        likelihood += density * tried.dof.sum(axis=1)
         best = int(np.argmax(likelihood))
-        kind, text, mended, _ = suppositions[best]
+        kind, text, mended, *_ = suppositions[best]
         chosen = tried.part(slice(best, best + 1))
         after = max(_excess(mended, chosen), 0.0) / excess
         if left - after < _WORTH or not likelihood[best] > here.log_likelihood[0].sum():

@@ -16,7 +16,7 @@ __all__ = ["contradicts", "nis_curve", "residual_tables"]
 
 # A filter contradicts its data where the normalised innovations squared of a log, or of a tenth of
 # it, are more than so many times what they should be, or so large a share of ranges is refused ...
-MOST_NIS, MOST_REFUSED, _PART = 2.0, 0.2, 0.1
+MOST_NIS, MOST_REFUSED, _PART = 1.5, 0.2, 0.1
 # ... and chance does not explain it.
 _CHANCE = 1e-6
 _BLOCKS = 20

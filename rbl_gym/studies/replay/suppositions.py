@@ -14,7 +14,7 @@ from rbl_gym.measurements import ranging
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.evidence import Evidence, Trial, std_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M
-from rbl_gym.studies.replay.tracking import recording_filter
+from rbl_gym.studies.replay.tracking import accel_of, recording_filter
 
 # Anchors or tags beyond so many are not tried in pairs, but for the most contradicted.
 _IN_PAIRS = 12
@@ -39,12 +39,14 @@ class Supposition(NamedTuple):
     """What kind of fault, its words, the log and the settings without it, and what it fits.
 
     `parameters`: how many numbers were chosen for it; that many more make any log likelier.
+    `scale`: by how much it shrinks the ranges, which makes their density larger by as much.
     """
 
     kind: str
     text: str
     trial: Trial
     parameters: int = 1
+    scale: float = 1.0
 
 
 def first_suppositions(trial: Trial) -> Iterator[Supposition]:
@@ -61,7 +63,8 @@ def first_suppositions(trial: Trial) -> Iterator[Supposition]:
             yield Supposition(f"{kind}-swapped", text, changed)
     for scale, unit in _UNITS:
         shrunk = recording._replace(ranges=scale * recording.ranges)
-        yield Supposition("units", f"the ranges look like {unit}", _with(trial, shrunk))
+        text = f"the ranges look like {unit}"
+        yield Supposition("units", text, _with(trial, shrunk), scale=scale)
         for field in ("anchors", "tags"):
             changed = recording._replace(**{field: scale * getattr(recording, field)})
             text = f"the places of the {field} look like {unit}"
@@ -151,8 +154,9 @@ def _of_settings(trial: Trial) -> Iterator[Supposition]:
 
     motion = settings.motion
     if getattr(recording_filter(recording, settings), "twist", None) is not None:
+        accel_m, accel_deg = accel_of(settings)
         for wider in _WIDER:
-            changed = {"accel_m": wider * motion.accel_m, "accel_deg": wider * motion.accel_deg}
+            changed = {"accel_m": wider * accel_m, "accel_deg": wider * accel_deg}
             yield supposed("acceleration", _moves("acceleration", changed), **changed)
     else:
         walk = max(motion.walk_m, _LEAST_WALK_M), max(motion.walk_deg, _LEAST_WALK_DEG)

@@ -193,6 +193,11 @@ def named_filter(
     return filter
 
 
+def accel_of(settings: Settings) -> tuple[float, float]:
+    """How much speed (m/s) and turn rate (deg/s) of an unknown twist change in 1 s."""
+    return settings.motion.accel_m, settings.motion.accel_deg
+
+
 def _noise(settings: Settings) -> ranging.RangeNoise:
     """Law of the ranges that have none of their own."""
     return ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)

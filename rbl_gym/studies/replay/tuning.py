@@ -1,0 +1,157 @@
+"""Deviation of the ranges and motion of the body, by the likelihood of a log's first part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_number
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.causes import cut, local_trial
+from rbl_gym.studies.replay.evidence import Trial, evidence
+from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
+from rbl_gym.studies.replay.tracking import accel_of, recording_filter
+
+__all__ = ["TUNING_ROUNDS", "Tuned", "tune"]
+
+# What each setting stays between.
+_LIMITS = {
+    "range_std_m": (2e-3, 10.0),
+    "walk_m": (5e-3, 100.0),
+    "walk_deg": (0.2, 1e3),
+    "accel_m": (1e-2, 100.0),
+    "accel_deg": (1.0, 1e4),
+}
+# Factors between the values that are tried of each setting, round by round.
+_FACTORS = (4.0, 3.0, 2.0, 1.5, 1.25, 1.15)
+TUNING_ROUNDS = len(_FACTORS)
+# Longest part that is looked at, in epochs.
+_MOST = 3_000
+
+
+class Tuned(NamedTuple):
+    """Settings that make a log likely.
+
+    Attributes
+    ----------
+    settings
+        The settings with what was found.
+    found
+        What was found, by the names of the settings.
+    options
+        The same as options of ``rbl-gym replay``.
+    log_likelihood, log_likelihood_before
+        Per range, of the part looked at, with the settings found and with those given.
+    epochs, seconds
+        How much of the log was looked at.
+    """
+
+    settings: Settings
+    found: dict[str, float]
+    options: str
+    log_likelihood: float
+    log_likelihood_before: float
+    epochs: int
+    seconds: float
+
+    def figures(self) -> dict[str, Any]:
+        """All but the settings as plain numbers and text."""
+        return {name: value for name, value in self._asdict().items() if name != "settings"}
+
+
+def tune(
+    recording: Recording,
+    settings: Settings,
+    seconds: float = 20.0,
+    advance: Callable[[], None] = lambda: None,
+) -> Tuned:
+    """Choose the deviation of the ranges and the motion by the likelihood of the innovations.
+
+    The likelihood is that of `estimators.Innovations`: a Gaussian for the ranges used, a constant
+    for those refused, so that refusing has its price. Tuned are ``range_std_m``, ``walk_m`` and
+    ``walk_deg``, and of filters that estimate a twist ``accel_m`` and ``accel_deg``; a walk of zero
+    stays zero. The laws of the biases stay as they are: left free they take over what the body
+    does. The truth is not looked at.
+
+    Parameters
+    ----------
+    recording, settings
+        What is filtered, and how; the search starts from the settings.
+    seconds
+        How much of the log, from its start, is looked at.
+    advance
+        Called after each of the `TUNING_ROUNDS`.
+
+    Raises
+    ------
+    ValueError
+        If `seconds` is not positive, or fewer than ten epochs are in them.
+    """
+    seconds = check_number("seconds", seconds, low=1e-6)
+    count = min(int(np.searchsorted(recording.times, recording.times[0] + seconds, "right")), _MOST)
+    if count < 10:
+        raise ValueError(f"the first {seconds:g} s must have 10 epochs to tune by, got {count}")
+    trial = local_trial(cut(recording, slice(count)), settings)
+    best = _start(trial)
+    ranges = trial.recording.links.sum()
+    seen: dict[tuple[float, ...], float] = {}
+    names = list(best)
+    low, high = np.array([_LIMITS[name] for name in names]).T
+
+    def values_of(points: list[FloatArray]) -> FloatArray:
+        keys = [tuple(point.tolist()) for point in points]
+        new = [key for key in dict.fromkeys(keys) if key not in seen]
+        trials = [
+            Trial(trial.recording, trial.settings.changed(**dict(zip(names, key, strict=True))))
+            for key in new
+        ]
+        if trials:
+            seen.update(zip(new, evidence(trials).log_likelihood.sum(axis=1), strict=True))
+        return np.array([seen[key] for key in keys])
+
+    centre = np.clip(np.array(list(best.values())), low, high)
+    before = float(evidence([trial]).log_likelihood.sum() / ranges)
+    for factor in _FACTORS:
+        star = [centre]
+        for k in range(len(names)):
+            for step in (1 / factor, factor):
+                point = centre.copy()
+                point[k] *= step
+                star.append(np.clip(point, low, high))
+        values = values_of(star)
+        # Along each axis the top of a parabola in the logarithm; together, if that is better.
+        steps = [_top(*values[[2 * k + 1, 0, 2 * k + 2]]) for k in range(len(names))]
+        together = np.clip(centre * factor ** np.array(steps), low, high)
+        star.append(together)
+        values = np.append(values, values_of([together]))
+        centre = star[int(np.argmax(values))]
+        advance()
+    centre = np.array(max(seen, key=lambda key: seen[key]))
+    found = {name: float(f"{value:.3g}") for name, value in zip(names, centre, strict=True)}
+    options = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in found.items())
+    after = max(seen.values()) / ranges
+    span = float(np.ptp(trial.recording.times))
+    return Tuned(settings.changed(**found), found, options, float(after), before, count, span)
+
+
+def _start(trial: Trial) -> dict[str, float]:
+    """What is tuned, as it is now."""
+    recording, settings = trial
+    std = settings.range_std_m
+    if std is None and recording.range_std is not None:
+        std = float(np.median(recording.range_std[recording.links]))
+    start: dict[str, Any] = {"range_std_m": std or DEFAULT_RANGE_STD_M}
+    start |= {name: getattr(settings.motion, name) for name in ("walk_m", "walk_deg")}
+    if getattr(recording_filter(recording, settings), "twist", None) is not None:
+        start |= dict(zip(("accel_m", "accel_deg"), accel_of(settings), strict=True))
+    return {name: value for name, value in start.items() if value > 0}
+
+
+def _top(below: float, here: float, above: float) -> float:
+    """Where a parabola through values at -1, 0 and 1 is highest, at most two away."""
+    bend = below - 2 * here + above
+    if not bend < 0:
+        return 1.0 if above > below else -1.0
+    return float(np.clip(0.5 * (below - above) / bend, -2.0, 2.0))

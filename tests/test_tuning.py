@@ -1,0 +1,113 @@
+"""Settings by the likelihood of a log's first part."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from rbl_gym.app import cli
+from rbl_gym.recordings import Truth
+from rbl_gym.studies import replay
+from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording
+
+DEFAULTS = replay.Settings()
+
+
+def test_the_settings_that_made_a_log_are_found():
+    """From the defaults: 0.12 m, 0.1 m and 7 degrees; the log has 0.1 m, 0.3 m, 17 degrees."""
+    tuned = replay.tune(recording(RANGES), DEFAULTS)
+    # Two hundred steps of the motion and 4,000 ranges: some per cent, and 1 % of the deviation.
+    assert tuned.found == {
+        "range_std_m": pytest.approx(0.1, rel=0.05),
+        "walk_m": pytest.approx(0.3, rel=0.25),
+        "walk_deg": pytest.approx(17.2, rel=0.25),
+    }
+    assert isinstance(tuned, replay.Tuned)
+    assert tuned.settings == DEFAULTS.changed(**tuned.found)
+    assert tuned.log_likelihood > tuned.log_likelihood_before
+    assert tuned.epochs == 120
+    assert tuned.seconds == pytest.approx(11.9)
+    figures = replay.replay_recording(recording(RANGES), tuned.settings).figures
+    assert figures["consistency"]["nis_per_dof"] == pytest.approx(1.0, abs=0.1)
+    assert figures["consistency"]["log_likelihood"] == pytest.approx(tuned.log_likelihood, abs=1e-3)
+
+
+def test_only_the_first_part_is_looked_at_and_never_the_truth():
+    log = recording(RANGES)
+    spoiled = RANGES.copy()
+    spoiled[40:] += 3.0
+    truth = Truth(log.times, np.broadcast_to(np.eye(3), (120, 3, 3)), np.zeros((120, 3)))
+    plain = replay.tune(log, SETTINGS, seconds=2.0)
+    assert plain.epochs == 21
+    assert replay.tune(recording(spoiled)._replace(truth=truth), SETTINGS, seconds=2.0) == plain
+
+
+def test_every_round_is_told():
+    told = []
+    replay.tune(recording(RANGES[:20]), SETTINGS, advance=lambda: told.append(1))
+    assert len(told) == replay.TUNING_ROUNDS
+
+
+def test_late_ranges_have_their_price():
+    """A twentieth of the ranges is late: neither are they noise, nor is all else refused."""
+    late = RANGES + 3.0 * (np.random.default_rng(4).random(RANGES.shape) < 0.05)
+    tuned = replay.tune(recording(late), DEFAULTS)
+    assert tuned.found["range_std_m"] == pytest.approx(0.1, rel=0.1)
+
+
+def test_filters_of_an_unknown_twist_have_their_acceleration_tuned():
+    settings = DEFAULTS.changed(filter="iekf-cv", walk_m=0.0, walk_deg=0.0)
+    tuned = replay.tune(recording(RANGES[:60]), settings)
+    assert list(tuned.found) == ["range_std_m", "accel_m", "accel_deg"]
+    assert tuned.settings.motion.walk_m == 0.0
+    assert tuned.log_likelihood > tuned.log_likelihood_before + 0.03
+    options = tuned.options.split()
+    assert options[::2] == ["--range-std-m", "--accel-m", "--accel-deg"]
+    assert [float(value) for value in options[1::2]] == list(tuned.found.values())
+
+
+def test_a_log_too_short_to_tune_by_is_refused():
+    with pytest.raises(ValueError, match=r"first 0\.5 s must have 10 epochs to tune by, got 6"):
+        replay.tune(recording(RANGES), SETTINGS, seconds=0.5)
+    with pytest.raises(ValueError, match="seconds"):
+        replay.tune(recording(RANGES), SETTINGS, seconds=-1.0)
+
+
+def written(folder):
+    """The files of a log, as arguments."""
+    ids = [(m, n) for m in range(7) for n in range(5)]
+    rows = [
+        f"{0.1 * k:.1f}," + ",".join(f"{x:.4f}" for x in r.ravel()) for k, r in enumerate(RANGES)
+    ]
+    header = "t," + ",".join(f"aA{m}tT{n}" for m, n in ids)
+    texts = {
+        "ranges": "\n".join([header, *rows]),
+        "anchors": "anchor,x,y,z\n"
+        + "\n".join(f"A{m},{x},{y},{z}" for m, (x, y, z) in enumerate(ANCHORS)),
+        "tags": "tag,x,y,z\n" + "\n".join(f"T{n},{x},{y},{z}" for n, (x, y, z) in enumerate(TAGS)),
+    }
+    arguments = ["replay"]
+    for name, text in texts.items():
+        (folder / f"{name}.csv").write_text(text)
+        arguments += [f"--{name}", str(folder / f"{name}.csv")]
+    return arguments
+
+
+def test_the_command_runs_with_what_it_tuned_and_prints_it(tmp_path, capsys):
+    arguments = written(tmp_path)
+    assert cli.main([*arguments, "--tune-s", "5", "--json", str(tmp_path / "tuned.json")]) == 0
+    tuned = json.loads((tmp_path / "tuned.json").read_text())
+    options = tuned["tuned"]["options"].split()
+    assert tuned["settings"]["walk_m"] == float(options[options.index("--walk-m") + 1])
+    assert tuned["tuned"]["epochs"] == 51
+    # The options repeated give the same run.
+    assert cli.main([*arguments, *options, "--json", str(tmp_path / "again.json")]) == 0
+    again = json.loads((tmp_path / "again.json").read_text())
+    assert again["consistency"] == tuned["consistency"]
+    capsys.readouterr()
+    assert cli.main([*arguments, "--tune", "--tune-s", "3"]) == 0
+    out = capsys.readouterr().out
+    assert "tuned on 31 epochs of the first 3.0 s: --range-std-m" in " ".join(out.split())
+    assert "NIS per degree of freedom" in out
