@@ -20,7 +20,7 @@ from rbl_gym.geometry import rotations
 
 __all__ = ["Factor", "LogState", "Rows"]
 
-_EXP, _ERROR = kernel(rotations.exp), kernel(rotations.error)
+_EXP, _ERROR, _HAT = (kernel(f) for f in (rotations.exp, rotations.error, rotations.hat))
 
 
 class LogState(NamedTuple):
@@ -165,20 +165,20 @@ class Equations:
         self.gradient[..., 0, :6] += times(Dt, pull)
 
     def step(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The step x (..., K, n) and (..., c), and the decrease (...) of cost that it promises."""
-        n, raise_by = self.gradient.shape[-1], (damping + 1e-14)[..., None]
-        diagonal = self.diagonal.copy()
-        own = np.einsum("...ii->...i", self.diagonal)
-        diagonal[..., range(n), range(n)] += raise_by[..., None] * own + 1e-300
+        """The step x (..., K, n) and (..., c), and the decrease (...) of cost that it promises.
+
+        Damping (...) holds every pose back by so much information, 1/rad^2 and 1/m^2. A share of
+        the diagonal, as Marquardt's, would not do: stiff laws of motion make it enormous.
+        """
+        n, diagonal = self.gradient.shape[-1], self.diagonal.copy()
+        diagonal[..., range(n), range(n)] *= 1 + 1e-14
+        diagonal[..., range(6), range(6)] += damping[..., None, None]
         right = np.concatenate([-self.gradient[..., None], self.border], axis=-1)
         found = solve_blocks(diagonal, self.above, right)
         x, X = found[..., 0], found[..., 1:]
-        c = self.corner.shape[-1]
         y = np.zeros(self.corner_gradient.shape)
-        if c:
-            corner = self.corner.copy()
-            corner[..., range(c), range(c)] += raise_by * np.einsum("...ii->...i", self.corner)
-            schur = corner - np.einsum("...kia,...kib->...ab", self.border, X)
+        if y.shape[-1]:
+            schur = self.corner - np.einsum("...kia,...kib->...ab", self.border, X)
             right = self.corner_gradient + np.einsum("...kia,...ki->...a", self.border, x)
             y = -np.linalg.solve(schur, right[..., None])[..., 0]
             x = x - np.einsum("...kia,...a->...ki", X, y)
@@ -201,14 +201,37 @@ class Equations:
         return P - crossed @ np.swapaxes(X, -1, -2), crossed, constants
 
 
-def moved(state: LogState, x: FloatArray, y: FloatArray) -> LogState:
-    """The state after steps (..., K, n) of the epochs and (..., c) of the constants."""
+def moved(state: LogState, x: FloatArray, y: FloatArray, turning: bool = False) -> LogState:
+    """The state after steps (..., K, n) of the epochs and (..., c) of the constants.
+
+    `turning`: the first three extra states are a vector that turns with the body, ``W <- exp(w) W
+    + dW``, so that one turn of all epochs changes no turn between them, however large it is.
+    """
+    turn = _EXP(x[..., :3])
+    extra = state.extra + x[..., 6:]
+    if turning:
+        extra[..., :3] = times(turn, state.extra[..., :3]) + x[..., 6:9]
     return LogState(
-        _EXP(x[..., :3]) @ state.rotation,
-        state.translation + x[..., 3:6],
-        state.extra + x[..., 6:],
-        state.constants + y,
+        turn @ state.rotation, state.translation + x[..., 3:6], extra, state.constants + y
     )
+
+
+def with_turning(rows: Rows, state: LogState) -> Rows:
+    """Rows with derivatives by the steps of `moved` of a turning vector, from those by its error.
+
+    The error of the vector is ``dW + w x W``.
+    """
+    W = _HAT(state.extra[..., :3])
+    ends = []
+    for A, spin in (
+        (rows.before, W[..., : rows.before.shape[-3], :, :]),
+        (rows.after, W[..., 1:, :, :]),
+    ):
+        if A is not None and A.shape[-1] > 6:
+            A = A.copy()
+            A[..., :3] -= A[..., 6:9] @ spin
+        ends.append(A)
+    return rows._replace(before=ends[0], after=ends[1])
 
 
 def times(matrix: FloatArray, vector: FloatArray) -> FloatArray:

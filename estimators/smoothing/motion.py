@@ -31,7 +31,15 @@ class Motion(Factor, Protocol):
     ----------
     extra_std
         Standard deviations (e,) about zero of those of the first epoch; e of them are estimated.
+    turning
+        Whether the first three are a vector that turns with the body, as a turn rate does. The
+        rows do not know of it: their derivatives are by errors, estimate less truth.
     """
+
+    @property
+    def turning(self) -> bool:
+        """See the class."""
+        ...
 
     @property
     def extra_std(self) -> FloatArray:
@@ -61,6 +69,7 @@ class KnownTwist:
             object.__setattr__(self, "twists", check_array("twists", self.twists, ("K", 6)))
 
     extra_std = constants_std = np.zeros(0)
+    turning = False
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
         """Rows of ``Jl(W dt)^-1 log(Q' (exp(W dt) Q)^T)`` and ``t' - t - V dt``, whitened."""
@@ -102,6 +111,7 @@ class UnknownTwist:
         check_one_process(self.process)
 
     constants_std = np.zeros(0)
+    turning = True
 
     @property
     def extra_std(self) -> FloatArray:

@@ -19,7 +19,14 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count
 from rbl_gym.estimators.costs.map_problem import PoseState, positive_inverse
 from rbl_gym.estimators.costs.range_cost import SQUARES, huber
 from rbl_gym.estimators.inputs import check_covariance, check_epoch, epoch_variance
-from rbl_gym.estimators.smoothing.equations import Equations, Factor, LogState, moved
+from rbl_gym.estimators.smoothing.equations import (
+    Equations,
+    Factor,
+    LogState,
+    Rows,
+    moved,
+    with_turning,
+)
 from rbl_gym.estimators.smoothing.motion import Motion
 from rbl_gym.estimators.smoothing.ranges import LogRanges, add_biases, bias_blocks, bias_of
 from rbl_gym.geometry import rotations
@@ -31,8 +38,9 @@ __all__ = ["LogModel", "RangeLog", "Smoothed", "smooth"]
 # Whitened residual at which Huber's loss turns, where a loss that forgets is to be started.
 _HUBER = 1.5
 # A step is the last one where it promises less decrease of the cost than this, per epoch.
-_TOLERANCE, _COARSE = 1e-7, 1e-3
-_MOST_DAMPING = 1e12
+_TOLERANCE, _COARSE = 1e-6, 1e-3
+# Information (1/rad^2, 1/m^2) that holds a pose back, where a step goes too far: a little, much.
+_SMALL, _MOST_DAMPING = 0.1, 1e12
 
 
 class RangeLog(NamedTuple):
@@ -181,6 +189,8 @@ def smooth(
     if not np.isfinite(P).all():
         raise ValueError("log and prior must tell of every state, some have no information")
     squares, freedom = problem.ranges.consistency(state, losses[-1], covariances)
+    if model.motion.turning:
+        P = _of_errors(P, state)
     e = 6 + len(model.motion.extra_std)
     spread, shape = problem.ranges.spread, problem.ranges.shape
     biases = bias_of(problem.ranges.blocks, state, shape[0] * shape[1])
@@ -190,6 +200,13 @@ def smooth(
         biases.reshape((*biases.shape[:-1], *shape)), state.constants, constants,
         spread(-problem.ranges.residual(state)[0]), squares, freedom, equations.cost, converged,
     )  # fmt: skip
+
+
+def _of_errors(P: FloatArray, state: LogState) -> FloatArray:
+    """Covariance of errors (..., K, n, n), ``dW + w x W`` of a turning vector, from that of steps."""
+    T = np.broadcast_to(np.eye(P.shape[-1]), P.shape).copy()
+    T[..., 6:9, :3] = -rotations.hat(state.extra[..., :3])
+    return T @ P @ np.swapaxes(T, -1, -2)
 
 
 def _is_convex(loss: FloatArray) -> bool:
@@ -213,20 +230,29 @@ class _Problem:
         n = 6 + state.extra.shape[-1]
         equations = Equations.empty(batch, K, n, state.constants.shape[-1])
         equations.add_pose_prior(state, self.prior, self.information)
-        std = self.motion.extra_std
-        if len(std):
-            equations.add_prior(slice(6, 6 + len(std)), state.extra[..., 0, : len(std)], std)
+        equations.add(self._turned(self._extra_prior(state), state))
         first = 0
         for factor in (self.motion, *self.factors):
             where = slice(first, first + len(factor.constants_std))
             own = state.constants[..., where]
-            equations.add(factor.linearize(state, self.times, own), first)
+            rows = factor.linearize(state, self.times, own)
+            equations.add(self._turned(rows, state), first)
             if where.stop > first:
                 equations.add_constants_prior(where, own, factor.constants_std)
             first = where.stop
         add_biases(equations, self.ranges.blocks, state, self.times)
         self.ranges.add(equations, state, loss)
         return equations
+
+    def _extra_prior(self, state: LogState) -> Rows:
+        """Rows of the first epoch's further states."""
+        std = self.motion.extra_std
+        A = np.zeros((*state.extra.shape[:-2], 1, len(std), 6 + len(std)))
+        A[..., range(len(std)), range(6, 6 + len(std))] = 1 / std
+        return Rows(state.extra[..., :1, : len(std)] / std, A)
+
+    def _turned(self, rows: Rows, state: LogState) -> Rows:
+        return with_turning(rows, state) if self.motion.turning else rows
 
     def minimize(
         self, state: LogState, loss: FloatArray, iterations: int, tolerance: float
@@ -237,7 +263,7 @@ class _Problem:
         converged = np.zeros(equations.cost.shape, np.bool_)
         for _ in range(iterations):
             x, y, decrease = equations.step(damping)
-            new = moved(state, x, y)
+            new = moved(state, x, y, self.motion.turning)
             cost, equations = equations.cost, self.linearize(new, loss)
             # What is less than rounding may change: as good as the same.
             better = (equations.cost <= cost * (1 + 1e-12)) | (np.abs(decrease) < 1e-8)
@@ -247,11 +273,11 @@ class _Problem:
                 new = LogState(*(_where(taken, a, b, axes) for a, b, axes in kept))
                 equations = self.linearize(new, loss)
             state = new
-            # Damping shortens a step by about 1 + damping: a short step alone proves nothing.
-            most = tolerance * state.translation.shape[-2]
-            converged = converged | (better & (decrease * (1 + damping) < most))
-            eased = np.where(damping > 1e-5, 0.1 * damping, 0.0)
-            damping = np.where(better, eased, np.clip(10 * damping, 1e-3, _MOST_DAMPING))
+            # Held back by more, a short step proves nothing.
+            short = (decrease < tolerance * state.translation.shape[-2]) & (damping <= _SMALL)
+            converged = converged | (better & short)
+            eased = np.where(damping > 0.1 * _SMALL, 0.3 * damping, 0.0)
+            damping = np.where(better, eased, np.clip(10 * damping, _SMALL, _MOST_DAMPING))
             if converged.all():
                 break
         return state, equations, converged
