@@ -46,6 +46,8 @@ class InertialMotion:
     speed_m_s: float = 1.0
     gravity_tilt_rad: float = 0.0
 
+    turning = False
+
     def __post_init__(self) -> None:
         if not isinstance(self.sensor, InertialSensor):
             raise ValueError(f"sensor must be an InertialSensor, got {self.sensor!r:.80}")
