@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rbl_gym.app import consistency, figures, reports
 from rbl_gym.estimators import Innovations
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
@@ -190,3 +191,41 @@ def test_residuals_by_anchor_tag_and_link():
     assert when[0] == pytest.approx(log.times[:12].mean())
     assert ratio[3] == pytest.approx(found.nis[36:48].sum() / found.dof[36:48].sum())
     assert ((low < 1) & (high > 1)).all()
+
+
+def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
+    pytest.importorskip("plotly")
+    from rbl_gym.app import track_pages
+
+    _, log, changed = FAULTS["a link"]
+    lost = log.links.copy()
+    lost[:, 6, 4] = False
+    log = log._replace(links=lost)
+    replayed = replay.replay_recording(log, SETTINGS.changed(**changed))
+    chart = consistency._charts(replayed)
+    mean, refused = (trace for trace in chart.data if trace.type == "heatmap")
+    links = replayed.figures["consistency"]["residuals"]["links"]
+    assert refused.z[3][1] == pytest.approx(100.0)
+    assert np.isnan(mean.z[6][4])
+    assert np.isnan(mean.z[3][1])
+    assert mean.z[0][2] == next(
+        row["mean_m"] for row in links if (row["anchor"], row["tag"]) == ("A0", "T2")
+    )
+    html = track_pages.replay_page(log, replayed)
+    for heading in (
+        "likely causes",
+        "residuals of anchors",
+        "residuals of tags",
+        "residuals of links",
+    ):
+        assert f"<h2>{heading}</h2>" in html
+    assert "the ranges from anchor A3 to tag T1 look 0.8" in html
+    axes = figures.replay_figure(log, replayed).axes[-1]
+    assert axes.get_ylabel() == "NIS / dof"
+    found = replayed.track.innovations
+    assert found is not None
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), found.nis / found.dof)
+    reports.print_replay(replayed.figures)
+    out = capsys.readouterr().out
+    assert "anchor A3" in out
+    assert "20.0" in out

@@ -44,6 +44,16 @@ def test_only_the_first_part_is_looked_at_and_never_the_truth():
     assert replay.tune(recording(spoiled)._replace(truth=truth), SETTINGS, seconds=2.0) == plain
 
 
+def test_the_likelier_filter_is_taken():
+    """Biases where there are some; none where the noise is white."""
+    biases = 0.15 * np.random.default_rng(6).standard_normal((7, 5))
+    settings = SETTINGS.changed(bias_std_m=0.15, bias_time_s=None)
+    for ranges, name in ((RANGES, "iekf"), (RANGES + biases, "iekf-bias")):
+        tuned = replay.tune(recording(ranges[:20]), settings, filters=("iekf", "iekf-bias"))
+        assert tuned.found["filter"] == tuned.settings.filter == name
+        assert tuned.options.startswith(f"--filter {name} --range-std-m ")
+
+
 def test_every_round_is_told():
     told = []
     replay.tune(recording(RANGES[:20]), SETTINGS, advance=lambda: told.append(1))
@@ -97,7 +107,20 @@ def written(folder):
 
 def test_the_command_runs_with_what_it_tuned_and_prints_it(tmp_path, capsys):
     arguments = written(tmp_path)
-    assert cli.main([*arguments, "--tune-s", "5", "--json", str(tmp_path / "tuned.json")]) == 0
+    assert (
+        cli.main(
+            [
+                *arguments,
+                "--filter",
+                "iekf",
+                "--tune-s",
+                "5",
+                "--json",
+                str(tmp_path / "tuned.json"),
+            ]
+        )
+        == 0
+    )
     tuned = json.loads((tmp_path / "tuned.json").read_text())
     options = tuned["tuned"]["options"].split()
     assert tuned["settings"]["walk_m"] == float(options[options.index("--walk-m") + 1])
@@ -107,7 +130,8 @@ def test_the_command_runs_with_what_it_tuned_and_prints_it(tmp_path, capsys):
     again = json.loads((tmp_path / "again.json").read_text())
     assert again["consistency"] == tuned["consistency"]
     capsys.readouterr()
-    assert cli.main([*arguments, "--tune", "--tune-s", "3"]) == 0
+    # Without a name of a filter the likelihood chooses one.
+    assert cli.main([*arguments, "--tune", "--tune-s", "1"]) == 0
     out = capsys.readouterr().out
-    assert "tuned on 31 epochs of the first 3.0 s: --range-std-m" in " ".join(out.split())
+    assert "tuned on 11 epochs of the first 1.0 s: --filter iekf" in " ".join(out.split())
     assert "NIS per degree of freedom" in out

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from rbl_gym.app.tables import new_table
 from rbl_gym.studies.replay import Replayed, nis_curve
@@ -77,7 +77,8 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     axes.axhline(1.0, color="0.5", lw=0.6)
     axes.set_yscale("log")
     axes.set_ylim(min(0.2, ratio.min()), max(5.0, 1.1 * ratio.max()))
-    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda y, _: f"{y:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel("NIS / dof")
     axes.set_xlabel("time [s]")

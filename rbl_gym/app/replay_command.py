@@ -97,7 +97,8 @@ def _add_tuning(group: Any) -> None:
         "--tune",
         action="store_true",
         help="choose --range-std-m and the motion (--walk-..., of an estimated twist --accel-...) "
-        "by the likelihood of the log's first part; the truth is not looked at",
+        "by the likelihood of the log's first part, and iekf or iekf-bias where no --filter is "
+        "given; the truth is not looked at",
     )
     _add_number(group, "--tune-s", "length of that part, default 20; tunes as --tune does")
 
@@ -222,8 +223,10 @@ def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
 
     longest = max(runs.values(), key=lambda run: len(run.times))
     length = {} if options.tune_s is None else {"seconds": options.tune_s}
-    with progress("tune", replay.TUNING_ROUNDS) as advance:
-        return replay.tune(longest, settings, advance=advance, **length)
+    # Where no filter is named the likelihood chooses one too.
+    filters = () if options.filter or settings.filter != "iekf" else ("iekf", "iekf-bias")
+    with progress("tune", replay.TUNING_ROUNDS * max(len(filters), 1)) as advance:
+        return replay.tune(longest, settings, filters=filters, advance=advance, **length)
 
 
 def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any, tuned: Any) -> int:

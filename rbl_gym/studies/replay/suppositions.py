@@ -210,7 +210,9 @@ def _biased(trial: Trial, kind: str, name: str, mine: np.ndarray, bias: float) -
     ranges = np.where(mine, np.maximum(recording.ranges - bias, 1e-3), recording.ranges)
     side = "long" if bias > 0 else "short"
     changed = recording._replace(ranges=np.where(recording.links, ranges, 0.0))
-    return Supposition(kind, f"{name} look {abs(bias):.2f} m too {side}", _with(trial, changed))
+    learned = " (--raw learns biases that stay)" if trial.settings.filter == "iekf" else ""
+    text = f"{name} look {abs(bias):.2f} m too {side}{learned}"
+    return Supposition(kind, text, _with(trial, changed))
 
 
 def _common_bias(trial: Trial, bias: float) -> Supposition:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +39,7 @@ class Tuned(NamedTuple):
     settings
         The settings with what was found.
     found
-        What was found, by the names of the settings.
+        What was found, by the names of the settings; `filter` where it was chosen too.
     options
         The same as options of ``rbl-gym replay``.
     log_likelihood, log_likelihood_before
@@ -49,7 +49,7 @@ class Tuned(NamedTuple):
     """
 
     settings: Settings
-    found: dict[str, float]
+    found: dict[str, float | str]
     options: str
     log_likelihood: float
     log_likelihood_before: float
@@ -65,6 +65,7 @@ def tune(
     recording: Recording,
     settings: Settings,
     seconds: float = 20.0,
+    filters: Sequence[str] = (),
     advance: Callable[[], None] = lambda: None,
 ) -> Tuned:
     """Choose the deviation of the ranges and the motion by the likelihood of the innovations.
@@ -81,8 +82,11 @@ def tune(
         What is filtered, and how; the search starts from the settings.
     seconds
         How much of the log, from its start, is looked at.
+    filters
+        Names of filters, of which the one that makes the log likeliest is taken; none: that of the
+        settings stays.
     advance
-        Called after each of the `TUNING_ROUNDS`.
+        Called after each of the `TUNING_ROUNDS` of each filter.
 
     Raises
     ------
@@ -93,26 +97,46 @@ def tune(
     count = min(int(np.searchsorted(recording.times, recording.times[0] + seconds, "right")), _MOST)
     if count < 10:
         raise ValueError(f"the first {seconds:g} s must have 10 epochs to tune by, got {count}")
-    trial = local_trial(cut(recording, slice(count)), settings)
-    best = _start(trial)
-    ranges = trial.recording.links.sum()
-    seen: dict[tuple[float, ...], float] = {}
-    names = list(best)
+    given = local_trial(cut(recording, slice(count)), settings)
+    ranges = given.recording.links.sum()
+    before = float(evidence([given]).log_likelihood.sum() / ranges)
+    names = dict.fromkeys(filters or (settings.filter,))
+    tried = {
+        name: _climbed(given._replace(settings=given.settings.changed(filter=name)), advance)
+        for name in names
+    }
+    best = max(tried, key=lambda name: tried[name][0])
+    value, found = tried[best]
+    if len(names) > 1:
+        found = {"filter": best, **found}
+    options = " ".join(
+        f"--{name.replace('_', '-')} {value if isinstance(value, str) else f'{value:g}'}"
+        for name, value in found.items()
+    )
+    span = float(np.ptp(given.recording.times))
+    after = float(value / ranges)
+    return Tuned(settings.changed(**found), found, options, after, before, count, span)
+
+
+def _climbed(trial: Trial, advance: Callable[[], None]) -> tuple[float, dict[str, Any]]:
+    """The log-likelihood that a search from the settings comes to, and what it found."""
+    start = _start(trial)
+    names = list(start)
     low, high = np.array([_LIMITS[name] for name in names]).T
+    seen: dict[tuple[float, ...], float] = {}
 
     def values_of(points: list[FloatArray]) -> FloatArray:
         keys = [tuple(point.tolist()) for point in points]
         new = [key for key in dict.fromkeys(keys) if key not in seen]
         trials = [
-            Trial(trial.recording, trial.settings.changed(**dict(zip(names, key, strict=True))))
+            trial._replace(settings=trial.settings.changed(**dict(zip(names, key, strict=True))))
             for key in new
         ]
         if trials:
             seen.update(zip(new, evidence(trials).log_likelihood.sum(axis=1), strict=True))
         return np.array([seen[key] for key in keys])
 
-    centre = np.clip(np.array(list(best.values())), low, high)
-    before = float(evidence([trial]).log_likelihood.sum() / ranges)
+    centre = np.clip(np.array(list(start.values())), low, high)
     for factor in _FACTORS:
         star = [centre]
         for k in range(len(names)):
@@ -125,15 +149,10 @@ def tune(
         steps = [_top(*values[[2 * k + 1, 0, 2 * k + 2]]) for k in range(len(names))]
         together = np.clip(centre * factor ** np.array(steps), low, high)
         star.append(together)
-        values = np.append(values, values_of([together]))
-        centre = star[int(np.argmax(values))]
+        centre = star[int(np.argmax(np.append(values, values_of([together]))))]
         advance()
-    centre = np.array(max(seen, key=lambda key: seen[key]))
-    found = {name: float(f"{value:.3g}") for name, value in zip(names, centre, strict=True)}
-    options = " ".join(f"--{name.replace('_', '-')} {value:g}" for name, value in found.items())
-    after = max(seen.values()) / ranges
-    span = float(np.ptp(trial.recording.times))
-    return Tuned(settings.changed(**found), found, options, float(after), before, count, span)
+    best = max(seen, key=lambda key: seen[key])
+    return seen[best], {name: float(f"{x:.3g}") for name, x in zip(names, best, strict=True)}
 
 
 def _start(trial: Trial) -> dict[str, float]:
