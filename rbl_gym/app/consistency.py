@@ -82,7 +82,7 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
     axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel("NIS / dof")
     axes.set_xlabel("time [s]")
-    axes.legend(frameon=False, fontsize=7, loc="upper right")
+    axes.legend(frameon=False, fontsize=7, loc="lower right")
     axes.grid(alpha=0.25, lw=0.5)
 
 
