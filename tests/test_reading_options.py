@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from typing import Any
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from rbl_gym import motion
+from rbl_gym.app import reading_options
 from rbl_gym.app.cli import main
 from rbl_gym.measurements import ranging
+from rbl_gym.recordings import Format, read_recording
 from tests.helpers import ROOT
 
 DATA = ROOT.parent / "shared" / "data"
@@ -171,35 +174,39 @@ MURP = (
 )
 SETS = {
     "lias_planar": (
-        f"--ranges static_ranges.csv --truth static_truth.csv {LIAS} --run 8_14_p1_d0 --planar",
-        213, 5112,
+        f"--ranges static_ranges.csv --truth static_truth.csv {LIAS} --run 8_14_p1_d0",
+        (213, 8, 3), 5112,
     ),
-    "murp_relative": (MURP + " --planar --height-offset-m 1.2", 177, 6372),
-    "murp_relative, seen from A": (MURP + " --planar --relative --height-offset-m 1.2", 177, 6372),
-    "labyrinth_single_tag": ("--ranges ranges.csv", 233, 233),
+    "starloc_two_tags": (
+        "--ranges uwb.csv --anchors anchors.csv --tags tags.csv --truth truth.csv "
+        "--columns range=range_calib", (7602, 8, 2), 7602,
+    ),
+    "labyrinth_single_tag": ("--ranges ranges.csv --truth truth.csv", (233, 4, 1), 233),
+    "murp_relative": (MURP, (177, 6, 6), 6372),
+    "murp_relative, seen from A": (MURP + " --relative", (177, 6, 6), 6372),
 }  # fmt: skip
 
 
 @needs_data
 @pytest.mark.parametrize("name", SETS)
-def test_public_sets(name, capsys, monkeypatch):
-    arguments, epochs, links = SETS[name]
+def test_public_sets(name, monkeypatch):
+    """Read by the options of the command; not replayed, which takes longer."""
+    arguments, shape, links = SETS[name]
     monkeypatch.chdir(DATA / name.split(",")[0])
-    assert main(["replay", "--json", *arguments.split()]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert (figures["epochs"], figures["links"]) == (epochs, links)
-    assert figures["reading"]["ranges"] == links
+    parser = argparse.ArgumentParser()
+    reading_options.add_reading(parser)
+    (log,) = reading_options.read_runs(parser.parse_args(arguments.split())).values()
+    assert log.ranges.shape == shape
+    assert log.links.sum() == log.report.ranges == links
+    assert log.truth is not None
+    assert (log.anchors.ndim == 3) == (name == "murp_relative")
 
 
 @needs_data
-def test_starloc(monkeypatch):
-    """7,602 epochs: read, not replayed."""
-    from rbl_gym.recordings import Format, read_recording
-
+def test_ranges_that_a_set_has_calibrated(monkeypatch):
     monkeypatch.chdir(DATA / "starloc_two_tags")
     files: dict[str, Any] = {name: f"{name}.csv" for name in ("anchors", "tags", "truth")}
     log = read_recording("uwb.csv", **files, format=Format(columns={"range": "range_calib"}))
-    assert log.ranges.shape == (7602, 8, 2)
     assert log.range_std is not None
     np.testing.assert_allclose(log.ranges[0].max(), 1.74375)
     np.testing.assert_allclose(log.range_std[0].max(), 0.11086)

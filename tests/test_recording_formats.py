@@ -16,7 +16,7 @@ from tests.test_recordings import ANCHORS, LONG, TAGS, TRUTH, WIDE, assert_same,
 def write(folder: Path, **texts: str) -> dict[str, Any]:
     """Files of these texts, by their names."""
     for name, text in texts.items():
-        (folder / f"{name}.csv").write_text(text, newline="")
+        (folder / f"{name}.csv").write_text(text, encoding="utf-8", newline="")
     return {name: folder / f"{name}.csv" for name in texts}
 
 
@@ -59,6 +59,7 @@ SPELLINGS = {
     "units in the header": GOOD.replace("t,", "time [s],", 1).replace("range", "range (m)"),
     "ids as floats": GOOD.replace(",1,", ",1.0,"),
     "ids in capitals": GOOD.replace("left", "LEFT").replace("A", "a"),
+    "a spreadsheet's first line": "SEP=;\r\n" + GOOD.replace(",", ";").replace("\n", "\r\n"),
     "more columns": GOOD.replace("\n", ",-80\n").replace("range,-80", "range,rssi"),
 }
 
@@ -121,6 +122,9 @@ def test_unit_of_time_in_the_header(tmp_path):
         log = read(tmp_path, text)
         np.testing.assert_allclose(log.times, 1e-3 * np.arange(5))
         assert log.report.notes == ()
+    for micro in ("u", "\N{MICRO SIGN}", "\N{GREEK SMALL LETTER MU}"):
+        log = read(tmp_path, many(5, 1000.0).replace("t,", f"t [{micro}s],", 1))
+        np.testing.assert_allclose(log.times, 1e-3 * np.arange(5))
 
 
 def test_iso_times(tmp_path):

@@ -35,7 +35,9 @@ _OTHER_NAMES = {
     "run": ("run", "run_id"),
     **{f"a{axis}": (f"a{axis}", f"anchor_{axis}") for axis in "xyz"},
 }
-_UNIT = re.compile(r"\s*[\[(](|s|ms|us|ns|m|cm|mm|deg|rad)[\])]$|_(s|ms|us|ns|m|cm|mm)$")
+_UNIT = re.compile(
+    "\\s*[\\[(](|s|ms|[u\u00b5\u03bc]s|ns|m|cm|mm|deg|rad)[\\])]$|_(s|ms|us|ns|m|cm|mm)$"
+)
 
 
 class Source(NamedTuple):
@@ -243,7 +245,9 @@ def _name_and_unit(cell: str) -> tuple[str, str]:
     unit = _UNIT.search(cell)
     if unit is None:
         return cell, ""
-    return (cell, unit[2]) if unit[2] else (cell[: unit.start()], unit[1])
+    if unit[2]:
+        return cell, unit[2]
+    return cell[: unit.start()], re.sub("[\u00b5\u03bc]", "u", unit[1])
 
 
 def _column(cells: tuple[str, ...]) -> NDArray[np.object_]:

@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 # What may stand between cells; white space only where the header has none of the others.
 _DELIMITERS = ("\t", ";", ",")
+# A first line by which spreadsheets say what does.
+_SEPARATOR = re.compile(r"sep=.\r?$", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"\d,\d")
 _DECIMAL_POINT = re.compile(r"\d\.\d")
 
@@ -50,6 +52,8 @@ def read_cells(path: str, headless: Sequence[str] = ()) -> Cells:
         If the file cannot be read, has no header or no row, or a row does not fit the header.
     """
     lines = _read_lines(path)
+    if _SEPARATOR.match(lines[0]):
+        lines[0] = ""
     shown = (i for i, line in enumerate(lines) if line.lstrip()[:1] not in ("", "#"))
     first, second = [*islice(shown, 2), -1, -1][:2]
     count = 0 if first < 0 else 1 if second < 0 else 2
