@@ -51,6 +51,7 @@ def posterior_crb_step(
     steps: ArrayLike,
     sensor: InertialSensor,
     links: ArrayLike | None = None,
+    offset: str | None = None,
 ) -> FloatArray:
     """One step of the posterior Cramer-Rao recursion of all states, at the truth.
 
@@ -66,6 +67,8 @@ def posterior_crb_step(
         sample, as `navigation.preintegrate`.
     sensor
         Law of their noise.
+    offset
+        Whose ranges have an unknown offset in common, as of `bounds.range_information`.
 
     Returns
     -------
@@ -85,7 +88,7 @@ def posterior_crb_step(
     predicted = predict_information(J, rotation, readings, steps, sensor)
     if not np.isfinite(predicted).all():
         raise ValueError(f"J must be information about all states, got a singular one {J!r:.80}")
-    seen = range_information(anchors, tags, rotation, translation, noise, links)
+    seen = range_information(anchors, tags, rotation, translation, noise, links, offset=offset)
     return with_pose(predicted, seen)
 
 

@@ -23,7 +23,7 @@ from rbl_gym.checks import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
-from rbl_gym.measurements import ranging
+from rbl_gym.measurements import offsets, ranging
 
 __all__ = [
     "directions", "information_rank", "lift", "pose_crb",
@@ -103,6 +103,7 @@ def range_information(
     *,
     model: str = "raw",
     tag_std_m: float = 0.0,
+    offset: str | None = None,
 ) -> FloatArray:
     """Fisher information (..., 6, 6) of one epoch of ranges about the pose.
 
@@ -124,6 +125,9 @@ def range_information(
         of the tracking paper's model.
     tag_std_m
         Standard deviation of the tags' places on the body, per axis: a nuisance, marginalised.
+    offset
+        Whose ranges have an unknown offset in common (`measurements.offsets`): ``"tag"``,
+        ``"anchor"``, or ``"epoch"``; None: no ranges. Of raw ranges, with tags at known places.
 
     Raises
     ------
@@ -131,6 +135,10 @@ def range_information(
         On a wrong shape or a value that is not finite.
     """
     check_one_of("model", model, ("raw", "squared"))
+    if offsets.check_offset(offset) is not None and (model != "raw" or tag_std_m != 0):
+        raise ValueError(
+            f"offset goes with model 'raw' and tag_std_m 0, got {model!r} and {tag_std_m!r}"
+        )
     tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0)
     anchors = check_array("anchors", anchors, ("M", 3))
     tags = check_array("tags", tags, ("N", 3))
@@ -140,7 +148,7 @@ def range_information(
         raise ValueError(f"noise must be a noise law of rbl_gym.ranging, got {noise!r:.80}")
     mask = check_links(links, (anchors.shape[-2], tags.shape[-2]))
     if model == "raw" and tag_std_m == 0:
-        return information_at(anchors, tags, rotation, translation, noise, mask)
+        return information_at(anchors, tags, rotation, translation, noise, mask, offset)
     positions = _TAG_POSITIONS(rotation, translation, tags)
     of_tag = _raw_tag_information if model == "raw" else _squared_tag_information
     per_tag = of_tag(anchors, positions, noise, mask)
@@ -155,6 +163,7 @@ def information_at(
     translation: FloatArray,
     noise: ranging.NoiseLaw,
     share: Any = None,
+    offset: str | None = None,
 ) -> FloatArray:
     """`range_information` on arrays that are known to be good.
 
@@ -163,11 +172,15 @@ def information_at(
     share = _ONE if share is None else share
     numbers = ranging.numbers_of(noise, tags.shape[-2])
     if numbers is None:
-        return _range_information(anchors, tags, rotation, translation, noise, share)
+        return _range_information(anchors, tags, rotation, translation, noise, share, offset)
     links = anchors.shape[-2], tags.shape[-2]
     if share.shape[-2:] != links:
         share = np.broadcast_to(share, (*share.shape[:-2], *links))
-    told = _information(_NOTHING, anchors, tags, rotation, translation, numbers, share)
+    told = _NOTHING, anchors, tags, rotation, translation, numbers, share
+    if offset is None:
+        told = _information(*told)
+    else:
+        told = _offset_information(*told, offsets.code_of(offset))
     if not np.isfinite(told).all():
         check_variance(noise, _DISTANCES(anchors, _TAG_POSITIONS(rotation, translation, tags)))
     return told
@@ -188,6 +201,22 @@ def _information(
     return prior + _range_information(anchors, tags, rotation, translation, noise, share)
 
 
+@compiled("offsets:information")
+def _offset_information(
+    prior: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    rotation: FloatArray,
+    translation: FloatArray,
+    law: FloatArray,
+    share: FloatArray,
+    offset: int,
+) -> FloatArray:
+    """`_information` of ranges with unknown offsets, by the code of their kind."""
+    noise, kind = ranging.law_of(law), offsets.OFFSETS[offset - 1]
+    return prior + _range_information(anchors, tags, rotation, translation, noise, share, kind)
+
+
 def _range_information(
     anchors: FloatArray,
     tags: FloatArray,
@@ -195,9 +224,14 @@ def _range_information(
     translation: FloatArray,
     noise: ranging.NoiseLaw,
     share: FloatArray,
+    offset: str | None = None,
 ) -> FloatArray:
     distance, J = range_jacobian(anchors, tags, rotation, translation)
     weight = _inverse(noise.variance(distance), distance) * share
+    if offset is not None:
+        links = J.reshape((*J.shape[:-1], *distance.shape[-2:]))
+        J = offsets.centred(links, weight[..., None, :, :], offset)
+        J = J.reshape((*J.shape[:-2], -1))
     flat = weight.reshape((*weight.shape[:-2], 1, -1))
     return (J * flat) @ np.swapaxes(J, -1, -2)
 
@@ -265,6 +299,7 @@ def pose_crb(
     *,
     model: str = "raw",
     tag_std_m: float = 0.0,
+    offset: str | None = None,
 ) -> FloatArray:
     """Cramer-Rao bound (..., 6, 6) of the pose from one epoch of ranges.
 
@@ -279,8 +314,9 @@ def pose_crb(
         As `range_information`, and where the information is singular, with its rank.
     """
     information = range_information(
-        anchors, tags, rotation, translation, noise, links, model=model, tag_std_m=tag_std_m
-    )
+        anchors, tags, rotation, translation, noise, links,
+        model=model, tag_std_m=tag_std_m, offset=offset,
+    )  # fmt: skip
     if prior_information is not None:
         information = information + check_array("prior_information", prior_information, (6, 6))
     return inverted(information, "anchors or tags")

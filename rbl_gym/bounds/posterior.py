@@ -29,6 +29,7 @@ def posterior_crb_step(
     dt: float,
     process: ProcessNoise,
     links: ArrayLike | None = None,
+    offset: str | None = None,
 ) -> FloatArray:
     """One step of the posterior Cramer-Rao recursion (Tichavsky et al. 1998) at the true pose.
 
@@ -42,6 +43,8 @@ def posterior_crb_step(
         Law of the ranges.
     twist, dt, process
         Motion of the interval that ends at the new epoch, and its noise.
+    offset
+        Whose ranges have an unknown offset in common, as of `range_information`.
 
     Returns
     -------
@@ -53,7 +56,9 @@ def posterior_crb_step(
         raise ValueError(f"dt must not be negative, got {dt}")
     check_process(process)
     predicted = predict_information(J, twist, dt, process)
-    return predicted + pose.range_information(anchors, tags, rotation, translation, noise, links)
+    return predicted + pose.range_information(
+        anchors, tags, rotation, translation, noise, links, offset=offset
+    )
 
 
 def predict_information(

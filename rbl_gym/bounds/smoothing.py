@@ -39,6 +39,7 @@ def smoothing_crb(
     prior_covariance: ArrayLike,
     links: ArrayLike | None = None,
     law: WanderingTwist | None = None,
+    offset: str | None = None,
 ) -> FloatArray:
     """Cramer-Rao bound of the poses of K epochs from the ranges of all of them, at the truth.
 
@@ -62,6 +63,9 @@ def smoothing_crb(
         (..., K, M, N), True where a range is measured; None: all.
     law
         Of a twist that is not known; None: it is.
+    offset
+        Whose ranges have an unknown offset in common, new at every epoch, as of
+        `range_information`.
 
     Returns
     -------
@@ -81,7 +85,7 @@ def smoothing_crb(
     if law is not None:
         check_laws(law, process)
     P = check_array("prior_covariance", prior_covariance, (6, 6))
-    seen = range_information(anchors, tags, rotation, translation, noise, links)
+    seen = range_information(anchors, tags, rotation, translation, noise, links, offset=offset)
     n = 6 if law is None else 12
     F, Q = _transition(twists, dt, process, law)
     weight, Ft = np.linalg.inv(Q), np.swapaxes(F, -1, -2)

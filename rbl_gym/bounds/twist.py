@@ -65,6 +65,7 @@ def posterior_crb_step(
     law: WanderingTwist,
     links: ArrayLike | None = None,
     sensor: TwistSensor | None = None,
+    offset: str | None = None,
 ) -> FloatArray:
     """One step of the posterior Cramer-Rao recursion of pose and twist, at the truth.
 
@@ -81,6 +82,8 @@ def posterior_crb_step(
         Seconds, and the laws of pose and twist.
     sensor
         Reads the twist of that interval; None: nobody does.
+    offset
+        Whose ranges have an unknown offset in common, as of `bounds.range_information`.
 
     Returns
     -------
@@ -106,7 +109,7 @@ def posterior_crb_step(
         raise ValueError(
             f"J must be information about all 12 states, got a singular one {J!r:.80}"
         ) from error
-    seen = range_information(anchors, tags, rotation, translation, noise, links)
+    seen = range_information(anchors, tags, rotation, translation, noise, links, offset=offset)
     batch = np.broadcast_shapes(predicted.shape[:-2], seen.shape[:-2])
     result = np.broadcast_to(symmetric(predicted), (*batch, 12, 12)).copy()
     result[..., :6, :6] += seen

@@ -1,0 +1,68 @@
+"""Unknown offsets of ranges: pseudo-ranges, and differences of times of arrival.
+
+A tag whose clock runs free, or whose time of sending nobody knows (uplink TDoA), gives ranges that
+are all longer by one unknown length; an anchor out of step with the others does so to all its
+ranges, and of passive receivers all ranges of an epoch are. A white offset is new at every epoch.
+Of a group of ranges ``r = d + c + noise`` with weights w the likeliest offset is the weighted mean
+of ``r - d``; what is left of the information is ``J^T (W - W 1 1^T W / 1^T W 1) J``: derivatives
+less their own weighted mean. A time difference to a reference anchor is the difference of two such
+ranges: the noise of the reference, common to all differences, is counted right by itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_one_of
+
+__all__ = ["OFFSETS", "centred", "common"]
+
+# Over which axes of (..., M, N) the ranges with one offset lie.
+_AXES = {"tag": (-2,), "anchor": (-1,), "epoch": (-2, -1)}
+OFFSETS = tuple(_AXES)
+
+
+def check_offset(offset: str | None) -> str | None:
+    """The name of a kind of offset, or None: there is none; else a ValueError."""
+    if offset is not None:
+        check_one_of("offset", offset, OFFSETS)
+    return offset
+
+
+def code_of(offset: str | None) -> int:
+    """The kind as kernels have it: 0 for none, else 1 by tag, 2 by anchor, 3 by epoch."""
+    return 0 if offset is None else 1 + OFFSETS.index(offset)
+
+
+def group_shape(offset: str, anchors: int, tags: int) -> tuple[int, int]:
+    """Shape of the offsets of one epoch, broadcast against (M, N): (1, N), (M, 1) or (1, 1)."""
+    return {"tag": (1, tags), "anchor": (anchors, 1), "epoch": (1, 1)}[offset]
+
+
+def common(values: FloatArray, weights: FloatArray, offset: str) -> FloatArray:
+    """Weighted means of groups, of values (..., M, N); 0 where a group has no weight.
+
+    Parameters
+    ----------
+    values, weights
+        (..., M, N), which broadcast.
+    offset
+        One of `OFFSETS`: which values are of one group.
+
+    Returns
+    -------
+    (..., 1, N), (..., M, 1) or (..., 1, 1).
+    """
+    axes = _AXES[offset]
+    total = weights.sum(axis=axes, keepdims=True)
+    return (weights * values).sum(axis=axes, keepdims=True) / np.where(total > 0, total, 1.0)
+
+
+def centred(values: FloatArray, weights: FloatArray, offset: str) -> FloatArray:
+    """Values (..., M, N) less the weighted mean of their group; arguments as `common`."""
+    return values - common(values, weights, offset)
+
+
+def paired(links: FloatArray, offset: str) -> FloatArray:
+    """Which of the links (..., M, N) share their offset with another: one alone tells nothing."""
+    return links & (links.sum(axis=_AXES[offset], keepdims=True) > 1)
