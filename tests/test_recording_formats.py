@@ -137,10 +137,17 @@ def test_iso_times(tmp_path):
         read(tmp_path, f"t,anchor,tag,range\n{stamps[0]},A,1,2\nx,A,1,2\n")
 
 
-def test_whole_seconds_far_apart_are_said(tmp_path):
-    log = read(tmp_path, many(20, 5.0))
-    np.testing.assert_array_equal(log.times, 5.0 * np.arange(20))
-    assert "say the time unit ms" in note_of(log, "whole numbers")
+@pytest.mark.parametrize("step", [2, 5, 9])
+def test_whole_numbers_some_units_apart(tmp_path, step):
+    """Ticks at some hundred a second are likelier than a range every few seconds; both are said."""
+    log = read(tmp_path, many(40, step))
+    np.testing.assert_allclose(log.times, 1e-3 * step * np.arange(40))
+    assert "are taken for milliseconds" in note_of(log, f"{step} apart")
+    for text in (many(12, step), many(40, step + 0.5)):
+        log = read(tmp_path, text)
+        assert log.times[1] == float(text.splitlines()[2].split(",")[0])
+        assert "taken for seconds; say the time unit ms" in note_of(log, "apart (median)")
+    assert read_as(tmp_path, many(40, step), time_unit="s").times[1] == step
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1), ("cm", 100), ("mm", 1000)])
@@ -228,7 +235,9 @@ def test_rows_out_of_order_are_sorted_and_counted(tmp_path):
     with pytest.raises(ValueError, match=r"line 6, column 't': time must not fall by more than 0"):
         read_as(tmp_path, "\n".join(lines), strict=True)
     lines[9], lines[20] = lines[20], lines[9]
-    with pytest.raises(ValueError, match=r"line 21, column 't': time must not fall .* column run"):
+    with pytest.raises(
+        ValueError, match=r"line 21, column 't': time must not fall .* column run; another"
+    ):
         read(tmp_path, "\n".join(lines))
 
 

@@ -79,8 +79,8 @@ def _sort(measured: Measured, table: Table, times: FloatArray, format: Format, s
     table.check(
         late <= allowed + 1e-9,
         "t",
-        f"time must not fall by more than {allowed:g} s from row to row (several runs in one file "
-        "need a column run)",
+        f"time must not fall by more than {allowed:g} s from row to row (several runs in one file? "
+        "they need a column run; another unit? say the time unit)",
     )
     if count := int((late > 0).sum()):
         said.sorted_rows += count

@@ -13,13 +13,15 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 # Epochs of a log in this unit are seldom further apart (s), no log starts later (s).
-_LONGEST_STEP_S = {"s": 10.0, "ms": 2.0, "us": 2.0}
+_LONGEST_STEP_S = {"s": 10.0, "ms": 1.0, "us": 1.0}
 _LATEST_S = 1e11
 # Seconds since 1970 of the years 2001 to 2065: stamps that say their unit by their size.
 _DATES_S = (1e9, 3e9)
 _LONGEST_DATED_STEP_S = 60.0
 # Fewer different times say nothing by their spacing.
 _FEWEST = 4
+# Whole numbers further apart are taken for milliseconds where there are many.
+_WHOLE_STEP_S, _MANY = 2.0, 20
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 
 
@@ -64,10 +66,13 @@ def found_unit(stamps: FloatArray) -> tuple[str, str]:
         if step * scale <= _LONGEST_STEP_S.get(name, np.inf) and start * scale <= _LATEST_S:
             unit = name
             break
-    if unit == "s" and step >= 2 and (distinct == np.round(distinct)).all():
+    if unit == "s" and step >= _WHOLE_STEP_S:
+        # A log of many whole numbers is one of ticks.
+        if len(distinct) >= _MANY and (distinct == np.round(distinct)).all():
+            return "ms", _words("ms", step)
         return "s", (
-            f"times are whole numbers, {step:.6g} apart (median), and are taken for seconds; "
-            "say the time unit ms if they are milliseconds"
+            f"times are {step:.6g} apart (median) and are taken for seconds; say the time unit ms "
+            "if they are milliseconds"
         )
     return unit, _words(unit, step)
 
