@@ -233,7 +233,7 @@ def test_a_record_has_the_figures_of_a_plain_loop(tmp_path, short):
             nees.append(metrics.nees(error, belief.covariance))
     np.testing.assert_allclose(record["tags_m"]["rmse"], np.sqrt(np.mean(np.square(tags))))
     np.testing.assert_allclose(record["position_m"]["rmse"], np.sqrt(np.mean(np.square(position))))
-    np.testing.assert_allclose(record["position_m"]["median"], np.median(position), rtol=0.05)
+    assert record["position_m"]["median"] == pytest.approx(sorted(position)[len(position) // 2])
     assert np.quantile(position, 0.9) <= record["position_m"]["p95"] <= max(position)
     np.testing.assert_allclose(record["anees"], np.mean(nees) / 6)
     bound = np.sqrt(np.trace(world.bound[..., 3:, 3:], axis1=-2, axis2=-1).mean())
@@ -579,3 +579,10 @@ def test_filters_made_for_other_worlds_run_when_they_are_named():
     assert set(leaderboard.ELSEWHERE) < set(estimators.names())
     assert set(leaderboard.default_filters()) & set(leaderboard.ELSEWHERE) == set()
     assert {"iekf", "kf", *leaderboard.VARIANTS} <= set(leaderboard.default_filters())
+
+
+def test_scenes_keep_their_hash_when_fields_are_added():
+    # The seed of the trials comes from it: another hash makes every published figure another.
+    plain, sensed = scenes.get("uwb_room"), scenes.get({"name": "uwb_room", "inertial": "consumer"})
+    assert bench_worlds.scene_hash(plain) == "ef968268a369d56a"
+    assert bench_worlds.scene_hash(sensed) != "ef968268a369d56a"
