@@ -26,25 +26,29 @@ def cross(x: float, y: float, z: float, M: Any, out: Any) -> None:
 @helper
 def integrate(
     readings: Any, steps: Any, extra: Any, law: Any, Q: Any, moved: Any, J: Any, N: Any, room: Any
-) -> float:
-    """Preintegrate; moved (2, 3): place and velocity; seconds are returned; room (8, 3, 3).
+) -> tuple[float, float]:
+    """Preintegrate: seconds and the variance of the rotation are returned; room (6, 3, 3).
 
-    J (5, 3, 3): derivatives of rotation, place, velocity by the gyroscope's bias, of place and
-    velocity by the accelerometer's. N (6, 3, 3): covariances ee, te, ve, tt, tv, vv of the errors.
+    moved (4, 3): place, velocity, l and m. J (5, 3, 3): derivatives of rotation, place, velocity by
+    the gyroscope's bias, of place and velocity by the accelerometer's. The noise is isotropic, so
+    that the covariance of the rotation is a number, and those of place and velocity with it are
+    ``-[l]x`` and ``-[m]x``. N (3, 3, 3): covariances tt, tv, vv.
     """
-    half, A, D, E = room[0], room[1], room[2], room[3]
-    U, V, W, Y = room[4], room[5], room[6], room[7]
-    seconds = 0.0
+    half, A, B, D, E, U = room[0], room[1], room[2], room[3], room[4], room[5]
+    seconds = turned = 0.0
     for i in range(3):
-        moved[0, i] = moved[1, i] = 0.0
+        for k in range(4):
+            moved[k, i] = 0.0
         for j in range(3):
             Q[i, j] = 1.0 if i == j else 0.0
             for k in range(5):
                 J[k, i, j] = 0.0
-            for k in range(6):
+            for k in range(3):
                 N[k, i, j] = 0.0
     for k in range(readings.shape[0]):
         h = steps[k]
+        if h == 0:
+            continue
         seconds += h
         hh = 0.5 * h * h
         x = h * (readings[k, 0] - extra[3])
@@ -57,85 +61,62 @@ def integrate(
         rotations.series(0.5 * x, 0.5 * y, 0.5 * z, a, b, 1 - 0.25 * b * s, E)
         rotations.compose(Q, E, half)
         rotations.series(0.5 * x, 0.5 * y, 0.5 * z, b, c, 1 - 0.25 * c * s, D)
-        rotations.compose(Q, D, A)
-        sx = half[0, 0] * fx + half[0, 1] * fy + half[0, 2] * fz
-        sy = half[1, 0] * fx + half[1, 1] * fy + half[1, 2] * fz
-        sz = half[2, 0] * fx + half[2, 1] * fy + half[2, 2] * fz
-        cross(sx, sy, sz, A, D)
-        cross(sx, sy, sz, J[0], U)
+        rotations.compose(Q, D, B)
         # Of the whole turn, from those of half of it.
         b, c = 0.5 * a * a, 0.25 * (c + a * b)
-        rotations.series(x, y, z, b, c, 1 - c * s, V)
-        rotations.compose(Q, V, A)
+        rotations.series(x, y, z, b, c, 1 - c * s, D)
+        rotations.compose(Q, D, A)
+        rotations.compose(half, E, Q)
+        fx, fy, fz = (
+            half[0, 0] * fx + half[0, 1] * fy + half[0, 2] * fz,
+            half[1, 0] * fx + half[1, 1] * fy + half[1, 2] * fz,
+            half[2, 0] * fx + half[2, 1] * fy + half[2, 2] * fz,
+        )
         for i in range(3):
             for j in range(3):
-                force = 0.5 * h * D[i, j] - U[i, j]
+                U[i, j] = 0.5 * h * B[i, j] - J[0, i, j]
                 J[0, i, j] -= h * A[i, j]
-                J[1, i, j] += h * J[2, i, j] + hh * force
-                J[2, i, j] += h * force
+        # The force's derivatives, by the errors that it had before the sample.
+        cross(fx, fy, fz, U, D)
+        for i in range(3):
+            for j in range(3):
+                J[1, i, j] += h * J[2, i, j] + hh * D[i, j]
+                J[2, i, j] += h * D[i, j]
                 J[3, i, j] += h * J[4, i, j] - hh * half[i, j]
                 J[4, i, j] -= h * half[i, j]
-        # Covariances of the force (minus signs: of [s]x e) with the errors before the sample.
-        cross(sx, sy, sz, N[0], U)
+        # Noise of the turn, and of the force; W and X: covariances of the force with v and t.
+        g, r = law[0] * h, law[1] / h
+        share, square = turned + 0.25 * g, turned + 0.5 * g
+        dot_l = fx * moved[2, 0] + fy * moved[2, 1] + fz * moved[2, 2]
+        dot_m = fx * moved[3, 0] + fy * moved[3, 1] + fz * moved[3, 2]
+        own = r + share * (fx * fx + fy * fy + fz * fz)
+        for i in range(3):
+            fi = fx if i == 0 else (fy if i == 1 else fz)
+            for j in range(3):
+                fj = fx if j == 0 else (fy if j == 1 else fz)
+                X, Xt = -moved[2, i] * fj, -moved[2, j] * fi
+                W, Wt = -moved[3, i] * fj, -moved[3, j] * fi
+                Y = -share * fi * fj
+                if i == j:
+                    X, Xt, W, Wt, Y = X + dot_l, Xt + dot_l, W + dot_m, Wt + dot_m, Y + own
+                U[i, j] = h * Xt + h * N[2, i, j] + h * h * Wt + hh * W + hh * h * Y
+                B[i, j] = hh * (X + Xt) + h * h * N[2, i, j] + h * hh * (W + Wt) + hh * hh * Y
+                D[i, j] = h * (W + Wt) + h * h * Y
         for i in range(3):
             for j in range(3):
-                D[i, j], Y[i, j] = N[2, j, i], N[1, j, i]
-        cross(sx, sy, sz, D, W)
-        cross(sx, sy, sz, Y, V)
-        # S ee S^T = S (S ee)^T as ee is symmetric.
+                N[0, i, j] += h * (N[1, i, j] + N[1, j, i]) + B[i, j]
         for i in range(3):
             for j in range(3):
-                A[i, j] = U[j, i]
-        cross(sx, sy, sz, A, Y)
-        g, r = law[0] * h, law[1] / h if h > 0 else 0.0
-        # Noise of the turn and its share of the force, -g/2 S, and of the force itself.
-        q = 0.25 * g
-        square = sx * sx + sy * sy + sz * sz
-        Y[0, 0] += q * (square - sx * sx) + r
-        Y[1, 1] += q * (square - sy * sy) + r
-        Y[2, 2] += q * (square - sz * sz) + r
-        Y[0, 1] -= q * sx * sy
-        Y[1, 0] -= q * sx * sy
-        Y[0, 2] -= q * sx * sz
-        Y[2, 0] -= q * sx * sz
-        Y[1, 2] -= q * sy * sz
-        Y[2, 1] -= q * sy * sz
-        g *= 0.5
-        U[0, 1] -= g * sz
-        U[1, 0] += g * sz
-        U[0, 2] += g * sy
-        U[2, 0] -= g * sy
-        U[1, 2] -= g * sx
-        U[2, 1] += g * sx
-        g *= 2.0
+                N[1, i, j] += U[i, j]
+                N[2, i, j] += D[i, j]
         for i in range(3):
-            N[0, i, i] += g
-            for j in range(3):
-                N[3, i, j] += (
-                    h * (N[4, i, j] + N[4, j, i])
-                    + h * h * N[5, i, j]
-                    - hh * (V[i, j] + V[j, i])
-                    - h * hh * (W[i, j] + W[j, i])
-                    + hh * hh * Y[i, j]
-                )
-        for i in range(3):
-            for j in range(3):
-                N[4, i, j] += (
-                    h * (N[5, i, j] - V[j, i] + hh * Y[i, j]) - h * h * W[j, i] - hh * W[i, j]
-                )
-        for i in range(3):
-            for j in range(3):
-                N[1, i, j] += h * N[2, i, j] - hh * U[i, j]
-                N[2, i, j] -= h * U[i, j]
-                N[5, i, j] += h * h * Y[i, j] - h * (W[i, j] + W[j, i])
-        rotations.compose(half, E, Q)
-        moved[0, 0] += h * moved[1, 0] + hh * sx
-        moved[0, 1] += h * moved[1, 1] + hh * sy
-        moved[0, 2] += h * moved[1, 2] + hh * sz
-        moved[1, 0] += h * sx
-        moved[1, 1] += h * sy
-        moved[1, 2] += h * sz
-    return seconds
+            fi = fx if i == 0 else (fy if i == 1 else fz)
+            moved[2, i] += h * moved[3, i] + hh * square * fi
+            moved[3, i] += h * square * fi
+            moved[0, i] += h * moved[1, i] + hh * fi
+            moved[1, i] += h * fi
+        turned += g
+    return seconds, turned
 
 
 @helper
@@ -177,14 +158,14 @@ def propagate(Q0, t0, extra, P0, readings, steps, law, Q, t, after, P):
     """State and covariance after the samples of an interval."""
     n = P0.shape[0]
     # Fewer allocations: each takes as long as a small product.
-    room, rows, before = np.empty((30, 3, 3)), np.empty((2, 9, n)), np.empty((n, n))
-    R = room[29]
+    room, rows, before = np.empty((25, 3, 3)), np.empty((2, 9, n)), np.empty((n, n))
+    R, turned, half, lean = room[0], room[1], room[2], room[3]
+    J, N, F, moves = room[4:9], room[9:12], room[12:17], np.empty((8, 3))
+    moved, gone = moves[:4], moves[4:]
     for i in range(3):
         for j in range(3):
             R[i, j] = Q0[i, j]
-    turned, half, lean, moved, gone = room[0], room[1], room[2], room[3], room[4]
-    J, N, F = room[5:10], room[10:16], room[16:21]
-    T = integrate(readings, steps, extra, law, turned, moved, J, N, room[21:])
+    T, variance = integrate(readings, steps, extra, law, turned, moved, J, N, room[17:])
     rotations.compose(R, turned, Q)
     tilted = law[5] != 0
     down_x, down_y, down_z = 0.0, 0.0, -law[4]
@@ -196,7 +177,7 @@ def propagate(Q0, t0, extra, P0, readings, steps, law, Q, t, after, P):
             lean[0, j] = down_z * half[1, j] - down_y * half[2, j]
             lean[1, j] = down_x * half[2, j] - down_z * half[0, j]
             lean[2, j] = down_y * half[0, j] - down_x * half[1, j]
-    for b in range(2):
+    for b in range(4):
         for i in range(3):
             gone[b, i] = R[i, 0] * moved[b, 0] + R[i, 1] * moved[b, 1] + R[i, 2] * moved[b, 2]
     for b in range(5):
@@ -217,16 +198,26 @@ def propagate(Q0, t0, extra, P0, readings, steps, law, Q, t, after, P):
             before[j, i] = rows[0, i, j]
     carry(F, lean, T, tilted, gone, before, 9, rows[1])
     # Noise, turned into the world; the walks of the biases.
-    for b in range(6):
-        row, column = (0, 3, 6, 3, 3, 6)[b], (0, 0, 0, 3, 6, 6)[b]
+    for b in range(3):
+        row, column = (3, 6, 6)[b], (3, 3, 6)[b]
         rotations.compose(R, N[b], half)
         for i in range(3):
             for j in range(3):
                 total = half[i, 0] * R[j, 0] + half[i, 1] * R[j, 1] + half[i, 2] * R[j, 2]
-                if column <= row:
-                    rows[1, row + i, column + j] += total
+                if b == 1:
+                    rows[1, row + j, column + i] += total
                 else:
-                    rows[1, column + j, row + i] += total
+                    rows[1, row + i, column + j] += total
+    for b in range(2):
+        row, x, y, z = 3 + 3 * b, gone[2 + b, 0], gone[2 + b, 1], gone[2 + b, 2]
+        rows[1, b, b] += variance
+        rows[1, row, 1] += z
+        rows[1, row, 2] -= y
+        rows[1, row + 1, 0] -= z
+        rows[1, row + 1, 2] += x
+        rows[1, row + 2, 0] += y
+        rows[1, row + 2, 1] -= x
+    rows[1, 2, 2] += variance
     for i in range(9):
         for j in range(i + 1):
             P[i, j] = P[j, i] = rows[1, i, j]
