@@ -375,6 +375,9 @@ def test_anchors_that_move(tmp_path):
     late = "".join(f"{t},A,1,2\n" for t in (28, 29, 40))
     gone = read(tmp_path, "t,anchor,tag,range\n" + rows + late, anchors=anchors)
     assert gone.report.dropped == {"of an anchor whose place is not known then": 1}
+    rare = "".join(f"A,{t},{t},0,1\n" for t in (0, 1, 2, 3, 9))
+    holed = read(tmp_path, anchors="anchor,t,x,y,z\n" + rare + "B,0,4,0,1\nC,0,0,4,2\n")
+    assert "'A' has no place for 6 s (usually 1 s)" in note_of(holed, "meanwhile")
     still = "anchor,t,x,y,z\nA,0,0,0,1\nA,9,0,0,1\nB,0,4,0,1\nC,0,0,4,2\n"
     np.testing.assert_array_equal(read(tmp_path, anchors=still).anchors, read(tmp_path).anchors)
     with pytest.raises(ValueError, match=r"anchors.csv, line 8, column 't': anchor 'A' may have"):

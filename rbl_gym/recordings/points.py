@@ -11,6 +11,8 @@ from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import MAX_COORDINATE_M, AnyPath, Source, is_first, read_table
 
 MAX_TAG_M = 1e4
+# A point that moves is missed after so many of its usual steps.
+_GAP = 5.0
 
 
 class Points(NamedTuple):
@@ -71,7 +73,21 @@ def read_points(path: AnyPath, kind: str, source: Source, said: Said) -> Points:
         again[rows[1:]] = np.diff(times[rows]) > 0
         table.check(again, "t", f"{kind} {name!r} may have one place at a time")
         tracks.append((times[rows], places[rows]))
+    said.note(table.path, _longest_gap(names, tracks))
     return moving(names, tuple(tracks))
+
+
+def _longest_gap(ids: tuple[str, ...], tracks: list[tuple[FloatArray, FloatArray]]) -> str:
+    """A word on the longest time between two places of a point that moves, where it stands out."""
+    gaps = [np.diff(at) if len(at) > 1 else np.zeros(1) for at, _ in tracks]
+    worst = max(range(len(ids)), key=lambda p: gaps[p].max())
+    gap, usual = gaps[worst].max(), np.median(gaps[worst])
+    if gap <= _GAP * usual:
+        return ""
+    return (
+        f"{ids[worst]!r} has no place for {gap:.4g} s (usually {usual:.4g} s); it is taken to move "
+        "straight meanwhile"
+    )
 
 
 def moving(ids: tuple[str, ...], tracks: tuple[tuple[FloatArray, FloatArray], ...]) -> Points:
