@@ -35,6 +35,15 @@ _CAUSES = {
     "of an anchor whose place is not known then": ("the anchor's place must be known", "t"),
 }
 _NAMES = [*_CAUSES]
+# What to look at where a cause prevails.
+_HINTS = {
+    "too long": "ranges in another unit? say it",
+    "of an unknown anchor": "add it to the table of anchors",
+    "of an unknown tag": "add it to the table of tags",
+    "twice with two values": "stamps too coarse, or several runs without a column run?",
+    "without a standard deviation": "another column of them? say which",
+    "of an anchor whose place is not known then": "do the clocks agree?",
+}
 _FINE = ("", "empty", "marked as not valid", "repeated")
 
 
@@ -260,9 +269,12 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
         raise ValueError(_first(measured, table, ids, refused))
     if (count := sum(bad.values())) > _MOST_BAD * total:
         causes = ", ".join(f"{n} {cause}" for cause, n in bad.items())
+        worst = max(bad, key=lambda cause: bad[cause])
+        hint = f" ({_HINTS[worst]})" if worst in _HINTS else ""
         raise ValueError(
             f"{table.path}: {count} of {total} ranges are no measurement: {causes}; a log with "
-            f"more than a fifth is refused. The first: {_first(measured, table, ids, refused)}"
+            f"more than a fifth is refused{hint}. The first: "
+            f"{_first(measured, table, ids, refused)}"
         )
     if shown := {c: n for c, n in counts.items() if c not in ("", "empty", "marked as not valid")}:
         causes = ", ".join(f"{n} {cause}" for cause, n in shown.items())
