@@ -91,8 +91,9 @@ def dense_residuals(log, tags, prior, law, biases, level):
             far = np.linalg.norm(places[None] - log.anchors[:, None], axis=-1).ravel()
             off = far + drift[k] + stay[:links] + stay[links] - log.ranges[k].ravel()
             rows.append(off[log.links[k].ravel()] / NOISE.floor_m)
-            rows.append([(t[k, 2] - level.height_m) / level.height_std_m])
-            rows.append(Q[k, :2, 2] / level.tilt_std_rad)
+            share = 1.0 if k == 0 else dt[k - 1] / level.time_s
+            rows.append(np.sqrt(share) * (t[k, 2:] - level.height_m) / level.height_std_m)
+            rows.append(np.sqrt(share) * Q[k, :2, 2] / level.tilt_std_rad)
         return np.concatenate(rows)
 
     return residuals, unpack
@@ -100,7 +101,7 @@ def dense_residuals(log, tags, prior, law, biases, level):
 
 def test_as_dense_least_squares_of_all_unknowns():
     log, tags, prior, path = world(1, 3, 4, 3)
-    level = Level(float(path.translation[0, 2]), 0.3, 1.0)
+    level = Level(float(path.translation[0, 2]), 0.3, 1.0, 2.0)
     model = LogModel(tags, NOISE, UnknownTwist(WANDER, PROCESS), BIASES, (level,))
     found = smooth(log, model, prior, (path.rotation, path.translation))
     residuals, unpack = dense_residuals(log, tags, prior, WANDER, BIASES, level)

@@ -16,15 +16,14 @@ __all__ = ["Level"]
 class Level:
     """Soft knowledge of height and tilt: a body that stays about level, at about one height.
 
-    Deviations of different epochs count as independent. With one that lasts, the height or the tilt
-    itself, the belief about that direction is narrower than it should be.
-
     Parameters
     ----------
     height_m, height_std_m
         Height of the body's origin, and the standard deviation about it; None: unknown.
     tilt_std_rad
         Standard deviation of roll and pitch about level, on each of two axes; None: unknown.
+    time_s
+        How long a deviation lasts: epochs closer than this tell of it together what one would.
 
     Raises
     ------
@@ -35,6 +34,7 @@ class Level:
     height_m: float | None = None
     height_std_m: float | None = None
     tilt_std_rad: float | None = None
+    time_s: float = 10.0
 
     def __post_init__(self) -> None:
         if (self.height_m is None) != (self.height_std_m is None):
@@ -45,6 +45,7 @@ class Level:
         for name in ("height_std_m", "tilt_std_rad"):
             if getattr(self, name) is not None:
                 check_number(name, getattr(self, name), low=1e-9)
+        check_number("time_s", self.time_s, low=1e-9)
 
     constants_std = np.zeros(0)
 
@@ -68,4 +69,9 @@ class Level:
         shape = upright.shape[:-1]
         residuals = residuals or [np.zeros((*shape, 0))]
         rows = rows or [np.zeros((*shape, 0, 6))]
-        return Rows(np.concatenate(residuals, axis=-1), np.concatenate(rows, axis=-2))
+        # The first epoch counts in full, what comes later by the time that has passed.
+        share = np.ones(times.shape)
+        share[..., 1:] = np.minimum(np.diff(times) / self.time_s, 1.0)
+        root = np.sqrt(share)[..., None]
+        residual, A = np.concatenate(residuals, axis=-1), np.concatenate(rows, axis=-2)
+        return Rows(root * residual, root[..., None] * A)

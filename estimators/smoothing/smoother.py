@@ -203,7 +203,7 @@ def smooth(
 
 
 def _of_errors(P: FloatArray, state: LogState) -> FloatArray:
-    """Covariance (..., K, n, n) of errors from that of steps: ``dW + w x W`` of a turning vector."""
+    """Covariance of errors (..., K, n, n) from that of steps: a vector turns, ``dW + w x W``."""
     T = np.broadcast_to(np.eye(P.shape[-1]), P.shape).copy()
     T[..., 6:9, :3] = -rotations.hat(state.extra[..., :3])
     return T @ P @ np.swapaxes(T, -1, -2)
