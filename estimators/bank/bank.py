@@ -32,6 +32,7 @@ from rbl_gym.estimators.bank.hypotheses import (
 from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.iekf.manifold import WEIGHTS, IteratedEkf, as_state, update_pose
+from rbl_gym.estimators.iekf.robust_update import ROBUST
 from rbl_gym.estimators.inputs import check_batches, check_one_process, plain, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
 from rbl_gym.geometry.rotations import error as rotation_error
@@ -80,7 +81,7 @@ class IteratedEkfBank:
     noise: NoiseLaw
     process: ProcessNoise
     iterations: int = 4
-    robust: bool = False
+    robust: bool | str = False
     volume: ArrayLike | None = None
 
     def __post_init__(self) -> None:
@@ -223,7 +224,7 @@ class IteratedEkfBank:
                 self.tags,
                 *start,
                 self.iterations,
-                self.robust,
+                ROBUST[self.robust],
             )
         )
 

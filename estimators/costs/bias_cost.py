@@ -17,11 +17,20 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, minimize_pose
-from rbl_gym.estimators.costs.range_cost import huber, loss_of
+from rbl_gym.estimators.costs.levenberg_marquardt import (
+    Linearization,
+    Solution,
+    minimize_pose,
+)
+from rbl_gym.estimators.costs.map_problem import positive_inverse
+from rbl_gym.estimators.costs.range_cost import loss_of
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
+
+# Weights that change by no more than this between two poses are those of both.
+_SAME_SHARE = 0.01
 
 
 class AugmentedState(NamedTuple):
@@ -59,9 +68,7 @@ class BiasProblem:
     sums
         S (L, K): of which extra states every link is biased.
     ranges, variance, links
-        (..., L), metres, of the links that matter; `links` None where all were measured.
-    chosen
-        Which of the M N links these are, (L,), or all.
+        (..., L), metres, and which of the L = M N links were measured.
     anchors, tags
         (..., M, 3), (N, 3).
     weight
@@ -77,8 +84,7 @@ class BiasProblem:
     sums: FloatArray
     ranges: FloatArray
     variance: FloatArray
-    links: BoolArray | None
-    chosen: np.ndarray | slice
+    links: BoolArray
     anchors: FloatArray
     tags: FloatArray
     weight: FloatArray
@@ -93,9 +99,9 @@ class BiasProblem:
         D[..., :3, :3] = rotations.left_jacobian_inverse(turn)
         D[..., 3:, 3:] = np.eye(3)
         distance, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
-        distance = distance.reshape((*distance.shape[:-2], -1))[..., self.chosen]
-        nu = self._unbiased - distance - _times(self._slope, e)
-        H = np.swapaxes(J[..., self.chosen], -1, -2) + self._slope @ D
+        distance = distance.reshape((*distance.shape[:-2], -1))
+        nu = np.where(self.links, self._unbiased - distance - _times(self._slope, e), 0.0)
+        H = np.swapaxes(J, -1, -2) + self._slope @ D
         return nu, H, e, D
 
     @functools.cached_property
@@ -124,30 +130,98 @@ class BiasProblem:
         hessian = transposed[1] @ self.information @ D + transposed[0] @ self.weight @ H
         return Linearization(cost, gradient, hessian)
 
-    def weighed(self, share: FloatArray | None = None) -> BiasProblem:
+    def weighed(self, share: FloatArray) -> BiasProblem:
         """The problem with its `weight`, each link of it worth a `share` (..., L) of its own."""
         S = self._own
         n = S.shape[-1]
-        variance = self.variance
-        if share is not None:
-            own = np.diagonal(S, axis1=-2, axis2=-1)
-            variance = (own + variance) / share - own
-        S = S + variance[..., None] * np.eye(n)
-        if self.links is None:
-            return dataclasses.replace(self, weight=inverse(S))
+        own = np.diagonal(S, axis1=-2, axis2=-1)
+        S = S + ((own + self.variance) / share - own)[..., None] * np.eye(n)
         both = self.links[..., None] & self.links[..., None, :]
         weight = np.where(both, inverse(np.where(both, S, np.eye(n))), 0.0)
         return dataclasses.replace(self, weight=weight)
 
     def shares(
-        self, rotation: FloatArray, translation: FloatArray, threshold: float, P: FloatArray | None
+        self,
+        rotation: FloatArray,
+        translation: FloatArray,
+        loss: FloatArray,
+        P: FloatArray | None = None,
     ) -> FloatArray:
-        """Huber's weights (..., L) of the innovations at a pose whose covariance is P (None: 0)."""
+        """Weights (..., L) by a loss of the innovations at a pose of covariance P (None: 0)."""
         nu, H, _, _ = self.innovation(rotation, translation)
         variance = np.diagonal(self._own, axis1=-2, axis2=-1) + self.variance
         if P is not None:
             variance = variance + np.einsum("...la,...ab,...lb->...l", H, P, H)
-        return loss_of((nu**2 / variance)[..., None], huber(threshold))[1][..., 0]
+        return loss_of((nu**2 / variance)[..., None], loss, (nu > 0)[..., None])[1][..., 0]
+
+
+@compiled("augmented_filter:update")
+def update_augmented(
+    rotation: FloatArray,
+    translation: FloatArray,
+    extra: FloatArray,
+    covariance: FloatArray,
+    ranges: FloatArray,
+    weights: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    start_rotation: FloatArray,
+    start_translation: FloatArray,
+    start_covariance: FloatArray,
+    iterations: int,
+    loss: FloatArray,
+    n_twist: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The most likely pose of an epoch near a start, and what follows for the other states.
+
+    Parameters
+    ----------
+    rotation, translation, extra, covariance
+        The prior, as of `AugmentedState`.
+    ranges, weights, anchors, tags
+        As of `RangeCost`; the variances are those of a range beside its bias.
+    start_rotation, start_translation, start_covariance
+        Where Gauss-Newton starts, and how well that pose is known: the weights of the loss are
+        taken there, and once more at the pose found from them.
+    iterations
+        Of Gauss-Newton, at the most.
+    loss
+        (5,), of the innovations whitened by all that is not known.
+    n_twist
+        How many of the extra states are no biases.
+
+    Returns
+    -------
+    The fields of the state. The covariance is NaN where the information about the pose is not
+    positive definite.
+    """
+    n_links = ranges.shape[-2] * ranges.shape[-1]
+    sums = sums_of(n_twist, (extra.shape[-1] - n_twist) // n_links, n_links)
+    batch = np.broadcast_shapes(
+        extra.shape[:-1], ranges.shape[:-2], weights.shape[:-2], anchors.shape[:-2]
+    )
+    state = AugmentedState(
+        *(
+            np.broadcast_to(field, (*batch, *field.shape[field.ndim - n :]))
+            for field, n in zip(
+                (rotation, translation, extra, covariance), (2, 1, 1, 2), strict=True
+            )
+        )
+    )
+    links = weights > 0
+    problem = _problem(state, sums, ranges, weights, anchors, tags)
+    start = start_rotation, start_translation
+    share = problem.shares(*start, loss, start_covariance)
+    problem = problem.weighed(share)
+    found = minimize_pose(problem, *start, iterations=iterations)
+    again = problem.shares(found.rotation, found.translation, loss)
+    changed = (np.abs(again - share) > _SAME_SHARE) & problem.links
+    if changed.any():
+        changed = changed.any(axis=-1)
+        second = problem.weighed(np.where(changed[..., None], again, share))
+        better = minimize_pose(second, found.rotation, found.translation, iterations)
+        found, problem = _chosen(changed, better, found), second
+    return _solved(problem, found, links.any(axis=-2))
 
 
 def sums_of(n_twist: int, n_laws: int, links: int) -> FloatArray:
@@ -155,59 +229,46 @@ def sums_of(n_twist: int, n_laws: int, links: int) -> FloatArray:
     return np.concatenate([np.zeros((links, n_twist)), *[np.eye(links)] * n_laws], axis=1)
 
 
-def problem(
+def _problem(
     state: AugmentedState,
     sums: FloatArray,
     ranges: FloatArray,
-    variance: FloatArray,
+    weights: FloatArray,
     anchors: FloatArray,
     tags: FloatArray,
-    links: BoolArray | None,
 ) -> BiasProblem:
-    """The problem of ranges and their variances (..., M, N), for a state of the same batch."""
-    flat = (*ranges.shape[:-2], -1)
-    ranges, variance = ranges.reshape(flat), variance.reshape(flat)
-    chosen: np.ndarray | slice = slice(None)
-    if links is not None:
-        links = links.reshape((*links.shape[:-2], -1))
-        if links.ndim == 1:
-            # The same for all trials: what is missing need not be carried along.
-            chosen, links = links.nonzero()[0], None
+    """The problem of ranges and their weights (..., M, N), for a state of the same batch."""
+    ranges, weights = (a.reshape((*a.shape[:-2], -1)) for a in (ranges, weights))
+    links = weights > 0
     P = state.covariance
-    information = inverse(P[..., :6, :6])
+    information = positive_inverse(P[..., :6, :6])
     gain = P[..., 6:, :6] @ information
-    found = BiasProblem(
+    return BiasProblem(
         state.rotation, state.translation, information, state.extra, gain,
-        P[..., 6:, 6:] - gain @ P[..., :6, 6:], sums[chosen], ranges[..., chosen],
-        variance[..., chosen], links, chosen, anchors, tags, weight=np.zeros(()),
+        P[..., 6:, 6:] - gain @ P[..., :6, 6:], sums, np.where(links, ranges, 0.0),
+        1 / np.where(links, weights, 1.0), links, anchors, tags, weight=np.zeros(()),
     )  # fmt: skip
-    return found.weighed()
 
 
-def solve(
-    problem: BiasProblem,
-    start: tuple[FloatArray, FloatArray],
-    covariance: FloatArray | None,
-    iterations: int,
-    threshold: float | None,
-    heard: BoolArray | np.bool_,
+def _chosen(where: BoolArray, first: Solution, second: Solution) -> Solution:
+    """The first solution of some trials (...), the second of the others."""
+    at = Linearization(
+        np.where(where, first.at.cost, second.at.cost),
+        np.where(where[..., None], first.at.gradient, second.at.gradient),
+        np.where(where[..., None, None], first.at.hessian, second.at.hessian),
+    )
+    return Solution(
+        np.where(where[..., None, None], first.rotation, second.rotation),
+        np.where(where[..., None], first.translation, second.translation),
+        at,
+        np.where(where, first.converged, second.converged),
+    )
+
+
+def _solved(
+    problem: BiasProblem, found: Solution, heard: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The fields of the state at the most likely pose near a start.
-
-    `heard` (..., N): which tags had any link.
-
-    Huber's weights (`threshold`; None: least squares) are taken at the start, whose pose has a
-    `covariance` (..., 6, 6; None: not to be counted), and once more at the pose found from them.
-    """
-    if threshold is not None:
-        share = problem.shares(*start, threshold, covariance)
-        problem = problem.weighed(share)
-    found = minimize_pose(problem, *start, iterations=iterations)
-    if threshold is not None:
-        again = problem.shares(found.rotation, found.translation, threshold, None)
-        if (np.abs(again - share) > 0.01).any():
-            problem = problem.weighed(again)
-            found = minimize_pose(problem, found.rotation, found.translation, iterations)
+    """The fields of the state at the pose found; `heard` (..., N): which tags had any link."""
     rotation, translation = found.rotation, found.translation
     nu, H, e, D = problem.innovation(rotation, translation)
     # Of the extra states: what the ranges tell given the pose, then what the pose tells.
@@ -215,9 +276,12 @@ def solve(
     slope = problem.gain @ D - gain @ H
     pose = kept_wide(
         AugmentedState(
-            problem.rotation, problem.translation, problem.extra, inverse(problem.information)
+            problem.rotation,
+            problem.translation,
+            problem.extra,
+            positive_inverse(problem.information),
         ),
-        AugmentedState(rotation, translation, problem.extra, inverse(found.at.hessian)),
+        AugmentedState(rotation, translation, problem.extra, positive_inverse(found.at.hessian)),
         heard,
         problem.tags,
     ).covariance

@@ -31,7 +31,7 @@ class DoaCost:
     station
         (..., 3), the base station, metres.
     loss
-        Of the squared whitened residuals, (..., 3), as of `range_cost.loss_of`.
+        Of the squared whitened residuals, (..., 5), as of `range_cost.loss_of`.
     """
 
     angles: FloatArray

@@ -8,6 +8,7 @@ that of the plain `IteratedEkf`, at its speed.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,13 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym import bounds
-from rbl_gym.bounds.twist import predict_covariance
+from rbl_gym.bounds.twist import covariance_after
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.costs import bias_cost
-from rbl_gym.estimators.costs.bias_cost import AugmentedState
+from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
+from rbl_gym.estimators.costs.range_cost import SQUARES, huber, redescending
 from rbl_gym.estimators.filter import PoseBelief, register
-from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state
+from rbl_gym.estimators.iekf.robust_update import LATE_HUBER, LATE_SHARE
 from rbl_gym.estimators.inputs import (
     check_batches,
     check_epoch,
@@ -31,15 +34,17 @@ from rbl_gym.estimators.inputs import (
     plain,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise, propagate
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
 
-# Whitened innovation at which Huber's loss on biased ranges turns from squares to absolute values:
-# what is left of real ranges has heavier tails than noise (1.0 was measured better than 1.5).
-HUBER = 1.0
+# Losses of whitened innovations, by `robust`. What is left of real ranges has heavier tails than
+# noise: Huber's threshold of 1.0 was measured better than 1.5.
+LOSSES = {False: SQUARES, True: huber(1.0), "late": redescending(LATE_HUBER, LATE_SHARE)}
+_AT_REST = np.zeros(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,33 +107,33 @@ class AugmentedEkf:
         known = self.twist is None
         if twist is None and known:
             raise ValueError("twist must be given to a filter that does not estimate it, got None")
-        if twist is not None:
-            twist = check_array("twist", twist, (6,))
-            if self.sensor is not None and not known:
-                state = _sensed(state, twist, self.sensor)  # pyright: ignore[reportArgumentType]
-        moving: FloatArray = twist if known else state.extra[..., :6]  # pyright: ignore[reportAssignmentType]
-        rotation, translation = propagate(state.rotation, state.translation, moving, dt)
-        covariance = predict_covariance(state.covariance, moving, dt, self.pose.process, self.twist)
-        extra = np.broadcast_to(state.extra, (*translation.shape[:-1], state.extra.shape[-1]))
-        moved = AugmentedState(rotation, translation, extra, covariance)
-        return self._forget(moved, dt)
+        told = _AT_REST if twist is None else check_array("twist", twist, (6,))
+        if twist is not None and self.sensor is not None and not known:
+            state = _sensed(state, told, self.sensor)
+        return AugmentedState(
+            *predict_augmented(
+                *state, told, dt, self._process, self._wander, self._laws, self._n_twist
+            )
+        )
 
-    def _forget(self, state: AugmentedState, dt: float) -> AugmentedState:
-        """Biases after `dt` seconds: towards zero, and wandering."""
-        start = self._n_twist
-        n = state.extra.shape[-1] - start
-        if n == 0 or all(law.time_s is None for law in self.biases):
-            return state
-        links = n // len(self.biases)
-        kept = np.ones(6 + start + n)
-        P = state.covariance.copy()
-        for k, law in enumerate(self.biases):
-            kept[6 + start + k * links :][:links] = law.decay(dt)
-        P *= kept[:, None] * kept
-        for k, law in enumerate(self.biases):
-            block = slice(6 + start + k * links, 6 + start + (k + 1) * links)
-            P[..., block, block] += (1 - law.decay(dt) ** 2) * law.covariance(links)
-        return state._replace(extra=state.extra * kept[6:], covariance=P)
+    @functools.cached_property
+    def _process(self) -> FloatArray:
+        """Variances (6,) of the pose's own motion after 1 s."""
+        return self.pose.process.std() ** 2
+
+    @functools.cached_property
+    def _wander(self) -> FloatArray:
+        """Variances (6,) of the change of an unknown twist after 1 s."""
+        return np.zeros(6) if self.twist is None else self.twist.std() ** 2
+
+    @functools.cached_property
+    def _laws(self) -> FloatArray:
+        """Standard deviation, time and common standard deviation (n, 3) of the biases' laws."""
+        laws = [
+            (law.std_m, math.inf if law.time_s is None else law.time_s, law.common_std_m)
+            for law in self.biases
+        ]
+        return np.array(laws).reshape(-1, 3)
 
     def update(
         self,
@@ -159,33 +164,32 @@ class AugmentedEkf:
         ranges, variance = np.broadcast_arrays(ranges, variance)
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         state = self._with_biases(state, ranges.shape[-2:])
-        batch = np.broadcast_shapes(
-            state.translation.shape[:-1], ranges.shape[:-2], anchors.shape[:-2]
-        )
-        state = AugmentedState(
-            *(
-                np.broadcast_to(field, (*batch, *field.shape[field.ndim - n :]))
-                for field, n in zip(state, (2, 1, 1, 2), strict=True)
-            )
-        )
-        sums = bias_cost.sums_of(self._n_twist, len(self.biases), math.prod(ranges.shape[-2:]))
-        problem = bias_cost.problem(state, sums, ranges, variance, anchors, self.pose.tags, mask)
-        start, covariance = (state.rotation, state.translation), state.covariance[..., :6, :6]
         weights = 1 / variance if mask is None else mask / variance
+        start, covariance = (state.rotation, state.translation), state.covariance[..., :6, :6]
         vague = self.pose.is_sought(pose, ranges, weights, anchors)
         if vague.any():
-            found = self._found_from_nothing(state, sums, ranges, variance, anchors, mask)
+            found = self._found_from_nothing(state, ranges, variance, anchors, mask)
             start = (
                 np.where(vague[..., None, None], found.rotation, start[0]),
                 np.where(vague[..., None], found.translation, start[1]),
             )
             covariance = np.where(vague[..., None, None], found.covariance, covariance)
-        threshold = HUBER if self.pose.robust else None
-        heard = np.ones(ranges.shape[-1], np.bool_) if mask is None else mask.any(axis=-2)
-        iterations = self.pose.iterations
-        return AugmentedState(
-            *bias_cost.solve(problem, start, covariance, iterations, threshold, heard)
+        found = AugmentedState(
+            *update_augmented(
+                *state,
+                ranges,
+                weights,
+                anchors,
+                self.pose.tags,
+                *start,
+                covariance,
+                self.pose.iterations,
+                LOSSES[self.pose.robust],
+                self._n_twist,
+            )
         )
+        as_state(*found[:2], found.covariance)
+        return found
 
     def _with_biases(self, state: AugmentedState, shape: tuple[int, ...]) -> AugmentedState:
         """The state with room for the biases of (M, N) links."""
@@ -212,7 +216,6 @@ class AugmentedEkf:
     def _found_from_nothing(
         self,
         state: AugmentedState,
-        sums: FloatArray,
         ranges: FloatArray,
         variance: FloatArray,
         anchors: FloatArray,
@@ -220,6 +223,8 @@ class AugmentedEkf:
     ) -> PoseState:
         """The pose by the plain filter, the biases taken for noise of the ranges."""
         prior = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
+        links = math.prod(ranges.shape[-2:])
+        sums = bias_cost.sums_of(self._n_twist, len(self.biases), links)
         biases = (state.extra @ sums.T).reshape((*state.extra.shape[:-1], *ranges.shape[-2:]))
         spread = np.einsum("lk,...kj,lj->...l", sums, state.covariance[..., 6:, 6:], sums)
         law = ranging.LinkNoise(np.sqrt(variance + spread.reshape(biases.shape)))
@@ -239,6 +244,51 @@ class AugmentedEkf:
         rotation = state.rotation.copy()
         covariance = state.covariance[..., :6, :6].copy()
         return PoseBelief(rotation, state.translation.copy(), covariance, rotation)
+
+
+@compiled("augmented_filter:predict")
+def predict_augmented(
+    rotation: FloatArray,
+    translation: FloatArray,
+    extra: FloatArray,
+    covariance: FloatArray,
+    twist: FloatArray,
+    dt: float,
+    process: FloatArray,
+    wander: FloatArray,
+    laws: FloatArray,
+    n_twist: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The fields of a state after `dt` seconds.
+
+    Parameters
+    ----------
+    rotation, translation, extra, covariance
+        As of `AugmentedState`.
+    twist
+        (..., 6), where it is known: where the state holds none (`n_twist` 0).
+    process, wander
+        Variances (6,) after 1 s: of the pose beyond its twist, and of the twist.
+    laws
+        (n, 3) of the biases: standard deviation, time (infinite: constant), common deviation.
+        They are forgotten, and wander.
+    """
+    moving = extra[..., :6] if n_twist else twist
+    moved = propagate(rotation, translation, moving, dt)
+    P = covariance_after(covariance, moving, dt, process, wander if n_twist else None)
+    links = (extra.shape[-1] - n_twist) // max(1, len(laws))
+    kept = np.ones(P.shape[-1])
+    blocks = [
+        slice(6 + n_twist + k * links, 6 + n_twist + (k + 1) * links) for k in range(len(laws))
+    ]
+    for block, (_, time, _) in zip(blocks, laws, strict=True):
+        kept[block] = np.exp(-dt / time)
+    P = P * kept[:, None] * kept
+    for block, (std, time, common) in zip(blocks, laws, strict=True):
+        fresh = std**2 * np.eye(links) + common**2
+        P[..., block, block] += (1 - np.exp(-dt / time) ** 2) * fresh
+    extra = np.broadcast_to(extra * kept[6:], (*moved[1].shape[:-1], extra.shape[-1]))
+    return *moved, extra, P
 
 
 def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> AugmentedState:
@@ -283,7 +333,7 @@ def iekf_cv(
     noise: NoiseLaw,
     process: ProcessNoise,
     iterations: int = 4,
-    robust: bool = False,
+    robust: bool | str = False,
     turn_rate_rad_s: float | Sequence[float] = 0.5,
     speed_m_s: float | Sequence[float] = 5.0,
     turn_acceleration: float | Sequence[float] = 0.3,
@@ -315,7 +365,7 @@ def iekf_bias(
     noise: NoiseLaw,
     process: ProcessNoise,
     iterations: int = 4,
-    robust: bool = False,
+    robust: bool | str = False,
     bias_std_m: float = 0.05,
     bias_time_s: float | None = None,
     common_std_m: float = 0.1,

@@ -31,7 +31,13 @@ from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positiv
 from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import PoseBelief
-from rbl_gym.estimators.iekf.robust_update import GATE, HUBER, robust_solution
+from rbl_gym.estimators.iekf.robust_update import (
+    GATE,
+    HUBER,
+    check_robust,
+    late_solution,
+    robust_solution,
+)
 from rbl_gym.estimators.iekf.vague_start import (
     VAGUE_ROTATION_RAD,
     global_start,
@@ -75,20 +81,26 @@ class IteratedEkf:
     iterations
         Gauss-Newton iterations of an update; one alone is overconfident at high turn noise.
     robust
-        Huber's loss on the whitened innovations (threshold 1.5): for real radios.
+        For real radios. True: Huber's loss on the whitened residuals (threshold 1.5), and nothing
+        of ranges that contradict the rest. ``"late"``: for ranges that err late rather than
+        early, weights that fall with the square of the residual, half as large where it is late.
     """
 
     tags: FloatArray
     noise: NoiseLaw
     process: ProcessNoise
     iterations: int = 4
-    robust: bool = False
+    robust: bool | str = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
         check_count("iterations", self.iterations)
-        if not isinstance(self.robust, bool):
-            raise ValueError(f"robust must be True or False, got {self.robust!r}")
+        check_robust(self.robust)
+
+    @functools.cached_property
+    def _loss(self) -> int:
+        """`robust` as the kernel takes it."""
+        return check_robust(self.robust)
 
     @functools.cached_property
     def _variance(self) -> FloatArray:
@@ -167,7 +179,7 @@ class IteratedEkf:
                 self.tags,
                 *start,
                 self.iterations,
-                self.robust,
+                self._loss,
             )[:3]
         )
 
@@ -192,7 +204,7 @@ class IteratedEkf:
             return None
         rotation, translation, P, cost = update_pose(
             *state, ranges, shares, numbers, anchors, self.tags,
-            state.rotation, state.translation, self.iterations, self.robust,
+            state.rotation, state.translation, self.iterations, self._loss,
         )  # fmt: skip
         # One number tells of all: it is finite where the covariance is.
         if not all_finite(cost):
@@ -303,7 +315,7 @@ def update_pose(
     start_rotation: FloatArray,
     start_translation: FloatArray,
     iterations: int,
-    robust: bool,
+    robust: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """The most likely pose of an epoch near a start, its covariance, and the cost there.
 
@@ -321,8 +333,8 @@ def update_pose(
     iterations
         Of Gauss-Newton, at the most.
     robust
-        Whether links may be wrong: see `robust_update`. The cost is then that of Huber's loss,
-        constant beyond `GATE`, of all links.
+        Of `robust_update.ROBUST`. 1: the cost is that of Huber's loss, constant beyond `GATE`, of
+        all links. 2: it is that of the redescending loss.
 
     Returns
     -------
@@ -333,7 +345,10 @@ def update_pose(
     prior = plain(PoseState(rotation, translation, covariance))
     data = RangeCost(ranges, weights, anchors, tags, SQUARES)
     problem = map_problem(prior, data)
-    if robust:
+    if robust == 2:
+        found = late_solution(problem, start_rotation, start_translation, iterations)
+        cost = found.at.cost
+    elif robust:
         found = robust_solution(problem, start_rotation, start_translation, iterations)
         data = dataclasses.replace(data, loss=cut_huber(HUBER, GATE))
         cost = dataclasses.replace(problem, data=data)(found.rotation, found.translation).cost

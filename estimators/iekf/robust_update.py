@@ -1,19 +1,28 @@
-"""The robust update: Huber's loss, and no pull at all of links that contradict the rest.
+"""The robust updates: Huber's loss, and no pull at all of links that contradict the rest.
 
 Huber's loss alone survives wrong ranges, but each of them still pulls with the force of 1.5
 standard deviations: with one range in ten over a reflected path that doubles the error.
+
+Where ranges err late, the redescending loss for late ranges takes the place of both.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
-from rbl_gym.estimators.costs.range_cost import RangeCost, cut_huber, huber, squared_residuals
+from rbl_gym.estimators.costs.range_cost import (
+    RangeCost,
+    cut_huber,
+    huber,
+    redescending,
+    squared_residuals,
+)
 
 # Whitened residual at which Huber's loss turns from squares to absolute values.
 HUBER = 1.5
@@ -21,6 +30,11 @@ HUBER = 1.5
 GATE = 4.0
 # Where the gate at the prior was wrong: first with care, as Huber's pose is biased.
 _CUTOFFS = (6.0, GATE)
+# Whitened residual from which on a range that may be late counts less, and what is left of its
+# weight where it is late.
+LATE_HUBER, LATE_SHARE = 1.0, 0.5
+# What `robust` may be, to the kernel.
+ROBUST = {False: 0, True: 1, "late": 2}
 # A pose that more than this share of the links contradict is itself in doubt: all links count.
 _LARGEST_SHARE_OUT = 0.5
 
@@ -69,6 +83,24 @@ def robust_solution(
         ),
         np.where(wrong, found.converged, first.converged),
     )
+
+
+def late_solution(
+    problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
+) -> Solution:
+    """The pose by the redescending loss, from that of Huber's; arguments as `robust_solution`."""
+    data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
+    easy = _with(problem, dataclasses.replace(data, loss=huber(HUBER)))
+    found = minimize_pose(easy, rotation, translation, iterations, 1e-2)
+    hard = _with(problem, dataclasses.replace(data, loss=redescending(LATE_HUBER, LATE_SHARE)))
+    return minimize_pose(hard, found.rotation, found.translation, iterations)
+
+
+def check_robust(robust: Any) -> int:
+    """`robust` as the kernel takes it, or a ValueError."""
+    if not isinstance(robust, bool | str) or robust not in ROBUST:
+        raise ValueError(f"robust must be True, False or 'late', got {robust!r:.80}")
+    return ROBUST[robust]
 
 
 def _with(problem: MapProblem, data: RangeCost) -> MapProblem:

@@ -31,20 +31,28 @@ def predict_covariance(
     beyond the twelve stand still. Without a law the twist is known: all beyond six stand still.
     `process` adds its noise to the pose.
     """
+    wander = None if law is None else law.std() ** 2
+    return covariance_after(P, twist, dt, process.std() ** 2, wander)
+
+
+def covariance_after(
+    P: FloatArray, twist: FloatArray, dt: float, process: FloatArray, wander: FloatArray | None
+) -> FloatArray:
+    """`predict_covariance` by variances (6,) after 1 s; `wander` None: the twist is known."""
     turn = twist[..., :3] * dt
     step, jacobian = _EXP(turn), _LEFT_JACOBIAN(turn)
     n = P.shape[-1]
     F = np.broadcast_to(np.eye(n), (*turn.shape[:-1], n, n)).copy()
     F[..., :3, :3] = step
-    if law is not None:
+    if wander is not None:
         F[..., :3, 6:9] = dt * jacobian
         F[..., 3:6, 9:12] = dt * np.eye(3)
     # The noise in the frame of the turn: of an acceleration q the change of speed has variance
     # q dt, the way q dt^3 / 3, and their covariance is q dt^2 / 2.
-    wander = np.zeros(6) if law is None else law.std() ** 2
+    of_twist = np.zeros(6) if wander is None else wander
     Q = np.zeros((n, n))
-    Q[range(6), range(6)] = dt * process.std() ** 2 + dt**3 / 3 * wander
-    if law is not None:
+    Q[range(6), range(6)] = dt * process + dt**3 / 3 * of_twist
+    if wander is not None:
         Q[range(6), range(6, 12)] = Q[range(6, 12), range(6)] = dt**2 / 2 * wander
         Q[range(6, 12), range(6, 12)] = dt * wander
     G = np.broadcast_to(np.eye(n), F.shape).copy()

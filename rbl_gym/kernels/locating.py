@@ -14,6 +14,7 @@ from rbl_gym.kernels.eigen import eigen, nearest_rotation
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6, of_size
 from rbl_gym.kernels.pose_solver import copy_pose, room_to_solve, solve, take_linearization
+from rbl_gym.kernels.range_cost import set_huber
 
 _cholesky3, _solve3, _invert3 = of_size(3)
 
@@ -298,7 +299,7 @@ def search(
 ) -> tuple[float, bool]:  # fmt: skip
     """The best of many local solves and its rivals; `has_first`: (Q, t) is a solution already."""
     centre, loss = np.zeros(3), room[3]
-    loss[0] = loss[1] = loss[2] = math.inf
+    set_huber(loss, math.inf)
     for n in range(tags.shape[0]):
         for i in range(3):
             centre[i] += tags[n, i] / tags.shape[0]
@@ -365,7 +366,7 @@ def most_likely_pose(
                 other_Q[k, i, j] = 1.0 if i == j else 0.0
     room = room_to_solve()
     loss = room[3]
-    loss[0] = loss[1] = loss[2] = math.inf
+    set_huber(loss, math.inf)
     usable = True
     for i in range(3):
         usable = usable and math.isfinite(start_t[i])

@@ -14,7 +14,7 @@ from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
 from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
-from rbl_gym.kernels.range_cost import loss_of, squared_residuals
+from rbl_gym.kernels.range_cost import loss_of, set_huber, squared_residuals
 
 # No length is as large.
 HUGE = 1e50
@@ -22,6 +22,11 @@ HUGE = 1e50
 HUBER = 1.5
 # Standard deviations beyond which a link contradicts a pose.
 GATE = 4.0
+# What `robust` may be: squares, Huber's loss with a gate, the loss of ranges that err late.
+SQUARES, GATED, LATE = 0, 1, 2
+# Whitened residual from which on a range that may be late counts less, and what is left of its
+# weight where it is late.
+LATE_HUBER, LATE_SHARE = 1.0, 0.5
 # Where the gate at the prior was wrong: first with care, as Huber's pose is biased.
 CUTOFFS = (6.0, GATE)
 # A pose that more than this share of the links contradict is itself in doubt: all links count.
@@ -156,7 +161,7 @@ def data_cost(squared: Any, loss: Any) -> float:
     total = 0.0
     for m in range(squared.shape[0]):
         for n in range(squared.shape[1]):
-            total += loss_of(squared[m, n], loss)[0]
+            total += loss_of(squared[m, n], False, loss)[0]
     return total
 
 
@@ -242,7 +247,7 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
 
 @gufunc(
     "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(),()->(d,d),(d),(p,p),()",
-    "ffffffffffibffff",
+    "ffffffffffiiffff",
 )
 def update(
     Q0,
@@ -264,13 +269,13 @@ def update(
 ):
     """The most likely pose of an epoch near a start, its covariance, and the cost there.
 
-    The robust one leaves out links that the prior contradicts (stage 0). Where the pose that
+    `robust` as GATED leaves out links that the prior contradicts (stage 0). Where the pose that
     follows tells otherwise, it starts again with Huber's loss on all of them (1), and leaves out
-    those beyond each cutoff (2 and 3).
+    those beyond each cutoff (2 and 3). As LATE it goes from Huber's loss to the redescending one.
     """
     room = room_to_solve()
     H, information, loss, L = room[1], room[2], room[3], room[4]
-    loss[0] = loss[1] = loss[2] = math.inf
+    set_huber(loss, math.inf)
     weights = np.empty(shares.shape)
     kept, tolerance = weights, 1e-6
     squared = kept
@@ -281,8 +286,11 @@ def update(
         fill(math.nan, P)
         cost[0] = math.nan
         return
-    if robust:
+    if robust != SQUARES:
         loss[0] = HUBER
+    if robust == LATE:
+        tolerance = 1e-2
+    if robust == GATED:
         squared, kept = np.empty(weights.shape), np.empty(weights.shape)
         for m in range(weights.shape[0]):
             for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
@@ -291,7 +299,9 @@ def update(
         squared_residuals(Q0, t0, ranges, weights, anchors, tags, squared)
         leave_out(P0, squared, tags, kept)
     for stage in range(4):
-        if stage == 1:
+        if stage == 1 and robust == LATE:
+            loss[0], loss[3], loss[4], tolerance = LATE_HUBER, 2.0, LATE_SHARE, 1e-6
+        elif stage == 1:
             if not is_wrong(squared, weights, kept):
                 break
             kept, tolerance = weights, 1e-2
@@ -300,26 +310,28 @@ def update(
             cutoff = CUTOFFS[stage - 2]
             doubted = count_beyond(squared, cutoff) > LARGEST_SHARE_OUT * links
             loss[1] = math.inf if doubted else cutoff
-        if stage < 2:
+        if stage == 0 or (stage == 1 and robust == GATED):
             copy_pose(start_Q, start_t, Q, t)
         total, _ = solve(
             Q, t, True, Q0, t0, information, ranges, kept, anchors, tags, loss,
             iterations, tolerance, room,
         )  # fmt: skip
-        if not robust:
+        if robust == SQUARES or (robust == LATE and stage == 1):
             break
+        if robust == LATE:
+            continue
         squared_residuals(Q, t, ranges, weights, anchors, tags, squared)
     mirror(H)
     keep_wide(Q0, information, Q, weights, tags, H)
     if not invert(H, L, P):
         total = math.nan
-    if robust:
+    if robust == GATED:
         # A link that contradicts the pose costs so much and no more, whoever left it out.
         of_prior = total
         for m in range(weights.shape[0]):
             for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
                 if kept[m, n] > 0:
-                    of_prior -= loss_of(squared[m, n], loss)[0]
+                    of_prior -= loss_of(squared[m, n], False, loss)[0]
         loss[1] = GATE
         total = of_prior + data_cost(squared, loss)
     cost[0] = total

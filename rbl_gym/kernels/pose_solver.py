@@ -126,7 +126,7 @@ def solve(
 def room_to_solve() -> Any:
     """Arrays to work in, of two that are allocated, as that takes its time.
 
-    A gradient (6,), a Hessian (6, 6); an information (6, 6), a loss (3,) and a factor (6, 6) that
+    A gradient (6,), a Hessian (6, 6); an information (6, 6), a loss (6,) and a factor (6, 6) that
     `solve` is given or leaves alone; what it needs besides.
     """
     large, small = np.empty((5, 6, 6)), np.empty((3, 3, 3))

@@ -13,11 +13,12 @@ from rbl_gym.kernels.jit import helper, inlined
 
 
 @inlined
-def loss_of(squared: float, loss: Any) -> tuple[float, float]:
+def loss_of(squared: float, late: bool, loss: Any) -> tuple[float, float]:
     """Cost of a squared whitened residual, and the share of its weight that is left.
 
-    `loss` is (threshold, cutoff, scale): Huber's up to a cutoff, or that of Geman and McClure
-    where the scale is finite.
+    `loss` is (threshold, cutoff, scale, power, late): Huber's up to a cutoff, or that of Geman
+    and McClure where the scale is finite, or the redescending one where the power is 2. A range
+    that is late, longer than expected, has a share of its own of all that.
     """
     threshold, cutoff, scale = loss[0], loss[1], loss[2]
     if scale < math.inf:
@@ -31,7 +32,22 @@ def loss_of(squared: float, loss: Any) -> tuple[float, float]:
     if squared > threshold * threshold:
         share = threshold / math.sqrt(squared)
     cost = share * squared * (1 - 0.5 * share)
+    if loss[3] == 2.0:
+        if share < 1:
+            cost = threshold * threshold * (0.5 - math.log(share))
+        share *= share
+        if late:
+            cost *= loss[4]
+            share *= loss[4]
     return cost, share if inside else 0.0
+
+
+@inlined
+def set_huber(loss: Any, threshold: float) -> None:
+    """Huber's loss into `loss`; half the square where the threshold is infinite."""
+    loss[0] = threshold
+    loss[1] = loss[2] = math.inf
+    loss[3] = loss[4] = 1.0
 
 
 @inlined
@@ -74,7 +90,7 @@ def linearize(
             if plain:
                 cost += 0.5 * weight * residual * residual
             else:
-                part, share = loss_of(weight * residual * residual, loss)
+                part, share = loss_of(weight * residual * residual, residual < 0, loss)
                 cost += part
                 weight *= share
             # The weight of the difference, which is no unit vector: a root less to divide by.

@@ -1,0 +1,397 @@
+"""Prediction and update of a pose with an unknown twist and biased links, one body.
+
+The textbook forms are `rbl_gym.estimators.iekf.augmented` and `estimators.costs.bias_cost`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.kernels import rotations
+from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.linear_algebra import (
+    cholesky,
+    cholesky6,
+    fill,
+    invert_factored,
+    invert_factored6,
+    solve_factored6,
+)
+from rbl_gym.kernels.pose_filter import keep_wide
+from rbl_gym.kernels.pose_solver import copy_pose, mirror
+from rbl_gym.kernels.range_cost import loss_of
+
+# No step is longer (rad, m) on any axis.
+_LONGEST = 1e12
+# Weights that change by no more than this between two poses are those of both.
+_SAME_SHARE = 0.01
+
+
+@gufunc(
+    "(d,d),(d),(k),(s,s),(p),(),(p),(p),(l,q),()->(d,d),(d),(k),(s,s)",
+    "fffffffffiffff",
+)
+def predict(
+    Q0, t0, extra0, P0, twist, dt, variance, wander, laws, n_twist, Q, t, extra, P
+):  # fmt: skip
+    """Pose, twist and biases after a step: ``F P F^T + G Q G^T``, biases forgotten."""
+    turn, J, both = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    kept = np.empty(max(1, laws.shape[0]))
+    size = P0.shape[0]
+    unknown = n_twist > 0
+    reach = dt**3 / 3 if unknown else 0.0
+    x, y, z = twist[0] * dt, twist[1] * dt, twist[2] * dt
+    if unknown:
+        x, y, z = extra0[0] * dt, extra0[1] * dt, extra0[2] * dt
+    rotations.exp(x, y, z, turn)
+    rotations.left_jacobian(x, y, z, J)
+    rotations.compose(turn, Q0, Q)
+    for i in range(3):
+        t[i] = t0[i] + dt * (extra0[3 + i] if unknown else twist[3 + i])
+    first = 6 + n_twist
+    links = (size - first) // laws.shape[0] if laws.shape[0] > 0 else 1
+    for a in range(laws.shape[0]):
+        kept[a] = math.exp(-dt / laws[a, 1])
+    # Rows of P, then columns: F acts on those of the pose, the decay on those of the biases.
+    for i in range(size):
+        decay = 1.0 if i < first else kept[(i - first) // links]
+        for j in range(size):
+            if i < 3:
+                value = turn[i, 0] * P0[0, j] + turn[i, 1] * P0[1, j] + turn[i, 2] * P0[2, j]
+                if unknown:
+                    value += dt * (J[i, 0] * P0[6, j] + J[i, 1] * P0[7, j] + J[i, 2] * P0[8, j])
+            elif i < 6:
+                value = P0[i, j]
+                if unknown:
+                    value += dt * P0[i + 6, j]
+            else:
+                value = decay * P0[i, j]
+            P[i, j] = value
+    for i in range(size):
+        a0, a1, a2 = P[i, 0], P[i, 1], P[i, 2]
+        for j in range(3):
+            value = turn[j, 0] * a0 + turn[j, 1] * a1 + turn[j, 2] * a2
+            if unknown:
+                value += dt * (J[j, 0] * P[i, 6] + J[j, 1] * P[i, 7] + J[j, 2] * P[i, 8])
+                P[i, 3 + j] += dt * P[i, 9 + j]
+            P[i, j] = value
+        for j in range(first, size):
+            P[i, j] *= kept[(j - first) // links]
+    # Of an acceleration q the change of speed has variance q dt, the way q dt^3 / 3, and their
+    # covariance is q dt^2 / 2.
+    for i in range(3):
+        for j in range(3):
+            both[i, j] = J[i, j] * (dt * variance[j] + reach * wander[j])
+    for i in range(3):
+        for j in range(3):
+            P[i, j] += both[i, 0] * J[j, 0] + both[i, 1] * J[j, 1] + both[i, 2] * J[j, 2]
+            if unknown:
+                cross = 0.5 * dt * dt * J[i, j] * wander[j]
+                P[i, 6 + j] += cross
+                P[6 + j, i] += cross
+        P[3 + i, 3 + i] += dt * variance[3 + i] + reach * wander[3 + i]
+        if unknown:
+            cross = 0.5 * dt * dt * wander[3 + i]
+            P[3 + i, 9 + i] += cross
+            P[9 + i, 3 + i] += cross
+            P[6 + i, 6 + i] += dt * wander[i]
+            P[9 + i, 9 + i] += dt * wander[3 + i]
+    for i in range(n_twist):
+        extra[i] = extra0[i]
+    for a in range(laws.shape[0]):
+        begin = first + a * links
+        fresh = 1 - kept[a] * kept[a]
+        for i in range(links):
+            extra[begin - 6 + i] = kept[a] * extra0[begin - 6 + i]
+            if fresh > 0:
+                for j in range(links):
+                    P[begin + i, begin + j] += fresh * laws[a, 2] * laws[a, 2]
+                P[begin + i, begin + i] += fresh * laws[a, 0] * laws[a, 0]
+
+
+@helper
+def innovation(
+    Q: Any, t: Any, Q0: Any, t0: Any, told: Any, slope: Any, chosen: Any, anchors: Any, tags: Any,
+    e: Any, D: Any, nu: Any, H: Any,
+) -> None:  # fmt: skip
+    """nu (L,), H = -dnu (L, 6) by (w, v), e (6,) and its derivative's rotation D (3, 3)."""
+    for i in range(3):
+        e[3 + i] = t[i] - t0[i]
+        for j in range(3):
+            D[i, j] = Q[i, 0] * Q0[j, 0] + Q[i, 1] * Q0[j, 1] + Q[i, 2] * Q0[j, 2]
+    e[0], e[1], e[2] = rotations.log(D)
+    rotations.left_jacobian_inverse(e[0], e[1], e[2], D)
+    n_tags = tags.shape[0]
+    for k in range(nu.shape[0]):
+        m, n = chosen[k] // n_tags, chosen[k] % n_tags
+        x = Q[0, 0] * tags[n, 0] + Q[0, 1] * tags[n, 1] + Q[0, 2] * tags[n, 2]
+        y = Q[1, 0] * tags[n, 0] + Q[1, 1] * tags[n, 1] + Q[1, 2] * tags[n, 2]
+        z = Q[2, 0] * tags[n, 0] + Q[2, 1] * tags[n, 1] + Q[2, 2] * tags[n, 2]
+        ux, uy, uz = x + t[0] - anchors[m, 0], y + t[1] - anchors[m, 1], z + t[2] - anchors[m, 2]
+        # Where an anchor stands on a tag the difference is zero, and so are all the terms.
+        distance = math.sqrt(max(ux * ux + uy * uy + uz * uz, 1e-200))
+        ux, uy, uz = ux / distance, uy / distance, uz / distance
+        value = told[k] - distance
+        for j in range(6):
+            value -= slope[k, j] * e[j]
+        nu[k] = value
+        for j in range(3):
+            H[k, j] = slope[k, 0] * D[0, j] + slope[k, 1] * D[1, j] + slope[k, 2] * D[2, j]
+            H[k, 3 + j] = slope[k, 3 + j]
+        H[k, 0] += y * uz - z * uy
+        H[k, 1] += z * ux - x * uz
+        H[k, 2] += x * uy - y * ux
+        H[k, 3] += ux
+        H[k, 4] += uy
+        H[k, 5] += uz
+
+
+@helper
+def linearize(e: Any, D: Any, nu: Any, H: Any, W: Any, information: Any, g: Any, A: Any) -> float:
+    """The cost at a pose; its gradient and the lower half of its Hessian into g and A."""
+    cost = 0.0
+    for i in range(6):
+        pull = 0.0
+        for j in range(6):
+            pull += information[i, j] * e[j]
+        cost += 0.5 * e[i] * pull
+        g[i] = pull
+    x, y, z = g[0], g[1], g[2]
+    for i in range(3):
+        g[i] = D[0, i] * x + D[1, i] * y + D[2, i] * z
+    for i in range(6):
+        for j in range(i + 1):
+            # D^T I D, D being blkdiag(D, I).
+            total = 0.0
+            if i < 3:
+                for a in range(3):
+                    for b in range(3):
+                        total += D[a, i] * information[a, b] * D[b, j]
+            elif j < 3:
+                for b in range(3):
+                    total += information[i, b] * D[b, j]
+            else:
+                total = information[i, j]
+            A[i, j] = total
+    for k in range(nu.shape[0]):
+        pull = 0.0
+        for m in range(nu.shape[0]):
+            pull += W[k, m] * nu[m]
+        cost += 0.5 * nu[k] * pull
+        for i in range(6):
+            g[i] -= H[k, i] * pull
+            of_row = 0.0
+            for m in range(nu.shape[0]):
+                of_row += W[k, m] * H[m, i]
+            for j in range(i, 6):
+                A[j, i] += H[k, j] * of_row
+    return cost
+
+
+@helper
+def weigh(own: Any, variance: Any, share: Any, L: Any, W: Any) -> bool:
+    """``W = (own + R)^-1``, R the variances, of each link as much more as its share is less."""
+    for i in range(own.shape[0]):
+        for j in range(i + 1):
+            L[i, j] = own[i, j]
+        L[i, i] = (own[i, i] + variance[i]) / share[i]
+    good = cholesky(L, L)
+    invert_factored(L, W)
+    return good
+
+
+@helper
+def shares(nu: Any, H: Any, own: Any, variance: Any, P: Any, loss: Any, share: Any) -> float:
+    """Weights of the innovations at a pose of covariance P; the most they changed."""
+    most = 0.0
+    for k in range(nu.shape[0]):
+        expected = own[k, k] + variance[k]
+        for i in range(6):
+            for j in range(6):
+                expected += H[k, i] * P[i, j] * H[k, j]
+        left = loss_of(nu[k] * nu[k] / expected, nu[k] > 0, loss)[1]
+        most = max(most, abs(left - share[k]))
+        share[k] = left
+    return most
+
+
+@gufunc(
+    "(d,d),(d),(k),(s,s),(m,n),(m,n),(m,d),(n,d),(d,d),(d),(p,p),(),(l),()->(d,d),(d),(k),(s,s)",
+    "fffffffffffififfff",
+)
+def update(
+    Q0, t0, extra0, P0, ranges, weights, anchors, tags, start_Q, start_t, start_P, iterations,
+    loss, n_twist, Q, t, extra, P,
+):  # fmt: skip
+    """The most likely pose of an epoch whose ranges carry biases, and what follows from it."""
+    size, n_tags = P0.shape[0], tags.shape[0]
+    n_links = weights.shape[0] * n_tags
+    first = 6 + n_twist
+    n_laws = (size - first) // n_links
+    count = 0
+    sound = True
+    chosen = np.empty(n_links, np.int64)
+    for m in range(weights.shape[0]):
+        for n in range(n_tags):
+            if weights[m, n] > 0:
+                chosen[count] = m * n_tags + n
+                count += 1
+    chosen = chosen[:count]
+    six = np.empty((7, 6, 6))
+    information, A, best, L6, pose, at_start = six[0], six[1], six[2], six[3], six[4], six[5]
+    g, new_g, step, e = six[6, 0], six[6, 1], six[6, 2], six[6, 3]
+    small = np.empty((3, 3, 3))
+    D, turn, new_Q = small[0], small[1], small[2]
+    new_t = np.empty(3)
+    rows = np.empty((4, count, 6))
+    of_pose, slope, H, new_H = rows[0], rows[1], rows[2], rows[3]
+    squares = np.empty((3, count, count))
+    own, W, L = squares[0], squares[1], squares[2]
+    values = np.empty((5, count))
+    told, variance, share, nu, new_nu = values[0], values[1], values[2], values[3], values[4]
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = P0[i, j]
+            at_start[i, j] = start_P[i, j]
+    sound = cholesky6(A, L6)
+    invert_factored6(L6, information)
+    for k in range(count):
+        told[k] = ranges[chosen[k] // n_tags, chosen[k] % n_tags]
+        variance[k] = 1 / weights[chosen[k] // n_tags, chosen[k] % n_tags]
+        share[k] = 1.0
+        for j in range(6):
+            of_pose[k, j] = 0.0
+        for a in range(n_laws):
+            row = first + a * n_links + chosen[k]
+            told[k] -= extra0[row - 6]
+            for j in range(6):
+                of_pose[k, j] += P0[row, j]
+    for k in range(count):
+        for i in range(6):
+            slope[k, i] = 0.0
+            for j in range(6):
+                slope[k, i] += of_pose[k, j] * information[j, i]
+        for m in range(k + 1):
+            total = 0.0
+            for a in range(n_laws):
+                for b in range(n_laws):
+                    row = first + a * n_links + chosen[k]
+                    total += P0[row, first + b * n_links + chosen[m]]
+            for j in range(6):
+                total -= slope[k, j] * of_pose[m, j]
+            own[k, m] = own[m, k] = total
+    copy_pose(start_Q, start_t, Q, t)
+    robust = loss[0] < math.inf
+    for again in range(2):
+        innovation(Q, t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
+        if again:
+            fill(0.0, at_start)
+        if robust:
+            changed = shares(nu, H, own, variance, at_start, loss, share)
+            if again and changed <= _SAME_SHARE:
+                break
+        elif again:
+            break
+        sound = weigh(own, variance, share, L, W) and sound
+        # Damped Gauss-Newton as `pose_solver.solve`.
+        cost, decrease, damping = 0.0, 0.0, 0.0
+        copy_pose(Q, t, new_Q, new_t)
+        for k in range(iterations + 1):
+            innovation(
+                new_Q, new_t, Q0, t0, told, slope, chosen, anchors, tags, e, D, new_nu, new_H
+            )
+            new = linearize(e, D, new_nu, new_H, W, information, new_g, A)
+            if k == 0 or new <= cost * (1 + 1e-12) or decrease < 1e-8:
+                cost = new
+                damping = 0.1 * damping if damping > 1e-5 else 0.0
+                copy_pose(new_Q, new_t, Q, t)
+                for i in range(6):
+                    g[i] = new_g[i]
+                    for j in range(i + 1):
+                        best[i, j] = A[i, j]
+            else:
+                damping = max(10 * damping, 1e-3)
+            if k == iterations or (k > 0 and decrease < 1e-12):
+                break
+            for i in range(6):
+                for j in range(i):
+                    A[i, j] = best[i, j]
+                A[i, i] = best[i, i] * (1 + damping + 1e-14) + 1e-300
+            cholesky6(A, L6)
+            solve_factored6(L6, g, step)
+            decrease = 0.0
+            for i in range(6):
+                step[i] = min(max(-step[i], -_LONGEST), _LONGEST)
+                decrease -= g[i] * step[i]
+            decrease *= 1 + damping
+            rotations.exp(step[0], step[1], step[2], turn)
+            rotations.compose(turn, Q, new_Q)
+            for i in range(3):
+                new_t[i] = t[i] + step[3 + i]
+    innovation(Q, t, Q0, t0, told, slope, chosen, anchors, tags, e, D, nu, H)
+    mirror(best)
+    keep_wide(Q0, information, Q, weights, tags, best)
+    sound = cholesky6(best, L6) and sound
+    invert_factored6(L6, pose)
+    if not sound:
+        fill(math.nan, pose)
+    # Of the extra states: what the ranges tell given the pose, then what the pose tells.
+    K = size - 6
+    wide = np.empty((K, 2 * count + 12))
+    told_by, gain = wide[:, :count], wide[:, count : 2 * count]
+    by_pose, moved = wide[:, 2 * count : 2 * count + 6], wide[:, 2 * count + 6 :]
+    for i in range(K):
+        for j in range(6):
+            total = 0.0
+            for m in range(6):
+                total += P0[6 + i, m] * information[m, j]
+            by_pose[i, j] = total
+        for k in range(count):
+            total = 0.0
+            for b in range(n_laws):
+                total += P0[6 + i, first + b * n_links + chosen[k]]
+            for j in range(6):
+                total -= by_pose[i, j] * of_pose[k, j]
+            told_by[i, k] = total
+    for i in range(6):
+        for j in range(6):
+            P[i, j] = pose[i, j]
+    for i in range(K):
+        for k in range(count):
+            total = 0.0
+            for m in range(count):
+                total += told_by[i, m] * W[m, k]
+            gain[i, k] = total
+        value = extra0[i]
+        for j in range(6):
+            value += by_pose[i, j] * e[j]
+        for k in range(count):
+            value += gain[i, k] * nu[k]
+        extra[i] = value
+        x, y, z = by_pose[i, 0], by_pose[i, 1], by_pose[i, 2]
+        for j in range(6):
+            total = by_pose[i, j]
+            if j < 3:
+                total = x * D[0, j] + y * D[1, j] + z * D[2, j]
+            for k in range(count):
+                total -= gain[i, k] * H[k, j]
+            moved[i, j] = total
+        for j in range(6):
+            total = 0.0
+            for m in range(6):
+                total += moved[i, m] * pose[m, j]
+            P[6 + i, j] = total
+            P[j, 6 + i] = total
+    for i in range(K):
+        for j in range(i + 1):
+            total = P0[6 + i, 6 + j]
+            for m in range(6):
+                total -= by_pose[i, m] * P0[6 + j, m]
+                total += P[6 + i, m] * moved[j, m]
+            for k in range(count):
+                total -= gain[i, k] * told_by[j, k]
+            P[6 + i, 6 + j] = total
+            P[6 + j, 6 + i] = total
