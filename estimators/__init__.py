@@ -23,6 +23,7 @@ from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
 from rbl_gym.estimators.iekf.doa_filter import DoaEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.innovation import Innovations, innovations
+from rbl_gym.estimators.level import hold_level
 from rbl_gym.estimators.linear.kalman import KalmanFamily, KalmanState
 from rbl_gym.estimators.locating.doa import locate_doa
 from rbl_gym.estimators.locating.localization import PoseEstimate, locate, methods
@@ -67,6 +68,7 @@ __all__ = [
     "cycle_iteration",
     "cycle_projection",
     "frames",
+    "hold_level",
     "innovations",
     "locate",
     "locate_doa",

@@ -307,7 +307,7 @@ def test_environments_take_it_by_its_name():
         ({"volume": [[0, 0], [1, 1]]}, r"volume must have shape \(..., 2, 3\)"),
         ({"volume": np.zeros((4, 2, 3))}, "volume must be a lower and an upper corner"),
         ({"iterations": 0}, "iterations must be"),
-        ({"robust": 1}, "robust must be True or False"),
+        ({"robust": 1}, "robust must be True, False or 'late'"),
         ({"rivals": 3}, "filter 'iekf-bank' has no option 'rivals'"),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import estimators, metrics, motion
-from rbl_gym.estimators.costs.range_cost import cut_huber, loss_of
+from rbl_gym.estimators.costs.range_cost import cut_huber, huber, loss_of, redescending
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import monte_carlo
@@ -49,6 +49,26 @@ def test_the_cut_loss_and_its_weights(cutoff):
     slope = (next(loss((x + 1e-6) ** 2)) - next(loss((x - 1e-6) ** 2))) / 2e-6
     away = np.abs(x - cutoff) > 1e-3
     np.testing.assert_allclose(slope[away], (weight * x)[away], atol=1e-5)
+
+
+def test_the_redescending_loss_and_its_weights():
+    """Weights min(1, (h / x)^2), half as large of late ranges; the cost is their integral."""
+    x = np.linspace(-6.0, 6.0, 121)
+
+    def loss(x):
+        return (a[0] for a in loss_of(x[None] ** 2, redescending(0.8), x[None] > 0))
+
+    _, weight = loss(x)
+    want = np.minimum(1.0, (0.8 / np.maximum(np.abs(x), 1e-9)) ** 2) * np.where(x > 0, 0.5, 1.0)
+    np.testing.assert_allclose(weight, want)
+    slope = (next(loss(x + 1e-6)) - next(loss(x - 1e-6))) / 2e-6
+    np.testing.assert_allclose(slope, weight * x, atol=1e-5)
+    # Without a word on which are late it is that of early ones, and others do not ask.
+    for other in (huber(1.0), cut_huber(1.5, 4.0)):
+        for a, b in zip(
+            loss_of(x[None] ** 2, other), loss_of(x[None] ** 2, other, x[None] > 0), strict=True
+        ):
+            np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("trials", [None, 40])

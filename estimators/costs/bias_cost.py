@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym import bounds
-from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.estimators.costs.levenberg_marquardt import (
     Linearization,
     Solution,
@@ -29,6 +29,9 @@ from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 
+# Behind the doors: what comes to these was checked, or made here.
+_ERROR = kernel(rotations.error)
+_LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 # Weights that change by no more than this between two poses are those of both.
 _SAME_SHARE = 0.01
 
@@ -93,10 +96,10 @@ class BiasProblem:
         self, rotation: FloatArray, translation: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """nu (..., L), H = -dnu (..., L, 6), e (..., 6), and e's derivative D (..., 6, 6)."""
-        turn = rotations.error(rotation, self.rotation)
+        turn = _ERROR(rotation, self.rotation)
         e = np.concatenate([turn, translation - self.translation], axis=-1)
         D = np.zeros((*turn.shape[:-1], 6, 6))
-        D[..., :3, :3] = rotations.left_jacobian_inverse(turn)
+        D[..., :3, :3] = _LEFT_JACOBIAN_INVERSE(turn)
         D[..., 3:, 3:] = np.eye(3)
         distance, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
         distance = distance.reshape((*distance.shape[:-2], -1))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +22,7 @@ from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
 from rbl_gym.estimators.costs.range_cost import SQUARES, huber, redescending
-from rbl_gym.estimators.filter import PoseBelief, register
+from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state
 from rbl_gym.estimators.iekf.robust_update import LATE_HUBER, LATE_SHARE
 from rbl_gym.estimators.inputs import (
@@ -38,7 +37,7 @@ from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.ranging import NoiseLaw
-from rbl_gym.motion.kinematics import ProcessNoise, propagate
+from rbl_gym.motion.kinematics import propagate
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
 
 # Losses of whitened innovations, by `robust`. What is left of real ranges has heavier tails than
@@ -326,63 +325,3 @@ def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
     covariance[..., 6:, 6:] = bounds.symmetric(kept)
     extra = state.extra + (gain @ error[..., None])[..., 0]
     return AugmentedState(pose.rotation, pose.translation, extra, covariance)
-
-
-def iekf_cv(
-    tags: FloatArray,
-    noise: NoiseLaw,
-    process: ProcessNoise,
-    iterations: int = 4,
-    robust: bool | str = False,
-    turn_rate_rad_s: float | Sequence[float] = 0.5,
-    speed_m_s: float | Sequence[float] = 5.0,
-    turn_acceleration: float | Sequence[float] = 0.3,
-    acceleration: float | Sequence[float] = 1.0,
-    gyro_std_rad_s: float | None = None,
-    speed_std_m_s: float | None = None,
-    frame: str = "world",
-) -> AugmentedEkf:
-    """The filter ``"iekf-cv"``: pose and twist of a body without odometry (12 error states).
-
-    Parameters
-    ----------
-    tags, noise, process, iterations, robust
-        As `IteratedEkf`; `process` moves the pose beyond what the twist does.
-    turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration
-        As `WanderingTwist`.
-    gyro_std_rad_s, speed_std_m_s, frame
-        As `TwistSensor`: what `predict` is told is then a reading. Both None: it is ignored.
-    """
-    law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
-    sensor = TwistSensor(gyro_std_rad_s, speed_std_m_s, frame)
-    measured = gyro_std_rad_s is not None or speed_std_m_s is not None
-    pose = IteratedEkf(tags, noise, process, iterations, robust)
-    return AugmentedEkf(pose, law, sensor if measured else None)
-
-
-def iekf_bias(
-    tags: FloatArray,
-    noise: NoiseLaw,
-    process: ProcessNoise,
-    iterations: int = 4,
-    robust: bool | str = False,
-    bias_std_m: float = 0.05,
-    bias_time_s: float | None = None,
-    common_std_m: float = 0.1,
-) -> AugmentedEkf:
-    """The filter ``"iekf-bias"``: the pose, and a bias of every link that it learns on the way.
-
-    Parameters
-    ----------
-    tags, noise, process, iterations, robust
-        As `IteratedEkf`; `noise` is what remains of a range beside its bias.
-    bias_std_m, bias_time_s, common_std_m
-        As `LinkBias`. A short time marginalises errors that are correlated rather than learning
-        them.
-    """
-    pose = IteratedEkf(tags, noise, process, iterations, robust)
-    return AugmentedEkf(pose, biases=(LinkBias(bias_std_m, bias_time_s, common_std_m),))
-
-
-register("iekf-cv", iekf_cv)
-register("iekf-bias", iekf_bias)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from typing import Any
 
 from rbl_gym.app.reading_options import add_reading, read_runs
@@ -35,7 +36,7 @@ def add_replay(commands: Any) -> None:
     _add_filter(replay.add_argument_group("filter"))
     _add_motion(replay.add_argument_group("how the body moves"))
     _add_tuning(replay.add_argument_group("settings by the likelihood of the log"))
-    _add_biases(replay.add_argument_group("biases of the links (filter iekf-bias)"))
+    _add_biases(replay.add_argument_group("biases of the links"))
     _add_smoothing(replay.add_argument_group("the smoothed track"))
     _add_comparison(replay.add_argument_group("comparison with the truth"))
     _add_output(replay.add_argument_group("output"))
@@ -65,17 +66,43 @@ def _add_knowledge(group: Any) -> None:
         default=None,
         help="the body stays below the anchors' mean height",
     )
+    group.add_argument(
+        "--start",
+        type=_start,
+        metavar="x,y,z[,yaw_deg]",
+        help="where the body's origin is at first, metres, and its heading; write --start=-1,... "
+        "for a minus",
+    )
+    _add_number(group, "--prior-position-m", "standard deviation of the start, default 0.5")
+    _add_number(
+        group, "--prior-rotation-deg", "of its rotation, default 30 with a yaw, else unknown"
+    )
+    _add_number(group, "--height-m", "the body's origin stays at about this height (or --planar)")
+    _add_number(group, "--height-std-m", "standard deviation of that")
+    _add_number(group, "--tilt-std-deg", "the body stays level but for this, about each axis")
 
 
 def _add_filter(group: Any) -> None:
-    group.add_argument("--filter", metavar="NAME", help="default iekf, iekf-bias with a bias")
+    group.add_argument(
+        "--filter",
+        metavar="NAME",
+        help="default iekf-log; iekf with --walk-..., iekf-bias with --raw or --bias-...",
+    )
     _add_number(group, "--range-std-m", "of a range; default the recording's own, else 0.12")
+    group.add_argument(
+        "--loss",
+        dest="robust",
+        type=_loss,
+        metavar="NAME",
+        help="squares, huber, or late: for ranges that err late rather than early; default late "
+        "of iekf-log, else huber",
+    )
     group.add_argument(
         "--no-robust",
         dest="robust",
         action="store_false",
         default=None,
-        help="squares in place of Huber's loss",
+        help="as --loss squares",
     )
 
 
@@ -83,12 +110,14 @@ def _add_motion(group: Any) -> None:
     _add_number(group, "--walk-m", "random walk of the position after 1 s, default 0.1")
     _add_number(group, "--walk-deg", "random walk of the rotation after 1 s, default 7")
     _add_number(
-        group, "--accel-m", "filter iekf-cv: change of the speed (m/s) after 1 s, default 0.5"
+        group,
+        "--accel-m",
+        "iekf-log, iekf-cv: change of the speed (m/s) after 1 s, default 1 and 0.5",
     )
     _add_number(
         group,
         "--accel-deg",
-        "filter iekf-cv: of the turn rate (deg/s) after 1 s, default 30",
+        "iekf-log, iekf-cv: of the turn rate (deg/s) after 1 s, default 30",
     )
 
 
@@ -104,13 +133,16 @@ def _add_tuning(group: Any) -> None:
 
 
 def _add_biases(group: Any) -> None:
-    _add_number(group, "--bias-std-m", "of a link's bias, default 0.02, with --raw 0.05")
-    _add_number(group, "--bias-time-s", "how long a bias lasts, default 3, with --raw for ever")
-    _add_number(
-        group,
-        "--bias-common-m",
-        "of the bias that all links have in common, default 0, with --raw 0.1",
-    )
+    for name, text in (
+        ("constant-std-m", "iekf-log: of a link's bias that stays, default 0.05"),
+        ("constant-common-m", "iekf-log: of what all links have in common, default 0.1"),
+        ("drift-std-m", "iekf-log: of a link's bias that moves, default 0.05"),
+        ("drift-time-s", "iekf-log: how long that lasts, default 3"),
+        ("bias-std-m", "iekf-bias: of a link's bias, default 0.02, with --raw 0.05"),
+        ("bias-time-s", "iekf-bias: how long it lasts, default 3, with --raw for ever"),
+        ("bias-common-m", "iekf-bias: of what all have in common, default 0, with --raw 0.1"),
+    ):
+        _add_number(group, f"--{name}", text)
     group.add_argument(
         "--raw",
         action="store_true",
@@ -261,10 +293,38 @@ def _settings(options: argparse.Namespace) -> Any:
         if options.calibration:
             raise ValueError("--raw means ranges without --calibration")
         biases = {**_RAW, **biases}
-    name = options.filter or ("iekf-bias" if biases else "iekf")
+    name = options.filter or _filter_for(given, biases)
     if biases and name != "iekf-bias":
-        raise ValueError(f"{name} knows no biases: --raw and --bias-... are of iekf-bias")
+        raise ValueError(f"--raw and --bias-... are of iekf-bias, not of {name}")
+    of_log = [key for key in given if key.startswith(("constant_", "drift_"))]
+    if of_log and name != "iekf-log":
+        option = of_log[0].replace("_", "-")
+        raise ValueError(f"--{option} is of iekf-log, not of {name}")
     return replay.Settings.of(**{**given, **biases, "filter": name})
+
+
+def _filter_for(given: Mapping[str, Any], biases: Mapping[str, Any]) -> str:
+    """The filter that takes what was told; told nothing, the one that needs nothing."""
+    if biases:
+        return "iekf-bias"
+    return "iekf" if "walk_m" in given or "walk_deg" in given else "iekf-log"
+
+
+def _loss(text: str) -> bool | str:
+    losses: dict[str, bool | str] = {"squares": False, "huber": True, "late": "late"}
+    if text not in losses:
+        raise argparse.ArgumentTypeError(f"must be squares, huber or late, got {text!r}")
+    return losses[text]
+
+
+def _start(text: str) -> tuple[float, ...]:
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in (3, 4):
+        raise argparse.ArgumentTypeError(f"must be x,y,z or x,y,z,yaw_deg, got {text!r}")
+    return values
 
 
 def _window(text: str) -> tuple[float, float]:

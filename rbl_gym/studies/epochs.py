@@ -82,6 +82,7 @@ def track_epochs(
     prior: Prior,
     readings: Iterable[Reading],
     restart: Callable[[PoseBelief, FloatArray], Prior | None] | None = None,
+    hold: Callable[[Any, Any], Any] | None = None,
 ) -> Iterator[Step]:
     """Run a filter over epochs, one step after the other.
 
@@ -97,6 +98,9 @@ def track_epochs(
     restart
         Called with every belief and the anchors of its epoch. Where it returns a prior, the
         filter starts again from that one and takes the ranges of the same epoch.
+    hold
+        Called with the states before and after every prediction, for what is known besides:
+        `rbl_gym.estimators.hold_level` of a level body. What it returns is updated.
 
     Yields
     ------
@@ -111,7 +115,8 @@ def track_epochs(
                 raise ValueError("the filter reads an inertial sensor, and there is none here")
             told = reading.inertial
         if told is not None:
-            state = filter.predict(state, told, reading.dt)
+            moved = filter.predict(state, told, reading.dt)
+            state = moved if hold is None else hold(state, moved)
         predicted, state = state, _updated(filter, state, reading)
         belief = filter.belief(state)
         if restart is not None and (other := restart(belief, reading.anchors)) is not None:

@@ -43,7 +43,7 @@ __all__ = [
 # Options with which a filter of ours stands in the table besides its plain self.
 VARIANTS = ("iekf/robust=true",)
 # Made for what no scene has: a start that nobody knows, biased links, no odometry. They take long.
-ELSEWHERE = ("iekf-bank", "iekf-bias", "iekf-cv", "iekf-imu")
+ELSEWHERE = ("iekf-bank", "iekf-bias", "iekf-cv", "iekf-imu", "iekf-log")
 # What makes a record another record; a finished one with the same is not run again.
 KEY = ("scene_hash", "condition", "filter", "filter_source", "trials", "seed", "versions")
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.smoothing.knowledge import Level
+from rbl_gym.geometry import rotations
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.settings import Settings
 
@@ -16,6 +20,10 @@ __all__ = [
 
 # Coordinates beyond this are those of a map.
 _MAP_M = 1e4
+# Standard deviations of a start, and of its yaw, where they are not told.
+_START_M, _START_DEG = 0.5, 30.0
+# What the planar constraint leaves to height (m), roll and pitch (rad).
+_PLANAR_STD = 1e-3
 # Heights of anchors within this much are one plane.
 _PLANE_M = 0.1
 
@@ -66,6 +74,59 @@ def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
     return np.array([low, high])
 
 
+def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotation, translation and covariance (6, 6) of the body before the first ranges.
+
+    Anywhere among the anchors, turned anyhow, but for what is known: a start, a volume, a height,
+    a level body. Coordinates are relative to `origin_of`.
+    """
+    known, origin = settings.knowledge, origin_of(recording)
+    anchors = recording.anchors_by_epoch[0] - origin
+    rotation, centre = np.eye(3), anchors.mean(axis=0)
+    # Anchors may stand close together, or on one body.
+    away = float(np.median(recording.ranges[recording.links]))
+    extent = max(float(np.ptp(anchors, axis=0).max()), away, 1.0)
+    std = np.array([math.pi] * 3 + [extent] * 3)
+    volume = volume_of(recording, settings)
+    if volume is not None:
+        volume = volume - origin
+        bounded = np.isfinite(volume).all(axis=0)
+        centre = np.where(bounded, np.where(bounded, volume, 0.0).mean(axis=0), centre)
+        half = 0.5 * np.diff(np.where(bounded, volume, 0.0), axis=0)[0]
+        std[3:] = np.where(bounded, half, std[3:])
+    if known.planar:
+        centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
+    if known.start is not None:
+        centre = np.array(known.start[:3]) - origin
+        std[3:] = _START_M if known.prior_position_m is None else known.prior_position_m
+        if len(known.start) == 4:
+            rotation = rotations.exp([0.0, 0.0, math.radians(known.start[3])])
+            std[:3] = math.radians(_START_DEG)
+        if known.prior_rotation_deg is not None:
+            std[:3] = math.radians(known.prior_rotation_deg)
+    if known.height_m is not None:
+        centre[2] = known.height_m - origin[2]
+        std[5] = min(std[5], known.height_std_m or std[5])
+    if known.tilt_std_deg is not None:
+        std[:2] = np.minimum(std[:2], math.radians(known.tilt_std_deg))
+    if known.planar:
+        std[[0, 1, 5]] = _PLANAR_STD
+    return rotation, centre, np.diag(std**2)
+
+
+def level_of(settings: Settings, origin: FloatArray) -> Level | None:
+    """What is softly known of height and tilt, relative to an origin (3,); None: nothing."""
+    known = settings.knowledge
+    if known.height_std_m is None and known.tilt_std_deg is None:
+        return None
+    height = tilt = None
+    if known.height_std_m is not None and known.height_m is not None:
+        height = known.height_m - float(origin[2])
+    if known.tilt_std_deg is not None:
+        tilt = math.radians(known.tilt_std_deg)
+    return Level(height, known.height_std_m, tilt)
+
+
 def has_own_std(recording: Recording, settings: Settings) -> bool:
     """Whether every range has its own standard deviation."""
     return settings.range_std_m is None and recording.range_std is not None
@@ -73,14 +134,11 @@ def has_own_std(recording: Recording, settings: Settings) -> bool:
 
 def height_offset(recording: Recording, settings: Settings) -> float:
     """How far the tags lie below the anchors [m]; a ValueError where that has to be said."""
-    heights = recording.anchors[..., 2]
-    if (
-        settings.knowledge.planar
-        and settings.knowledge.height_offset_m is None
-        and np.ptp(heights) > _PLANE_M
-    ):
+    heights, known = recording.anchors[..., 2], settings.knowledge
+    told = (known.height_offset_m, known.height_m, known.start)
+    if known.planar and all(x is None for x in told) and np.ptp(heights) > _PLANE_M:
         raise ValueError(
             f"height_offset_m must be given for anchors at heights of {heights.min():g} to "
-            f"{heights.max():g} m: how far the tags lie below the anchors' mean height"
+            f"{heights.max():g} m: how far the tags lie below the anchors' mean height; or height_m"
         )
     return settings.knowledge.height_offset_m or 0.0

@@ -32,35 +32,49 @@ class Motion:
     walk_m, walk_deg
         The pose is a random walk of this standard deviation after 1 s.
     accel_m, accel_deg
-        Of the filter ``"iekf-cv"``: how much speed (m/s) and turn rate (deg/s) change in 1 s.
+        Of the filters ``"iekf-log"`` and ``"iekf-cv"``: how much speed (m/s) and turn rate (deg/s)
+        change in 1 s; None: 30 deg/s, and 1 m/s, of ``"iekf-cv"`` 0.5.
     """
 
     walk_m: float = 0.1
     walk_deg: float = 7.0
-    accel_m: float = 0.5
-    accel_deg: float = 30.0
+    accel_m: float | None = None
+    accel_deg: float | None = None
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            check_number(field.name, getattr(self, field.name), low=0.0)
+            value = getattr(self, field.name)
+            if value is not None:
+                check_number(field.name, value, low=0.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Biases:
-    """Law of the links' biases, of the filter ``"iekf-bias"``.
+    """Laws of the links' biases.
 
     Parameters
     ----------
     bias_std_m, bias_time_s, bias_common_m
-        As of `rbl_gym.measurements.link_bias.LinkBias`.
+        Of the filter ``"iekf-bias"``: as of `rbl_gym.measurements.link_bias.LinkBias`.
+    constant_std_m, constant_common_m
+        Of the filter ``"iekf-log"``: biases that stay, of each link and in common to all.
+    drift_std_m, drift_time_s
+        Of the filter ``"iekf-log"``: biases that move as the body does.
     """
 
     bias_std_m: float = 0.02
     bias_time_s: float | None = 3.0
     bias_common_m: float = 0.0
+    constant_std_m: float = 0.05
+    constant_common_m: float = 0.1
+    drift_std_m: float = 0.05
+    drift_time_s: float = 3.0
 
     def __post_init__(self) -> None:
         LinkBias(self.bias_std_m, self.bias_time_s, self.bias_common_m)
+        for field in dataclasses.fields(self)[3:]:
+            low = 1e-9 if field.name == "drift_time_s" else 0.0
+            check_number(field.name, getattr(self, field.name), low=low)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,10 +84,11 @@ class Loss:
     Parameters
     ----------
     robust
-        Huber's loss (the iterated EKFs only) in place of squares.
+        Of the iterated EKFs: False, squares; True, Huber's loss; ``"late"``, the redescending loss
+        for ranges that err late. None: ``"late"`` of ``"iekf-log"``, else True.
     """
 
-    robust: bool = True
+    robust: bool | str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,16 +107,51 @@ class Knowledge:
         there is no limit. It tells a pose from its mirror image.
     below_anchors
         The body stays below the anchors' mean height.
+    start
+        Where the body's origin is at the first epoch: x, y, z in metres, and its yaw in degrees or
+        nothing. None: anywhere among the anchors, turned anyhow.
+    prior_position_m, prior_rotation_deg
+        Standard deviations of that, on each axis; None: 0.5 m, and 30 degrees where a yaw is told.
+    height_m, height_std_m
+        The body's origin stays at about this height; with `planar` at this height.
+    tilt_std_deg
+        The body stays level but for this, about each of two axes.
     """
 
     planar: bool = False
     height_offset_m: float | None = None
     volume: tuple[float | None, ...] | None = None
     below_anchors: bool = False
+    start: tuple[float, ...] | None = None
+    prior_position_m: float | None = None
+    prior_rotation_deg: float | None = None
+    height_m: float | None = None
+    height_std_m: float | None = None
+    tilt_std_deg: float | None = None
 
     def __post_init__(self) -> None:
         if check_number("height_offset_m", self.height_offset_m or 0.0) != 0 and not self.planar:
             raise ValueError("height_offset_m means nothing without planar")
+        for name in ("prior_position_m", "prior_rotation_deg"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), low=1e-6)
+                if self.start is None:
+                    raise ValueError(f"{name} means nothing without start")
+        for name in ("height_std_m", "tilt_std_deg"):
+            if getattr(self, name) is not None:
+                check_number(name, getattr(self, name), low=1e-6)
+                if self.planar:
+                    raise ValueError(f"planar holds height, roll and pitch: leave out {name}")
+        if self.height_m is not None:
+            check_number("height_m", self.height_m)
+            if self.height_std_m is None and not self.planar:
+                raise ValueError("height_m needs height_std_m, or planar, which holds it")
+            if self.height_offset_m:
+                raise ValueError("height_m and height_offset_m say the same: give one")
+        elif self.height_std_m is not None:
+            raise ValueError("height_std_m needs height_m")
+        if self.start is not None:
+            object.__setattr__(self, "start", _start(self.start))
         if self.volume is not None:
             object.__setattr__(self, "volume", _six_limits(self.volume))
 
@@ -244,6 +294,13 @@ class Settings:
         for name, value in dataclasses.asdict(self).items():
             result |= value if isinstance(value, dict) else {name: value}
         return result
+
+
+def _start(start: Any) -> tuple[float, ...]:
+    values = tuple(check_number("start", x) for x in start)
+    if len(values) not in (3, 4):
+        raise ValueError(f"start must be x, y, z and perhaps yaw_deg, got {len(values)} numbers")
+    return values
 
 
 def _six_limits(volume: Any) -> tuple[float | None, ...]:

@@ -22,7 +22,7 @@ from rbl_gym.studies.replay.judging import (
 from rbl_gym.studies.replay.place import height_offset
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.smoothing import SmoothedRecording, smooth_recording
-from rbl_gym.studies.replay.tracking import Track, recording_filter, track_recording
+from rbl_gym.studies.replay.tracking import Track, recording_filter, robust_of, track_recording
 from rbl_gym.studies.replay.truth import check_overlap
 
 __all__ = ["Replayed", "check_replay", "replay_recording"]
@@ -63,7 +63,7 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
         not overlap the ranges.
     """
     offset = height_offset(recording, settings)
-    settings = settings.changed(height_offset_m=offset)
+    settings = settings.changed(height_offset_m=offset, robust=robust_of(settings))
     recording_filter(recording, settings)
     comparison = settings.comparison
     if recording.truth is not None and comparison.time_offset != "auto":

@@ -13,6 +13,7 @@ from rbl_gym import estimators, motion
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import Innovations
 from rbl_gym.estimators.filter import check_takes_noise
+from rbl_gym.estimators.level import hold_level
 from rbl_gym.geometry.mirror import mirror_pose
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings.recording import Recording
@@ -20,8 +21,9 @@ from rbl_gym.studies.epochs import Reading, Step, innovations_of, stack_beliefs,
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
 from rbl_gym.studies.replay.place import (
     has_own_std,
-    height_offset,
+    level_of,
     origin_of,
+    prior_of,
     reach_of,
     volume_of,
 )
@@ -36,8 +38,6 @@ __all__ = [
     "track_recording",
 ]
 
-# What the planar constraint leaves to height (m), roll and pitch (rad).
-_PLANAR_STD = 1e-3
 # How much wider than the belief its mirror image starts.
 _IMAGE_RAD, _IMAGE_M = 0.1, 0.2
 
@@ -75,13 +75,14 @@ def track_recording(
         found.append(innovation)
     foretold = Innovations(*map(np.array, zip(*found, strict=True)))
     track = Track(recording.times, *stack_beliefs(beliefs)[:3], innovations=foretold)
-    if settings.knowledge.planar:
-        # Height, roll and pitch are held: they tell the sides apart.
+    known = settings.knowledge
+    if known.planar or known.height_std_m is not None or known.tilt_std_deg is not None:
+        # Height, roll and pitch are known: they tell the sides apart.
         return track
     std = None
     if not has_own_std(recording, settings):
         std = settings.range_std_m or DEFAULT_RANGE_STD_M
-    judge = named_filter(recording, settings, "iekf", {"robust": settings.loss.robust})
+    judge = named_filter(recording, settings, "iekf", {"robust": robust_of(settings)})
     poses = track[1:4]
     other = other_pose(recording, judge, std, poses, volume_of(recording, settings))
     if other is None:
@@ -108,9 +109,11 @@ def recording_steps(
     local = recording._replace(anchors=recording.anchors - origin)
     volume = volume_of(recording, settings)
     volume = None if volume is None else volume - origin
-    prior = _prior(local, settings, volume)
     restart = None if volume is None else partial(_image_inside, recording.tags, volume)
-    for step in track_epochs(filter, prior, _readings(local, settings), restart):
+    level = level_of(settings, origin)
+    hold = None if level is None else partial(hold_level, level=level)
+    readings = _readings(local, settings)
+    for step in track_epochs(filter, prior_of(recording, settings), readings, restart, hold):
         belief = step.belief
         yield step._replace(belief=belief._replace(translation=belief.translation + origin))
 
@@ -205,56 +208,48 @@ def _noise(settings: Settings) -> ranging.RangeNoise:
 
 # Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
 _ANY_TURN, _ANY_SPEED = 1.0, 3.0
+# How much they change in 1 s (m/s, deg/s), where it is not told.
+_ACCEL = {"iekf-log": (1.0, 30.0), "iekf-cv": (0.5, 30.0)}
+
+
+def robust_of(settings: Settings) -> bool | str:
+    """The loss of the filter."""
+    if settings.loss.robust is not None:
+        return settings.loss.robust
+    return "late" if settings.filter == "iekf-log" else True
 
 
 def _options(settings: Settings) -> dict[str, Any]:
     """What the settings say to the named filter."""
+    robust, biases = {"robust": robust_of(settings)}, settings.biases
     if settings.filter in ("iekf", "iekf-bank"):
-        return {"robust": settings.loss.robust}
+        return robust
     if settings.filter == "iekf-bias":
         return {
-            "robust": settings.loss.robust,
-            "bias_std_m": settings.biases.bias_std_m,
-            "bias_time_s": settings.biases.bias_time_s,
-            "common_std_m": settings.biases.bias_common_m,
+            **robust,
+            "bias_std_m": biases.bias_std_m,
+            "bias_time_s": biases.bias_time_s,
+            "common_std_m": biases.bias_common_m,
         }
     if settings.filter == "iekf-cv":
-        turn, shift = (
-            ((0, 0, 1), (1, 1, 0)) if settings.knowledge.planar else ((1, 1, 1), (1, 1, 1))
-        )
-        return {
-            "robust": settings.loss.robust,
-            "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),
-            "speed_m_s": tuple(_ANY_SPEED * axis for axis in shift),
-            "turn_acceleration": tuple(
-                math.radians(settings.motion.accel_deg) * axis for axis in turn
-            ),
-            "acceleration": tuple(settings.motion.accel_m * axis for axis in shift),
-        }
+        return {**robust, **_twist(settings)}
+    if settings.filter == "iekf-log":
+        names = ("constant_std_m", "constant_common_m", "drift_std_m", "drift_time_s")
+        return {**robust, **_twist(settings), **{name: getattr(biases, name) for name in names}}
     return {}
 
 
-def start_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What is known before any range: rotation, translation, covariance (6, 6)."""
-    return _prior(recording, settings, volume_of(recording, settings))
-
-
-def _prior(
-    recording: Recording, settings: Settings, volume: FloatArray | None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Anywhere among the anchors, turned anyhow; the plane, where there is one, is known."""
-    anchors = recording.anchors_by_epoch[0]
-    centre = anchors.mean(axis=0)
-    # Anchors may stand close together, or on one body.
-    away = float(np.median(recording.ranges[recording.links]))
-    extent = max(float(np.ptp(anchors, axis=0).max()), away, 1.0)
-    std = np.array([math.pi] * 3 + [extent] * 3)
-    if volume is not None:
-        bounded = np.isfinite(volume).all(axis=0)
-        centre = np.where(bounded, np.where(bounded, volume, 0.0).mean(axis=0), centre)
-        half = 0.5 * np.diff(np.where(bounded, volume, 0.0), axis=0)[0]
-        std[3:] = np.where(bounded, half, std[3:])
-    if settings.knowledge.planar:
-        centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
-        std[[0, 1, 5]] = _PLANAR_STD
-    return np.eye(3), centre, np.diag(std**2)
+def _twist(settings: Settings) -> dict[str, Any]:
+    """Law of an unknown twist."""
+    told = settings.motion.accel_m, settings.motion.accel_deg
+    accel_m, accel_deg = (
+        usual if value is None else value
+        for value, usual in zip(told, _ACCEL[settings.filter], strict=True)
+    )
+    turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.knowledge.planar else ((1, 1, 1), (1, 1, 1))
+    return {
+        "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),
+        "speed_m_s": tuple(_ANY_SPEED * axis for axis in shift),
+        "turn_acceleration": tuple(math.radians(accel_deg) * axis for axis in turn),
+        "acceleration": tuple(accel_m * axis for axis in shift),
+    }

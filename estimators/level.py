@@ -1,0 +1,102 @@
+"""Soft knowledge of height and tilt in a filter: a body that stays level, at about one height.
+
+Its height and tilt are stationary: Gaussian about what is known, with that standard deviation S.
+By what a prediction adds to their variance, D, they have moved within it: that is what an
+observation of standard deviation ``S sqrt(1 + S^2 / D)`` says. It leaves a variance of S^2 as it
+is, however often it comes, and after a long time it is the knowledge itself.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.smoothing.knowledge import Level
+from rbl_gym.geometry import rotations
+
+__all__ = ["hold_level"]
+
+
+def hold_level(before: Any, predicted: Any, level: Level) -> Any:
+    """The predicted state of a filter, with what is known of height and tilt.
+
+    The prior of the filter has to know of it as well: standard deviations of the height and of
+    the tilt no larger than these.
+
+    Parameters
+    ----------
+    before, predicted
+        States before and after a prediction: of the iterated EKFs, NamedTuples with `rotation`,
+        `translation`, `covariance` (..., n, n) of (w, v) and further states, and those in `extra`.
+    level
+        What is known.
+
+    Returns
+    -------
+    A state as `predicted`.
+
+    Raises
+    ------
+    ValueError
+        On states of other filters.
+
+    Examples
+    --------
+    >>> level = Level(height_m=0.5, height_std_m=0.2, tilt_std_rad=0.05)
+    >>> state = hold_level(state, filter.predict(state, twist, dt), level)
+    """
+    fields = getattr(predicted, "_fields", ())
+    if fields[:2] != ("rotation", "translation") or set(fields[2:]) - {"extra", "covariance"}:
+        raise ValueError(
+            "level must be of an iterated EKF ('iekf', 'iekf-cv', 'iekf-bias', 'iekf-log'), got a "
+            f"state of {', '.join(fields) or type(predicted).__name__}"
+        )
+    P0, P = before.covariance, predicted.covariance
+    Q, t = predicted.rotation, predicted.translation
+    extra = getattr(predicted, "extra", np.zeros((*t.shape[:-1], 0)))
+    step = np.zeros(P.shape[:-1])
+    for row, value, std in _known(Q, t, level):
+        h = np.concatenate([row, np.zeros((*row.shape[:-1], P.shape[-1] - 6))], axis=-1)
+        added = _variance(P, h) - _variance(P0, h[..., : P0.shape[-1]])
+        added = np.maximum(added, 0.0)
+        information = added / (std**2 * (std**2 + added))
+        crossed = (P @ h[..., None])[..., 0]
+        # The rows are linear in the step that the rows before them made.
+        left = value - (h * step).sum(axis=-1)
+        gain = crossed * (information / (1 + information * _variance(P, h)))[..., None]
+        step = step + gain * left[..., None]
+        P = P - gain[..., None] * crossed[..., None, :]
+    P = 0.5 * (P + np.swapaxes(P, -1, -2))
+    found = {
+        "rotation": rotations.exp(step[..., :3]) @ Q,
+        "translation": t + step[..., 3:6],
+        "covariance": P,
+    }
+    if "extra" in fields:
+        found["extra"] = extra + step[..., 6:]
+    return predicted._replace(**found)
+
+
+def _known(
+    Q: FloatArray, t: FloatArray, level: Level
+) -> list[tuple[FloatArray, FloatArray, float]]:
+    """Rows (..., 6) by the pose error, what is missing (...) to what is known, deviations."""
+    known: list[tuple[FloatArray, FloatArray, float]] = []
+    if level.height_m is not None and level.height_std_m is not None:
+        row = np.zeros((*t.shape[:-1], 6))
+        row[..., 5] = 1.0
+        known.append((row, level.height_m - t[..., 2], level.height_std_m))
+    if level.tilt_std_rad is not None:
+        # An error w turns the upright axis u by w x u; level it is (0, 0, 1).
+        x, y, z = np.moveaxis(Q[..., :, 2], -1, 0)
+        for place, parts in ((0, (0 * z, z, -y)), (1, (-z, 0 * z, x))):
+            row = np.zeros((*t.shape[:-1], 6))
+            row[..., :3] = np.stack(parts, axis=-1)
+            known.append((row, -(x, y)[place], level.tilt_std_rad))
+    return known
+
+
+def _variance(P: FloatArray, h: FloatArray) -> FloatArray:
+    return np.einsum("...i,...ij,...j->...", h, P, h)
