@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_count, check_number
 from rbl_gym.estimators.filter import Filter, PoseBelief
-from rbl_gym.measurements.ranging import NoiseLaw
+from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
 
 
 class TimedRange(NamedTuple):
@@ -34,6 +34,8 @@ class TimedRange(NamedTuple):
         (..., 6) of the interval before; None: the filter estimates it.
     noise
         Law of the range; None: the filter's.
+    anchors
+        (..., M, 3) at its time; None: where they stand.
     """
 
     time: float
@@ -42,6 +44,7 @@ class TimedRange(NamedTuple):
     range: FloatArray
     twist: FloatArray | None
     noise: NoiseLaw | None = None
+    anchors: FloatArray | None = None
 
 
 class Checkpoint(NamedTuple):
@@ -81,7 +84,7 @@ class Asynchronous:
     filter
         Any filter.
     anchors
-        (M, 3), metres.
+        (M, 3), metres; where they move, the places of those that no range tells.
     n_tags
         Of the body.
     window_s
@@ -124,6 +127,9 @@ class Asynchronous:
         range: ArrayLike,
         twist: ArrayLike | None = (0.0,) * 6,
         noise: NoiseLaw | None = None,
+        *,
+        std_m: float | None = None,
+        anchors: ArrayLike | None = None,
     ) -> Stream:
         """The stream with one more range (metres; (...) of many bodies with the same times).
 
@@ -137,11 +143,15 @@ class Asynchronous:
             told; None for a filter that estimates it.
         noise
             Law of this range, for instance ``LinkNoise([[0.05]])``; None: the filter's.
+        std_m
+            Standard deviation of this range, metres, in place of a law.
+        anchors
+            (..., M, 3), all anchors at this time, where they move; None: where they stand.
 
         Raises
         ------
         ValueError
-            On an index out of range, a range or a twist that cannot be.
+            On an index out of range, a range, a deviation, a twist or anchors that cannot be.
         """
         time = check_number("time", time)
         anchor = check_count("anchor", anchor, least=0, most=len(self.anchors) - 1)
@@ -151,7 +161,17 @@ class Asynchronous:
             raise ValueError(f"range must be positive, got {value.min()}")
         if twist is not None:
             twist = check_array("twist", twist, (6,))
-        measured = TimedRange(time, anchor, tag, value, twist, noise)
+        if std_m is not None:
+            if noise is not None:
+                raise ValueError("std_m and noise say the same: give one")
+            noise = LinkNoise([[check_number("std_m", std_m, low=1e-9)]])
+        if anchors is not None:
+            anchors = check_array("anchors", anchors, ("M", 3))
+            if anchors.shape[-2] != len(self.anchors):
+                raise ValueError(
+                    f"anchors must be all {len(self.anchors)}, got shape {anchors.shape}"
+                )
+        measured = TimedRange(time, anchor, tag, value, twist, noise, anchors)
         newest = max(time, stream.time)
         if time < stream.checkpoints[0].time or time < newest - self.window_s:
             return stream._replace(refused=stream.refused + 1)
@@ -174,7 +194,8 @@ class Asynchronous:
         links[measured.anchor, measured.tag] = True
         # A filter of an older interface takes no law, and needs none where no range has one.
         law = {} if measured.noise is None else {"noise": measured.noise}
-        state = self.filter.update(state, ranges, self.anchors, links, **law)
+        anchors = self.anchors if measured.anchors is None else measured.anchors
+        state = self.filter.update(state, ranges, anchors, links, **law)
         return Checkpoint(measured.time, state, measured)
 
     def _moved(self, point: Checkpoint, time: float, twist: FloatArray | None) -> Any:

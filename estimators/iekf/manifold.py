@@ -62,6 +62,8 @@ from rbl_gym.motion.kinematics import ProcessNoise
 
 # The law of `update_pose` whose shares are weights.
 WEIGHTS = np.array([2.0, 0.0, 0.0, -1.0])
+# Fewer ranges in an epoch are no reason for a search.
+_FEWEST_SOUGHT = 3
 # Behind the doors: what comes to these was checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
@@ -263,6 +265,10 @@ class IteratedEkf:
     ) -> BoolArray:
         """Where (...) an update by a checked epoch starts from many poses (`vague_start`)."""
         vague = is_vague(state.covariance)
+        if not vague.any():
+            return vague
+        # So few ranges leave a curve of poses: to search them is to guess.
+        vague = vague & ((weights > 0).sum(axis=(-2, -1)) >= _FEWEST_SOUGHT)
         if not vague.any():
             return vague
         data = RangeCost(ranges, weights, anchors, self.tags)
