@@ -91,6 +91,9 @@ def print_slides2013(result: dict[str, Any]) -> None:
     print_camsap2013(result["dynamic"])
 
 
+_SHOWN = {"centre": "tags' centre", "axis": "tags' line"}
+
+
 def print_replay(result: dict[str, Any]) -> None:
     """The figures of a recording, one a line."""
     console = new_console()
@@ -126,10 +129,13 @@ def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -
     table = new_table()
     for heading in (title, "RMSE", "median", "p95"):
         table.add_column(heading, justify="left" if heading == title else "right")
-    for name, unit, places in (("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2)):
+    for name, unit, places in (
+        ("position", "m", 4), ("yaw", "deg", 2), ("rotation", "deg", 2), ("centre", "m", 4),
+        ("axis", "deg", 2),
+    ):  # fmt: skip
         if f"{name}_rmse_{unit}" not in result:
             continue
-        label = f"position {axes} (m)" if name == "position" else f"{name} ({unit})"
+        label = f"position {axes} (m)" if name == "position" else f"{_SHOWN.get(name, name)} ({unit})"
         values = [result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")]
         table.add_row(label, *(f"{value:.{places}f}" for value in values))
     console.print(table)

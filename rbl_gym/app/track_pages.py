@@ -165,7 +165,10 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
                 f"{name} {result['position_axes']} (m)" if unit == "m" else f"{name} (deg)",
                 *(result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")),
             ]
-            for name, unit in (("position", "m"), ("yaw", "deg"), ("rotation", "deg"))
+            for name, unit in (
+                ("position", "m"), ("yaw", "deg"), ("rotation", "deg"), ("centre", "m"),
+                ("axis", "deg"),
+            )
             if f"{name}_rmse_{unit}" in result
         ]
         parts.append(page.table("errors", ["error", "RMSE", "median", "p95"], rows))

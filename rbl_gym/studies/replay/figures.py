@@ -19,6 +19,7 @@ from rbl_gym.studies.replay.judging import (
     truth_of,
 )
 from rbl_gym.studies.replay.mirror import DECIDED, is_outside
+from rbl_gym.studies.replay.observed import rank_figures
 from rbl_gym.studies.replay.place import volume_of
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.smoothing import SmoothedRecording
@@ -78,6 +79,8 @@ def error_figures(found: TrackErrors) -> dict[str, float]:
         ("position_{}_m", found.position),
         ("yaw_{}_deg", found.yaw),
         ("rotation_{}_deg", found.rotation),
+        ("centre_{}_m", found.centre),
+        ("axis_{}_deg", found.axis),
     ):
         if values is None:
             continue
@@ -132,6 +135,9 @@ def _notes(
     """The mirror pose, and what a reader is to be warned of, a sentence each."""
     result: dict[str, Any] = {}
     notes = [f"Note: {hint}." for hint in _stamp_hints(recording, track, settings)]
+    rank, unknown = rank_figures(recording, track)
+    result |= rank
+    notes += unknown
     count = len(track.times)
     if track.other is not None and np.isfinite(track.other.log_odds[-1]):
         alive = track.other.alive

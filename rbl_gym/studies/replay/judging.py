@@ -14,6 +14,7 @@ from rbl_gym.recordings import TimeOffset, motion_offset
 from rbl_gym.recordings.align import Alignment, align_positions, apply_alignment
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.recordings.truth import Truth
+from rbl_gym.studies.replay.observed import is_line
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track
 from rbl_gym.studies.replay.truth import check_overlap, matched
@@ -84,6 +85,10 @@ class TrackErrors(NamedTuple):
         Root mean square (K,) over the tags, metres; None where the truth does not tell.
     freedom
         How many of the six components of the pose are judged.
+    centre, axis
+        Distance (K,) of the tags' centre, metres, and angle (K,) of their line, radians: where
+        the tags are in a line, so that ranges tell no more; None of other bodies, the angle also
+        of a single tag.
     """
 
     known: BoolArray
@@ -93,6 +98,8 @@ class TrackErrors(NamedTuple):
     nees: FloatArray
     tags: FloatArray | None
     freedom: int
+    centre: FloatArray | None = None
+    axis: FloatArray | None = None
 
 
 def find_offset(recording: Recording, track: Track, settings: Settings) -> TimeOffset | None:
@@ -230,7 +237,7 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
     error = metrics.pose_error(track.rotation, track.translation, expected, truth.translation)
     axes = truth.turn_axes + truth.place_axes
     block = track.covariance[:, axes][:, :, axes]
-    yaw = rotation = tags = None
+    yaw = rotation = tags = centre = axis = None
     if truth.rotation is not None:
         turn = rotations.yaw(track.rotation) - rotations.yaw(expected)
         yaw = (turn + np.pi) % (2 * np.pi) - np.pi
@@ -240,6 +247,8 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
             tags = metrics.tag_error(
                 track.rotation, track.translation, expected, truth.translation, recording.tags
             )
+        if is_line(recording.tags):
+            centre, axis = _line_errors(track, expected, truth, recording.tags)
     return TrackErrors(
         truth.known,
         np.linalg.norm(error[:, truth.place_axes], axis=-1),
@@ -248,4 +257,21 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
         metrics.nees(error[:, axes], block),
         tags,
         len(axes),
+        centre,
+        axis,
     )
+
+
+def _line_errors(
+    track: Track, expected: FloatArray, truth: Reference, tags: FloatArray
+) -> tuple[FloatArray, FloatArray | None]:
+    """Distance (K,) of the tags' centre, and angle (K,) of their line; None of a single tag."""
+    middle = tags.mean(axis=0)
+    off = track.translation + track.rotation @ middle - truth.translation - expected @ middle
+    centre = np.linalg.norm(off[:, [axis - 3 for axis in truth.place_axes]], axis=-1)
+    along = np.linalg.svd(tags - middle)[2][0]
+    if len(tags) < 2:
+        return centre, None
+    lines = track.rotation @ along, expected @ along
+    across = np.linalg.norm(np.cross(*lines), axis=-1)
+    return centre, np.arctan2(across, np.einsum("ki,ki->k", *lines))

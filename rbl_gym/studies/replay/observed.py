@@ -1,0 +1,102 @@
+"""What the ranges of a recording determine of the body's pose, and since when."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry import rotations
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.tracking import Track
+
+__all__ = ["Observed", "observed"]
+
+# A direction of the rotation (rad) and of the place (m) is known to less than this, or is not.
+_KNOWN_RAD, _KNOWN_M = 0.5, 1.0
+# Tags this thin beside their length (squared) are as good as in a line.
+_THIN = 0.01
+
+
+class Observed(NamedTuple):
+    """Directions of a pose of six that are known, epoch by epoch.
+
+    Attributes
+    ----------
+    turns, places
+        How many (K,) of the rotation's and of the place's three directions: standard deviation
+        below 0.5 rad and below 1 m; the place is that of the tags' centre.
+    turn_axes
+        (K, 3, 3), columns: principal axes of the rotation's error in the body frame, the best
+        known first.
+    turn_std, place_std
+        (K, 3), rad and m, of the principal axes.
+    """
+
+    turns: np.ndarray
+    places: np.ndarray
+    turn_axes: FloatArray
+    turn_std: FloatArray
+    place_std: FloatArray
+
+
+def observed(track: Track, tags: FloatArray) -> Observed:
+    """What the beliefs (K,) of a track say of themselves; tags (N, 3)."""
+    Q, P = track.rotation, track.covariance
+    # Of the tags' centre: v + w x Q c.
+    T = np.broadcast_to(np.eye(6), P.shape).copy()
+    T[:, 3:, :3] = -rotations.hat(Q @ tags.mean(axis=0))
+    moved = T @ P @ np.swapaxes(T, -1, -2)
+    values, axes = np.linalg.eigh(np.swapaxes(Q, -1, -2) @ P[:, :3, :3] @ Q)
+    turn = np.sqrt(np.maximum(values, 0.0))
+    place = np.sqrt(np.maximum(np.linalg.eigvalsh(moved[:, 3:, 3:]), 0.0))
+    return Observed(
+        (turn < _KNOWN_RAD).sum(axis=-1), (place < _KNOWN_M).sum(axis=-1), axes, turn, place
+    )
+
+
+def rank_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], list[str]]:
+    """Rank of the pose at the end, the time since when, and notes on what is not known."""
+    found, times = observed(track, recording.tags), track.times - track.times[0]
+    rank = found.turns + found.places
+    result: dict[str, Any] = {"rank": int(rank[-1]), "rank_since_s": _since(rank, times)}
+    notes = []
+    if found.turns[-1] < 3:
+        spread = np.rad2deg(found.turn_std[-1, found.turns[-1] :])
+        what = (
+            "the rotation",
+            "of the rotation more than that about the body's axis "
+            f"{_axis(found.turn_axes[-1, :, 0])}",
+            f"the rotation about the body's axis {_axis(found.turn_axes[-1, :, 2])}",
+        )[int(found.turns[-1])]
+        notes.append(_note(what, f"{spread.max():.0f} deg", _since(found.turns, times)))
+    if found.places[-1] < 3:
+        spread = found.place_std[-1].max()
+        notes.append(_note("the place", f"{spread:.3g} m", _since(found.places, times)))
+    return result, notes
+
+
+def is_line(tags: FloatArray) -> bool:
+    """Whether tags (N, 3) are about in a line, or one: no range tells a rotation about it."""
+    values = np.linalg.svd(tags - tags.mean(axis=0), compute_uv=False) ** 2
+    return len(tags) < 3 or bool(values[1] <= _THIN * values[0])
+
+
+def _since(count: np.ndarray, times: FloatArray) -> float:
+    """The time from which on a count has been what it is at the end."""
+    other = np.flatnonzero(count != count[-1])
+    return float(times[other[-1] + 1]) if len(other) else 0.0
+
+
+def _axis(axis: FloatArray) -> str:
+    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
+    return "(" + ", ".join(f"{x:.2f}" for x in axis + 0.0) + ")"
+
+
+def _note(what: str, std: str, since: float) -> str:
+    when = "from the start" if since == 0 else f"since {since:.1f} s"
+    return (
+        f"Note: the ranges do not determine {what}: standard deviation {std} at the end, "
+        f"{when}. The belief is as wide."
+    )
