@@ -168,3 +168,26 @@ def test_a_stream_that_cannot_be_is_refused():
         Asynchronous(links.filter, links.anchors, 0)
     with pytest.raises(ValueError, match="n_tags must be a positive int, got '4'"):
         Asynchronous(links.filter, links.anchors, "4")  # pyright: ignore[reportArgumentType]
+
+
+def test_anchors_that_move_and_a_deviation_for_every_range():
+    """As an epoch of one link with its anchors and its law; late ones find their own anchors."""
+    rng = np.random.default_rng(5)
+    links, stream, rows = stream_of("iekf", rng)
+    places = [links.anchors + 0.3 * k * rng.standard_normal((5, 3)) for k in range(len(rows))]
+    state, time = stream.checkpoints[-1].state, 0.0
+    for (t, m, n, value), anchors in zip(rows, places, strict=True):
+        state = links.filter.predict(state, np.zeros(6), t - time)
+        mask = np.zeros((5, 4), dtype=bool)
+        mask[m, n] = True
+        law = ranging.LinkNoise([[0.05 + 0.01 * n]])
+        state, time = links.filter.update(state, value * mask, anchors, mask, noise=law), t
+    order = [*range(8), 9, 8, 10, 11]
+    for k in order:
+        t, m, n, value = rows[k]
+        stream = links.add(stream, t, m, n, value, std_m=0.05 + 0.01 * n, anchors=places[k])
+    same(links.belief(stream), links.filter.belief(state))
+    with pytest.raises(ValueError, match="std_m and noise say the same"):
+        links.add(stream, time, 0, 0, 1.0, noise=NOISE, std_m=0.1)
+    with pytest.raises(ValueError, match="anchors must be all 5"):
+        links.add(stream, time, 0, 0, 1.0, anchors=np.zeros((4, 3)))

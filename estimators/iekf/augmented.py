@@ -21,10 +21,9 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
-from rbl_gym.estimators.costs.range_cost import SQUARES, huber, redescending
+from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, huber
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state
-from rbl_gym.estimators.iekf.robust_update import LATE_HUBER, LATE_SHARE
 from rbl_gym.estimators.inputs import (
     check_batches,
     check_epoch,
@@ -42,7 +41,7 @@ from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
 
 # Losses of whitened innovations, by `robust`. What is left of real ranges has heavier tails than
 # noise: Huber's threshold of 1.0 was measured better than 1.5.
-LOSSES = {False: SQUARES, True: huber(1.0), "late": redescending(LATE_HUBER, LATE_SHARE)}
+LOSSES = {False: SQUARES, True: huber(1.0), "late": LATE}
 _AT_REST = np.zeros(6)
 
 

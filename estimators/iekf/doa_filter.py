@@ -19,11 +19,11 @@ from rbl_gym.estimators.costs.map_problem import (
     minimize,
     positive_inverse,
 )
-from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, huber, redescending
+from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, RangeCost, huber
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import register
 from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state
-from rbl_gym.estimators.iekf.robust_update import HUBER, LATE_HUBER, LATE_SHARE
+from rbl_gym.estimators.iekf.robust_update import HUBER
 from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, settles, spread
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.locating.doa_global import global_search
@@ -122,7 +122,7 @@ class DoaEkf(IteratedEkf):
             shape = np.broadcast_shapes(of_ranges.shape, ranges.shape)
             of_ranges = np.broadcast_to(of_ranges, shape)
             of_ranges = of_ranges if mask is None else of_ranges * mask
-            of_late = redescending(LATE_HUBER, LATE_SHARE) if self.robust == "late" else loss
+            of_late = LATE if self.robust == "late" else loss
             measured = measured | (of_ranges > 0).any(axis=-2)
             data = SumCost((data, RangeCost(ranges, of_ranges, anchors, self.tags, of_late)))
         problem = map_problem(state, data)

@@ -17,10 +17,10 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
 from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
 from rbl_gym.estimators.costs.range_cost import (
+    LATE,
     RangeCost,
     cut_huber,
     huber,
-    redescending,
     squared_residuals,
 )
 
@@ -30,9 +30,6 @@ HUBER = 1.5
 GATE = 4.0
 # Where the gate at the prior was wrong: first with care, as Huber's pose is biased.
 _CUTOFFS = (6.0, GATE)
-# Whitened residual from which on a range that may be late counts less, and what is left of its
-# weight where it is late.
-LATE_HUBER, LATE_SHARE = 1.0, 0.5
 # What `robust` may be, to the kernel.
 ROBUST = {False: 0, True: 1, "late": 2}
 # A pose that more than this share of the links contradict is itself in doubt: all links count.
@@ -92,7 +89,7 @@ def late_solution(
     data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
     easy = _with(problem, dataclasses.replace(data, loss=huber(HUBER)))
     found = minimize_pose(easy, rotation, translation, iterations, 1e-2)
-    hard = _with(problem, dataclasses.replace(data, loss=redescending(LATE_HUBER, LATE_SHARE)))
+    hard = _with(problem, dataclasses.replace(data, loss=LATE))
     return minimize_pose(hard, found.rotation, found.translation, iterations)
 
 

@@ -106,7 +106,9 @@ def locate(
         constrained least squares (static paper, Remark 2; slides, appendix). ``"ml"``: maximum
         likelihood of the raw ranges, searched for globally where the geometry is poor.
         ``"two-step"``: ``cls`` and two Gauss-Newton steps on the raw ranges. ``"robust"``: for
-        ranges of which some are wrong. Or a name that a package offers by the entry-point group
+        ranges of which some are wrong. ``"robust-late"``: for radio ranges, which err late rather
+        than early: weights that fall with the square of the residual, half as large where it is
+        late. Or a name that a package offers by the entry-point group
         ``rbl_gym.locators``.
     links
         Mask (..., M, N), True = measured.

@@ -22,7 +22,7 @@ from rbl_gym.estimators.locating.maximum_likelihood import (
     no_alternatives,
     points_start,
 )
-from rbl_gym.estimators.locating.robust_location import robust
+from rbl_gym.estimators.locating.robust_location import robust, robust_late
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
@@ -152,6 +152,12 @@ def _robust(epoch: StaticEpoch) -> Fit:
     return _from_solution(*robust(cost, *start))
 
 
+def _robust_late(epoch: StaticEpoch) -> Fit:
+    cost = _range_cost(epoch)
+    start = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
+    return _from_solution(*robust_late(cost, *start))
+
+
 def _range_cost(epoch: StaticEpoch) -> RangeCost:
     return RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags)
 
@@ -218,4 +224,5 @@ METHODS: dict[str, Callable[[StaticEpoch], Fit]] = {
     "two-step": _two_step,
     "ml": _ml,
     "robust": _robust,
+    "robust-late": _robust_late,
 }

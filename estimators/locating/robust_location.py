@@ -10,7 +10,13 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray, are_finite
 from rbl_gym.estimators.costs.levenberg_marquardt import Solution
 from rbl_gym.estimators.costs.map_problem import minimize
-from rbl_gym.estimators.costs.range_cost import RangeCost, geman_mcclure, huber, squared_residuals
+from rbl_gym.estimators.costs.range_cost import (
+    LATE,
+    RangeCost,
+    geman_mcclure,
+    huber,
+    squared_residuals,
+)
 from rbl_gym.estimators.linear.least_squares import points_fit
 from rbl_gym.estimators.linear.squared_range import statistic
 from rbl_gym.estimators.locating.maximum_likelihood import (
@@ -56,6 +62,16 @@ def robust(
     weights = np.where(_inliers(cost, solution), cost.weights, 0.0)
     refit = dataclasses.replace(cost, weights=weights)
     return maximum_likelihood(refit, solution.rotation, solution.translation)
+
+
+def robust_late(
+    cost: RangeCost, rotation: FloatArray, translation: FloatArray
+) -> tuple[Solution, Alternatives]:
+    """Pose from ranges that err late rather than early: `robust`, then the redescending loss."""
+    found, alternatives = robust(cost, rotation, translation)
+    late = dataclasses.replace(cost, loss=LATE)
+    better = minimize(late, found.rotation, found.translation, iterations=20)
+    return better, alternatives
 
 
 def _stand_ins(

@@ -295,7 +295,9 @@ def _settings(options: argparse.Namespace) -> Any:
         biases = {**_RAW, **biases}
     name = options.filter or _filter_for(given, biases)
     if biases and name != "iekf-bias":
-        raise ValueError(f"--raw and --bias-... are of iekf-bias, not of {name}")
+        raise ValueError(
+            f"{name} knows no biases of that law: --raw and --bias-... are of iekf-bias"
+        )
     of_log = [key for key in given if key.startswith(("constant_", "drift_"))]
     if of_log and name != "iekf-log":
         option = of_log[0].replace("_", "-")

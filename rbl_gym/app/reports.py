@@ -135,7 +135,9 @@ def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -
     ):  # fmt: skip
         if f"{name}_rmse_{unit}" not in result:
             continue
-        label = f"position {axes} (m)" if name == "position" else f"{_SHOWN.get(name, name)} ({unit})"
+        label = (
+            f"position {axes} (m)" if name == "position" else f"{_SHOWN.get(name, name)} ({unit})"
+        )
         values = [result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")]
         table.add_row(label, *(f"{value:.{places}f}" for value in values))
     console.print(table)

@@ -166,7 +166,10 @@ def replay_page(recording: Recording, replayed: Replayed) -> str:
                 *(result[f"{name}_{what}_{unit}"] for what in ("rmse", "median", "p95")),
             ]
             for name, unit in (
-                ("position", "m"), ("yaw", "deg"), ("rotation", "deg"), ("centre", "m"),
+                ("position", "m"),
+                ("yaw", "deg"),
+                ("rotation", "deg"),
+                ("centre", "m"),
                 ("axis", "deg"),
             )
             if f"{name}_rmse_{unit}" in result

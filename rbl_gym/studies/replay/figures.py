@@ -135,9 +135,6 @@ def _notes(
     """The mirror pose, and what a reader is to be warned of, a sentence each."""
     result: dict[str, Any] = {}
     notes = [f"Note: {hint}." for hint in _stamp_hints(recording, track, settings)]
-    rank, unknown = rank_figures(recording, track)
-    result |= rank
-    notes += unknown
     count = len(track.times)
     if track.other is not None and np.isfinite(track.other.log_odds[-1]):
         alive = track.other.alive
@@ -148,6 +145,10 @@ def _notes(
             "log_odds": float(track.other.log_odds[alive][-1]),
         }
         notes.append(_mirror_note(result["mirror"], count))
+    rank, unknown = rank_figures(recording, track)
+    result |= rank
+    # A mirror pose is warned of by its own name.
+    notes += unknown if "mirror" not in result else []
     volume = volume_of(recording, settings)
     if volume is not None:
         outside = int(is_outside(volume, track.translation, track.covariance).sum())

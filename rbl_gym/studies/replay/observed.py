@@ -70,7 +70,8 @@ def rank_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], li
             f"{_axis(found.turn_axes[-1, :, 0])}",
             f"the rotation about the body's axis {_axis(found.turn_axes[-1, :, 2])}",
         )[int(found.turns[-1])]
-        notes.append(_note(what, f"{spread.max():.0f} deg", _since(found.turns, times)))
+        std = f"{spread.max():.0f} deg" if spread.max() < 180 else "beyond 180 deg"
+        notes.append(_note(what, std, _since(found.turns, times)))
     if found.places[-1] < 3:
         spread = found.place_std[-1].max()
         notes.append(_note("the place", f"{spread:.3g} m", _since(found.places, times)))

@@ -1,0 +1,124 @@
+"""Replay of bodies with one tag or two, a start, soft knowledge; what is not determined is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements import ranging
+from rbl_gym.recordings import Recording, Truth
+from rbl_gym.studies import replay
+from rbl_gym.studies.replay.observed import Observed, observed
+from rbl_gym.studies.replay.place import prior_of
+
+ANCHORS = np.array([[0.0, 0, 0], [6, 0, 3], [6, 5, 0], [0, 5, 3], [3, 0, 3], [3, 5, 0.5]])
+
+
+def record(tags, epochs=60, one_by_one=False, height=1.0, anchors=ANCHORS, seed=0):
+    """A body on a circle that turns as it goes, level; 10 epochs a second."""
+    rng = np.random.default_rng(seed)
+    times = 0.1 * np.arange(epochs)
+    angle = 0.4 * times
+    place = np.stack([3 + np.cos(angle), 2.5 + np.sin(angle), height + 0 * angle], axis=-1)
+    turn = rotations.exp(np.stack([0 * angle, 0 * angle, angle + np.pi / 2], axis=-1))
+    exact = ranging.distances(anchors, ranging.tag_positions(turn, place, tags))
+    ranges = exact + 0.05 * rng.standard_normal(exact.shape)
+    links = np.ones(exact.shape, dtype=bool)
+    if one_by_one:
+        links = np.arange(links[0].size) == rng.integers(links[0].size, size=(epochs, 1))
+        links = links.reshape(exact.shape)
+    ids = tuple(map(str, range(len(anchors)))), tuple(map(str, range(len(tags))))
+    truth = Truth(times, turn, place)
+    return Recording(times, ranges * links, links, None, anchors, tags, *ids, truth)
+
+
+def outcome(recording, **options):
+    settings = replay.Settings.of(**{"filter": "iekf-log", "range_std_m": 0.05, **options})
+    return replay.replay_recording(recording, settings)
+
+
+def test_one_tag_gives_a_place_and_says_so():
+    found = outcome(record(np.zeros((1, 3)))).figures
+    assert found["position_rmse_m"] < 0.2
+    assert (found["rank"], found["rank_since_s"]) == (3, 0.0)
+    assert found["centre_rmse_m"] == pytest.approx(found["position_rmse_m"])
+    assert "axis_rmse_deg" not in found
+    (note,) = [note for note in found["notes"] if "do not determine" in note]
+    assert note.startswith("Note: the ranges do not determine the rotation: standard deviation")
+    assert found["settings"]["robust"] == "late"
+
+
+def test_two_tags_give_their_line():
+    tags = np.array([[0.0, 0.4, 0.1], [0.0, -0.4, 0.1]])
+    result = outcome(record(tags))
+    found = result.figures
+    assert found["rank"] == 5
+    assert found["axis_rmse_deg"] < 15
+    assert found["centre_rmse_m"] < 0.2
+    (note,) = [note for note in found["notes"] if "do not determine" in note]
+    assert "the rotation about the body's axis (" in note
+    axis = [float(x) for x in note.split("(")[1].split(")")[0].split(",")]
+    np.testing.assert_allclose(axis, [0, 1, 0], atol=0.1)
+    held = observed(result.track, tags)
+    assert isinstance(held, Observed)
+    assert held.turns[-1] == 2
+    assert held.places[-1] == 3
+    # Planar, they give the heading.
+    planar = outcome(record(tags), planar=True, height_m=1.0).figures
+    assert planar["rank"] == 6
+    assert planar["yaw_rmse_deg"] < 12
+
+
+def test_ranges_one_by_one_from_a_start():
+    recording = record(np.zeros((1, 3)), 300, one_by_one=True)
+    found = outcome(recording, start=(3.8, 2.6, 1.3), prior_position_m=0.5).figures
+    assert found["position_rmse_m"] < 0.25
+    assert found["links"] == 300
+
+
+def test_soft_knowledge_of_height_and_tilt_stands_for_a_plane():
+    """Anchors and tags in planes: without it height and tilt wander."""
+    anchors, tags = ANCHORS.copy(), np.array([[0.4, 0, 0], [-0.3, 0.4, 0], [-0.3, -0.4, 0]])
+    anchors[:, 2] = 1.5
+    recording = record(tags, anchors=anchors)
+    found = outcome(recording, height_m=1.0, height_std_m=0.1, tilt_std_deg=2.0).figures
+    assert found["position_rmse_m"] < 0.25
+    assert found["yaw_rmse_deg"] < 10
+    assert 0.1 < found["anees"] < 2
+    assert "mirror" not in found
+
+
+def test_a_start_is_the_prior():
+    recording = record(np.zeros((1, 3)))
+    told = {"start": (1, 2, 0.5, 90), "prior_position_m": 0.2, "prior_rotation_deg": 10}
+    rotation, place, P = prior_of(recording, replay.Settings.of(**told))
+    np.testing.assert_allclose(rotation, rotations.exp(np.array([0, 0, np.pi / 2])), atol=1e-12)
+    np.testing.assert_allclose(place, [1, 2, 0.5])
+    np.testing.assert_allclose(np.sqrt(np.diag(P)), [np.deg2rad(10)] * 3 + [0.2] * 3)
+    free = np.sqrt(np.diag(prior_of(recording, replay.Settings.of(start=(1, 2, 0.5)))[2]))
+    np.testing.assert_allclose(free, [np.pi] * 3 + [0.5] * 3)
+    soft = {"height_m": 0.4, "height_std_m": 0.1, "tilt_std_deg": 3}
+    _, place, P = prior_of(recording, replay.Settings.of(**soft))
+    assert place[2] == 0.4
+    np.testing.assert_allclose(np.sqrt(np.diag(P))[[0, 1, 5]], [*[np.deg2rad(3)] * 2, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"start": (1, 2)}, "start must be x, y, z and perhaps yaw_deg, got 2 numbers"),
+        ({"prior_position_m": 1.0}, "prior_position_m means nothing without start"),
+        ({"height_m": 1.0}, "height_m needs height_std_m, or planar"),
+        ({"height_std_m": 1.0}, "height_std_m needs height_m"),
+        ({"planar": True, "tilt_std_deg": 1.0}, "planar holds height, roll and pitch: leave out"),
+        (
+            {"planar": True, "height_m": 1.0, "height_offset_m": 0.3},
+            "height_m and height_offset_m say the same",
+        ),
+        ({"drift_time_s": 0.0}, "drift_time_s"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        replay.Settings.of(**options)
