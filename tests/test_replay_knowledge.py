@@ -10,7 +10,7 @@ from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay.observed import Observed, observed
-from rbl_gym.studies.replay.place import prior_of
+from rbl_gym.studies.replay.place import start_of
 
 ANCHORS = np.array([[0.0, 0, 0], [6, 0, 3], [6, 5, 0], [0, 5, 3], [3, 0, 3], [3, 5, 0.5]])
 
@@ -92,14 +92,14 @@ def test_soft_knowledge_of_height_and_tilt_stands_for_a_plane():
 def test_a_start_is_the_prior():
     recording = record(np.zeros((1, 3)))
     told = {"start": (1, 2, 0.5, 90), "prior_position_m": 0.2, "prior_rotation_deg": 10}
-    rotation, place, P = prior_of(recording, replay.Settings.of(**told))
+    rotation, place, P = start_of(recording, replay.Settings.of(**told))
     np.testing.assert_allclose(rotation, rotations.exp(np.array([0, 0, np.pi / 2])), atol=1e-12)
     np.testing.assert_allclose(place, [1, 2, 0.5])
     np.testing.assert_allclose(np.sqrt(np.diag(P)), [np.deg2rad(10)] * 3 + [0.2] * 3)
-    free = np.sqrt(np.diag(prior_of(recording, replay.Settings.of(start=(1, 2, 0.5)))[2]))
+    free = np.sqrt(np.diag(start_of(recording, replay.Settings.of(start=(1, 2, 0.5)))[2]))
     np.testing.assert_allclose(free, [np.pi] * 3 + [0.5] * 3)
     soft = {"height_m": 0.4, "height_std_m": 0.1, "tilt_std_deg": 3}
-    _, place, P = prior_of(recording, replay.Settings.of(**soft))
+    _, place, P = start_of(recording, replay.Settings.of(**soft))
     assert place[2] == 0.4
     np.testing.assert_allclose(np.sqrt(np.diag(P))[[0, 1, 5]], [*[np.deg2rad(3)] * 2, 0.1])
 

@@ -28,7 +28,7 @@ from rbl_gym.checks import (
 )
 from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
 from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positive_inverse
-from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber
+from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber, huber
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.robust_update import (
@@ -257,7 +257,9 @@ class IteratedEkf:
         sought = self.is_sought(state, ranges, weights, anchors)
         if not sought.any():
             return state.rotation, state.translation
-        problem = map_problem(state, RangeCost(ranges, weights, anchors, self.tags))
+        # Late ranges would lead squares to the wrong one of many minima.
+        loss = huber(HUBER) if self.robust == "late" else SQUARES
+        problem = map_problem(state, RangeCost(ranges, weights, anchors, self.tags, loss))
         return global_start(problem, sought, sought.shape, net_of_starts)
 
     def is_sought(

@@ -33,7 +33,7 @@ def add_bench(commands: Any) -> None:
         type=_names,
         metavar="A,B",
         help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all but "
-        "iekf-bank, iekf-bias, iekf-cv and iekf-log",
+        "iekf-bank, iekf-bias, iekf-cv, iekf-imu and iekf-log",
     )
     bench.add_argument(
         "--scenes",

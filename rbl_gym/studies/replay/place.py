@@ -74,14 +74,13 @@ def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
     return np.array([low, high])
 
 
-def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
+def start_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Rotation, translation and covariance (6, 6) of the body before the first ranges.
 
     Anywhere among the anchors, turned anyhow, but for what is known: a start, a volume, a height,
-    a level body. Coordinates are relative to `origin_of`.
+    a level body. Coordinates are of the world.
     """
-    known, origin = settings.knowledge, origin_of(recording)
-    anchors = recording.anchors_by_epoch[0] - origin
+    known, anchors = settings.knowledge, recording.anchors_by_epoch[0]
     rotation, centre = np.eye(3), anchors.mean(axis=0)
     # Anchors may stand close together, or on one body.
     away = float(np.median(recording.ranges[recording.links]))
@@ -89,7 +88,6 @@ def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, Floa
     std = np.array([math.pi] * 3 + [extent] * 3)
     volume = volume_of(recording, settings)
     if volume is not None:
-        volume = volume - origin
         bounded = np.isfinite(volume).all(axis=0)
         centre = np.where(bounded, np.where(bounded, volume, 0.0).mean(axis=0), centre)
         half = 0.5 * np.diff(np.where(bounded, volume, 0.0), axis=0)[0]
@@ -97,7 +95,7 @@ def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, Floa
     if known.planar:
         centre[2] -= height_offset(recording, settings) + recording.tags[:, 2].mean()
     if known.start is not None:
-        centre = np.array(known.start[:3]) - origin
+        centre = np.array(known.start[:3])
         std[3:] = _START_M if known.prior_position_m is None else known.prior_position_m
         if len(known.start) == 4:
             rotation = rotations.exp([0.0, 0.0, math.radians(known.start[3])])
@@ -105,7 +103,7 @@ def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, Floa
         if known.prior_rotation_deg is not None:
             std[:3] = math.radians(known.prior_rotation_deg)
     if known.height_m is not None:
-        centre[2] = known.height_m - origin[2]
+        centre[2] = known.height_m
         std[5] = min(std[5], known.height_std_m or std[5])
     if known.tilt_std_deg is not None:
         std[:2] = np.minimum(std[:2], math.radians(known.tilt_std_deg))

@@ -12,7 +12,7 @@ import numpy as np
 from rbl_gym import estimators
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import smoothing
-from rbl_gym.estimators.costs.range_cost import SQUARES, huber
+from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, huber
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.unknown_twist import WanderingTwist
@@ -21,7 +21,13 @@ from rbl_gym.studies.epochs import stack_beliefs
 from rbl_gym.studies.replay.mirror import covering
 from rbl_gym.studies.replay.place import has_own_std, origin_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
-from rbl_gym.studies.replay.tracking import Track, recording_filter, recording_steps, start_of
+from rbl_gym.studies.replay.tracking import (
+    Track,
+    recording_filter,
+    recording_steps,
+    robust_of,
+    start_of,
+)
 
 __all__ = ["SmoothedRecording", "smooth_recording"]
 
@@ -115,7 +121,7 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
             LinkBias(laws.smooth_constant_m, None, laws.smooth_common_m),
             LinkBias(laws.smooth_bias_std_m, laws.smooth_bias_time_s),
         ),
-        loss=huber(_HUBER) if settings.loss.robust else SQUARES,
+        loss={False: SQUARES, True: huber(_HUBER), "late": LATE}[robust_of(settings)],
     )
 
 

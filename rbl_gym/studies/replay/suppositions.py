@@ -14,7 +14,7 @@ from rbl_gym.measurements import ranging
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.evidence import Evidence, Trial, std_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M
-from rbl_gym.studies.replay.tracking import accel_of, recording_filter
+from rbl_gym.studies.replay.tracking import accel_of, recording_filter, robust_of
 
 # Anchors or tags beyond so many are not tried in pairs, but for the most contradicted.
 _IN_PAIRS = 12
@@ -165,7 +165,7 @@ def _of_settings(trial: Trial) -> Iterator[Supposition]:
             yield supposed("walk", _moves("walk", changed), **changed)
     for more in _NOISIER:
         yield _noisier(trial, more)
-    if not settings.loss.robust:
+    if not robust_of(settings):
         yield supposed("outliers", "some ranges are far off: leave out --no-robust", robust=True)
 
 

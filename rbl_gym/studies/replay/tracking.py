@@ -23,8 +23,8 @@ from rbl_gym.studies.replay.place import (
     has_own_std,
     level_of,
     origin_of,
-    prior_of,
     reach_of,
+    start_of,
     volume_of,
 )
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
@@ -113,7 +113,9 @@ def recording_steps(
     level = level_of(settings, origin)
     hold = None if level is None else partial(hold_level, level=level)
     readings = _readings(local, settings)
-    for step in track_epochs(filter, prior_of(recording, settings), readings, restart, hold):
+    rotation, translation, covariance = start_of(recording, settings)
+    prior = rotation, translation - origin, covariance
+    for step in track_epochs(filter, prior, readings, restart, hold):
         belief = step.belief
         yield step._replace(belief=belief._replace(translation=belief.translation + origin))
 
@@ -198,7 +200,10 @@ def named_filter(
 
 def accel_of(settings: Settings) -> tuple[float, float]:
     """How much speed (m/s) and turn rate (deg/s) of an unknown twist change in 1 s."""
-    return settings.motion.accel_m, settings.motion.accel_deg
+    told = settings.motion.accel_m, settings.motion.accel_deg
+    usual = _ACCEL.get(settings.filter, _ACCEL["iekf-log"])
+    accel_m, accel_deg = (a if b is None else b for a, b in zip(usual, told, strict=True))
+    return accel_m, accel_deg
 
 
 def _noise(settings: Settings) -> ranging.RangeNoise:
@@ -241,11 +246,7 @@ def _options(settings: Settings) -> dict[str, Any]:
 
 def _twist(settings: Settings) -> dict[str, Any]:
     """Law of an unknown twist."""
-    told = settings.motion.accel_m, settings.motion.accel_deg
-    accel_m, accel_deg = (
-        usual if value is None else value
-        for value, usual in zip(told, _ACCEL[settings.filter], strict=True)
-    )
+    accel_m, accel_deg = accel_of(settings)
     turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.knowledge.planar else ((1, 1, 1), (1, 1, 1))
     return {
         "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),
