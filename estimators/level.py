@@ -16,8 +16,6 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.smoothing.knowledge import Level
 from rbl_gym.geometry import rotations
 
-__all__ = ["hold_level"]
-
 
 def hold_level(before: Any, predicted: Any, level: Level) -> Any:
     """The predicted state of a filter, with what is known of height and tilt.
