@@ -256,7 +256,8 @@ def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
     longest = max(runs.values(), key=lambda run: len(run.times))
     length = {} if options.tune_s is None else {"seconds": options.tune_s}
     # Where no filter is named the likelihood chooses one too.
-    filters = () if options.filter or settings.filter != "iekf" else ("iekf", "iekf-bias")
+    any_filter = not options.filter and settings.filter in ("iekf", "iekf-log")
+    filters = ("iekf-log", "iekf", "iekf-bias") if any_filter else ()
     with progress("tune", replay.TUNING_ROUNDS * max(len(filters), 1)) as advance:
         return replay.tune(longest, settings, filters=filters, advance=advance, **length)
 
