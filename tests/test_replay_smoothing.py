@@ -131,8 +131,10 @@ def test_the_command_prints_both_tracks(tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["settings"]["smooth_accel_m"] == 0.3
     assert result["smoothed"]["nis"] < 1
-    assert main([*command, "--smooth"]) == 0
+    picture = tmp_path / "track.png"
+    assert main([*command, "--smooth", "--plot", str(picture)]) == 0
     assert "smoothed" in capsys.readouterr().out
+    assert picture.stat().st_size > 10_000
 
 
 @pytest.mark.skipif(not LABYRINTH.is_dir(), reason=f"the recording is not at {LABYRINTH}")

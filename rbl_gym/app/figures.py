@@ -290,6 +290,9 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
         label = "truth" if align == "none" else f"truth, aligned ({align})"
         axes.plot(*true[:, :2].T, color="0.55", lw=2.2, label=label)
     axes.plot(*track.translation[:, :2].T, color=COLOURS["iterated EKF"], lw=0.8, label="estimate")
+    if replayed.smoothed is not None:
+        smoothed = replayed.smoothed.track.translation
+        axes.plot(*smoothed[:, :2].T, color=COLOURS["KF"], lw=0.8, label="smoothed")
     axes.set_aspect("equal", adjustable="box")  # datalim cuts off the label
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
