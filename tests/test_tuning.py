@@ -18,7 +18,7 @@ DEFAULTS = replay.Settings()
 def test_the_settings_that_made_a_log_are_found():
     """From the defaults: 0.12 m, 0.1 m and 7 degrees; the log has 0.1 m, 0.3 m, 17 degrees."""
     tuned = replay.tune(recording(RANGES), DEFAULTS)
-    # Two hundred steps of the motion and 4,000 ranges: some per cent, and 1 % of the deviation.
+    # Two hundred steps of the motion and 2,400 ranges: some per cent, and 1 % of the deviation.
     assert tuned.found == {
         "range_std_m": pytest.approx(0.1, rel=0.05),
         "walk_m": pytest.approx(0.3, rel=0.25),
@@ -27,8 +27,8 @@ def test_the_settings_that_made_a_log_are_found():
     assert isinstance(tuned, replay.Tuned)
     assert tuned.settings == DEFAULTS.changed(**tuned.found)
     assert tuned.log_likelihood > tuned.log_likelihood_before
-    assert tuned.epochs == 120
-    assert tuned.seconds == pytest.approx(11.9)
+    assert tuned.epochs == 70
+    assert tuned.seconds == pytest.approx(6.9)
     figures = replay.replay_recording(recording(RANGES), tuned.settings).figures
     assert figures["consistency"]["nis_per_dof"] == pytest.approx(1.0, abs=0.1)
     assert figures["consistency"]["log_likelihood"] == pytest.approx(tuned.log_likelihood, abs=1e-3)
@@ -38,7 +38,7 @@ def test_only_the_first_part_is_looked_at_and_never_the_truth():
     log = recording(RANGES)
     spoiled = RANGES.copy()
     spoiled[40:] += 3.0
-    truth = Truth(log.times, np.broadcast_to(np.eye(3), (120, 3, 3)), np.zeros((120, 3)))
+    truth = Truth(log.times, np.broadcast_to(np.eye(3), (70, 3, 3)), np.zeros((70, 3)))
     plain = replay.tune(log, SETTINGS, seconds=2.0)
     assert plain.epochs == 21
     assert replay.tune(recording(spoiled)._replace(truth=truth), SETTINGS, seconds=2.0) == plain
@@ -69,7 +69,7 @@ def test_late_ranges_have_their_price():
 
 def test_filters_of_an_unknown_twist_have_their_acceleration_tuned():
     settings = DEFAULTS.changed(filter="iekf-cv", walk_m=0.0, walk_deg=0.0)
-    tuned = replay.tune(recording(RANGES[:60]), settings)
+    tuned = replay.tune(recording(RANGES), settings)
     assert list(tuned.found) == ["range_std_m", "accel_m", "accel_deg"]
     assert tuned.settings.motion.walk_m == 0.0
     assert tuned.log_likelihood > tuned.log_likelihood_before + 0.03
