@@ -74,8 +74,8 @@ def test_filters_of_an_unknown_twist_have_their_acceleration_tuned():
     assert tuned.settings.motion.walk_m == 0.0
     assert tuned.log_likelihood > tuned.log_likelihood_before + 0.03
     options = tuned.options.split()
-    assert options[::2] == ["--range-std-m", "--accel-m", "--accel-deg"]
-    assert [float(value) for value in options[1::2]] == list(tuned.found.values())
+    assert options[::2] == ["--filter", "--range-std-m", "--accel-m", "--accel-deg"]
+    assert [float(value) for value in options[3::2]] == list(tuned.found.values())
 
 
 def test_a_log_too_short_to_tune_by_is_refused():
@@ -130,7 +130,6 @@ def test_the_command_runs_with_what_it_tuned_and_prints_it(tmp_path, capsys):
     again = json.loads((tmp_path / "again.json").read_text())
     assert again["consistency"] == tuned["consistency"]
     capsys.readouterr()
-    # Without a name of a filter the likelihood chooses one.
     assert cli.main([*arguments, "--tune", "--tune-s", "1"]) == 0
     out = capsys.readouterr().out
     assert "tuned on 11 epochs of the first 1.0 s: --filter iekf" in " ".join(out.split())

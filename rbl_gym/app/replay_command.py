@@ -126,8 +126,8 @@ def _add_tuning(group: Any) -> None:
         "--tune",
         action="store_true",
         help="choose --range-std-m and the motion (--walk-..., of an estimated twist --accel-...) "
-        "by the likelihood of the log's first part, and iekf or iekf-bias where no --filter is "
-        "given; the truth is not looked at",
+        "by the likelihood of the log's first part; the truth is not looked at; where no "
+        "--filter is given it is chosen too, with a --calibration iekf-bias",
     )
     _add_number(group, "--tune-s", "length of that part, default 20; tunes as --tune does")
 
@@ -255,9 +255,11 @@ def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
 
     longest = max(runs.values(), key=lambda run: len(run.times))
     length = {} if options.tune_s is None else {"seconds": options.tune_s}
-    # Where no filter is named the likelihood chooses one too.
-    any_filter = not options.filter and settings.filter in ("iekf", "iekf-log")
-    filters = ("iekf-log", "iekf", "iekf-bias") if any_filter else ()
+    filters: tuple[str, ...] = ()
+    if not options.filter and settings.filter in ("iekf", "iekf-log"):
+        # Where no filter is named the likelihood chooses one too. What a calibration leaves is
+        # small and moves with the pose: the law of iekf-bias.
+        filters = ("iekf-bias",) if options.calibration else ("iekf-log", "iekf", "iekf-bias")
     with progress("tune", replay.TUNING_ROUNDS * max(len(filters), 1)) as advance:
         return replay.tune(longest, settings, filters=filters, advance=advance, **length)
 

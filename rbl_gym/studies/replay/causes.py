@@ -8,7 +8,7 @@ most of that.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -133,8 +133,14 @@ def cut(recording: Recording, epochs: slice) -> Recording:
 def local_trial(recording: Recording, settings: Settings) -> Trial:
     """A recording relative to its anchors, where its coordinates are those of a map."""
     origin = origin_of(recording)
-    limits = settings.knowledge.volume
-    if limits is not None:
-        pairs = zip(limits, np.repeat(origin, 2), strict=True)
-        settings = settings.changed(volume=tuple(None if x is None else x - o for x, o in pairs))
+    known = settings.knowledge
+    changed: dict[str, Any] = {}
+    if known.volume is not None:
+        pairs = zip(known.volume, np.repeat(origin, 2), strict=True)
+        changed["volume"] = tuple(None if x is None else x - o for x, o in pairs)
+    if known.start is not None:
+        changed["start"] = (*(np.array(known.start[:3]) - origin), *known.start[3:])
+    if known.height_m is not None:
+        changed["height_m"] = known.height_m - float(origin[2])
+    settings = settings.changed(**changed)
     return Trial(recording._replace(anchors=recording.anchors - origin), settings)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym import estimators, motion
 from rbl_gym.checks import FloatArray
-from rbl_gym.estimators import IteratedEkf
+from rbl_gym.estimators import IteratedEkf, hold_level
 from rbl_gym.measurements.ranging import LinkNoise, RangeNoise
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
+from rbl_gym.studies.replay.place import level_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import has_own_std, recording_filter, start_of
 
@@ -106,7 +108,10 @@ def _together(trials: list[Trial]) -> list[tuple[FloatArray, ...]]:
     filter = _stacked([recording_filter(*trial) for trial in trials])
     prior = tuple(map(np.array, zip(*(start_of(*trial) for trial in trials), strict=True)))
     tags = np.stack([trial.recording.tags for trial in trials])
-    steps = track_epochs(filter, prior, _readings(trials))  # pyright: ignore[reportArgumentType]
+    level = level_of(trials[0].settings, np.zeros(3))
+    hold = None if level is None else partial(hold_level, level=level)
+    told = _readings(trials)
+    steps = track_epochs(filter, prior, told, hold=hold)  # pyright: ignore[reportArgumentType]
     columns = [
         (i.log_likelihood, i.nis, i.dof, step.belief.rotation, step.belief.translation, i.residual)
         for step, i in innovations_of(filter, steps, tags, RangeNoise())

@@ -107,11 +107,12 @@ def tune(
     }
     best = max(tried, key=lambda name: tried[name][0])
     value, found = tried[best]
-    if len(names) > 1:
+    if best != settings.filter or len(names) > 1:
         found = {"filter": best, **found}
+    # Without the filter's name other options may mean another filter.
     options = " ".join(
         f"--{name.replace('_', '-')} {value if isinstance(value, str) else f'{value:g}'}"
-        for name, value in found.items()
+        for name, value in {"filter": best, **found}.items()
     )
     span = float(np.ptp(given.recording.times))
     after = float(value / ranges)
