@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rbl_gym import bounds, estimators, metrics, motion
+from rbl_gym import bounds, estimators, kernels, metrics, motion
 from rbl_gym.bounds import inertial as inertial_bounds
 from rbl_gym.estimators.bank.headings import HeadingBank
+from rbl_gym.estimators.iekf.augmented import carry_states
 from rbl_gym.estimators.iekf.inertial import InertialEkf
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import inertial, link_bias, ranging
@@ -106,6 +107,21 @@ def test_the_update_against_a_textbook_filter():
     np.testing.assert_allclose(found.translation - state.translation, step[3:6], atol=1e-9)
     np.testing.assert_allclose(found.extra - state.extra, step[6:], atol=1e-8)
     np.testing.assert_allclose(found.covariance, P, atol=1e-6)
+
+
+@pytest.mark.skipif(not kernels.enabled(), reason="needs numba")
+@pytest.mark.parametrize("batch", [(), (2, 3)])
+def test_the_kernel_that_carries_states_along_and_its_textbook(batch):
+    rng = np.random.default_rng(8)
+    A = rng.standard_normal((*batch, 17, 17))
+    Q, turn = rotations.random(rng, batch), 0.5 * rng.standard_normal((*batch, 3))
+    P, t = A @ np.swapaxes(A, -1, -2), rng.standard_normal((2, *batch, 3))
+    # What is known of the pose afterwards is not more than nothing, nor more than before.
+    new = 0.3 * P[..., :6, :6]
+    state = Q, t[0], rng.standard_normal((*batch, 11)), P, rotations.exp(turn) @ Q, t[1], new
+    one, other = (form(*state) for form in (carry_states.textbook, carry_states.kernel))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
 def test_samples_may_have_lengths_of_their_own_and_bodies_their_own_readings():

@@ -201,7 +201,7 @@ def iekf_imu(
     noise: NoiseLaw,
     process: ProcessNoise,
     iterations: int = 4,
-    robust: bool = False,
+    robust: bool | str = False,
     inertial: str | Mapping[str, Any] | InertialSensor = "consumer",
     speed_m_s: float = 1.0,
     gravity_tilt_rad: float = 0.0,

@@ -310,9 +310,26 @@ def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> 
 
 def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
     """The state once its pose is known better: the others follow by their correlation with it."""
-    P, new = state.covariance, pose.covariance
-    turn = rotations.error(pose.rotation, state.rotation)
-    error, D = pose_error(turn, pose.translation - state.translation)
+    return AugmentedState(pose.rotation, pose.translation, *carry_states(*state, *pose))
+
+
+@compiled("carried_states:carry")
+def carry_states(
+    rotation: FloatArray,
+    translation: FloatArray,
+    extra: FloatArray,
+    covariance: FloatArray,
+    new_rotation: FloatArray,
+    new_translation: FloatArray,
+    new_covariance: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Extra states (..., K) and the covariance (..., 6 + K, 6 + K) of all, of a new pose.
+
+    The first four are of the state before, the others of the pose that an update has found.
+    """
+    P, new = covariance, new_covariance
+    turn = rotations.error(new_rotation, rotation)
+    error, D = pose_error(turn, new_translation - translation)
     gain = P[..., 6:, :6] @ positive_inverse(P[..., :6, :6])
     # An error of the new pose is one of the old times blkdiag(Jl^-1, I).
     slope = gain @ D
@@ -322,5 +339,4 @@ def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
     covariance[..., :6, :6] = new
     covariance[..., 6:, :6], covariance[..., :6, 6:] = across, np.swapaxes(across, -1, -2)
     covariance[..., 6:, 6:] = bounds.symmetric(kept)
-    extra = state.extra + (gain @ error[..., None])[..., 0]
-    return AugmentedState(pose.rotation, pose.translation, extra, covariance)
+    return extra + (gain @ error[..., None])[..., 0], covariance

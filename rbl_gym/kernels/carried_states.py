@@ -1,0 +1,66 @@
+"""States beside the pose of one body, once its pose is known better.
+
+The textbook form is in `rbl_gym.estimators.iekf.augmented`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.kernels import rotations
+from rbl_gym.kernels.jit import gufunc
+from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6, multiply
+
+
+@gufunc("(d,d),(d),(k),(p,p),(d,d),(d),(q,q)->(k),(p,p)")
+def carry(
+    Q0: Any, t0: Any, x0: Any, P0: Any, Q: Any, t: Any, new: Any, x: Any, P: Any
+) -> None:  # fmt: skip
+    """Further states by their correlation with the pose, and the covariance of all."""
+    k = x0.shape[0]
+    room, D, turn, e = np.empty((3, 6, 6)), np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
+    own, L, inverse = room[0], room[1], room[2]
+    gain, slope, across = np.empty((k, 6)), np.empty((k, 6)), np.empty((k, 6))
+    for i in range(6):
+        for j in range(6):
+            own[i, j] = P0[i, j]
+            P[i, j] = new[i, j]
+    if not cholesky6(own, L):
+        for i in range(k):
+            x[i] = math.nan
+        fill(math.nan, P)
+        return
+    invert_factored6(L, inverse)
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = Q[i, 0] * Q0[j, 0] + Q[i, 1] * Q0[j, 1] + Q[i, 2] * Q0[j, 2]
+        e[3 + i] = t[i] - t0[i]
+    e[0], e[1], e[2] = rotations.log(turn)
+    rotations.left_jacobian_inverse(e[0], e[1], e[2], D)
+    for i in range(k):
+        x[i] = x0[i]
+        for j in range(6):
+            total = 0.0
+            for m in range(6):
+                total += P0[6 + i, m] * inverse[m, j]
+            gain[i, j] = total
+            x[i] += total * e[j]
+        # An error of the new pose is one of the old times blkdiag(Jl^-1, I).
+        for j in range(3):
+            slope[i, j] = gain[i, 0] * D[0, j] + gain[i, 1] * D[1, j] + gain[i, 2] * D[2, j]
+            slope[i, 3 + j] = gain[i, 3 + j]
+    for i in range(6):
+        for j in range(6):
+            own[i, j] = new[i, j]
+    multiply(slope, own, across)
+    for i in range(k):
+        for j in range(6):
+            P[6 + i, j] = P[j, 6 + i] = across[i, j]
+        for j in range(i + 1):
+            total = P0[6 + i, 6 + j]
+            for m in range(6):
+                total += across[i, m] * slope[j, m] - gain[i, m] * P0[6 + j, m]
+            P[6 + i, 6 + j] = P[6 + j, 6 + i] = total
