@@ -110,6 +110,20 @@ def test_laws_that_cannot_be_are_named(options):
         replay.Smoothing(**options)
 
 
+def test_soft_knowledge_and_the_loss_for_late_ranges():
+    log = recording()
+    log = log._replace(
+        ranges=log.ranges + 2.0 * (np.random.default_rng(3).random(log.ranges.shape) < 0.1)
+    )
+    settings = SMOOTH.changed(height_m=1.2, height_std_m=0.3, tilt_std_deg=5.0)
+    figures = [
+        replay.replay_recording(log, settings.changed(robust=robust)).figures["smoothed"]
+        for robust in (False, "late")
+    ]
+    assert figures[1]["position_rmse_m"] < 0.5 * figures[0]["position_rmse_m"]
+    assert figures[1]["position_rmse_m"] < 0.06
+
+
 def table(path: Path, header: str, rows) -> str:
     path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
     return str(path)

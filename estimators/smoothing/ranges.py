@@ -179,7 +179,7 @@ class LogRanges:
         Derivatives by constants are by all of the log.
         """
         residual, J = self.residual(state)
-        cost, share = loss_of(self.weights * residual**2, loss)
+        cost, share = loss_of(self.weights * residual**2, loss, residual < 0)
         root = np.sqrt(self.weights * share)
         before = np.zeros((*residual.shape, 6 + state.extra.shape[-1]))
         before[..., :6] = J

@@ -19,14 +19,13 @@ from rbl_gym.motion.unknown_twist import WanderingTwist
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import stack_beliefs
 from rbl_gym.studies.replay.mirror import covering
-from rbl_gym.studies.replay.place import has_own_std, origin_of
+from rbl_gym.studies.replay.place import has_own_std, level_of, origin_of, start_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import (
     Track,
     recording_filter,
     recording_steps,
     robust_of,
-    start_of,
 )
 
 __all__ = ["SmoothedRecording", "smooth_recording"]
@@ -106,6 +105,7 @@ def smooth_recording(recording: Recording, settings: Settings, track: Track) -> 
 def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
     """What the settings take for true of a recording."""
     laws, planar = settings.smoothing, settings.knowledge.planar
+    level = level_of(settings, origin_of(recording))
     turn, shift = ((0, 0, 1), (1, 1, 0)) if planar else ((1, 1, 1), (1, 1, 1))
     wander = WanderingTwist(
         tuple(_ANY_TURN * axis for axis in turn),
@@ -121,6 +121,7 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
             LinkBias(laws.smooth_constant_m, None, laws.smooth_common_m),
             LinkBias(laws.smooth_bias_std_m, laws.smooth_bias_time_s),
         ),
+        () if level is None else (level,),
         loss={False: SQUARES, True: huber(_HUBER), "late": LATE}[robust_of(settings)],
     )
 
