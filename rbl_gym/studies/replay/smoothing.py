@@ -12,7 +12,7 @@ import numpy as np
 from rbl_gym import estimators
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import smoothing
-from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, huber
+from rbl_gym.estimators.costs.range_cost import LATE, SQUARES
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.unknown_twist import WanderingTwist
@@ -30,8 +30,6 @@ from rbl_gym.studies.replay.tracking import (
 
 __all__ = ["SmoothedRecording", "smooth_recording"]
 
-# Huber's threshold: what is left of real ranges has heavier tails than noise.
-_HUBER = 1.0
 # Squared residuals beyond this multiple of what is to be expected: the start had lost its way.
 _LOST = 2.0
 # Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
@@ -122,7 +120,7 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
             LinkBias(laws.smooth_bias_std_m, laws.smooth_bias_time_s),
         ),
         () if level is None else (level,),
-        loss={False: SQUARES, True: huber(_HUBER), "late": LATE}[robust_of(settings)],
+        loss=LATE if robust_of(settings) else SQUARES,
     )
 
 
