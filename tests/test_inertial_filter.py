@@ -12,7 +12,7 @@ from rbl_gym import bounds, estimators, kernels, metrics, motion
 from rbl_gym.bounds import inertial as inertial_bounds
 from rbl_gym.estimators.bank.headings import HeadingBank
 from rbl_gym.estimators.iekf.augmented import carry_states
-from rbl_gym.estimators.iekf.inertial import InertialEkf
+from rbl_gym.estimators.iekf.inertial import InertialEkf, fade
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import inertial, link_bias, ranging
 from rbl_gym.motion import navigation
@@ -122,6 +122,19 @@ def test_the_kernel_that_carries_states_along_and_its_textbook(batch):
     one, other = (form(*state) for form in (carry_states.textbook, carry_states.kernel))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.skipif(not kernels.enabled(), reason="needs numba")
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_the_kernel_that_forgets_biases_and_its_textbook(batch):
+    rng = np.random.default_rng(9)
+    A = rng.standard_normal((*batch, 27, 27))
+    laws = np.array([[0.2, np.inf, 0.3], [0.1, 2.0, 0.05]])
+    state = rng.standard_normal((*batch, 21)), A @ np.swapaxes(A, -1, -2), laws
+    dt = rng.uniform(0.1, 3, batch)
+    one, other = (form(*state, dt, 9) for form in (fade.textbook, fade.kernel))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
 def test_samples_may_have_lengths_of_their_own_and_bodies_their_own_readings():

@@ -19,6 +19,7 @@ from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf
 from rbl_gym.estimators.inputs import check_batches, plain
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements.inertial import SENSORS, InertialSensor
 from rbl_gym.motion import navigation
 
@@ -113,24 +114,35 @@ class InertialEkf(AugmentedEkf):
         state = plain(state)
         check_batches(state=state.translation.shape[:-1], readings=readings.shape[:-2])
         moved = navigation.propagate(*state, readings, steps, self._law)
-        moved = AugmentedState(*moved)
         if any(law.time_s is not None for law in self.biases):
-            moved = self._faded(moved, steps.sum(axis=-1))
-        return moved
+            faded = fade(*moved[2:], self._laws, steps.sum(axis=-1), self._n_twist)
+            moved = (*moved[:2], *faded)
+        return AugmentedState(*moved)
 
-    def _faded(self, state: AugmentedState, dt: FloatArray) -> AugmentedState:
-        """Biases of the links after `dt` seconds (...): towards zero, and wandering."""
-        start = 6 + self._n_twist
-        links = (state.covariance.shape[-1] - start) // len(self.biases)
-        if not links:
-            return state
-        P = state.covariance
-        dt = np.asarray(dt)[..., None]
-        rates = [0.0 if law.time_s is None else 1 / law.time_s for law in self.biases]
-        kept = np.exp(-dt * np.concatenate([np.zeros(start), np.repeat(rates, links)]))
-        P = P * kept[..., :, None] * kept[..., None, :]
-        for k, law in enumerate(self.biases):
-            block = slice(start + k * links, start + (k + 1) * links)
-            fresh = (1 - np.exp(-2 * rates[k] * dt))[..., None]
-            P[..., block, block] += fresh * law.covariance(links)
-        return state._replace(extra=state.extra * kept[..., 6:], covariance=P)
+
+@compiled("carried_states:fade")
+def fade(
+    extra: FloatArray, covariance: FloatArray, laws: FloatArray, dt: FloatArray, n_twist: int
+) -> tuple[FloatArray, FloatArray]:
+    """Extra states and covariance after `dt` seconds (...): biases of the links are forgotten.
+
+    Parameters
+    ----------
+    extra, covariance
+        As of `AugmentedState`.
+    laws
+        (n, 3) of the biases: standard deviation, time (infinite: constant), common deviation.
+    dt, n_twist
+        Seconds (...), and how many of the extra states are no biases.
+    """
+    start = 6 + n_twist
+    links = (covariance.shape[-1] - start) // len(laws)
+    dt = np.asarray(dt)[..., None]
+    rates = 1 / laws[:, 1]
+    kept = np.exp(-dt * np.concatenate([np.zeros(start), np.repeat(rates, links)]))
+    P = covariance * kept[..., :, None] * kept[..., None, :]
+    for k, (std, _, common) in enumerate(laws):
+        block = slice(start + k * links, start + (k + 1) * links)
+        fresh = (1 - np.exp(-2 * rates[k] * dt))[..., None]
+        P[..., block, block] += fresh * (std**2 * np.eye(links) + common**2)
+    return extra * kept[..., 6:], P

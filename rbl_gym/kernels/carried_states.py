@@ -1,6 +1,6 @@
-"""States beside the pose of one body, once its pose is known better.
+"""States beside the pose of one body: once its pose is known better, and as time passes.
 
-The textbook form is in `rbl_gym.estimators.iekf.augmented`.
+The textbook forms are in `rbl_gym.estimators.iekf`: `augmented` and `inertial`.
 """
 
 from __future__ import annotations
@@ -64,3 +64,30 @@ def carry(
             for m in range(6):
                 total += across[i, m] * slope[j, m] - gain[i, m] * P0[6 + j, m]
             P[6 + i, 6 + j] = P[6 + j, 6 + i] = total
+
+
+@gufunc("(k),(p,p),(l,c),(),()->(k),(p,p)", "ffffiff")
+def fade(x0: Any, P0: Any, laws: Any, dt: float, n_twist: int, x: Any, P: Any) -> None:
+    """Biases of the links after `dt` seconds: towards zero, and wandering."""
+    n, count, start = P0.shape[0], laws.shape[0], 6 + n_twist
+    links = (n - start) // count
+    kept = np.empty(n)
+    for i in range(n):
+        kept[i] = 1.0
+    for law in range(count):
+        share = math.exp(-dt / laws[law, 1])
+        for i in range(links):
+            kept[start + law * links + i] = share
+    for i in range(n):
+        for j in range(n):
+            P[i, j] = P0[i, j] * (kept[i] * kept[j])
+    for i in range(n - 6):
+        x[i] = x0[i] * kept[6 + i]
+    for law in range(count):
+        first = start + law * links
+        fresh = 1 - math.exp(-2 * dt / laws[law, 1])
+        own, common = fresh * laws[law, 0] ** 2, fresh * laws[law, 2] ** 2
+        for i in range(links):
+            P[first + i, first + i] += own
+            for j in range(links):
+                P[first + i, first + j] += common
