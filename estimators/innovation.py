@@ -119,7 +119,8 @@ def innovations(
     spread = A @ P @ np.swapaxes(A, -1, -2)
     own = np.diagonal(spread, axis1=-2, axis2=-1)
     spread = np.where(used[..., None] & used[..., None, :], spread, 0.0)
-    sound = np.isfinite(spread).all(axis=(-2, -1)) & np.isfinite(residual).all(axis=-1)
+    finite = np.isfinite(spread).all(axis=(-2, -1)) & np.isfinite(residual).all(axis=-1)
+    sound: BoolArray = np.asarray(finite)
     spread = np.where(sound[..., None, None], spread, 0.0) + np.eye(flat[-1])
     root = np.linalg.cholesky(spread)
     u = np.where(used & sound[..., None], v * scale, 0.0)
@@ -130,8 +131,11 @@ def innovations(
     refused = links.sum(axis=-1) - dof
     likelihood = dof * LOG_USED - 0.5 * (nis + log_det) + refused * LOG_REFUSED
     std = np.sqrt(variance * (1 + own))
+    v, std, residual = (np.where(links, a, 0.0).reshape(shape) for a in (v, std, residual))
     return Innovations(
-        *(np.where(links, a, 0.0).reshape(shape) for a in (v, std, residual)),
+        v,
+        std,
+        residual,
         used.reshape(shape),
         np.where(sound, nis, np.inf),
         dof,

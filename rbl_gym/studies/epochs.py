@@ -190,8 +190,8 @@ def _innovations(
     if not steps:
         return
     before, after = (
-        type(steps[0][k])(*(np.array(field) for field in zip(*(s[k] for s in steps), strict=True)))
-        for k in (0, 1)
+        type(states[0])(*(np.array(field) for field in zip(*states, strict=True)))
+        for states in ([step.predicted for step in steps], [step.state for step in steps])
     )
     readings = [step.reading for step in steps]
     ranges = np.array([reading.ranges for reading in readings])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Innovations
 from rbl_gym.estimators.innovation import GATE
 from rbl_gym.recordings.recording import Recording
@@ -76,7 +76,7 @@ def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatA
     return nis, dof, links - dof
 
 
-def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> FloatArray:
+def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> BoolArray:
     by_chance = special.chdtri(np.maximum(dof, 1), _CHANCE)
     lost = refused > MOST_REFUSED * (dof + refused)
     # A single range in five may be wrong without a word.

@@ -126,7 +126,7 @@ def _stacked(filters: list[Any]) -> estimators.Filter:
     if len(filters) == 1 or not isinstance(first, IteratedEkf):
         return first
     std = np.stack([filter.process.std() for filter in filters])
-    process = motion.ProcessNoise(std[:, :3], std[:, 3:])
+    process = motion.ProcessNoise(std[:, :3], std[:, 3:])  # pyright: ignore[reportArgumentType]
     tags = np.stack([filter.tags for filter in filters])
     return dataclasses.replace(first, process=process, tags=tags)
 
