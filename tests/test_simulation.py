@@ -329,6 +329,14 @@ def test_wide_drawn_prior_turns_as_far_as_stated():
 # --- measurements -----------------------------------------------------------------------------
 
 
+def test_an_epoch_is_what_the_episode_has_at_it():
+    episode = draw(change("hall", links=BAD_LINKS), 0, batch=(2,))
+    at = simulation.epoch_of(episode, 3)
+    for name in simulation.Epoch._fields[:5]:
+        of_episode = getattr(episode, {"twist": "twists"}.get(name, name))
+        np.testing.assert_array_equal(getattr(at, name), of_episode[:, 3])
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_measure_equals_a_loop_over_the_links(name):
     scene = change(name, steps=5, links=BAD_LINKS)
