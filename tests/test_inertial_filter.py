@@ -222,6 +222,7 @@ def bank_run(rng, headings, batch=()):
     state = filter.initial(level, episode.translation[..., 0, :], covariance)
     for k in range(21):
         at = simulation.epoch_of(episode, k)
+        assert isinstance(at, simulation.Epoch)
         if k:
             state = filter.predict(state, at.readings, scene.dt)
         measured = simulation.measure(scene, at, episode.anchors)

@@ -134,7 +134,13 @@ def test_the_scene_hash_sees_every_field():
     assert len(hashes) == len(scenes.SCENES)
     room = scenes.get("uwb_room")
     facts = bench_worlds.scene_facts(room)
-    assert set(facts) == {field.name for field in dataclasses.fields(room)} | {"kind"}
+    # A scene without a sensor keeps the hash that it had before there were any.
+    assert set(facts) == {field.name for field in dataclasses.fields(room)} - {"inertial"} | {
+        "kind"
+    }
+    sensed = scenes.get({"name": "uwb_room", "inertial": "consumer"})
+    assert "inertial" in bench_worlds.scene_facts(sensed)
+    assert bench_worlds.scene_hash(sensed) not in hashes
     assert bench_worlds.scene_hash(dataclasses.replace(room, steps=99)) not in hashes
     for change in ({"dt": 0.2}, {"noise": {"floor_m": 0.2}}, {"links": {"nlos_bias_m": 4.0}},
                    {"noise": {"kind": "squared-range", "sigma_m": 0.1}}):  # fmt: skip
