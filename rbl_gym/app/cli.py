@@ -1,4 +1,4 @@
-"""The command line: rbl-gym demo, place, train, bench, convert, replay, reproduce, network."""
+"""The command line: demo, place, train, bench, convert, replay, calibrate, reproduce, network."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rbl_gym import __version__
-from rbl_gym.app import bench_command, convert_command, learning, replay_command
+from rbl_gym.app import bench_command, calibrate_command, convert_command, learning, replay_command
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
@@ -57,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     bench_command.add_rerun(commands)
     convert_command.add_convert(commands)
     replay_command.add_replay(commands)
+    calibrate_command.add_calibrate(commands)
     _add_reproduce(commands)
     _add_network(commands)
     return parser

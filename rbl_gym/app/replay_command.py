@@ -11,8 +11,10 @@ from rbl_gym.app.terminal import (
     add_html,
     add_json,
     check_html,
+    offset,
     print_files,
     progress,
+    window,
     write_json,
 )
 
@@ -170,7 +172,7 @@ def _add_comparison(group: Any) -> None:
     _add_number(group, "--truth-gap-s", "longest gap bridged between truth and ranges, default 0.5")
     group.add_argument(
         "--truth-exclude",
-        type=_window,
+        type=window,
         action="append",
         metavar="START:END",
         help="seconds (of the ranges' clock) in which the truth is wrong: not judged; may be "
@@ -178,7 +180,7 @@ def _add_comparison(group: Any) -> None:
     )
     group.add_argument(
         "--time-offset",
-        type=_offset,
+        type=offset,
         metavar="S",
         help="how far the truth's clock is ahead of that of the ranges, seconds; auto: found by "
         "the motion",
@@ -330,21 +332,6 @@ def _start(text: str) -> tuple[float, ...]:
     if len(values) not in (3, 4):
         raise argparse.ArgumentTypeError(f"must be x,y,z or x,y,z,yaw_deg, got {text!r}")
     return values
-
-
-def _window(text: str) -> tuple[float, float]:
-    start, _, end = text.partition(":")
-    try:
-        return float(start), float(end)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be START:END in seconds, got {text!r}") from None
-
-
-def _offset(text: str) -> float | str:
-    try:
-        return text if text == "auto" else float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be seconds or auto, got {text!r}") from None
 
 
 def _volume(text: str) -> tuple[float | None, ...]:

@@ -121,3 +121,20 @@ def print_files(**files: str | None) -> None:
     for label, path in files.items():
         if path:
             print(f"{label}: {path}")
+
+
+def window(text: str) -> tuple[float, float]:
+    """``START:END`` in seconds, for argparse."""
+    start, _, end = text.partition(":")
+    try:
+        return float(start), float(end)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be START:END in seconds, got {text!r}") from None
+
+
+def offset(text: str) -> float | str:
+    """Seconds, or ``auto``, for argparse."""
+    try:
+        return text if text == "auto" else float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be seconds or auto, got {text!r}") from None

@@ -8,13 +8,16 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import MAX_RANGE_M, TOO_LONG, Ids, Table
 
+# Columns that say how well the others are known.
+_STDS = ("bias_std_m", "slope_std")
+
 
 def calibrated(
     ranges: FloatArray, std: FloatArray | None, table: Table, ids: Ids, said: Said
 ) -> tuple[FloatArray, FloatArray | None]:
     """Ranges (K, M, N) and their deviations with bias and slope of each link taken off."""
     table.require("anchor", "tag", "bias_m")
-    said.read(table, ("anchor", "tag", "bias_m", "slope", "sigma_m"))
+    said.read(table, ("anchor", "tag", "bias_m", "slope", "sigma_m", *_STDS))
     link = table.links(ids)
     slope = table.numbers("slope") if "slope" in table.columns else np.zeros(len(table.lines))
     table.check(slope > -1, "slope", "must be above -1")

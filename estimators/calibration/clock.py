@@ -1,0 +1,150 @@
+"""The clock of a path against that of ranges, by the changes of the ranges.
+
+A range that changes tells when the body moved, whatever its bias. Changes over a fraction of a
+second are free of what lasts longer: biases, slow multipath, lever arms that are a little off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.calibration import robust
+
+__all__ = ["Clock", "find_clock"]
+
+# Changes are over one of these many seconds, or from a range of a link to the next, up to so many
+# times it. Longer ones tell more of a clock, and shorter ones are freer of what lasts.
+_LAGS_S, _LONGEST = (0.2, 0.4, 0.8), 3.0
+_SEARCH_STEP_S, _FEWEST, _BLOCK_S = 0.1, 30, 2.0
+# Half-width of the difference that gives rates (s).
+_HALF_S = 0.02
+_LEAST_M = 1e-4
+
+Places = Callable[[float], tuple[FloatArray, BoolArray]]
+
+
+class Clock(NamedTuple):
+    """Seconds by which a path's stamps are ahead of the ranges', and the standard deviation."""
+
+    offset_s: float
+    std_s: float
+
+
+def find_clock(
+    times: FloatArray,
+    ranges: FloatArray,
+    links: BoolArray,
+    distances: Places,
+    search_s: float,
+) -> Clock | None:
+    """The shift in time at which distances along a path change as the ranges do.
+
+    Parameters
+    ----------
+    times
+        (K,) seconds of the ranges.
+    ranges, links
+        (K, M, N) metres, and where there is a range.
+    distances
+        Of a shift: distances (K, M, N) at ``times + shift`` along the path, and where they are
+        known (K,).
+    search_s
+        Shifts up to this are tried, in both directions.
+
+    Returns
+    -------
+    Clock
+        What has stamp t of the ranges has ``t + offset_s`` on the path. None where too few ranges
+        change to tell.
+    """
+    K = len(times)
+    flat, used = ranges.reshape(K, -1), links.reshape(K, -1)
+    grid = np.arange(-search_s, search_s + 1e-9, _SEARCH_STEP_S) if search_s > 0 else np.zeros(1)
+    found: list[Clock] = []
+    start: float | None = None
+    for lag in _LAGS_S:
+        changes = _changes(times, used, flat, distances, lag)
+        if changes is None:
+            continue
+        if start is None:
+            spreads = [changes.spread(float(shift)) for shift in grid]
+            if not np.isfinite(spreads).any():
+                continue
+            start = float(grid[int(np.argmin(spreads))])
+        clock = _refined(changes, start)
+        if clock is not None:
+            found.append(clock)
+    return min(found, key=lambda clock: clock.std_s, default=None)
+
+
+class _Changes(NamedTuple):
+    """How P ranges change, and how distances do at a shift."""
+
+    times: FloatArray  # (P,)
+    change: FloatArray  # (P,) metres
+    foretold: Callable[[float], tuple[FloatArray, BoolArray]]
+
+    def left(self, shift: float) -> tuple[FloatArray, BoolArray]:
+        """What is left of the changes at a shift, and where that is known."""
+        foretold, known = self.foretold(shift)
+        return self.change - foretold, known
+
+    def spread(self, shift: float) -> float:
+        """Robust standard deviation of what is left."""
+        e, known = self.left(shift)
+        return float(robust.spread(e, known, _LEAST_M)) if known.sum() >= _FEWEST else np.inf
+
+
+def _refined(changes: _Changes, start: float) -> Clock | None:
+    """The shift near `start` that leaves least, and its standard deviation."""
+    std = changes.spread(start)
+
+    def cost(shift: float) -> float:
+        e, known = changes.left(shift)
+        return float(robust.loss_of(e[known] / std).mean()) if known.any() else np.inf
+
+    if not np.isfinite(std):
+        return None
+    bounds = start - 1.5 * _SEARCH_STEP_S, start + 1.5 * _SEARCH_STEP_S
+    offset = float(minimize_scalar(cost, bounds=bounds, options={"xatol": 1e-4}).x)
+    e, known = changes.left(offset)
+    rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]
+    rate = (rate / (2 * _HALF_S * std))[known]
+    z = (e / std)[known]
+    # Changes overlap, and errors last: scores are summed over stretches of time first.
+    block = np.unique((changes.times[known] // _BLOCK_S).astype(int), return_inverse=True)[1]
+    score = np.bincount(block, z * robust.share_of(z) * rate)
+    information = float((rate**2).sum())
+    if information <= 0:
+        return None
+    return Clock(offset, float(np.sqrt((score**2).sum()) / information))
+
+
+def _changes(
+    times: FloatArray, links: BoolArray, ranges: FloatArray, distances: Places, lag_s: float
+) -> _Changes | None:
+    """Changes of the ranges (K, L) of each link over a lag; None where there are too few."""
+    found = []
+    for link in range(links.shape[1]):
+        at = np.flatnonzero(links[:, link])
+        later = np.searchsorted(times[at], times[at] + lag_s - 1e-9)
+        inside = later < len(at)
+        a, b = at[inside], at[later[inside]]
+        apart = times[b] - times[a]
+        near = (apart > 0) & (apart <= _LONGEST * lag_s)
+        found.append((a[near], b[near], np.full(near.sum(), link)))
+    first, second, link = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if len(first) < _FEWEST:
+        return None
+
+    def foretold(shift: float) -> tuple[FloatArray, BoolArray]:
+        d, known = distances(shift)
+        d = d.reshape(len(times), -1)
+        return d[second, link] - d[first, link], known[first] & known[second]
+
+    return _Changes(times[first], ranges[second, link] - ranges[first, link], foretold)

@@ -1,0 +1,81 @@
+"""Pictures of rbl-gym calibrate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from rbl_gym.app.figures import new_figure, styled
+from rbl_gym.studies.calibrate import CalibratedLinks
+
+_MOST_POINTS = 20_000
+
+
+@styled
+def links_figure(found: CalibratedLinks) -> Figure:
+    """Biases of the links, residuals over distance, their histogram; tags in the body frame."""
+    figure = new_figure(12, 7.2)
+    axes = figure.subplots(2, 2)
+    _biases(axes[0, 0], found)
+    _over_distance(axes[0, 1], found)
+    _histogram(axes[1, 0], found)
+    _tags(axes[1, 1], found)
+    return figure
+
+
+def _biases(axes: Any, found: CalibratedLinks) -> None:
+    fit = found.fit
+    for n, tag in enumerate(found.tag_ids):
+        at = np.arange(len(found.anchor_ids)) + 0.12 * (n - 0.5 * (len(found.tag_ids) - 1))
+        told = fit.counts[:, n] > 0
+        axes.errorbar(
+            at[told], fit.bias_m[told, n], 2 * fit.bias_std_m[told, n], fmt="o", ms=4, label=tag
+        )
+    axes.set_xticks(range(len(found.anchor_ids)), found.anchor_ids)
+    axes.set_xlabel("anchor")
+    axes.set_ylabel("bias [m], 2 standard deviations")
+    axes.grid(alpha=0.25, lw=0.5)
+    if len(found.tag_ids) <= 12:
+        axes.legend(title="tag", frameon=False, fontsize=8, ncols=4)
+
+
+def _over_distance(axes: Any, found: CalibratedLinks) -> None:
+    d, e = found.distances.ravel(), found.fit.residuals.ravel()
+    at = np.flatnonzero(np.isfinite(d) & (e != 0))
+    at = at[:: max(1, len(at) // _MOST_POINTS)]
+    limit = 4 * float(np.median(found.fit.noise_std_m[found.fit.counts > 0]))
+    axes.plot(d[at], np.clip(e[at], -limit, limit), ".", ms=1, color="#2e86ab", alpha=0.4)
+    axes.axhline(0, color="0.4", lw=0.6)
+    axes.set_xlabel("distance [m]")
+    axes.set_ylabel(f"residual [m], cut at {limit:.2g}")
+    axes.grid(alpha=0.25, lw=0.5)
+
+
+def _histogram(axes: Any, found: CalibratedLinks) -> None:
+    e = found.fit.residuals[found.fit.residuals != 0]
+    std = float(np.median(found.fit.noise_std_m[found.fit.counts > 0]))
+    edges = np.linspace(-6, 6, 97) * std
+    counts, _ = np.histogram(np.clip(e, edges[0], edges[-1]), edges)
+    axes.stairs(np.maximum(counts, 0.5), edges, color="#2e86ab", fill=True, alpha=0.5)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    width = edges[1] - edges[0]
+    bell = len(e) * width / std / np.sqrt(2 * np.pi) * np.exp(-0.5 * (middle / std) ** 2)
+    axes.plot(middle, np.maximum(bell, 0.5), color="#d1495b", label=f"Gaussian, {std:.3f} m")
+    axes.set_yscale("log")
+    axes.set_xlabel("residual [m], the ends hold what is beyond")
+    axes.set_ylabel("ranges")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def _tags(axes: Any, found: CalibratedLinks) -> None:
+    tags, std = found.fit.tags, found.fit.tags_std_m
+    axes.errorbar(*tags[:, :2].T, xerr=2 * std[:, 0], yerr=2 * std[:, 1], fmt="o", ms=4)
+    for place, name in zip(tags, found.tag_ids, strict=True):
+        axes.annotate(name, place[:2], xytext=(5, 5), textcoords="offset points", fontsize=8)
+    axes.plot(0, 0, "k+", ms=9)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("x in the truth's body frame [m]")
+    axes.set_ylabel("y [m]")
+    axes.grid(alpha=0.25, lw=0.5)

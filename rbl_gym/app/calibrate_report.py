@@ -1,0 +1,82 @@
+"""Tables of rbl-gym calibrate on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rbl_gym.app.tables import new_console, new_table
+
+
+def print_links(figures: dict[str, Any]) -> None:
+    """Links, tags, clock, and what is not determined."""
+    console = new_console()
+    title = f"{figures['ranges']} ranges, biases by {figures['biases']}"
+    table = new_table(title)
+    for heading in ("anchor", "tag"):
+        table.add_column(heading)
+    for heading in ("ranges", "bias [m]", "+-", "slope", "+-", "noise [m]"):
+        table.add_column(heading, justify="right")
+    for row in figures["links"]:
+        table.add_row(
+            row["anchor"],
+            row["tag"],
+            str(row["ranges"]),
+            f"{row['bias_m']:.3f}",
+            f"{row['bias_std_m']:.3f}",
+            f"{row['slope']:.4f}",
+            f"{row['slope_std']:.4f}",
+            f"{row['noise_std_m']:.3f}",
+        )
+    console.print(table)
+    if "nodes" in figures:
+        table = new_table("antenna delays of nodes, those of the tags about their mean")
+        table.add_column("node")
+        for heading in ("delay [m]", "+-"):
+            table.add_column(heading, justify="right")
+        for row in figures["nodes"]:
+            kind = "anchor" if "anchor" in row else "tag"
+            table.add_row(f"{kind} {row[kind]}", f"{row['delay_m']:.3f}", f"{row['std_m']:.3f}")
+        console.print(table)
+    table = new_table("tags in the truth's body frame [m]")
+    table.add_column("tag")
+    for heading in ("x", "y", "z", "+-x", "+-y", "+-z"):
+        table.add_column(heading, justify="right")
+    for row in figures["tags"]:
+        numbers = *row["place_m"], *row["std_m"]
+        table.add_row(row["tag"], *("held" if x is None else f"{x:.3f}" for x in numbers))
+    console.print(table)
+    for line in _sentences(figures):
+        console.print(line)
+
+
+def _sentences(figures: dict[str, Any]) -> list[str]:
+    """What stands beside the tables."""
+    said = []
+    if clock := figures["time_offset"]:
+        said.append(
+            f"The ranges fit the truth {clock['offset_s']:.4f} s later than its stamps say, +- "
+            f"{clock['std_s']:.4f} (replay --time-offset {clock['offset_s']:.4f})."
+        )
+    if turn := figures.get("turn"):
+        text = f"The table of tags is turned by {_three(turn['rotation_vector_deg'], 2)} deg"
+        if "std_deg" in turn:
+            text += f", +- {_three(turn['std_deg'], 2)},"
+        text += f" and shifted by {_three(turn['shift_m'], 3)} m in the truth's body frame."
+        said.append(text)
+        for row, off in zip(figures["tags"], turn.get("off_table_m", ()), strict=False):
+            said.append(f"Tag {row['tag']} is {_three(off, 3)} m off its place in the table.")
+    noise = figures["noise"]
+    text = f"Noise of a range: {noise['std_m']:.3f} m (median of the links)"
+    if noise["slow_time_s"]:
+        text += (
+            f", {100 * noise['slow_share']:.0f} % of its variance slow, over "
+            f"{noise['slow_time_s']:.2g} s"
+        )
+    said.append(f"{text}; {100 * noise['beyond_3_std']:.1f} % of the ranges beyond three of it.")
+    said += [f"Not determined: {what}." for what in figures["not_determined"]]
+    return said
+
+
+def _three(values: Sequence[float], digits: int) -> str:
+    return "(" + ", ".join(f"{x:.{digits}f}" for x in values) + ")"

@@ -1,0 +1,66 @@
+"""Files that a calibration writes, as `rbl_gym.recordings` reads them."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.calibration import LinkFit
+
+__all__ = ["write_link_table", "write_points"]
+
+
+def write_link_table(
+    path: str | os.PathLike[str], fit: LinkFit, anchor_ids: Sequence[str], tag_ids: Sequence[str]
+) -> None:
+    """Write ``anchor,tag,bias_m,slope,sigma_m,bias_std_m,slope_std``, a row a link.
+
+    Parameters
+    ----------
+    path
+        File; its folder is made.
+    fit
+        Of `calibrate_links`; links without ranges are left out.
+    anchor_ids, tag_ids
+        In the order of its arrays.
+    """
+    columns = fit.bias_m, fit.slope, fit.noise_std_m, fit.bias_std_m, fit.slope_std
+    _write(
+        path,
+        ("anchor", "tag", "bias_m", "slope", "sigma_m", "bias_std_m", "slope_std"),
+        [
+            [anchor_ids[m], tag_ids[n], *(f"{column[m, n]:.6f}" for column in columns)]
+            for m, n in np.argwhere(fit.counts > 0)
+        ],
+    )
+
+
+def write_points(
+    path: str | os.PathLike[str], kind: str, ids: Sequence[str], places: FloatArray
+) -> None:
+    """Write ``anchor,x,y,z`` or ``tag,x,y,z``.
+
+    Parameters
+    ----------
+    path
+        File; its folder is made.
+    kind
+        ``"anchor"`` or ``"tag"``.
+    ids, places
+        Names, and places (n, 3) in metres.
+    """
+    rows = [[name, *(f"{x:.6f}" for x in place)] for name, place in zip(ids, places, strict=True)]
+    _write(path, (kind, "x", "y", "z"), rows)
+
+
+def _write(path: str | os.PathLike[str], header: Sequence[str], rows: Iterable[list[str]]) -> None:
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)

@@ -1,0 +1,153 @@
+"""The truth of recordings as the path that a calibration goes by."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.calibration import KnownPath, spread_of_residuals
+from rbl_gym.estimators.calibration.clock import Clock, find_clock
+from rbl_gym.estimators.calibration.link_equations import carried_tags, directions
+from rbl_gym.geometry import rotations
+from rbl_gym.recordings import truth_at
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.calibrate.settings import LinkSettings
+
+# Shifts of time that are tried (s), and how well a clock must be told to be taken.
+_SEARCH_S, _CLOCK_STD_S = 1.0, 0.05
+# Epochs that coarse starts are compared on, and by how much another turn must fit better than none.
+_COARSE, _BETTER = 400, 0.8
+
+
+class Log(NamedTuple):
+    """Runs with truth behind each other: K epochs of M anchors and N tags."""
+
+    runs: tuple[Recording, ...]
+    times: FloatArray  # (K,)
+    ranges: FloatArray  # (K, M, N)
+    links: BoolArray  # (K, M, N), False where there is no truth
+    anchors: FloatArray  # (K, M, 3)
+    tags: FloatArray  # (N, 3)
+
+
+def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
+    """The runs, checked.
+
+    Raises
+    ------
+    ValueError
+        If runs differ in anchors or tags, or have no truth that serves.
+    """
+    if not recordings:
+        raise ValueError("recordings must hold a run, got none")
+    runs = tuple(recordings.values())
+    first = runs[0]
+    for name, run in recordings.items():
+        label = f"run {name!r}: " if name else ""
+        if run.anchor_ids != first.anchor_ids or run.tag_ids != first.tag_ids:
+            raise ValueError(f"{label}runs must have the same anchors and tags")
+        if run.truth is None:
+            raise ValueError(f"{label}links are calibrated by truth, and the recording has none")
+        if run.truth.rotation is None and (len(run.tags) > 1 or run.tags.any()):
+            raise ValueError(
+                f"{label}the truth must have rotations where tags are off the body's origin, got "
+                "positions alone"
+            )
+        if run.truth.planar and not settings.planar:
+            raise ValueError(f"{label}the truth has no heights: say planar")
+        if run.truth.planar and settings.height_offset_m is None:
+            heights = run.anchors[..., 2]
+            if np.ptp(heights) > 0.1:
+                raise ValueError(
+                    f"{label}height_offset_m must be given: the truth has no heights, and the "
+                    f"anchors stand at {heights.min():g} to {heights.max():g} m"
+                )
+    times = np.concatenate([run.times for run in runs])
+    out = np.zeros(len(times), dtype=bool)
+    for start, end in settings.truth_exclude:
+        out |= (times >= start) & (times <= end)
+    return Log(
+        runs,
+        times,
+        np.concatenate([run.ranges for run in runs]),
+        np.concatenate([run.links for run in runs]) & ~out[:, None, None],
+        np.concatenate([run.anchors_by_epoch for run in runs]),
+        first.tags,
+    )
+
+
+def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, BoolArray]:
+    """The path at the times of the ranges, by the truth so many seconds later; and where known."""
+    rotation, translation, known = [], [], []
+    for run in log.runs:
+        truth = run.truth
+        assert truth is not None
+        Q, p, ok = truth_at(truth, run.times + shift, settings.truth_gap_s)
+        still = truth.times[-1] - truth.times[0] > 0 and not np.ptp(truth.translation, axis=0).any()
+        if still and (truth.rotation is None or not np.ptp(truth.rotation, axis=0).any()):
+            ok = np.ones_like(ok)  # a body that stands stands a little earlier and later too
+        Q = np.broadcast_to(np.eye(3), (len(p), 3, 3)) if Q is None else Q
+        if settings.planar:
+            Q = rotations.exp(rotations.yaw(Q)[:, None] * np.array([0.0, 0.0, 1.0]))
+        if truth.planar:
+            p = p.copy()
+            offset = settings.height_offset_m or 0.0
+            p[:, 2] = run.anchors_by_epoch[..., 2].mean(axis=-1) - offset - log.tags[:, 2].mean()
+        rotation.append(Q)
+        translation.append(p)
+        known.append(ok)
+    path = KnownPath(log.times, np.concatenate(rotation), np.concatenate(translation))
+    return path, np.concatenate(known)
+
+
+def first_turn(log: Log, settings: LinkSettings, shift: float) -> FloatArray:
+    """What turns the table of tags (3, 3) to fit the path coarsely; the identity where it does."""
+    if len(log.tags) == 1 and not log.tags.any():
+        return np.eye(3)
+    path, known = path_at(log, settings, shift)
+    at = np.flatnonzero(known & log.links.any(axis=(1, 2)))
+    if not len(at):
+        return np.eye(3)
+    at = at[:: max(1, len(at) // _COARSE)]
+    few = KnownPath(*(a[at] for a in path))
+
+    def misfit(turn: FloatArray) -> float:
+        places = carried_tags(few, log.tags @ turn.T)
+        return spread_of_residuals(log.ranges[at], log.links[at], log.anchors[at], places)
+
+    if settings.planar:
+        turns = rotations.exp(np.linspace(0, 2 * np.pi, 24, False)[:, None] * [0.0, 0.0, 1.0])
+    else:
+        turns = _cube()
+    found = [misfit(turn) for turn in turns]
+    best = int(np.argmin(found))
+    return turns[best] if found[best] < _BETTER * found[0] else np.eye(3)
+
+
+def _cube() -> FloatArray:
+    """The 24 rotations (24, 3, 3) of a cube, the identity first."""
+    quarter = rotations.exp(0.5 * np.pi * np.eye(3))
+    found = [np.eye(3)]
+    for rotation in found:
+        for turn in quarter:
+            new = np.round(turn @ rotation)
+            if not any(np.array_equal(new, old) for old in found):
+                found.append(new)
+    return np.array(found)
+
+
+def clock_of(log: Log, settings: LinkSettings, tags: FloatArray) -> Clock | None:
+    """How far the truth's clock is ahead, by the ranges; None where they do not tell.
+
+    `tags` (N, 3) in the truth's body frame.
+    """
+
+    def distances(shift: float) -> tuple[FloatArray, BoolArray]:
+        path, known = path_at(log, settings, shift)
+        return directions(log.anchors, carried_tags(path, tags))[1], known
+
+    found = find_clock(log.times, log.ranges, log.links, distances, _SEARCH_S)
+    return found if found is not None and found.std_s <= _CLOCK_STD_S else None

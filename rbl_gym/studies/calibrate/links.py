@@ -1,0 +1,278 @@
+"""`rbl-gym calibrate` with truth, as a function: links, tags, noise and clock of recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.calibration import KnownPath, LinkFit, LinkModel, fit_links
+from rbl_gym.estimators.calibration.clock import Clock
+from rbl_gym.estimators.calibration.link_equations import ARM_M, BIAS_M, SLOPE, TURN_RAD
+from rbl_gym.geometry import rotations
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_of, path_at
+from rbl_gym.studies.calibrate.settings import LinkSettings
+
+__all__ = ["CalibratedLinks", "calibrate_links"]
+
+# A parameter whose standard deviation stays above this share of what was thought of it before is
+# not determined.
+_UNTOLD = 0.5
+# Links with fewer ranges than this (median) have antenna delays of nodes only.
+_FEW_RANGES = 30
+# Epochs that tell where tags are about, and how a fit moves with the clock.
+_FEW_EPOCHS = 1000
+
+
+class CalibratedLinks(NamedTuple):
+    """Links as a recording with truth tells them.
+
+    Attributes
+    ----------
+    settings
+        As they were used.
+    fit
+        Biases, slopes, tags and noise with standard deviations; residuals of all epochs.
+    clock
+        Of the truth; None where it was told or the ranges do not tell it.
+    anchor_ids, tag_ids
+        In the order of the arrays.
+    figures
+        Plain numbers: what `rbl-gym calibrate --json` writes.
+    """
+
+    settings: LinkSettings
+    fit: LinkFit
+    clock: Clock | None
+    anchor_ids: tuple[str, ...]
+    tag_ids: tuple[str, ...]
+    distances: Any
+    figures: dict[str, Any]
+
+
+def calibrate_links(
+    recordings: Recording | Mapping[str, Recording],
+    settings: LinkSettings = LinkSettings(),  # noqa: B008 (frozen)
+    advance: Callable[[], None] = lambda: None,
+) -> CalibratedLinks:
+    """Calibrate links, tags and clock by the truth of a recording, or of several runs.
+
+    Parameters
+    ----------
+    recordings
+        With truth, or runs by their names, of one set of anchors and tags.
+    settings
+        What is estimated.
+    advance
+        Called after each of the four parts of the work.
+
+    Returns
+    -------
+    CalibratedLinks
+        The clock is found by how ranges change (`find_clock`), then links and tags by robust least
+        squares (`rbl_gym.estimators.calibration.fit_links`).
+
+    Raises
+    ------
+    ValueError
+        Without truth that serves, or where no range has truth.
+    """
+    if isinstance(recordings, Recording):
+        recordings = {"": recordings}
+    log = log_of(recordings, settings)
+    told = settings.time_offset
+    start = 0.0 if isinstance(told, str) else float(told)
+    turn = first_turn(log, settings, start)
+    clock = clock_of(log, settings, log.tags @ turn.T) if told == "auto" else None
+    shift = start if clock is None else clock.offset_s
+    turn = first_turn(log, settings, shift)
+    advance()
+    links = log.links & path_at(log, settings, shift)[1][:, None, None]
+    if not links.any():
+        raise ValueError(
+            f"no range has truth within {settings.truth_gap_s:g} s: see time_offset, truth_gap_s "
+            "and truth_exclude"
+        )
+    biases = settings.biases
+    if biases == "auto":
+        counts = links.sum(axis=0)
+        biases = "link" if np.median(counts[counts > 0]) >= _FEW_RANGES else "node"
+    tags = "held" if len(log.tags) == 1 and not log.tags.any() else settings.tags
+    first = LinkModel(biases, settings.slopes, "held" if tags == "held" else "turned",
+                      settings.planar)  # fmt: skip
+    if clock is not None:
+        # A clock is told well by tags that are where they belong.
+        coarse = _fit(log, settings, first, turn, shift, few=True)
+        turn, clock = coarse.rotation, clock_of(log, settings, coarse.tags) or clock
+        shift = clock.offset_s
+    advance()
+    fit = _fit(log, settings, first, turn, shift)
+    advance()
+    model = first
+    if tags == "free":
+        model = LinkModel(biases, settings.slopes, "free", settings.planar)
+        fit = _fit(log, settings, model, fit.rotation, shift)
+    if clock is not None:
+        fit = _with_clock(log, settings, model, fit, clock)
+    advance()
+    return _result(log, settings, model, fit, clock, shift)
+
+
+def _fit(
+    log: Log,
+    settings: LinkSettings,
+    model: LinkModel,
+    turn: FloatArray,
+    shift: float,
+    few: bool = False,
+) -> LinkFit:
+    """The fit to all epochs, or to `few` of them, by the truth so many seconds later."""
+    at = slice(None, None, max(1, len(log.times) // _FEW_EPOCHS) if few else 1)
+    path, known = path_at(log, settings, shift)
+    links = (log.links & known[:, None, None])[at]
+    path = KnownPath(*(a[at] for a in path))
+    return fit_links(log.ranges[at], links, log.anchors[at], log.tags, path, model, turn)
+
+
+def _with_clock(
+    log: Log, settings: LinkSettings, model: LinkModel, fit: LinkFit, clock: Clock
+) -> LinkFit:
+    """Standard deviations with what the clock's own adds, by two fits to fewer epochs."""
+    fits = [
+        _fit(log, settings, model, fit.rotation, shift, few=True)
+        for shift in (clock.offset_s, clock.offset_s + clock.std_s)
+    ]
+    moved = {
+        "bias_std_m": fits[1].bias_m - fits[0].bias_m,
+        "slope_std": fits[1].slope - fits[0].slope,
+        "rotation_std_rad": rotations.error(fits[1].rotation, fits[0].rotation),
+        "shift_std_m": fits[1].shift_m - fits[0].shift_m,
+        "tags_std_m": np.where(fit.tags_std_m > 0, fits[1].tags - fits[0].tags, 0.0),
+    }
+    return fit._replace(**{name: np.hypot(getattr(fit, name), by) for name, by in moved.items()})
+
+
+def _result(
+    log: Log, settings: LinkSettings, model: LinkModel, fit: LinkFit, clock: Clock | None,
+    shift: float,
+) -> CalibratedLinks:  # fmt: skip
+    anchor_ids, tag_ids = log.runs[0].anchor_ids, log.runs[0].tag_ids
+    told = fit.counts > 0
+    distance = np.where(
+        log.links, (log.ranges - fit.bias_m - fit.residuals) / (1 + fit.slope), np.nan
+    )
+    left = fit.residuals[log.links & (fit.residuals != 0)]
+    figures: dict[str, Any] = {
+        "ranges": int(fit.counts.sum()),
+        "epochs": len(log.times),
+        "biases": model.biases,
+        "links": [
+            {
+                "anchor": anchor_ids[m],
+                "tag": tag_ids[n],
+                "ranges": int(fit.counts[m, n]),
+                "bias_m": float(fit.bias_m[m, n]),
+                "bias_std_m": float(fit.bias_std_m[m, n]),
+                "slope": float(fit.slope[m, n]),
+                "slope_std": float(fit.slope_std[m, n]),
+                "noise_std_m": float(fit.noise_std_m[m, n]),
+            }
+            for m, n in np.argwhere(told)
+        ],
+        "noise": {
+            "std_m": float(np.median(fit.noise_std_m[told])),
+            "slow_share": fit.drift.share,
+            "slow_time_s": fit.drift.time_s if fit.drift.share else None,
+            "beyond_3_std": float((np.abs(left) > 3 * np.median(fit.noise_std_m[told])).mean()),
+            "late_quantile_99_m": float(np.quantile(left, 0.99)),
+        },
+        "time_offset": None if clock is None else {"offset_s": shift, "std_s": clock.std_s},
+        "tags": [
+            {
+                "tag": tag,
+                "place_m": fit.tags[n].tolist(),
+                "std_m": [float(std) if std > 0 else None for std in fit.tags_std_m[n]],
+            }
+            for n, tag in enumerate(tag_ids)
+        ],
+    }
+    if fit.node_delay_m is not None and fit.node_delay_std_m is not None:
+        names = [*(("anchor", a) for a in anchor_ids), *(("tag", t) for t in tag_ids)]
+        figures["nodes"] = [
+            {kind: name, "delay_m": float(delay), "std_m": float(std)}
+            for (kind, name), delay, std in zip(
+                names, fit.node_delay_m, fit.node_delay_std_m, strict=True
+            )
+        ]
+    turn = np.rad2deg(rotations.log(fit.rotation))
+    if model.tags == "turned":
+        figures["turn"] = {
+            "rotation_vector_deg": turn.tolist(),
+            "std_deg": np.rad2deg(fit.rotation_std_rad).tolist(),
+            "shift_m": fit.shift_m.tolist(),
+            "shift_std_m": fit.shift_std_m.tolist(),
+        }
+    elif model.tags == "free" and len(log.tags) > 1:
+        figures["turn"] = _table_beside(log.tags, fit, settings.planar)
+    figures["not_determined"] = _untold(fit, model, settings, clock, (anchor_ids, tag_ids))
+    return CalibratedLinks(settings, fit, clock, anchor_ids, tag_ids, distance, figures)
+
+
+def _table_beside(table: Any, fit: LinkFit, planar: bool) -> dict[str, Any]:
+    """The rigid transform that takes the table nearest to the tags found, and what it leaves."""
+    a, b = table - table.mean(axis=0), fit.tags - fit.tags.mean(axis=0)
+    if planar:
+        spread = b[:, :2].T @ a[:, :2]
+        angle = np.arctan2(spread[1, 0] - spread[0, 1], spread[0, 0] + spread[1, 1])
+        turn = rotations.exp([0.0, 0.0, angle])
+    else:
+        turn = rotations.nearest(b.T @ a)
+    shift = fit.tags.mean(axis=0) - turn @ table.mean(axis=0)
+    back = (fit.tags - shift) @ turn
+    return {
+        "rotation_vector_deg": np.rad2deg(rotations.log(turn)).tolist(),
+        "shift_m": shift.tolist(),
+        "tags_in_table_axes_m": back.tolist(),
+        "off_table_m": (back - table).tolist(),
+    }
+
+
+def _untold(
+    fit: LinkFit, model: LinkModel, settings: LinkSettings, clock: Clock | None, ids: Any
+) -> list[str]:
+    """What the ranges do not determine, a sentence each."""
+    said = []
+    none = np.argwhere(fit.counts == 0)
+    names = [f"{ids[0][m]}-{ids[1][n]}" for m, n in none]
+    if names:
+        said.append(f"links without ranges: {_few(names)}")
+    loose = np.argwhere((fit.counts > 0) & (fit.bias_std_m > _UNTOLD * BIAS_M))
+    if len(loose):
+        said.append(f"bias of {_few([f'{ids[0][m]}-{ids[1][n]}' for m, n in loose])}")
+    loose = np.argwhere((fit.counts > 0) & (fit.slope_std > _UNTOLD * SLOPE))
+    if model.slopes and len(loose):
+        said.append(
+            f"slope of {_few([f'{ids[0][m]}-{ids[1][n]}' for m, n in loose])}: the distances vary "
+            "too little; bias and slope trade off"
+        )
+    if settings.time_offset == "auto" and clock is None:
+        said.append("time offset of the truth: the ranges change too little; taken as 0")
+    axes = "xyz"
+    if settings.planar:
+        said.append("heights of the tags, and the truth's roll and pitch: the motion is planar")
+    if model.tags == "turned":
+        turns = [axes[i] for i in np.flatnonzero(fit.rotation_std_rad > _UNTOLD * TURN_RAD)]
+        shifts = [axes[i] for i in np.flatnonzero(fit.shift_std_m > _UNTOLD * ARM_M)]
+        said += [f"turn of the tags about {axis}" for axis in turns]
+        said += [f"shift of the tags along {axis}" for axis in shifts]
+    elif model.tags == "free":
+        for n, i in np.argwhere(fit.tags_std_m > _UNTOLD * ARM_M):
+            said.append(f"{axes[i]} of tag {ids[1][n]}")
+    return said
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

@@ -1,0 +1,294 @@
+"""Links, tags and clocks calibrated by truth: known answers, honest standard deviations, files."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rbl_gym.app.cli import main
+from rbl_gym.estimators.calibration import (
+    KnownPath,
+    LinkFit,
+    LinkModel,
+    fit_links,
+    spread_of_residuals,
+)
+from rbl_gym.estimators.calibration.clock import Clock, find_clock
+from rbl_gym.estimators.calibration.drift import NO_DRIFT, Drift, Whitener, find_drift
+from rbl_gym.recordings import Recording, Truth, read_recording
+from rbl_gym.studies import calibrate
+from rbl_gym.studies.calibrate import CalibratedLinks, LinkSettings
+from tests.helpers import ROOT
+
+LIAS = ROOT.parent / "shared" / "data" / "lias_planar"
+ANCHORS = np.array(
+    [[-4, 3, 0.3], [0, 3, 2.5], [4, 3, 0.5], [4, -3, 2.2], [0, -3, 0.2], [-4, -3, 2]]
+)
+TAGS = np.array([[0.3, 0.0, 0.05], [-0.2, 0.25, 0.0], [-0.2, -0.2, 0.1], [0.0, 0.1, 0.35]])
+
+
+def path_of(times, planar=False):
+    """A body that drives about and turns every way."""
+    place = np.stack([2.5 * np.sin(0.5 * times), 1.8 * np.sin(0.83 * times + 1)], -1)
+    height = np.full_like(times, 1.0) if planar else 1.2 + 0.6 * np.sin(0.31 * times)
+    yaw = 0.9 * times + np.sin(0.4 * times)
+    tilt = 0.0 if planar else 0.6
+    angles = np.stack([yaw, tilt * np.sin(0.37 * times), tilt * np.cos(0.53 * times)], -1)
+    rotation = Rotation.from_euler("ZYX", angles).as_matrix()
+    return rotation, np.column_stack([place, height])
+
+
+def ranges_of(times, rng, tags=TAGS, bias=0.0, slope=0.0, noise=0.05, late=0.0, planar=False):
+    """Ranges at exact poses, by a loop over links."""
+    rotation, place = path_of(times, planar)
+    M, N = len(ANCHORS), len(tags)
+    bias, slope = np.broadcast_to(bias, (M, N)), np.broadcast_to(slope, (M, N))
+    ranges = np.zeros((len(times), M, N))
+    for n in range(N):
+        at = place + rotation @ tags[n]
+        for m in range(M):
+            d = np.sqrt(((at - ANCHORS[m]) ** 2).sum(axis=1))
+            ranges[:, m, n] = (1 + slope[m, n]) * d + bias[m, n]
+    ranges += noise * rng.standard_normal(ranges.shape)
+    return ranges + (rng.random(ranges.shape) < late) * rng.exponential(1.0, ranges.shape)
+
+
+def recording_of(times, ranges, truth, tags=TAGS):
+    ids = tuple(f"A{m}" for m in range(len(ANCHORS))), tuple(f"T{n}" for n in range(len(tags)))
+    return Recording(times, ranges, ranges > 0, None, ANCHORS, tags, *ids, truth)
+
+
+def test_standard_deviations_are_honest_with_white_noise_and_late_ranges():
+    """2 x 24 x 12 errors over their standard deviations: mean square 1 within 4 sigma."""
+    times = 0.1 * np.arange(500)
+    rotation, place = path_of(times)
+    squares = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        bias = rng.normal(0.1, 0.1, (6, 4))
+        slope = 0.01 * rng.standard_normal((6, 4))
+        ranges = ranges_of(times, rng, bias=bias, slope=slope, late=0.05 if seed % 2 else 0.0)
+        fit = fit_links(ranges, None, ANCHORS, TAGS, KnownPath(times, rotation, place))
+        squares += [((fit.bias_m - bias) / fit.bias_std_m) ** 2]
+        squares += [((fit.slope - slope) / fit.slope_std) ** 2]
+        np.testing.assert_allclose(np.median(fit.noise_std_m), 0.05, rtol=0.1)
+        assert np.abs(fit.tags - TAGS).max() < 0.01
+    squares = np.array(squares)
+    # Bias and slope of a link go together: half as many are independent.
+    assert squares.mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / (squares.size / 2)))
+
+
+def test_standard_deviations_are_honest_with_errors_that_last():
+    """Gauss-Markov errors of 1 s at 10 Hz, three times the white ones: white laws claim a third."""
+    times = 0.1 * np.arange(1000)
+    rotation, place = path_of(times)
+    squares, shares = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(100 + seed)
+        slow = np.zeros((len(times), 6, 4))
+        a = np.exp(-0.1)
+        slow[0] = 0.06 * rng.standard_normal((6, 4))
+        for k in range(1, len(times)):
+            step = 0.06 * np.sqrt(1 - a * a) * rng.standard_normal((6, 4))
+            slow[k] = a * slow[k - 1] + step
+        ranges = ranges_of(times, rng, noise=0.02) + slow
+        fit = fit_links(ranges, None, ANCHORS, TAGS, KnownPath(times, rotation, place))
+        squares += [(fit.bias_m / fit.bias_std_m) ** 2, (fit.slope / fit.slope_std) ** 2]
+        shares += [(fit.drift.share, fit.drift.time_s)]
+    squares = np.array(squares)
+    assert squares.mean() == pytest.approx(1.0, abs=5 * np.sqrt(2 / (squares.size / 2)))
+    np.testing.assert_allclose(np.mean(shares, axis=0), [0.9, 1.0], rtol=0.2)
+
+
+def test_whitening_is_that_of_the_covariance():
+    """Whitened columns have the Gram matrix of the inverse covariance, built entry by entry."""
+    rng = np.random.default_rng(3)
+    times = np.cumsum(rng.uniform(0.05, 0.3, 40))
+    used = rng.random((40, 2)) < 0.8
+    std, drift = np.array([0.1, 0.3]), Drift(0.6, 0.7)
+    columns = rng.standard_normal((40, 2, 3))
+    whitener = Whitener(std, drift, times)
+    white = [whitener.whitened(columns[a:b], used[a:b], np.ones((b - a, 2)))
+             for a, b in ((0, 13), (13, 40))]  # fmt: skip
+    white = np.concatenate(white)
+    for link in range(2):
+        at = used[:, link]
+        apart = np.abs(times[at][:, None] - times[at])
+        cov = std[link] ** 2 * (0.6 * np.exp(-apart / 0.7) + 0.4 * np.eye(at.sum()))
+        want = columns[at, link].T @ np.linalg.solve(cov, columns[at, link])
+        got = white[:, link].T @ white[:, link]
+        np.testing.assert_allclose(got, want, rtol=1e-9)
+    plain = Whitener(std, NO_DRIFT, times).whitened(columns, used, np.full((40, 2), 0.25))
+    np.testing.assert_allclose(plain, 0.5 * columns * used[..., None] / std[:, None])
+
+
+def test_white_residuals_have_no_slow_part():
+    rng = np.random.default_rng(0)
+    z = rng.standard_normal((400, 12))
+    assert find_drift(z, np.ones_like(z, dtype=bool), 0.1 * np.arange(400)) == NO_DRIFT
+
+
+def test_nodes_share_the_delays_of_antennas():
+    times = 0.2 * np.arange(40)
+    rng = np.random.default_rng(5)
+    of_anchors, of_tags = rng.normal(0.2, 0.1, 6), np.array([0.1, -0.05, 0.03, -0.08])
+    ranges = ranges_of(times, rng, bias=of_anchors[:, None] + of_tags, noise=0.02)
+    path = KnownPath(times, *path_of(times))
+    fit = fit_links(ranges, None, ANCHORS, TAGS, path, LinkModel("node", slopes=False, tags="held"))
+    assert isinstance(fit, LinkFit)
+    assert fit.node_delay_m is not None
+    want = np.concatenate([of_anchors, of_tags])
+    assert (np.abs(fit.node_delay_m - want) < 4 * fit.node_delay_std_m).all()
+    assert fit.node_delay_m[6:].sum() == pytest.approx(0, abs=1e-12)
+    common = fit_links(ranges, None, ANCHORS, TAGS, path, LinkModel("common", tags="held"))
+    assert np.ptp(common.bias_m) == 0
+    assert np.ptp(common.slope) == 0
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_clock_turn_and_arms_are_found(planar):
+    """The truth's body is upside down and 7 degrees off, its clock 0.31 s ahead."""
+    times = 0.05 * np.arange(1200)
+    rng = np.random.default_rng(7)
+    turn = Rotation.from_euler("ZYX", [7, 0, 0 if planar else 180], degrees=True).as_matrix()
+    shift = np.array([0.02, -0.03, 0.0])
+    table = (TAGS - shift) @ turn  # what the truth's frame calls TAGS
+    off = table + np.where(np.arange(4)[:, None] == 2, [0.04, -0.03, 0.0], 0.0)
+    ranges = ranges_of(times, rng, bias=0.15, planar=planar, late=0.03)
+    truth_times = 0.02 * np.arange(3100)
+    truth = Truth(truth_times + 0.31, *path_of(truth_times, planar))
+    recording = recording_of(times, ranges, truth, off)
+    settings = LinkSettings(tags="free", planar=planar)
+    found = calibrate.calibrate_links(recording, settings)
+    assert isinstance(found, CalibratedLinks)
+    assert found.clock is not None
+    assert found.clock.std_s < 0.006
+    assert abs(found.clock.offset_s - 0.31) < 4 * found.clock.std_s
+    axes = slice(2) if planar else slice(3)
+    error, std = (found.fit.tags - TAGS)[:, axes], found.fit.tags_std_m[:, axes]
+    assert (np.abs(error) < 4.5 * std).all()
+    assert std.max() < 0.02
+    if planar:
+        assert "planar" in " ".join(found.figures["not_determined"])
+    rigid = calibrate.calibrate_links(
+        recording._replace(tags=table), LinkSettings(planar=planar, time_offset=0.31)
+    )
+    assert np.degrees(Rotation.from_matrix(rigid.fit.rotation @ turn.T).magnitude()) < 0.5
+    np.testing.assert_allclose(rigid.fit.tags, TAGS, atol=0.01)
+    json.dumps(found.figures, allow_nan=False)
+
+
+def test_a_body_that_stands_says_what_it_does_not_tell():
+    times = 0.1 * np.arange(200)
+    rng = np.random.default_rng(2)
+    rotation, place = path_of(np.zeros(1))
+    ranges = ranges_of(np.zeros(200), rng, bias=0.1, noise=0.03)
+    truth = Truth(times, np.repeat(rotation, 200, 0), np.repeat(place, 200, 0))
+    found = calibrate.calibrate_links(recording_of(times, ranges, truth))
+    said = " ".join(found.figures["not_determined"])
+    assert found.clock is None
+    assert "time offset" in said
+    assert "slope of A0-T0" in said
+
+
+def test_clock_by_hand():
+    """A cosine and its copy, 0.12 s late, on one link."""
+    times = 0.05 * np.arange(600)
+    ranges = (5 + np.cos(times))[:, None, None]
+    rng = np.random.default_rng(0)
+    noisy = ranges + 0.01 * rng.standard_normal(ranges.shape)
+
+    def distances(shift):
+        return 5 + np.cos(times + shift - 0.12)[:, None, None], np.ones(600, dtype=bool)
+
+    clock = find_clock(times, noisy, ranges > 0, distances, 1.0)
+    assert isinstance(clock, Clock)
+    assert abs(clock.offset_s - 0.12) < 4 * clock.std_s
+    assert clock.std_s < 0.01
+
+
+def test_spread_of_residuals_leaves_biases_out():
+    rng = np.random.default_rng(1)
+    times = 0.1 * np.arange(300)
+    rotation, place = path_of(times)
+    ranges = ranges_of(times, rng, bias=rng.normal(0, 1, (6, 4)), noise=0.05)
+    places = place[:, None] + TAGS @ np.swapaxes(rotation, -1, -2)
+    got = spread_of_residuals(ranges, ranges > 0, ANCHORS, places)
+    assert got == pytest.approx(0.05 * 0.6745, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"truth": None}, "calibrated by truth"),
+        ({"rotation": None}, "must have rotations"),
+        ({"planar": True}, "say planar"),
+        ({"late": 100.0}, "no range has truth"),
+    ],
+)
+def test_what_cannot_serve_is_refused(change, message):
+    times = 0.1 * np.arange(50)
+    ranges = ranges_of(times, np.random.default_rng(0))
+    truth = Truth(times + change.pop("late", 0.0), *path_of(times))
+    truth = change.pop("truth", truth)
+    recording = recording_of(times, ranges, truth and truth._replace(**change))
+    with pytest.raises(ValueError, match=message):
+        calibrate.calibrate_links(recording)
+
+
+def test_the_command_writes_what_replay_reads(tmp_path, capsys):
+    times = 0.1 * np.arange(150)
+    rng = np.random.default_rng(4)
+    bias = rng.normal(0.2, 0.1, (6, 4))
+    ranges = ranges_of(times, rng, bias=bias, noise=0.02)
+    rotation, place = path_of(times)
+    names = [f"a{m}t{n}" for m in range(6) for n in range(4)]
+    table = np.column_stack([times, ranges.reshape(150, -1)])
+    header = {"ranges": ",".join(["t", *names]), "truth": "t,x,y,z,qx,qy,qz,qw"}
+    poses = np.column_stack([times, place, Rotation.from_matrix(rotation).as_quat()])
+    files = {name: str(tmp_path / f"{name}.csv") for name in ("ranges", "truth", "anchors", "tags")}
+    for name, values in (("ranges", table), ("truth", poses)):
+        np.savetxt(files[name], values, "%.9f", ",", header=header[name], comments="")
+    calibrate.write_points(files["anchors"], "anchor", "012345", ANCHORS)
+    calibrate.write_points(files["tags"], "tag", "0123", TAGS)
+    arguments = [part for name, file in files.items() for part in (f"--{name}", file)]
+    out = tmp_path / "out"
+    plot = tmp_path / "links.png"
+    assert main(["calibrate", *arguments, "--out", str(out), "--plot", str(plot)]) == 0
+    said = capsys.readouterr().out
+    assert "Noise of a range: 0.0" in said
+    assert plot.stat().st_size > 10_000
+    corrected = read_recording(
+        files["ranges"], files["anchors"], out / "tags.csv", files["truth"], out / "calibration.csv"
+    )
+    clean = ranges_of(times, rng, noise=0.0)
+    assert np.abs((corrected.ranges - clean).mean(axis=0)).max() < 0.01
+    assert main(["calibrate", *arguments, "--model", "node", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert len(figures["nodes"]) == 10
+    assert main(["calibrate", *arguments, "--calibration", str(out / "calibration.csv")]) == 2
+    assert main(["calibrate", *arguments[:2], *arguments[4:]]) == 2
+    assert "--truth is missing" in capsys.readouterr().err
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not LIAS.is_dir(), reason="the LIAS recording is not on this machine")
+def test_a_real_recording_at_a_third_of_its_rate():
+    recording = read_recording(
+        LIAS / "dynamic_fast_ranges.csv",
+        LIAS / "anchors_8_14.csv",
+        LIAS / "tags_8_14.csv",
+        LIAS / "dynamic_fast_truth.csv",
+    )
+    thin = recording._replace(
+        times=recording.times[::3], ranges=recording.ranges[::3], links=recording.links[::3]
+    )
+    found = calibrate.calibrate_links(thin, LinkSettings(planar=True))
+    assert found.clock is not None
+    assert 0.02 < found.clock.offset_s < 0.05
+    assert found.figures["turn"]["rotation_vector_deg"][2] == pytest.approx(7, abs=1)
+    assert found.figures["noise"]["std_m"] == pytest.approx(0.058, abs=0.008)
+    assert found.fit.bias_m.mean() == pytest.approx(0.12, abs=0.03)
