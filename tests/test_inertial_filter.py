@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -211,7 +212,7 @@ def bank_run(rng, headings, batch=()):
     """A body that circles, of unknown heading; what the bank believes at the end, and the truth."""
     filter = made(headings=headings, speed_m_s=1.0, bias_std_m=0.05)
     scene = scenes.get({"name": "uwb_room", "inertial": SENSOR, "steps": 20})
-    episode = simulation.draw_episode(scene, rng, batch)
+    episode: Any = simulation.draw_episode(scene, rng, batch)
     level, spread = navigation.attitude(
         np.concatenate(
             [np.zeros((*batch, 1, 3)), inertial.specific_force(episode.rotation[..., 0, :, :],
@@ -261,7 +262,7 @@ def test_a_batch_of_banks_keeps_its_shape():
 def test_it_reaches_its_bound_and_is_honest_in_all_fifteen_states(name):
     scene = scenes.get({"name": name, "inertial": "consumer", "steps": 25})
     trials = monte_carlo.simulate_trials(scene, 200, np.random.default_rng(5))
-    episode = trials.episode
+    episode: Any = trials.episode
     filter = monte_carlo.scene_filter(scene, "iekf-imu", {})
     square, nees = np.zeros(2), []
     for k, step in enumerate(monte_carlo.trial_steps(trials, filter)):
@@ -328,7 +329,7 @@ def test_the_tilt_of_gravity_costs_information():
 
 def test_biases_converge_within_their_covariance():
     scene = scenes.get({"name": "uwb_room", "inertial": "consumer", "steps": 60})
-    trials = monte_carlo.simulate_trials(scene, 100, np.random.default_rng(7))
+    trials: Any = monte_carlo.simulate_trials(scene, 100, np.random.default_rng(7))
     filter = monte_carlo.scene_filter(scene, "iekf-imu", {})
     *_, last = monte_carlo.trial_steps(trials, filter)
     error = last.state.extra[:, 3:9] - trials.episode.bias[:, -1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -26,7 +28,7 @@ WRONG_TRUTH = (6.4, 7.3)
 
 def tracked(column, yaw_off_rad, headings):
     """Times, errors (K, 6) and NEES / 6 of the filter from a start 0.3 m off."""
-    log = read_recording(
+    log: Any = read_recording(
         STARLOC / "uwb.csv", STARLOC / "anchors.csv", STARLOC / "tags.csv", STARLOC / "truth.csv",
         format=Format(columns={"range": column}),
     )  # fmt: skip
@@ -43,6 +45,7 @@ def tracked(column, yaw_off_rad, headings):
     chosen = np.flatnonzero((log.times > sensed.times[0] + 0.3) & (log.times < SECONDS))
     times = log.times[chosen]
     Q, t, _ = truth_at(log.truth, times)
+    assert Q is not None
     level, spread = navigation.attitude(
         samples_between(sensed, times[0] - 0.25, times[0])[0], SENSOR
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +31,7 @@ EXACT = inertial.InertialSensor(
 @pytest.mark.parametrize("name", NAMES)
 def test_exact_readings_lead_from_epoch_to_epoch(name):
     scene = scenes.get({"name": name, "inertial": EXACT, "steps": 12})
-    episode = simulation.draw_episode(scene, np.random.default_rng(0), (3,))
+    episode: Any = simulation.draw_episode(scene, np.random.default_rng(0), (3,))
     samples = EXACT.samples(scene.dt)
     assert episode.readings.shape == (3, 13, samples, 6)
     assert (episode.readings[:, 0] == 0).all()
@@ -50,7 +51,7 @@ def test_exact_readings_lead_from_epoch_to_epoch(name):
 
 def test_the_told_twist_is_off_by_the_process_noise():
     scene = scenes.get({"name": "uwb_room", "inertial": "consumer", "steps": 40})
-    episode = simulation.draw_episode(scene, np.random.default_rng(1), (200,))
+    episode: Any = simulation.draw_episode(scene, np.random.default_rng(1), (200,))
     true = motion.twists_between(episode.rotation, episode.translation, scene.dt)
     error = (true - episode.twists[:, 1:]) * np.sqrt(scene.dt)
     # 8000 values of each axis: 0.8 %, 5 sigma.
@@ -68,7 +69,7 @@ def test_filters_that_are_told_the_twist_are_honest_on_it():
 
 def test_the_body_stays_near_the_line_and_its_force_is_bearable():
     scene = scenes.get({"name": "drone_yard", "inertial": "consumer"})
-    episode = simulation.draw_episode(scene, np.random.default_rng(3), (20,))
+    episode: Any = simulation.draw_episode(scene, np.random.default_rng(3), (20,))
     low, high = scene.volume.bounds()
     assert (episode.translation >= low - 1).all()
     assert (episode.translation <= high + 1).all()
@@ -102,7 +103,7 @@ def test_what_is_no_scene(changes, message):
 
 def test_dicts_of_json_make_the_scene():
     changes = {"name": "drone_yard", "inertial": {"kind": "tactical", "rate_hz": 200}}
-    scene = scenes.get(json.loads(json.dumps(changes)))
+    scene: Any = scenes.get(json.loads(json.dumps(changes)))
     assert scene.inertial.rate_hz == 200
     assert scene.inertial.gyro_noise == inertial.SENSORS["tactical"].gyro_noise
     assert scenes.get({"name": "drone_yard", "inertial": None}).inertial is None
@@ -129,7 +130,7 @@ def test_the_environment_passes_its_checker(reward):
 
 
 def test_the_readings_of_an_epoch_are_a_copy():
-    env = gym.make(ID, scene=SCENE)
+    env: Any = gym.make(ID, scene=SCENE)
     env.reset(seed=0)
     observation, *_ = env.step(0)
     kept = observation["inertial"].copy()

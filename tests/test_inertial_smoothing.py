@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -66,7 +68,7 @@ def run():
     """Bodies with a sensor; the filter's states at all epochs; what the smoother finds."""
     scene = scenes.get({"name": "uwb_room", "inertial": "consumer", "steps": 8})
     trials = monte_carlo.simulate_trials(scene, 40, np.random.default_rng(1))
-    episode = trials.episode
+    episode: Any = trials.episode
     steps = list(monte_carlo.trial_steps(trials, monte_carlo.scene_filter(scene, "iekf-imu", {})))
     motion = InertialMotion(
         episode.readings[:, 1:], scene.dt / 10, scene.inertial, scene.speed_std_m_s
