@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,7 @@ from rbl_gym.checks import (
     check_links,
     check_shape,
 )
+from rbl_gym.measurements import offsets
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -47,8 +48,11 @@ def check_epoch(
     anchors: ArrayLike,
     links: ArrayLike | None,
     tags: FloatArray,
+    signed: bool = False,
 ) -> tuple[FloatArray, FloatArray, BoolArray | None]:
     """One epoch as (ranges, anchors, links): links None where all measured, else 0 behind False.
+
+    `signed`: ranges may be zero and negative, as with an offset.
 
     Raises
     ------
@@ -57,6 +61,7 @@ def check_epoch(
     """
     if (
         links is None
+        and not signed
         and is_plain_epoch(ranges, anchors, tags, ())
         and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportCallIssue, reportArgumentType]
         and are_positive(ranges)  # pyright: ignore[reportArgumentType]
@@ -77,8 +82,37 @@ def check_epoch(
         if mask.all():
             mask = None
     check_batches(ranges=ranges.shape[:-2], anchors=anchors.shape[:-2])
-    check_ranges(ranges, mask)
+    if signed:
+        check_finite("ranges", ranges)
+    else:
+        check_ranges(ranges, mask)
     return ranges, anchors, mask
+
+
+class OffsetEpoch(NamedTuple):
+    """An epoch of ranges with offsets: ranges (..., M, N) less their groups' means, and links."""
+
+    ranges: FloatArray
+    anchors: FloatArray
+    links: BoolArray
+
+
+def check_offset_epoch(
+    ranges: ArrayLike,
+    anchors: ArrayLike,
+    links: ArrayLike | None,
+    tags: FloatArray,
+    offset: str,
+) -> OffsetEpoch:
+    """`check_epoch` of ranges with an unknown offset in common, by the name of its kind.
+
+    The size of the offset leaves with the means. A link that shares its offset with no other says
+    nothing, and counts as none.
+    """
+    ranges, anchors, mask = check_epoch(ranges, anchors, links, tags, signed=True)
+    there = offsets.paired(np.broadcast_to(True if mask is None else mask, ranges.shape), offset)
+    means = offsets.common(ranges, there.astype(np.float64), offset)
+    return OffsetEpoch(np.where(there, ranges - means, 0.0), anchors, there)
 
 
 def is_plain_epoch(ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int, ...]) -> bool:

@@ -14,7 +14,7 @@ from rbl_gym import bounds, estimators, kernels, motion
 from rbl_gym.bounds import pose
 from rbl_gym.estimators.costs import range_cost
 from rbl_gym.estimators.costs.map_problem import PoseState, minimize_ranges, positive_inverse
-from rbl_gym.estimators.iekf.manifold import WEIGHTS, predict_pose, update_pose
+from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, predict_pose, update_pose
 from rbl_gym.estimators.locating.maximum_likelihood import most_likely_pose, points_start
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import bodies, rotations
@@ -34,6 +34,9 @@ losses = st.sampled_from(
     [range_cost.SQUARES, range_cost.huber(1.5), range_cost.cut_huber(1.5, 4.0),
      range_cost.geman_mcclure(3.0), range_cost.redescending(1.0)]
 )  # fmt: skip
+
+# Of offsets, as kernels have them.
+kinds = st.integers(0, 3)
 
 
 def epoch(seed, m, n, geometry="solid", lost=0.2, batch=(3,), wrong=0.0):
@@ -85,11 +88,14 @@ def test_prediction(seed, turn, dt):
 
 
 @needs_kernels
-@given(st.integers(0, 999), shapes, geometries, st.sampled_from([0, 1, 2]), st.sampled_from([1, 4]))
-def test_update(seed, shape, geometry, robust, iterations):
+@given(
+    st.integers(0, 999), shapes, geometries, st.sampled_from([0, 1, 2]), st.sampled_from([1, 4]),
+    kinds,
+)  # fmt: skip
+def test_update(seed, shape, geometry, robust, iterations, offset):
     prior, *data = epoch(seed, *shape, geometry=geometry, wrong=0.1 if robust else 0.0)
     ranges, weights, *places = data
-    args = *prior, ranges, weights, WEIGHTS, *places, *prior[:2], iterations, robust
+    args = *prior, ranges, weights, WEIGHTS, *places, *prior[:2], offset, iterations, robust
     with np.errstate(all="ignore"):
         assert_near(update_pose.kernel(*args), update_pose.textbook(*args))
 
@@ -107,7 +113,7 @@ def test_update(seed, shape, geometry, robust, iterations):
 def test_update_by_the_numbers_of_a_law(law):
     prior, ranges, _, *places = epoch(3, 4, 3, lost=0.0)
     ranges[1, 2, 1] = -1.0
-    args = *prior, ranges, np.ones((4, 3)), law.numbers, *places, *prior[:2], 3, False
+    args = *prior, ranges, np.ones((4, 3)), law.numbers, *places, *prior[:2], 0, 3, False
     with np.errstate(all="ignore"):
         got, want = update_pose.kernel(*args), update_pose.textbook(*args)
         weights = 1 / law.variance(ranges) + np.zeros_like(ranges)
@@ -120,11 +126,11 @@ def test_update_by_the_numbers_of_a_law(law):
 
 
 @needs_kernels
-@given(st.integers(0, 999), shapes, geometries, losses)
-def test_a_few_steps_by_every_loss(seed, shape, geometry, loss):
+@given(st.integers(0, 999), shapes, geometries, losses, kinds)
+def test_a_few_steps_by_every_loss(seed, shape, geometry, loss, offset):
     prior, *data = epoch(seed, *shape, geometry=geometry, wrong=0.1)
     information = positive_inverse(prior[2])
-    args = *prior[:2], *prior[:2], information, *data, loss, 3, 1e-6
+    args = *prior[:2], *prior[:2], information, *data, loss, offset, 3, 1e-6
     with np.errstate(all="ignore"):
         got, want = minimize_ranges.kernel(*args), minimize_ranges.textbook(*args)
     assert_near(got[:3], want[:3])
@@ -169,7 +175,7 @@ def test_what_is_not_positive_definite_is_nan_in_both():
     P = prior[2].copy()
     P[1] = 0.01 * np.diag([1.0, 1, -1, 1, 1, 1])
     P[2, 0, 0] = np.nan
-    args = *prior[:2], P, *data[:2], WEIGHTS, *data[2:], *prior[:2], 2, False
+    args = *prior[:2], P, *data[:2], WEIGHTS, *data[2:], *prior[:2], 0, 2, False
     for form in (update_pose.kernel, update_pose.textbook):
         with np.errstate(all="ignore"):
             got = form(*args)[2]
@@ -187,10 +193,10 @@ def test_an_anchor_on_a_tag_has_no_gradient():
     data = np.ones((3, 6)), np.ones((3, 6)), anchors, tags, range_cost.SQUARES
     start = np.eye(3), np.zeros(3)
     for form in (minimize_ranges.kernel, minimize_ranges.textbook):
-        got = form(*start, *start, np.zeros((6, 6)), *data, 0, 1e-6)
+        got = form(*start, *start, np.zeros((6, 6)), *data, 0, 0, 1e-6)
         without = form(
             *start, *start, np.zeros((6, 6)), np.ones((3, 6)),
-            np.where((np.arange(18) == 0).reshape(3, 6), 0.0, 1.0), *data[2:], 0, 1e-6,
+            np.where((np.arange(18) == 0).reshape(3, 6), 0.0, 1.0), *data[2:], 0, 0, 1e-6,
         )  # fmt: skip
         assert got[2] > without[2]
         for a, b in zip(got[3:5], without[3:5], strict=True):

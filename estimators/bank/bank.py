@@ -31,7 +31,8 @@ from rbl_gym.estimators.bank.hypotheses import (
 )
 from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.estimators.filter import PoseBelief, register
-from rbl_gym.estimators.iekf.manifold import WEIGHTS, IteratedEkf, as_state, update_pose
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, as_state, update_pose
 from rbl_gym.estimators.iekf.robust_update import ROBUST
 from rbl_gym.estimators.inputs import check_batches, check_one_process, plain, spanned_dimensions
 from rbl_gym.estimators.locating.localization import locate
@@ -146,7 +147,7 @@ class IteratedEkfBank:
             As `IteratedEkf.update`.
         """
         state = plain(state)
-        ranges, weights, anchors = self._filter.weighed(ranges, anchors, links, noise)
+        ranges, weights, anchors = self._filter.weighed(ranges, anchors, links, noise, state)
         check_batches(state=state.log_odds.shape[:-1], ranges=ranges.shape[:-2])
         batch = np.broadcast_shapes(
             state.log_odds.shape[:-1], ranges.shape[:-2], weights.shape[:-2], anchors.shape[:-2]
@@ -223,6 +224,7 @@ class IteratedEkfBank:
                 epoch.anchors,
                 self.tags,
                 *start,
+                0,
                 self.iterations,
                 ROBUST[self.robust],
             )

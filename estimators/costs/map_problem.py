@@ -16,6 +16,7 @@ from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution
 from rbl_gym.estimators.costs.range_cost import Index, RangeCost, pick
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
+from rbl_gym.measurements import offsets
 
 # Behind the doors: what comes to these was checked, or made here.
 _ERROR = kernel(rotations.error)
@@ -112,7 +113,8 @@ def minimize(
         return minimize_pose(problem, rotation, translation, iterations, tolerance)
     found = minimize_ranges(
         rotation, translation, prior.rotation, prior.translation, information,
-        data.ranges, data.weights, data.anchors, data.tags, data.loss, iterations, tolerance,
+        data.ranges, data.weights, data.anchors, data.tags, data.loss,
+        offsets.code_of(data.offset), iterations, tolerance,
     )  # fmt: skip
     return Solution(found[0], found[1], Linearization(*found[2:5]), found[5])
 
@@ -133,17 +135,22 @@ def minimize_ranges(
     anchors: FloatArray,
     tags: FloatArray,
     loss: FloatArray,
+    offset: int,
     iterations: int,
     tolerance: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
     """The most likely pose near a start: ranges, and a prior of some information (..., 6, 6).
 
+    `offset` is the kind of the ranges' offsets, as kernels have it (`offsets.code_of`).
+
     Returns
     -------
     Rotation, translation, cost, gradient, Hessian, and whether it converged: see `Solution`.
     """
-    prior = PoseState(rotation, translation, information)
-    problem = MapProblem(prior, information, RangeCost(ranges, weights, anchors, tags, loss))
+    prior, kind = PoseState(rotation, translation, information), offsets.name_of(offset)
+    problem = MapProblem(
+        prior, information, RangeCost(ranges, weights, anchors, tags, loss, offset=kind)
+    )
     found = minimize_pose(problem, start_rotation, start_translation, iterations, tolerance)
     cost, gradient, hessian = found.at
     return found.rotation, found.translation, cost, gradient, hessian, found.converged

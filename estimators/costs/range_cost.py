@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization
-from rbl_gym.measurements import ranging
+from rbl_gym.measurements import offsets, ranging
 
 # Behind the doors: what comes to these was checked, or made here.
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
@@ -28,6 +28,8 @@ Index = BoolArray | tuple[np.ndarray, ...]
 # the power by which weights fall beyond the threshold, and what is left of the weight of a range
 # that is late.
 SQUARES = np.array([np.inf, np.inf, np.inf, 1.0, 1.0])
+# Steps to the offset that a loss other than squares likes best.
+_STEPS = 20
 
 
 def huber(threshold: float) -> FloatArray:
@@ -117,6 +119,9 @@ class RangeCost:
         Variance [m^2] of every tag's place on the body, per axis, marginalised to first order
         about unit vectors (..., M, N, 3) from anchors to tags: it ties the ranges of a tag to
         each other. Least squares only.
+    offset
+        Whose ranges have an unknown offset in common (`measurements.offsets`); it takes the value
+        of least cost at every pose. Ranges may then have any sign.
     """
 
     ranges: FloatArray
@@ -126,6 +131,7 @@ class RangeCost:
     loss: FloatArray = dataclasses.field(default_factory=lambda: SQUARES)
     tag_variance: float = 0.0
     tag_unit: FloatArray | None = None
+    offset: str | None = None
 
     @property
     def batch(self) -> tuple[int, ...]:
@@ -136,10 +142,16 @@ class RangeCost:
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient ``J W (d - r)`` and Gauss-Newton Hessian ``J W J^T`` by the pose error."""
         distance, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
-        residual = np.where(self.weights > 0, distance - self.ranges, 0.0)
+        residual = self.residuals(distance)
         cost, share = loss_of(self.weights * residual**2, self.loss, residual < 0)
+        share = self.weights * share
         flat = (*residual.shape[:-2], 1, residual.shape[-2] * residual.shape[-1])
-        weighted = J * np.reshape(self.weights * share, flat)
+        if self.offset is not None:
+            J = J.reshape((*J.shape[:-1], *residual.shape[-2:]))
+            J = offsets.centred(J, share[..., None, :, :], self.offset).reshape(
+                (*J.shape[:-2], flat[-1])
+            )
+        weighted = J * np.reshape(share, flat)
         at = Linearization(
             cost.sum(axis=(-2, -1)),
             np.einsum("...al,...l->...a", weighted, residual.reshape((*flat[:-2], flat[-1]))),
@@ -148,6 +160,21 @@ class RangeCost:
         if self.tag_unit is None:
             return at
         return self._with_tag_noise(at, J, residual, self.tag_unit)
+
+    def residuals(self, distance: FloatArray) -> FloatArray:
+        """Distances (..., M, N) less ranges, the likeliest offsets taken out; 0 without a link."""
+        residual = np.where(self.weights > 0, distance - self.ranges, 0.0)
+        if self.offset is None:
+            return residual
+        found = _offset_of(residual, self.weights, self.loss, self.offset)
+        return np.where(self.weights > 0, residual - found, 0.0)
+
+    def offsets(self) -> np.ndarray | int:
+        """How many unknown offsets (...) the ranges have."""
+        if self.offset is None:
+            return 0
+        groups = (self.weights > 0).any(axis=offsets.axes_of(self.offset), keepdims=True)
+        return groups.sum(axis=(-2, -1))
 
     def _with_tag_noise(
         self, at: Linearization, J: FloatArray, residual: FloatArray, unit: FloatArray
@@ -190,7 +217,25 @@ class RangeCost:
 def squared_residuals(cost: RangeCost, rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """Squared whitened residuals (..., M, N) of a cost's ranges at a pose."""
     distance = _DISTANCES(cost.anchors, _TAG_POSITIONS(rotation, translation, cost.tags))
-    return np.where(cost.weights > 0, cost.weights * (distance - cost.ranges) ** 2, 0.0)
+    return cost.weights * cost.residuals(distance) ** 2
+
+
+def _offset_of(
+    residual: FloatArray, weights: FloatArray, loss: FloatArray, offset: str
+) -> FloatArray:
+    """The offsets of least cost: weighted means, of another loss than squares from the median on.
+
+    Of a bounded loss that is the minimum nearest to the median.
+    """
+    if np.isinf(loss[..., :3]).all() and (loss[..., 4] == 1).all():
+        return offsets.common(residual, weights, offset)
+    found = offsets.median(residual, weights > 0, offset)
+    for _ in range(_STEPS):
+        left = residual - found
+        share = weights * loss_of(weights * left**2, loss, left < 0)[1]
+        kept = share.sum(axis=offsets.axes_of(offset), keepdims=True) > 0
+        found = np.where(kept, offsets.common(residual, share, offset), found)
+    return found
 
 
 def pick(array: FloatArray, batch: tuple[int, ...], where: Index, trailing: int) -> FloatArray:

@@ -23,7 +23,8 @@ from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
 from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, huber
 from rbl_gym.estimators.filter import PoseBelief
-from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.estimators.iekf.pose_steps import as_state
 from rbl_gym.estimators.inputs import (
     check_batches,
     check_epoch,

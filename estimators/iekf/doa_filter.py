@@ -22,7 +22,8 @@ from rbl_gym.estimators.costs.map_problem import (
 from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, RangeCost, huber
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import register
-from rbl_gym.estimators.iekf.manifold import IteratedEkf, as_state
+from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.estimators.iekf.pose_steps import as_state
 from rbl_gym.estimators.iekf.robust_update import HUBER
 from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, settles, spread
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
@@ -201,6 +202,7 @@ def iterated_ekf(
     robust: bool | str = False,
     measurement: str = "ranges",
     range_noise: NoiseLaw | None = None,
+    offset: str | None = None,
 ) -> IteratedEkf:
     """The filter ``"iekf"``: `IteratedEkf` on ranges, `DoaEkf` on directions of arrival.
 
@@ -210,15 +212,17 @@ def iterated_ekf(
         ``"ranges"`` or ``"doa"``; `noise` is the law of what is measured.
     range_noise
         Of ``"doa"``: the law of ranges that an update may bring besides.
-    tags, process, iterations, robust
+    tags, process, iterations, robust, offset
         As `IteratedEkf`.
     """
     check_one_of("measurement", measurement, MEASUREMENTS)
     if measurement == "doa":
+        if offset is not None:
+            raise ValueError(f"offset must be None where angles are measured, got {offset!r:.80}")
         return DoaEkf(tags, noise, process, iterations, robust, range_noise)
     if range_noise is not None:
         raise ValueError("range_noise must be None where noise is the law of the ranges")
-    return IteratedEkf(tags, noise, process, iterations, robust)
+    return IteratedEkf(tags, noise, process, iterations, robust, offset)
 
 
 register("iekf", iterated_ekf)

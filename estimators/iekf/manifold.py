@@ -7,7 +7,6 @@ filters of the tracking paper, which project ``|s|^2`` out, cannot.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import (
-    HUGE,
     BoolArray,
     FloatArray,
     all_finite,
@@ -26,17 +24,13 @@ from rbl_gym.checks import (
     check_duration,
     kernel,
 )
-from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
-from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positive_inverse
-from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber, huber
-from rbl_gym.estimators.costs.unseen_directions import kept_wide
+from rbl_gym.estimators.costs.map_problem import PoseState, map_problem
+from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, huber
 from rbl_gym.estimators.filter import PoseBelief
+from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, as_state, predict_pose, update_pose
 from rbl_gym.estimators.iekf.robust_update import (
-    GATE,
     HUBER,
     check_robust,
-    late_solution,
-    robust_solution,
 )
 from rbl_gym.estimators.iekf.vague_start import (
     VAGUE_ROTATION_RAD,
@@ -50,22 +44,21 @@ from rbl_gym.estimators.inputs import (
     check_batches,
     check_covariance,
     check_epoch,
+    check_offset_epoch,
     epoch_variance,
     is_plain_epoch,
     plain,
 )
 from rbl_gym.geometry import rotations
-from rbl_gym.kernels import compiled
-from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise, law_of, numbers_of
+from rbl_gym.measurements import offsets, ranging
+from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
-# The law of `update_pose` whose shares are weights.
-WEIGHTS = np.array([2.0, 0.0, 0.0, -1.0])
 # Fewer ranges in an epoch are no reason for a search.
 _FEWEST_SOUGHT = 3
 # Behind the doors: what comes to these was checked, or made here.
-_EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
+_TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +79,10 @@ class IteratedEkf:
         For real radios. True: Huber's loss on the whitened residuals (threshold 1.5), and nothing
         of ranges that contradict the rest. ``"late"``: for ranges that err late rather than
         early, weights that fall with the square of the residual, half as large where it is late.
+    offset
+        Whose ranges have an unknown offset in common, new at every epoch: ``"tag"`` (uplink time
+        differences), ``"anchor"``, ``"epoch"``; None: no ranges. They may then have any sign, and
+        the law's variances are taken at the distances from the prior.
     """
 
     tags: FloatArray
@@ -93,11 +90,13 @@ class IteratedEkf:
     process: ProcessNoise
     iterations: int = 4
     robust: bool | str = False
+    offset: str | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tags", check_array("tags", self.tags, ("N", 3)))
         check_count("iterations", self.iterations)
         check_robust(self.robust)
+        offsets.check_offset(self.offset)
 
     @functools.cached_property
     def _loss(self) -> int:
@@ -166,11 +165,14 @@ class IteratedEkf:
         if found is not None:
             return found
         state = plain(state)
-        ranges, weights, anchors = self.weighed(ranges, anchors, links, noise)
+        epoch = ranges, anchors, links, noise
+        ranges, weights, anchors = self.weighed(*epoch, state)
         batch = state.translation.shape[:-1]
         check_batches(state=batch, ranges=ranges.shape[:-2])
         check_batches(state=batch, anchors=anchors.shape[:-2])
         start = self.start(state, ranges, weights, anchors)
+        if self.offset is not None and start[0] is not state.rotation:
+            weights = self.weighed(*epoch, PoseState(*start, state.covariance))[1]
         return as_state(
             *update_pose(
                 *state,
@@ -180,6 +182,7 @@ class IteratedEkf:
                 anchors,
                 self.tags,
                 *start,
+                offsets.code_of(self.offset),
                 self.iterations,
                 self._loss,
             )[:3]
@@ -194,7 +197,7 @@ class IteratedEkf:
         by `update_pose`.
         """
         P = state.covariance
-        if not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
+        if self.offset is not None or not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
             return None
         shares, numbers = self._plain_law(ranges, links, noise)  # pyright: ignore[reportArgumentType]
         if P.ndim == 2:
@@ -206,7 +209,7 @@ class IteratedEkf:
             return None
         rotation, translation, P, cost = update_pose(
             *state, ranges, shares, numbers, anchors, self.tags,
-            state.rotation, state.translation, self.iterations, self._loss,
+            state.rotation, state.translation, 0, self.iterations, self._loss,
         )  # fmt: skip
         # One number tells of all: it is finite where the covariance is.
         if not all_finite(cost):
@@ -241,14 +244,30 @@ class IteratedEkf:
         ranges: ArrayLike,
         anchors: ArrayLike,
         links: ArrayLike | None,
-        noise: NoiseLaw | None = None,
+        noise: NoiseLaw | None,
+        state: Any,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A checked epoch as (ranges, weights, anchors): inverse variances, 0 of lost links."""
-        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
-        weights = 1 / epoch_variance(noise, self.noise, ranges, mask)
-        if weights.shape[-2:] != ranges.shape[-2:]:
-            weights = np.broadcast_to(weights, np.broadcast_shapes(weights.shape, ranges.shape))
-        return ranges, weights if mask is None else weights * mask, anchors
+        """A checked epoch as (ranges, weights, anchors): inverse variances, 0 of lost links.
+
+        Of ranges with offsets the `state` tells the distances, for their variances.
+        """
+        ranges, variance, anchors, mask = self.measured(state, ranges, anchors, links, noise)
+        if variance.shape[-2:] != ranges.shape[-2:]:
+            variance = np.broadcast_to(variance, np.broadcast_shapes(variance.shape, ranges.shape))
+        return ranges, 1 / variance if mask is None else mask / variance, anchors
+
+    def measured(
+        self, state: Any, ranges: Any, anchors: Any, links: Any, noise: NoiseLaw | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray | None]:
+        """A checked epoch: ranges, variances, anchors, and links, None where all were measured."""
+        if self.offset is None:
+            ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
+            return ranges, epoch_variance(noise, self.noise, ranges, mask), anchors, mask
+        ranges, anchors, mask = check_offset_epoch(ranges, anchors, links, self.tags, self.offset)
+        places = _TAG_POSITIONS(state.rotation, state.translation, self.tags)
+        distance = _DISTANCES(anchors, places)
+        distance = np.broadcast_to(distance, np.broadcast_shapes(distance.shape, ranges.shape))
+        return ranges, epoch_variance(noise, self.noise, distance, mask), anchors, mask
 
     def start(
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
@@ -258,8 +277,9 @@ class IteratedEkf:
         if not sought.any():
             return state.rotation, state.translation
         # Late ranges would lead squares to the wrong one of many minima.
-        loss = huber(HUBER) if self.robust == "late" else SQUARES
-        problem = map_problem(state, RangeCost(ranges, weights, anchors, self.tags, loss))
+        late = self.robust == "late" or (self.robust and self.offset is not None)
+        loss = huber(HUBER) if late else SQUARES
+        problem = map_problem(state, self._cost(ranges, weights, anchors, loss=loss))
         return global_start(problem, sought, sought.shape, net_of_starts)
 
     def is_sought(
@@ -273,109 +293,20 @@ class IteratedEkf:
         vague = vague & ((weights > 0).sum(axis=(-2, -1)) >= _FEWEST_SOUGHT)
         if not vague.any():
             return vague
-        data = RangeCost(ranges, weights, anchors, self.tags)
+        data = self._cost(ranges, weights, anchors)
         batch = np.broadcast_shapes(vague.shape, state.translation.shape[:-1], data.batch)
         return settles(map_problem(state, data), vague, batch)
+
+    def _cost(
+        self,
+        ranges: FloatArray,
+        weights: FloatArray,
+        anchors: FloatArray,
+        loss: FloatArray = SQUARES,
+    ) -> RangeCost:
+        return RangeCost(ranges, weights, anchors, self.tags, loss, offset=self.offset)
 
     def belief(self, state: PoseState) -> PoseBelief:
         """The state as a belief (copies)."""
         rotation = state.rotation.copy()
         return PoseBelief(rotation, state.translation.copy(), state.covariance.copy(), rotation)
-
-
-@compiled("pose_filter:predict")
-def predict_pose(
-    rotation: FloatArray,
-    translation: FloatArray,
-    covariance: FloatArray,
-    twist: FloatArray,
-    dt: float,
-    variance: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pose and covariance after `dt` seconds of a twist, ``P <- F P F^T + dt G S G^T``.
-
-    ``F = blkdiag(exp(w dt), I)`` and ``G = blkdiag(Jl(w dt), I)``: the error is global, and the
-    noise, of `variance` (6,) after 1 s, is on the angular velocity.
-    """
-    rotation, translation, covariance = plain(PoseState(rotation, translation, covariance))
-    seconds = np.asarray(dt)[..., None]
-    turn = twist[..., :3] * seconds
-    F, G = (np.broadcast_to(np.eye(6), (*turn.shape[:-1], 6, 6)).copy() for _ in range(2))
-    F[..., :3, :3], G[..., :3, :3] = _EXP(turn), _LEFT_JACOBIAN(turn)
-    spread = (G * (seconds * variance)[..., None, :]) @ np.swapaxes(G, -1, -2)
-    return (
-        F[..., :3, :3] @ rotation,
-        translation + twist[..., 3:] * seconds,
-        F @ covariance @ np.swapaxes(F, -1, -2) + spread,
-    )
-
-
-@compiled("pose_filter:update")
-def update_pose(
-    rotation: FloatArray,
-    translation: FloatArray,
-    covariance: FloatArray,
-    ranges: FloatArray,
-    shares: FloatArray,
-    law: FloatArray,
-    anchors: FloatArray,
-    tags: FloatArray,
-    start_rotation: FloatArray,
-    start_translation: FloatArray,
-    iterations: int,
-    robust: int,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The most likely pose of an epoch near a start, its covariance, and the cost there.
-
-    Parameters
-    ----------
-    rotation, translation, covariance
-        The prior.
-    ranges, anchors, tags
-        As of `RangeCost`.
-    shares, law
-        The weights (..., M, N) and `WEIGHTS`; or ones and the numbers (4,) of a noise law
-        (`noise_laws.numbers_of`), where all links were measured.
-    start_rotation, start_translation
-        Where Gauss-Newton starts.
-    iterations
-        Of Gauss-Newton, at the most.
-    robust
-        Of `robust_update.ROBUST`. 1: the cost is that of Huber's loss, constant beyond `GATE`, of
-        all links. 2: it is that of the redescending loss.
-
-    Returns
-    -------
-    Rotation, translation, covariance, cost (...). The last two are NaN where a matrix is not
-    positive definite, a range that counts not positive, or anything not finite.
-    """
-    weights = shares if law[0] == WEIGHTS[0] else shares / law_of(law).variance(ranges)
-    prior = plain(PoseState(rotation, translation, covariance))
-    data = RangeCost(ranges, weights, anchors, tags, SQUARES)
-    problem = map_problem(prior, data)
-    if robust == 2:
-        found = late_solution(problem, start_rotation, start_translation, iterations)
-        cost = found.at.cost
-    elif robust:
-        found = robust_solution(problem, start_rotation, start_translation, iterations)
-        data = dataclasses.replace(data, loss=cut_huber(HUBER, GATE))
-        cost = dataclasses.replace(problem, data=data)(found.rotation, found.translation).cost
-    else:
-        found = minimize_pose(problem, start_rotation, start_translation, iterations)
-        cost = found.at.cost
-    sound = (shares == 0) | ((ranges > 0) & (ranges < HUGE) & (weights > 0) & np.isfinite(weights))
-    sound = sound.all(axis=(-2, -1)) & (np.abs(anchors) < HUGE).all(axis=(-2, -1))
-    covariance = np.where(sound[..., None, None], positive_inverse(found.at.hessian), np.nan)
-    pose = PoseState(found.rotation, found.translation, covariance)
-    pose = kept_wide(prior, pose, (weights > 0).any(axis=-2), tags)
-    known = np.isfinite(pose.covariance).all(axis=(-2, -1))
-    return *pose, np.where(known, cost, np.nan)
-
-
-def as_state(rotation: FloatArray, translation: FloatArray, covariance: FloatArray) -> PoseState:
-    """A state of what an update found, or a LinAlgError where its covariance is none."""
-    if not math.isfinite(np.vdot(covariance, covariance)):
-        raise np.linalg.LinAlgError(
-            "the information about the pose must be positive definite before and after an update"
-        )
-    return PoseState(rotation, translation, covariance)

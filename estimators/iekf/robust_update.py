@@ -55,15 +55,15 @@ def robust_solution(
         Gauss-Newton iterations of each stage.
     """
     data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
+    data = dataclasses.replace(data, loss=huber(HUBER))
     out = _beyond_gate(problem.prior, data)
-    kept = dataclasses.replace(data, weights=np.where(out, 0.0, data.weights), loss=huber(HUBER))
+    kept = dataclasses.replace(data, weights=np.where(out, 0.0, data.weights))
     first = minimize_pose(_with(problem, kept), rotation, translation, iterations)
     squared = squared_residuals(data, first.rotation, first.translation)
     wrong = np.asarray(((squared > GATE**2) != out).any(axis=(-2, -1)))
     if not wrong.any():
         return first
-    hubers = dataclasses.replace(data, loss=huber(HUBER))
-    found = minimize_pose(_with(problem, hubers), rotation, translation, iterations, 1e-2)
+    found = minimize_pose(_with(problem, data), rotation, translation, iterations, 1e-2)
     for cutoff in _CUTOFFS:
         squared = squared_residuals(data, found.rotation, found.translation)
         doubted = _contradicted(squared > cutoff**2, data.weights)
@@ -115,6 +115,9 @@ def _beyond_gate(prior: PoseState, data: RangeCost) -> BoolArray:
         for block in (slice(0, 3), slice(3, 6))
     )
     reach = of_place + np.linalg.norm(data.tags, axis=-1) * of_rotation
+    if data.offset is not None:
+        # An offset is told by the other ranges, which are as uncertain.
+        reach = 2 * reach
     allowed = GATE**2 * (1 + data.weights * np.square(reach)[..., None, :])
     out = squared_residuals(data, prior.rotation, prior.translation) > allowed
     return out & ~_contradicted(out, data.weights)[..., None, None]

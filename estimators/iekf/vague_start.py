@@ -15,6 +15,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState, minimize
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.linear.squared_range import statistic
+from rbl_gym.estimators.locating.differences import places_of_differences
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
@@ -62,7 +63,12 @@ def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> Bo
     values, vectors = np.linalg.eigh(part.prior.covariance[:, 0, 3:, 3:])
     steps = np.swapaxes(vectors * np.sqrt(values)[..., None, :], -1, -2)
     offsets = np.concatenate([np.zeros_like(steps[:, :1]), steps, -steps], axis=1)
-    told = part.data(part.prior.rotation, part.prior.translation + offsets).hessian
+    places = part.prior.translation + offsets
+    if isinstance(part.data, RangeCost) and part.data.offset is not None:
+        # Differences tell little outside of the anchors, where a vague prior may well be.
+        middle = part.data.anchors.mean(axis=-2)
+        places = np.concatenate([places, np.broadcast_to(middle, places[:, :1].shape)], axis=1)
+    told = part.data(part.prior.rotation, places).hessian
     left = _vague_directions(np.linalg.inv(part.prior_information + told))
     result = np.zeros(axes, np.bool_)
     result[where] = (left < _vague_directions(part.prior.covariance)).any(axis=-1)
@@ -97,8 +103,18 @@ def net_of_starts(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
     That is what the squared ranges and the prior imply, a linear problem. `problem` is one of
     ranges, of trials (K, 1).
     """
-    rotation = spread(problem.prior)
-    return rotation, _translation_given(rotation, problem.prior, problem.data)  # pyright: ignore[reportArgumentType]
+    rotation, data = spread(problem.prior), problem.data
+    assert isinstance(data, RangeCost)
+    if data.offset is None:
+        return rotation, _translation_given(rotation, problem.prior, data)
+    # Of differences the linear problem tells little, or nothing: other places as well.
+    places = places_of_differences(data, ROTATION_NET)[:, :, None]
+    places = places - (rotation @ data.tags.mean(axis=-2)[..., None])[..., 0][:, None]
+    near = [problem.prior.translation + np.zeros(rotation.shape[:-1])]
+    if data.offset != "anchor":
+        near.append(_translation_given(rotation, problem.prior, data))
+    translation = np.concatenate([*near, *np.moveaxis(places, 1, 0)], axis=1)
+    return np.tile(rotation, (1, translation.shape[1] // rotation.shape[1], 1, 1)), translation
 
 
 def spread(prior: PoseState) -> FloatArray:
@@ -112,9 +128,10 @@ def spread(prior: PoseState) -> FloatArray:
 
 def _translation_given(rotation: FloatArray, prior: PoseState, data: RangeCost) -> FloatArray:
     """Translations (K, S, 3) of the linear squared-range model and the prior, given rotations."""
-    # To first order var(r^2) = 4 r^2 var(r).
-    scale = 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
-    stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale)
+    # To first order var(r^2) = 4 r^2 var(r); of differences r is not known.
+    pseudo = data.offset is not None
+    scale = 1.0 if pseudo else 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
+    stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale, pseudo=pseudo)
     information = np.linalg.inv(prior.covariance[..., 3:, 3:])
     turned = data.tags @ np.swapaxes(rotation, -1, -2)
     of_tags = stat.b - (stat.G @ turned[..., None])[..., 0]

@@ -52,6 +52,7 @@ def statistic(
     tags: FloatArray,
     weights: FloatArray,
     links: BoolArray | None = None,
+    pseudo: bool = False,
 ) -> Statistic:
     """G and b of one epoch.
 
@@ -65,6 +66,10 @@ def statistic(
         Inverse variances of the squared ranges [1/m^4], (..., M, 1) where common to the tags.
     links
         Mask (..., M, N); a missing link has weight zero.
+    pseudo
+        Whether the ranges of a tag have an unknown offset c in common, ``r = d + c + noise``. Then
+        ``d_mn = |s_n|^2 - c^2 - 2 a_m^T s_n + 2 c r_mn``: what goes with r is projected out too,
+        and the weights are those of ``(r - c)^2``. It takes five anchors.
     """
     if links is not None and not links.all():
         weights = np.where(links, weights, 0.0)
@@ -72,10 +77,17 @@ def statistic(
     total = weights.sum(axis=-2, keepdims=True)
     share = weights / np.where(total > 0, total, 1.0)
     spread, weighted = weighted_spread(anchors, weights)
+    if pseudo:
+        # Only the spread must be free of r: what of d goes with it then falls out by itself.
+        r = np.swapaxes(ranges - (share * ranges).sum(axis=-2, keepdims=True), -1, -2)[..., None]
+        square = (np.swapaxes(weights, -1, -2)[..., None] * r**2).sum(axis=-2, keepdims=True)
+        along = np.swapaxes(weighted, -1, -2) @ r / np.where(square > 0, square, 1.0)
+        spread = spread - r @ np.swapaxes(along, -1, -2)
+        weighted = np.swapaxes(np.broadcast_to(weights, ranges.shape), -1, -2)[..., None] * spread
     G = 4 * np.swapaxes(weighted, -1, -2) @ spread
     d = ranges**2 - np.einsum("...mi,...mi->...m", anchors, anchors)[..., None]
     d = d - (share * d).sum(axis=-2, keepdims=True)
-    if weights.shape[-1] == 1:
+    if weights.shape[-1] == 1 and not pseudo:
         b = -2 * np.swapaxes(d, -1, -2) @ weighted[..., 0, :, :]
     else:
         b = -2 * (np.swapaxes(d, -1, -2)[..., None, :] @ weighted)[..., 0, :]

@@ -22,11 +22,17 @@ from rbl_gym.checks import (
     check_one_of,
     kernel,
 )
-from rbl_gym.estimators.inputs import check_batches, check_epoch, check_variance, spanned_dimensions
+from rbl_gym.estimators.inputs import (
+    check_batches,
+    check_epoch,
+    check_offset_epoch,
+    check_variance,
+    spanned_dimensions,
+)
 from rbl_gym.estimators.linear.least_squares import RETRACTIONS
 from rbl_gym.estimators.locating.locators import METHODS, Fit, StaticEpoch
 from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, no_alternatives
-from rbl_gym.measurements import ranging
+from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.ranging import NoiseLaw
 
 # Of what is not known the cost is not a number: no door here.
@@ -86,6 +92,7 @@ def locate(
     links: ArrayLike | None = None,
     tag_std_m: float = 0.0,
     retraction: str = "exponential",
+    offset: str | None = None,
 ) -> PoseEstimate:
     """The pose of a body from one epoch of ranges; a thousand problems are one call.
 
@@ -117,12 +124,19 @@ def locate(
     retraction
         How Newton's method of ``procrustes`` turns a step into a rotation: ``"exponential"``
         or ``"cayley"`` (slides). Both end in the same pose.
+    offset
+        Whose ranges have an unknown offset in common: ``"tag"`` (uplink time differences, as
+        ranges to the anchors), ``"anchor"``, or ``"epoch"``, all of them; None: no ranges. They
+        may then have any sign, variances are taken at the distances from the pose, and `rank`
+        says what is left: a tag by itself takes an anchor more, and the squared-range methods
+        five, which take the offset for that of each tag.
 
     Raises
     ------
     ValueError
         On wrong shapes, NaN, ranges that are not positive, an unknown method, a retraction
-        other than the exponential for a method that has none; and where the
+        other than the exponential for a method that has none, an offset with `tag_std_m` or for a
+        squared-range method one by anchor; and where the
         anchors or tags cannot give what a squared-range method needs (four anchors not
         coplanar; tags not collinear, for ``ls`` not coplanar).
     """
@@ -136,16 +150,38 @@ def locate(
     ranging.check_law("noise", noise)
     tags = check_array("tags", tags, ("N", 3))
     tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
-    ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
+    if offsets.check_offset(offset) is not None:
+        _check_offset(method, offset, tag_std_m)
+        ranges, anchors, mask = check_offset_epoch(ranges, anchors, links, tags, offset)
+    else:
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
     check_batches(ranges=ranges.shape[:-2], tags=tags.shape[:-2])
-    epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
-    epoch = epoch._replace(retraction=retraction)
+    if offset is None:
+        epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
+        return _in_blocks(fit, method, epoch._replace(retraction=retraction), batch)
+    # Variances from the middle of the anchors, then from the pose.
+    distance = _DISTANCES(anchors, anchors.mean(axis=-2, keepdims=True))
+    epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m, distance)
+    found = _in_blocks(fit, method, epoch._replace(retraction=retraction, offset=offset), batch)
+    there = _DISTANCES(
+        anchors, tags @ np.swapaxes(found.rotation, -1, -2) + found.translation[..., None, :]
+    )
+    distance, weights = np.where(np.isfinite(there), there, distance), epoch.weights
+    epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m, distance)
+    if np.array_equal(epoch.weights, weights):
+        return found
+    return _in_blocks(fit, method, epoch._replace(retraction=retraction, offset=offset), batch)
+
+
+def _in_blocks(
+    fit: Callable[[StaticEpoch], Fit], method: str, epoch: StaticEpoch, batch: tuple[int, ...]
+) -> PoseEstimate:
     blocks = [
         _solve(fit, _rows(epoch, slice(start, start + _BLOCK)))
         for start in range(0, len(epoch.ranges), _BLOCK)
     ]
     if method in _NEEDS and not all(np.isfinite(block[1]).all() for block in blocks):
-        _check_geometry(method, anchors, tags)
+        _check_geometry(method, epoch)
     fields = joined(blocks, batch)
     return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9], np.zeros(batch, int))
 
@@ -185,6 +221,8 @@ def _range_cost_of(
     """Half the sum of squared whitened range residuals (B,), infinite where no pose is known."""
     turned = epoch.tags @ np.swapaxes(rotation, -1, -2)
     residual = _DISTANCES(epoch.anchors, turned + translation[:, None]) - epoch.ranges
+    if epoch.offset is not None:
+        residual = offsets.centred(residual, epoch.weights, epoch.offset)
     cost = 0.5 * np.einsum("bmn,bmn,bmn->b", epoch.weights, residual, residual)
     return np.where(known, cost, np.inf)
 
@@ -201,15 +239,7 @@ def _rank_of_tags(tags: FloatArray) -> np.ndarray:
 
 def _rows(epoch: StaticEpoch, rows: slice) -> StaticEpoch:
     """Some of the trials."""
-    return StaticEpoch(
-        epoch.ranges[rows],
-        epoch.anchors[rows],
-        epoch.tags[rows],
-        epoch.weights[rows],
-        epoch.squared_weights[rows],
-        epoch.tag_std_m,
-        epoch.retraction,
-    )
+    return StaticEpoch(*(array[rows] for array in epoch[:5]), *epoch[5:])  # pyright: ignore[reportArgumentType]
 
 
 def _epoch(
@@ -219,10 +249,15 @@ def _epoch(
     noise: NoiseLaw,
     mask: BoolArray | None,
     tag_std_m: float,
+    distance: FloatArray | None = None,
 ) -> tuple[StaticEpoch, tuple[int, ...]]:
-    """One flat batch of all leading axes, and the shape it had."""
-    variance = check_variance(noise.variance(ranges, mask), mask)
-    squared = check_variance(noise.squared_range_variance(ranges, mask), mask)
+    """One flat batch of all leading axes, and the shape it had.
+
+    Variances are taken at the ranges, or at a `distance` (..., M, N).
+    """
+    told = ranges if distance is None else np.broadcast_to(distance, ranges.shape)
+    variance = check_variance(noise.variance(told, mask), mask)
+    squared = check_variance(noise.squared_range_variance(told, mask), mask)
     masks = () if mask is None else (mask.shape[:-2],)
     batch = np.broadcast_shapes(
         ranges.shape[:-2], anchors.shape[:-2], tags.shape[:-2], variance.shape[:-2], *masks
@@ -250,7 +285,23 @@ _NEEDS = {"ls": (3, 3), "ls-projected": (3, 3)} | dict.fromkeys(
 )
 
 
-def _check_geometry(method: str, anchors: FloatArray, tags: FloatArray) -> None:
+def _check_offset(method: str, offset: str, tag_std_m: float) -> None:
+    """A ValueError where a method cannot take the ranges' offsets."""
+    if method not in METHODS:
+        raise ValueError(f"offset goes with the methods {', '.join(METHODS)}, got {method!r}")
+    if tag_std_m != 0:
+        raise ValueError(f"offset goes with tag_std_m 0, got {tag_std_m!r}")
+    if offset == "anchor" and method not in ("ml", "robust"):
+        raise ValueError(f"offset 'anchor' goes with the methods 'ml' and 'robust', got {method!r}")
+
+
+def _check_geometry(method: str, epoch: StaticEpoch) -> None:
+    anchors, tags = epoch.anchors, epoch.tags
+    if epoch.offset is not None and anchors.shape[-2] < 5:
+        raise ValueError(
+            f"method {method!r} needs 5 anchors where ranges have an unknown offset, got "
+            f"{anchors.shape[-2]}; 'ml' takes any geometry and says what it determines"
+        )
     needs = zip(("anchors", "tags"), (anchors, tags), _NEEDS[method], strict=True)
     for name, points, needed in needs:
         rank = spanned_dimensions(points).min()

@@ -18,9 +18,9 @@ from rbl_gym.estimators.linear.squared_range import Statistic, information, stat
 from rbl_gym.estimators.linear.unitary import state_jacobian
 from rbl_gym.estimators.locating.maximum_likelihood import (
     Alternatives,
+    linear_start,
     maximum_likelihood,
     no_alternatives,
-    points_start,
 )
 from rbl_gym.estimators.locating.robust_location import robust, robust_late
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
@@ -35,7 +35,8 @@ class StaticEpoch(NamedTuple):
 
     `weights` (B, M, N) are inverse variances of the ranges, 0 where a link is missing;
     `squared_weights` those of the squared ranges, (B, M, 1) where common to the tags;
-    `tag_std_m` that of the tags' places; `retraction` that of Newton's method in ``procrustes``.
+    `tag_std_m` that of the tags' places; `retraction` that of Newton's method in ``procrustes``;
+    `offset` whose ranges have an unknown one in common.
     """
 
     ranges: FloatArray
@@ -45,11 +46,13 @@ class StaticEpoch(NamedTuple):
     squared_weights: FloatArray
     tag_std_m: float
     retraction: str = "exponential"
+    offset: str | None = None
 
     @property
     def stat(self) -> Statistic:
         """The statistic of the squared ranges."""
-        return statistic(self.ranges, self.anchors, self.tags, self.squared_weights)
+        offset = self.offset is not None
+        return statistic(self.ranges, self.anchors, self.tags, self.squared_weights, pseudo=offset)
 
 
 class Fit(NamedTuple):
@@ -122,8 +125,7 @@ def _procrustes(epoch: StaticEpoch) -> Fit:
 
 def _ml(epoch: StaticEpoch) -> Fit:
     cost = _range_cost(epoch)
-    rotation, translation = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
-    return _from_solution(*maximum_likelihood(cost, rotation, translation, epoch.tag_std_m))
+    return _from_solution(*maximum_likelihood(cost, *linear_start(cost), epoch.tag_std_m))
 
 
 def _two_step(epoch: StaticEpoch) -> Fit:
@@ -148,18 +150,16 @@ def _two_step(epoch: StaticEpoch) -> Fit:
 
 def _robust(epoch: StaticEpoch) -> Fit:
     cost = _range_cost(epoch)
-    start = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
-    return _from_solution(*robust(cost, *start))
+    return _from_solution(*robust(cost, *linear_start(cost)))
 
 
 def _robust_late(epoch: StaticEpoch) -> Fit:
     cost = _range_cost(epoch)
-    start = points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
-    return _from_solution(*robust_late(cost, *start))
+    return _from_solution(*robust_late(cost, *linear_start(cost)))
 
 
 def _range_cost(epoch: StaticEpoch) -> RangeCost:
-    return RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags)
+    return RangeCost(epoch.ranges, epoch.weights, epoch.anchors, epoch.tags, offset=epoch.offset)
 
 
 def _from_solution(solution: Solution, alternatives: Alternatives) -> Fit:

@@ -21,6 +21,7 @@ from rbl_gym.estimators.costs.range_cost import (
 )
 from rbl_gym.estimators.linear.least_squares import points_fit
 from rbl_gym.estimators.linear.squared_range import statistic
+from rbl_gym.estimators.locating.differences import places_of_differences
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
@@ -80,10 +81,13 @@ def maximum_likelihood(
         Standard deviation of the tags' places on the body, marginalised.
     """
     weights = cost.weights / (1 + tag_std_m**2 * cost.weights)
-    found = most_likely_pose(
-        cost.ranges, weights, cost.anchors, cost.tags, rotation, translation, ROTATION_NET,
-        np.empty((_MAX_ALTERNATIVES, 6)),
-    )  # fmt: skip
+    if cost.offset is not None:
+        found = _most_likely_pose(cost, rotation, translation, ROTATION_NET)
+    else:
+        found = most_likely_pose(
+            cost.ranges, weights, cost.anchors, cost.tags, rotation, translation, ROTATION_NET,
+            np.empty((_MAX_ALTERNATIVES, 6)),
+        )  # fmt: skip
     solution = Solution(found[0], found[1], Linearization(*found[2:5]), found[5])
     return _with_tag_noise(cost, solution, tag_std_m), Alternatives(*found[6:])
 
@@ -98,6 +102,18 @@ def _with_tag_noise(cost: RangeCost, solution: Solution, tag_std_m: float) -> So
         eased = dataclasses.replace(cost, tag_variance=tag_std_m**2, tag_unit=unit)
         solution = minimize(eased, solution.rotation, solution.translation, iterations=8)
     return solution
+
+
+def linear_start(cost: RangeCost) -> tuple[FloatArray, FloatArray]:
+    """`points_start` of a cost; where the offsets leave no linear solution, NaN."""
+    if cost.offset is None:
+        return points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
+    if cost.offset == "anchor":
+        batch = cost.batch
+        return np.full((*batch, 3, 3), np.nan), np.full((*batch, 3), np.nan)
+    # The distances, which say how squares are to be weighed, are not known yet.
+    stat = statistic(cost.ranges, cost.anchors, cost.tags, cost.weights, pseudo=True)
+    return points_fit(stat)
 
 
 @compiled("locating:points_start")
@@ -139,7 +155,12 @@ def most_likely_pose(
     -------
     Rotation, translation, cost, gradient, Hessian, converged, and three arrays of alternatives.
     """
-    cost = RangeCost(ranges, weights, anchors, tags)
+    return _most_likely_pose(RangeCost(ranges, weights, anchors, tags), rotation, translation, net)
+
+
+def _most_likely_pose(
+    cost: RangeCost, rotation: FloatArray, translation: FloatArray, net: FloatArray
+) -> tuple[Any, ...]:
     usable = are_finite(translation, 1) & are_finite(rotation, 2)
     found = minimize(
         cost,
@@ -167,15 +188,15 @@ def chunks(where: BoolArray) -> list[np.ndarray]:
 
 def in_doubt(cost: RangeCost, at: Linearization) -> BoolArray:
     """Whether a solution may not be the global one: poor geometry, or a cost too high."""
-    links = (cost.weights > 0).sum(axis=(-2, -1))
-    excess = 2 * at.cost - (links - 6)
-    high = excess > _SUSPICIOUS * np.sqrt(2 * np.maximum(links - 6, 1))
+    free = (cost.weights > 0).sum(axis=(-2, -1)) - 6 - cost.offsets()
+    excess = 2 * at.cost - free
+    high = excess > _SUSPICIOUS * np.sqrt(2 * np.maximum(free, 1))
     # The root of the covariance's trace: at most sqrt(3) times the largest standard deviation.
     trace = np.einsum("...ii->...", positive_inverse(at.hessian)[..., :3, :3])
     spread = cost.anchors - cost.anchors.mean(axis=-2, keepdims=True)
     squares = np.linalg.eigvalsh(np.swapaxes(spread, -1, -2) @ spread)
     flat = squares[..., 0] < _FLAT**2 * squares[..., 2]
-    few = cost.anchors.shape[-2] < _FEW_ANCHORS
+    few = cost.anchors.shape[-2] < _FEW_ANCHORS + (cost.offset is not None)
     return high | ~(trace < _UNCERTAIN_RAD**2) | flat | few
 
 
@@ -234,7 +255,10 @@ def local_minima(
 
 def _starts(part: RangeCost, net: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """The cheapest poses (K, 3 count) of a net's rotations at each of three places."""
-    places = candidate_places(part.ranges[:, 0], part.weights[:, 0], part.anchors[:, 0])
+    if part.offset is None:
+        places = candidate_places(part.ranges[:, 0], part.weights[:, 0], part.anchors[:, 0])
+    else:
+        places = places_of_differences(part, net)
     centre = part.tags.mean(axis=-2)[:, :, None]
     translation = places[:, :, None] - (net @ centre[..., None])[..., 0]
     rotation = np.broadcast_to(net, (*translation.shape[:-1], 3, 3))

@@ -30,6 +30,8 @@ from rbl_gym.estimators.locating.maximum_likelihood import (
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 
 _HUBER = 1.5
+# Standard deviations to which Geman and McClure's loss is narrowed.
+_NARROWEST = 3.0
 # A robust fit that fewer of its ranges agree with is searched for again.
 _TRUSTED_INLIERS = 0.65
 
@@ -47,7 +49,7 @@ def robust(
     rotation, translation = _stand_ins(rotation, translation, cost.anchors)
     easy = dataclasses.replace(cost, loss=huber(_HUBER))
     solution = minimize(easy, rotation, translation, iterations=20, tolerance=1e-2)
-    solution = _narrow(cost, solution.rotation, solution.translation, widest=1.0)
+    solution = _narrow(easy, solution.rotation, solution.translation, widest=1.0)
     links = np.maximum((cost.weights > 0).sum(axis=(-2, -1)), 1)
     doubtful = _inliers(cost, solution).sum(axis=(-2, -1)) < _TRUSTED_INLIERS * links
     for rows in chunks(doubtful):
@@ -87,6 +89,8 @@ def _stand_ins(
 
 def _inliers(cost: RangeCost, solution: Solution) -> BoolArray:
     """Links (..., M, N) within 4 standard deviations of a solution."""
+    # Squares would give an offset that wrong ranges have moved.
+    cost = dataclasses.replace(cost, loss=geman_mcclure(_NARROWEST))
     squared = squared_residuals(cost, solution.rotation, solution.translation)
     return (squared < 16.0) & (cost.weights > 0)
 
@@ -96,14 +100,14 @@ def _narrow(
 ) -> Solution:
     """Geman-McClure from the quantile `widest` of the residuals to 3 standard deviations."""
     residuals = np.sqrt(squared_residuals(cost, rotation, translation))
-    scale = np.maximum(np.quantile(residuals, widest, axis=(-2, -1)), 3.0)
+    scale = np.maximum(np.quantile(residuals, widest, axis=(-2, -1)), _NARROWEST)
     while True:
         narrowed = dataclasses.replace(cost, loss=geman_mcclure(scale))
         solution = minimize(narrowed, rotation, translation, iterations=4, tolerance=1e-3)
-        if (scale <= 3.0).all():
+        if (scale <= _NARROWEST).all():
             return solution
         rotation, translation = solution.rotation, solution.translation
-        scale = np.maximum(scale / 1.6, 3.0)
+        scale = np.maximum(scale / 1.6, _NARROWEST)
 
 
 def _without_pairs_of_anchors(part: RangeCost) -> tuple[FloatArray, FloatArray]:
@@ -112,7 +116,7 @@ def _without_pairs_of_anchors(part: RangeCost) -> tuple[FloatArray, FloatArray]:
     All pairs among the first 10 anchors; with fewer than 6 anchors nothing can be left out.
     """
     n_anchors = part.anchors.shape[-2]
-    if n_anchors < 6:
+    if n_anchors < 6 or part.offset is not None:
         return (np.empty((len(part.ranges), 0, 3, 3)), np.empty((len(part.ranges), 0, 3)))
     pairs = np.array(list(itertools.combinations(range(min(n_anchors, 10)), 2)))
     kept = np.ones((len(pairs), n_anchors, 1), bool)

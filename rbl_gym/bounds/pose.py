@@ -213,7 +213,7 @@ def _offset_information(
     offset: int,
 ) -> FloatArray:
     """`_information` of ranges with unknown offsets, by the code of their kind."""
-    noise, kind = ranging.law_of(law), offsets.OFFSETS[offset - 1]
+    noise, kind = ranging.law_of(law), offsets.name_of(offset)
     return prior + _range_information(anchors, tags, rotation, translation, noise, share, kind)
 
 

@@ -317,7 +317,7 @@ def search(
         for s in range(count):
             if stage == 0 or counted[s]:
                 costs[s], good[s] = solve(
-                    Qs[s], ts[s], False, Q, t, room[2], ranges, weights, anchors, tags, loss,
+                    Qs[s], ts[s], False, Q, t, room[2], ranges, weights, anchors, tags, loss, 0,
                     25 if stage else 10, 1e-6 if stage else 1e-2, room,
                 )  # fmt: skip
             else:
@@ -346,7 +346,9 @@ def search(
                     other_cost[kept - 2] = costs[s]
     copy_pose(Qs[order[0]], ts[order[0]], Q, t)
     # Where many poses are nearly as good the way along the valley is long.
-    return solve(Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 100, 1e-6, room)
+    return solve(
+        Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 0, 100, 1e-6, room
+    )
 
 
 @gufunc(
@@ -376,7 +378,7 @@ def most_likely_pose(
     converged[0] = False
     if usable:
         cost[0], converged[0] = solve(
-            Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 12, 3e-6, room
+            Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 0, 12, 3e-6, room
         )
     if not converged[0] or in_doubt(room[1], cost[0], weights, anchors):
         cost[0], converged[0] = search(

@@ -14,6 +14,10 @@ import numpy as np
 from rbl_gym.kernels.epoch import tag_position
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.noise_laws import reference_of, weight
+from rbl_gym.kernels.range_cost import is_plain, loss_of, squared_residuals
+
+# Steps to the offset that a loss other than squares likes best.
+STEPS = 20
 
 
 @helper
@@ -38,10 +42,15 @@ def derivative(translation: Any, x: float, y: float, z: float, anchor: Any, J: A
 
 
 @helper
-def add_centred(Q: Any, t: Any, anchors: Any, tags: Any, weights: Any, offset: int, H: Any) -> None:
-    """Add the information of ranges of known weights (M, N) to the lower half of H (6, 6).
+def add_centred(
+    Q: Any, t: Any, anchors: Any, tags: Any, weights: Any, residuals: Any, offset: int, g: Any,
+    H: Any,
+) -> None:  # fmt: skip
+    """Add the gradient and the information of ranges of known weights and residuals (M, N).
 
-    That is ``sum w (J - h / s) (J - h / s)^T``, ``h = sum w J`` and ``s = sum w`` of a group.
+    With ``C = J - h / s``, ``h = sum w J`` and ``s = sum w`` of a group, the information is
+    ``sum w C C^T``, of which the lower half is added to H (6, 6), and the gradient
+    ``sum w x C``.
     """
     groups = max(anchors.shape[0], tags.shape[0])
     mean, total, J = np.zeros((groups, 6)), np.zeros(groups), np.empty(6)
@@ -53,17 +62,118 @@ def add_centred(Q: Any, t: Any, anchors: Any, tags: Any, weights: Any, offset: i
                 if w == 0.0:
                     continue
                 derivative(t, x, y, z, anchors[m], J)
-                g = group_of(m, n, offset)
+                k = group_of(m, n, offset)
                 if again:
                     for i in range(6):
-                        J[i] -= mean[g, i] / total[g]
+                        J[i] -= mean[k, i] / total[k]
                     for i in range(6):
+                        g[i] += w * residuals[m, n] * J[i]
                         for j in range(i + 1):
                             H[i, j] += w * J[i] * J[j]
                 else:
-                    total[g] += w
+                    total[k] += w
                     for i in range(6):
-                        mean[g, i] += w * J[i]
+                        mean[k, i] += w * J[i]
+
+
+@helper
+def medians(residuals: Any, weights: Any, offset: int, found: Any) -> None:
+    """Medians of the residuals of each group, the lower one of two; 0 of an empty one."""
+    sorted_, count = np.empty(residuals.size), 0
+    for k in range(len(found)):
+        count = 0
+        for m in range(residuals.shape[0]):
+            for n in range(residuals.shape[1]):
+                if weights[m, n] > 0 and group_of(m, n, offset) == k:
+                    place = count
+                    while place > 0 and sorted_[place - 1] > residuals[m, n]:
+                        sorted_[place] = sorted_[place - 1]
+                        place -= 1
+                    sorted_[place] = residuals[m, n]
+                    count += 1
+        found[k] = sorted_[(count - 1) // 2] if count > 0 else 0.0
+
+
+@helper
+def take_out(
+    Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
+    shifted: Any,
+) -> None:  # fmt: skip
+    """Ranges with the likeliest offsets at a pose taken out: `shifted` (M, N)."""
+    groups = max(anchors.shape[0], tags.shape[0])
+    found, mean, total = np.zeros(groups), np.empty(groups), np.empty(groups)
+    residuals = np.zeros(ranges.shape)
+    for n in range(tags.shape[0]):
+        x, y, z = tag_position(Q, t, tags, n)
+        for m in range(anchors.shape[0]):
+            if weights[m, n] > 0:
+                dx, dy, dz = x - anchors[m, 0], y - anchors[m, 1], z - anchors[m, 2]
+                residuals[m, n] = math.sqrt(dx * dx + dy * dy + dz * dz) - ranges[m, n]
+    plain = is_plain(loss)
+    if not plain:
+        medians(residuals, weights, offset, found)
+    for _ in range(1 if plain else STEPS):
+        for k in range(groups):
+            mean[k] = total[k] = 0.0
+        for m in range(ranges.shape[0]):
+            for n in range(ranges.shape[1]):
+                w = weights[m, n]
+                if w > 0:
+                    k = group_of(m, n, offset)
+                    if not plain:
+                        left = residuals[m, n] - found[k]
+                        w *= loss_of(w * left * left, left < 0, loss)[1]
+                    mean[k] += w * residuals[m, n]
+                    total[k] += w
+        for k in range(groups):
+            if total[k] > 0:
+                found[k] = mean[k] / total[k]
+    for m in range(ranges.shape[0]):
+        for n in range(ranges.shape[1]):
+            shifted[m, n] = ranges[m, n] + found[group_of(m, n, offset)]
+
+
+@helper
+def linearize_shifted(
+    Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
+    g: Any, H: Any,
+) -> float:  # fmt: skip
+    """`range_cost.linearize` of ranges with offsets."""
+    shifted, left = np.empty(ranges.shape), np.zeros(ranges.shape)
+    take_out(Q, t, ranges, weights, anchors, tags, loss, offset, shifted)
+    plain, cost = is_plain(loss), 0.0
+    for i in range(6):
+        g[i] = 0.0
+        for j in range(i + 1):
+            H[i, j] = 0.0
+    for n in range(tags.shape[0]):
+        x, y, z = tag_position(Q, t, tags, n)
+        for m in range(anchors.shape[0]):
+            w = weights[m, n]
+            if w > 0:
+                dx, dy, dz = x - anchors[m, 0], y - anchors[m, 1], z - anchors[m, 2]
+                residual = math.sqrt(dx * dx + dy * dy + dz * dz) - shifted[m, n]
+                part, share = 0.5 * w * residual * residual, 1.0
+                if not plain:
+                    part, share = loss_of(w * residual * residual, residual < 0, loss)
+                cost += part
+                shifted[m, n], left[m, n] = residual, w * share
+    add_centred(Q, t, anchors, tags, left, shifted, offset, g, H)
+    return cost
+
+
+@helper
+def squared_residuals_of(
+    Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
+    out: Any,
+) -> None:  # fmt: skip
+    """Squared whitened residuals (M, N), 0 where a link is missing; `offset` 0: there is none."""
+    if offset == 0:
+        squared_residuals(Q, t, ranges, weights, anchors, tags, out)
+        return
+    shifted = np.empty(ranges.shape)
+    take_out(Q, t, ranges, weights, anchors, tags, loss, offset, shifted)
+    squared_residuals(Q, t, shifted, weights, anchors, tags, out)
 
 
 @gufunc("(p,p),(m,d),(n,d),(d,d),(d),(l),(m,n),()->(p,p)", "fffffffif")
@@ -71,7 +181,7 @@ def information(
     prior, anchors, tags, rotation, translation, law, share, offset, told
 ):  # fmt: skip
     """A prior's information and that of ranges with offsets, of which each link has a share."""
-    weights = np.empty(share.shape)
+    weights, nothing, g = np.empty(share.shape), np.zeros(share.shape), np.zeros(6)
     for n in range(tags.shape[0]):
         reference = reference_of(law, n)
         x, y, z = tag_position(rotation, translation, tags, n)
@@ -84,7 +194,7 @@ def information(
     for i in range(6):
         for j in range(6):
             told[i, j] = 0.0
-    add_centred(rotation, translation, anchors, tags, weights, offset, told)
+    add_centred(rotation, translation, anchors, tags, weights, nothing, offset, g, told)
     for i in range(6):
         for j in range(i + 1):
             told[j, i] = told[i, j]

@@ -13,8 +13,9 @@ import numpy as np
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6
+from rbl_gym.kernels.offsets import squared_residuals_of
 from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
-from rbl_gym.kernels.range_cost import loss_of, set_huber, squared_residuals
+from rbl_gym.kernels.range_cost import loss_of, set_huber
 
 # No length is as large.
 HUGE = 1e50
@@ -74,7 +75,7 @@ def invert(A: Any, L: Any, out: Any) -> bool:
 
 
 @helper
-def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, weights: Any) -> bool:
+def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, signed: bool, weights: Any) -> bool:
     """Weights of an epoch: shares over variances; False where a number is none that can be.
 
     `shares` are 0 where nothing was measured. `law` has the numbers of `noise_laws`, of an epoch
@@ -91,7 +92,7 @@ def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, weights: Any) -> boo
             if share == 0:
                 weights[m, n] = 0.0
                 continue
-            if not 0 < distance < HUGE:
+            if not (-HUGE if signed else 0.0) < distance < HUGE:
                 return False
             weight = share
             if not given:
@@ -118,11 +119,11 @@ def count_beyond(squared: Any, cutoff: float) -> int:
 
 
 @helper
-def leave_out(P0: Any, squared: Any, tags: Any, kept: Any) -> int:
+def leave_out(P0: Any, squared: Any, tags: Any, width: float, kept: Any) -> int:
     """Set the weights of links that contradict the prior to zero; how many, none of too many.
 
     `squared` and the weights `kept` are those of the prior. The variance of an innovation is at
-    most that of the range and the square of ``sqrt(tr P_v) + |c| sqrt(tr P_w)``.
+    most that of the range and the square of `width` times ``sqrt(tr P_v) + |c| sqrt(tr P_w)``.
     """
     of_rotation = math.sqrt(P0[0, 0] + P0[1, 1] + P0[2, 2])
     of_place = math.sqrt(P0[3, 3] + P0[4, 4] + P0[5, 5])
@@ -130,7 +131,7 @@ def leave_out(P0: Any, squared: Any, tags: Any, kept: Any) -> int:
     for again in range(2):
         for n in range(tags.shape[0]):
             x, y, z = tags[n, 0], tags[n, 1], tags[n, 2]
-            reach = of_place + math.sqrt(x * x + y * y + z * z) * of_rotation
+            reach = width * (of_place + math.sqrt(x * x + y * y + z * z) * of_rotation)
             for m in range(squared.shape[0]):
                 weight = kept[m, n]
                 beyond = squared[m, n] > GATE * GATE * (1 + weight * reach * reach)
@@ -246,8 +247,8 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
 
 
 @gufunc(
-    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(),()->(d,d),(d),(p,p),()",
-    "ffffffffffiiffff",
+    "(d,d),(d),(p,p),(m,n),(m,n),(q),(m,d),(n,d),(d,d),(d),(),(),()->(d,d),(d),(p,p),()",
+    "ffffffffffiiiffff",
 )
 def update(
     Q0,
@@ -260,6 +261,7 @@ def update(
     tags,
     start_Q,
     start_t,
+    offset,
     iterations,
     robust,
     Q,
@@ -280,7 +282,7 @@ def update(
     kept, tolerance = weights, 1e-6
     squared = kept
     links = 0
-    sound = weigh(ranges, shares, law, anchors, weights)
+    sound = weigh(ranges, shares, law, anchors, offset != 0, weights)
     if not (sound and invert(P0, L, information)):
         copy_pose(Q0, t0, Q, t)
         fill(math.nan, P)
@@ -296,8 +298,9 @@ def update(
             for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
                 kept[m, n] = weights[m, n]
                 links += weights[m, n] > 0
-        squared_residuals(Q0, t0, ranges, weights, anchors, tags, squared)
-        leave_out(P0, squared, tags, kept)
+        squared_residuals_of(Q0, t0, ranges, weights, anchors, tags, loss, offset, squared)
+        # An offset is told by the other ranges, which are as uncertain.
+        leave_out(P0, squared, tags, 1.0 if offset == 0 else 2.0, kept)
     for stage in range(4):
         if stage == 1 and robust == LATE:
             loss[0], loss[3], loss[4], tolerance = LATE_HUBER, 2.0, LATE_SHARE, 1e-6
@@ -313,14 +316,16 @@ def update(
         if stage == 0 or (stage == 1 and robust == GATED):
             copy_pose(start_Q, start_t, Q, t)
         total, _ = solve(
-            Q, t, True, Q0, t0, information, ranges, kept, anchors, tags, loss,
+            Q, t, True, Q0, t0, information, ranges, kept, anchors, tags, loss, offset,
             iterations, tolerance, room,
         )  # fmt: skip
         if robust == SQUARES or (robust == LATE and stage == 1):
             break
         if robust == LATE:
             continue
-        squared_residuals(Q, t, ranges, weights, anchors, tags, squared)
+        cutoff, loss[1] = loss[1], math.inf
+        squared_residuals_of(Q, t, ranges, weights, anchors, tags, loss, offset, squared)
+        loss[1] = cutoff
     mirror(H)
     keep_wide(Q0, information, Q, weights, tags, H)
     if not invert(H, L, P):
@@ -328,10 +333,14 @@ def update(
     if robust == GATED:
         # A link that contradicts the pose costs so much and no more, whoever left it out.
         of_prior = total
+        if offset != 0:
+            squared_residuals_of(Q, t, ranges, kept, anchors, tags, loss, offset, squared)
         for m in range(weights.shape[0]):
             for n in range(weights.shape[1]):  # pyright: ignore[reportGeneralTypeIssues]
                 if kept[m, n] > 0:
                     of_prior -= loss_of(squared[m, n], False, loss)[0]
         loss[1] = GATE
+        if offset != 0:
+            squared_residuals_of(Q, t, ranges, weights, anchors, tags, loss, offset, squared)
         total = of_prior + data_cost(squared, loss)
     cost[0] = total

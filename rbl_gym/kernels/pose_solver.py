@@ -11,6 +11,7 @@ import numpy as np
 
 from rbl_gym.kernels.jit import gufunc, helper, inlined
 from rbl_gym.kernels.linear_algebra import cholesky6, solve_factored6
+from rbl_gym.kernels.offsets import linearize_shifted
 from rbl_gym.kernels.range_cost import linearize
 from rbl_gym.kernels.rotations import compose, exp, left_jacobian_inverse, log
 
@@ -74,11 +75,12 @@ def add_prior(
 @inlined
 def solve(
     Q: Any, t: Any, has_prior: bool, Q0: Any, t0: Any, information: Any,
-    ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any,
+    ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
     iterations: int, tolerance: float, room: Any,
 ) -> tuple[float, bool]:  # fmt: skip
     """Move the pose (Q, t) to the least cost near it; the cost there, and whether it converged.
 
+    `offset` is the kind of the ranges' offsets, as in `kernels.offsets`, 0 for none.
     `room` comes from `room_to_solve`; its first two become the gradient and the Hessian (its
     lower half) there.
     """
@@ -86,7 +88,12 @@ def solve(
     copy_pose(Q, t, new_Q, new_t)
     cost, decrease, damping, converged = 0.0, 0.0, 0.0, False
     for k in range(iterations + 1):
-        new = linearize(new_Q, new_t, ranges, weights, anchors, tags, loss, new_g, new_H)
+        if offset == 0:
+            new = linearize(new_Q, new_t, ranges, weights, anchors, tags, loss, new_g, new_H)
+        else:
+            new = linearize_shifted(
+                new_Q, new_t, ranges, weights, anchors, tags, loss, offset, new_g, new_H
+            )
         if has_prior:
             new += add_prior(new_Q, new_t, Q0, t0, information, D, e, new_g, new_H)
         # A step of 1e-4 standard deviations changes the cost by less than rounding may.
@@ -164,11 +171,11 @@ def mirror(H: Any) -> None:
 
 
 @gufunc(
-    "(d,d),(d),(d,d),(d),(p,p),(m,n),(m,n),(m,d),(n,d),(l),(),()->(d,d),(d),(),(p),(p,p),()",
-    "ffffffffffiffffffb",
+    "(d,d),(d),(d,d),(d),(p,p),(m,n),(m,n),(m,d),(n,d),(l),(),(),()->(d,d),(d),(),(p),(p,p),()",
+    "ffffffffffiiffffffb",
 )
 def minimize(
-    start_Q, start_t, Q0, t0, information, ranges, weights, anchors, tags, loss,
+    start_Q, start_t, Q0, t0, information, ranges, weights, anchors, tags, loss, offset,
     iterations, tolerance, Q, t, cost, g, H, converged,
 ):  # fmt: skip
     """`solve` from a start; without a prior where its information is zero."""
@@ -178,7 +185,7 @@ def minimize(
     for i in range(6):
         has_prior = has_prior or information[i, i] != 0.0
     cost[0], converged[0] = solve(
-        Q, t, has_prior, Q0, t0, information, ranges, weights, anchors, tags, loss,
+        Q, t, has_prior, Q0, t0, information, ranges, weights, anchors, tags, loss, offset,
         iterations, tolerance, room,
     )  # fmt: skip
     take_linearization(room, g, H)

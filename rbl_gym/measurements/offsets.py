@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 
 __all__ = ["OFFSETS", "centred", "common"]
 
@@ -32,6 +32,11 @@ def check_offset(offset: str | None) -> str | None:
 def code_of(offset: str | None) -> int:
     """The kind as kernels have it: 0 for none, else 1 by tag, 2 by anchor, 3 by epoch."""
     return 0 if offset is None else 1 + OFFSETS.index(offset)
+
+
+def name_of(code: int) -> str | None:
+    """Inverse of `code_of`."""
+    return (None, *OFFSETS)[int(code)]
 
 
 def group_shape(offset: str, anchors: int, tags: int) -> tuple[int, int]:
@@ -63,6 +68,25 @@ def centred(values: FloatArray, weights: FloatArray, offset: str) -> FloatArray:
     return values - common(values, weights, offset)
 
 
-def paired(links: FloatArray, offset: str) -> FloatArray:
+def median(values: FloatArray, there: BoolArray, offset: str) -> FloatArray:
+    """Medians of groups, of the values (..., M, N) that are there: the lower one of two."""
+    axes = axes_of(offset)
+    values, there = np.broadcast_arrays(values, there)
+    ordered = np.where(there, values, np.inf)
+    if offset == "epoch":
+        ordered = ordered.reshape((*ordered.shape[:-2], 1, -1))
+        axes = (-1,)
+    ordered = np.sort(ordered, axis=axes[0])
+    count = there.sum(axis=axes_of(offset), keepdims=True)
+    found = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=axes[0])
+    return np.where(count > 0, found, 0.0)
+
+
+def axes_of(offset: str) -> tuple[int, ...]:
+    """Over which axes of (..., M, N) the links of one group lie."""
+    return _AXES[offset]
+
+
+def paired(links: BoolArray, offset: str) -> BoolArray:
     """Which of the links (..., M, N) share their offset with another: one alone tells nothing."""
-    return links & (links.sum(axis=_AXES[offset], keepdims=True) > 1)
+    return np.asarray(links & (links.sum(axis=_AXES[offset], keepdims=True) > 1))

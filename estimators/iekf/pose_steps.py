@@ -1,0 +1,129 @@
+"""Prediction and update of a pose as arrays: textbook forms of the kernels of `pose_filter`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from rbl_gym.checks import HUGE, FloatArray, kernel
+from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positive_inverse
+from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber
+from rbl_gym.estimators.costs.unseen_directions import kept_wide
+from rbl_gym.estimators.iekf.robust_update import GATE, HUBER, late_solution, robust_solution
+from rbl_gym.estimators.inputs import plain
+from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
+from rbl_gym.measurements import offsets
+from rbl_gym.measurements.noise_laws import law_of
+
+# The law of `update_pose` whose shares are weights.
+WEIGHTS = np.array([2.0, 0.0, 0.0, -1.0])
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
+
+
+@compiled("pose_filter:predict")
+def predict_pose(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    twist: FloatArray,
+    dt: float,
+    variance: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pose and covariance after `dt` seconds of a twist, ``P <- F P F^T + dt G S G^T``.
+
+    ``F = blkdiag(exp(w dt), I)`` and ``G = blkdiag(Jl(w dt), I)``: the error is global, and the
+    noise, of `variance` (6,) after 1 s, is on the angular velocity.
+    """
+    rotation, translation, covariance = plain(PoseState(rotation, translation, covariance))
+    seconds = np.asarray(dt)[..., None]
+    turn = twist[..., :3] * seconds
+    F, G = (np.broadcast_to(np.eye(6), (*turn.shape[:-1], 6, 6)).copy() for _ in range(2))
+    F[..., :3, :3], G[..., :3, :3] = _EXP(turn), _LEFT_JACOBIAN(turn)
+    spread = (G * (seconds * variance)[..., None, :]) @ np.swapaxes(G, -1, -2)
+    return (
+        F[..., :3, :3] @ rotation,
+        translation + twist[..., 3:] * seconds,
+        F @ covariance @ np.swapaxes(F, -1, -2) + spread,
+    )
+
+
+@compiled("pose_filter:update")
+def update_pose(
+    rotation: FloatArray,
+    translation: FloatArray,
+    covariance: FloatArray,
+    ranges: FloatArray,
+    shares: FloatArray,
+    law: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    start_rotation: FloatArray,
+    start_translation: FloatArray,
+    offset: int,
+    iterations: int,
+    robust: int,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The most likely pose of an epoch near a start, its covariance, and the cost there.
+
+    Parameters
+    ----------
+    rotation, translation, covariance
+        The prior.
+    ranges, anchors, tags
+        As of `RangeCost`.
+    shares, law
+        The weights (..., M, N) and `WEIGHTS`; or ones and the numbers (4,) of a noise law
+        (`noise_laws.numbers_of`), where all links were measured.
+    start_rotation, start_translation
+        Where Gauss-Newton starts.
+    offset
+        Kind of the ranges' offsets, as kernels have it (`offsets.code_of`).
+    iterations
+        Of Gauss-Newton, at the most.
+    robust
+        Of `robust_update.ROBUST`. 1: the cost is that of Huber's loss, constant beyond `GATE`, of
+        all links. 2: it is that of the redescending loss.
+
+    Returns
+    -------
+    Rotation, translation, covariance, cost (...). The last two are NaN where a matrix is not
+    positive definite, a range that counts not positive, or anything not finite.
+    """
+    weights = shares if law[0] == WEIGHTS[0] else shares / law_of(law).variance(ranges)
+    prior = plain(PoseState(rotation, translation, covariance))
+    data = RangeCost(ranges, weights, anchors, tags, SQUARES, offset=offsets.name_of(offset))
+    problem = map_problem(prior, data)
+    if robust == 2:
+        found = late_solution(problem, start_rotation, start_translation, iterations)
+        cost = found.at.cost
+    elif robust:
+        found = robust_solution(problem, start_rotation, start_translation, iterations)
+        data = dataclasses.replace(data, loss=cut_huber(HUBER, GATE))
+        cost = dataclasses.replace(problem, data=data)(found.rotation, found.translation).cost
+    else:
+        found = minimize_pose(problem, start_rotation, start_translation, iterations)
+        cost = found.at.cost
+    low = -HUGE if offset else 0.0
+    sound = (shares == 0) | (
+        (ranges > low) & (ranges < HUGE) & (weights > 0) & np.isfinite(weights)
+    )
+    sound = sound.all(axis=(-2, -1)) & (np.abs(anchors) < HUGE).all(axis=(-2, -1))
+    covariance = np.where(sound[..., None, None], positive_inverse(found.at.hessian), np.nan)
+    pose = PoseState(found.rotation, found.translation, covariance)
+    pose = kept_wide(prior, pose, (weights > 0).any(axis=-2), tags)
+    known = np.isfinite(pose.covariance).all(axis=(-2, -1))
+    return *pose, np.where(known, cost, np.nan)
+
+
+def as_state(rotation: FloatArray, translation: FloatArray, covariance: FloatArray) -> PoseState:
+    """A state of what an update found, or a LinAlgError where its covariance is none."""
+    if not math.isfinite(np.vdot(covariance, covariance)):
+        raise np.linalg.LinAlgError(
+            "the information about the pose must be positive definite before and after an update"
+        )
+    return PoseState(rotation, translation, covariance)

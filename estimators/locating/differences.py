@@ -1,0 +1,67 @@
+"""Where a search for a pose begins when the ranges have an unknown offset in common."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.costs.map_problem import minimize
+from rbl_gym.estimators.costs.range_cost import RangeCost, loss_of, squared_residuals
+
+# Places to begin at, on every axis in halves of the anchors' extent; flat ones are as deep as this
+# share of their longest axis.
+_GRID = np.array(list(itertools.product((-0.8, 0.0, 0.8), repeat=3)))
+_DEPTH = 0.5
+
+
+def places_of_differences(part: RangeCost, net: FloatArray) -> FloatArray:
+    """Three places (K, 3, 3) of the tags' centre that differences of ranges go with.
+
+    The ends of short local solves from a grid of places among the anchors, each with the rotation
+    of a net that fits best there.
+
+    Parameters
+    ----------
+    part
+        Trials (K, 1, ...).
+    net
+        Rotations (S, 3, 3).
+    """
+    anchors, tags = part.anchors[:, 0], part.tags[:, 0]
+    middle = anchors.mean(axis=-2, keepdims=True)
+    _, axes = np.linalg.eigh(np.swapaxes(anchors - middle, -1, -2) @ (anchors - middle))
+    along = (anchors - middle) @ axes
+    low, high = along.min(axis=-2), along.max(axis=-2)
+    reach = 0.5 * (high - low)
+    reach = np.maximum(reach, _DEPTH * reach.max(axis=-1, keepdims=True))
+    places = (0.5 * (high + low))[:, None] + _GRID * reach[:, None]
+    places = middle + places @ np.swapaxes(axes, -1, -2)
+    centre = tags.mean(axis=-2)[:, None, None]
+    translation = places[:, :, None] - (net @ centre[..., None])[..., 0]
+    rotation = np.broadcast_to(net, (*translation.shape[:-1], 3, 3))
+    grid = part.each(lambda array, _: array[:, None])
+    cost = loss_of(squared_residuals(grid, rotation, translation), grid.loss)[0].sum(axis=(-2, -1))
+    best = np.argmin(cost, axis=-1)[:, :, None]
+    found = minimize(
+        part,
+        np.take_along_axis(rotation, best[..., None, None], axis=2)[:, :, 0],
+        np.take_along_axis(translation, best[..., None], axis=2)[:, :, 0],
+        iterations=8,
+        tolerance=0.1,
+    )
+    ends = (found.rotation @ centre[:, 0, :, :, None])[..., 0] + found.translation
+    return _far_apart(ends, found.at.cost, 0.1 * reach.max(axis=-1))
+
+
+def _far_apart(places: FloatArray, cost: FloatArray, least: FloatArray) -> FloatArray:
+    """The three cheapest of places (K, P, 3), each at `least` (K,) from those before, if any is."""
+    rows, cost = np.arange(len(places)), np.array(cost)
+    chosen = []
+    for _ in range(3):
+        chosen.append(places[rows, np.argmin(cost, axis=-1)])
+        gap = np.linalg.norm(places - chosen[-1][:, None], axis=-1)
+        # What is near to one that is chosen comes after all others.
+        cost = cost + np.where(gap < least[:, None], 1e30, 0.0)
+    return np.stack(chosen, axis=1)
