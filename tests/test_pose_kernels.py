@@ -97,7 +97,11 @@ def test_update(seed, shape, geometry, robust, iterations, offset):
     ranges, weights, *places = data
     args = *prior, ranges, weights, WEIGHTS, *places, *prior[:2], offset, iterations, robust
     with np.errstate(all="ignore"):
-        assert_near(update_pose.kernel(*args), update_pose.textbook(*args))
+        got, want = update_pose.kernel(*args), update_pose.textbook(*args)
+    # A prior that is singular to rounding leaves a pose that means nothing.
+    known = np.isfinite(want[3])
+    np.testing.assert_array_equal(np.isfinite(got[3]), known)
+    assert_near([field[known] for field in got], [field[known] for field in want])
 
 
 @needs_kernels

@@ -133,7 +133,7 @@ def _plan_cost(
             information, env.twist[:, None], scene.dt, scene.process
         )
         information = information + bounds.information_at(
-            anchors, tags, rotation, translation, scene.noise
+            anchors, tags, rotation, translation, scene.noise, offset=scene.links.offset
         )
         cost += np.log(bounds.score(np.linalg.inv(information), rotation, tags))
     return cost / len(poses)

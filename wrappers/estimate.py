@@ -165,7 +165,7 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
         tags=np.asarray(scene.tags),
         noise=law,
         process=scene.process,
-        **{**inertial_options(name, scene), **told},
+        **{**scene.links.options, **inertial_options(name, scene), **told},
     )
     check_takes_obstacles(name, filter, scene)
     check_reads(name, filter, scene)

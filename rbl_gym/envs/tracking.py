@@ -43,7 +43,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     | key | shape | type | meaning |
     |---|---|---|---|
-    | `ranges` | (M, N) | float64 | metres, 0 where there is no link |
+    | `ranges` | (M, N) | float64 | metres, 0 where there is no link; with `links.offset` in the scene any sign |
     | `links` | (M, N) | int8 | 1 where a range was measured |
     | `anchors` | (M, 3) | float64 | places of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
@@ -86,6 +86,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         reward="none",
     )
     ```
+    ``scene={"links": {"offset": "tag"}}``: the ranges of a tag have an unknown offset in common
+    (time differences); see `rbl_gym.measurements.offsets`.
     `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
     `rbl_gym.worlds.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
 
@@ -253,7 +255,7 @@ def observation_space(scene: Scene) -> spaces.Dict:
     keys: dict[str, spaces.Space[Any]] = {
         "anchors": spaces.Box(low, high, dtype=np.float64),
         "twist": spaces.Box(-twist, twist, dtype=np.float64),
-        "ranges": spaces.Box(0.0, scene.range_limit_m, links, np.float64),
+        "ranges": spaces.Box(*scene.range_bounds_m, links, np.float64),
         "links": spaces.MultiBinary(links),
     }
     if scene.obstacles:

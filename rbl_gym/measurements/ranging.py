@@ -7,6 +7,7 @@ The noise laws of `noise_laws` are handed on.
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from rbl_gym.checks import (
     kernel,
 )
 from rbl_gym.kernels import compiled
+from rbl_gym.measurements import offsets
 from rbl_gym.measurements.noise_laws import (
     NOISE_LAWS,
     LinkNoise,
@@ -54,12 +56,18 @@ class LinkModel:
         Chance that a range is taken over a reflected path.
     nlos_bias_m
         What a reflected path adds to the range, metres.
+    offset, offset_std_m
+        Whose ranges have an unknown offset in common, new at every epoch (`offsets`): ``"tag"``,
+        ``"anchor"`` or ``"epoch"``; None: nobody's. Its standard deviation, metres. Estimators
+        take it for altogether unknown.
     """
 
     drop_probability: float = 0.0
     reach_m: float | None = None
     nlos_probability: float = 0.0
     nlos_bias_m: float = 5.0
+    offset: str | None = None
+    offset_std_m: float = 30.0
 
     def __post_init__(self) -> None:
         check_number("drop_probability", self.drop_probability, low=0.0, high=1.0)
@@ -67,6 +75,22 @@ class LinkModel:
         check_number("nlos_bias_m", self.nlos_bias_m, low=0.0)
         if self.reach_m is not None:
             check_number("reach_m", self.reach_m, low=0.0)
+        offsets.check_offset(self.offset)
+        check_number("offset_std_m", self.offset_std_m, low=0.0)
+
+    @property
+    def options(self) -> dict[str, str]:
+        """What an estimator is told of the links: ``offset``, where they have one."""
+        return {} if self.offset is None else {"offset": self.offset}
+
+    def n_offsets(self, anchors: int, tags: int) -> int:
+        """How many offsets there are at an epoch."""
+        return 0 if self.offset is None else math.prod(self.offset_shape(anchors, tags))
+
+    def offset_shape(self, anchors: int, tags: int) -> tuple[int, int]:
+        """Their shape, which broadcasts against (M, N)."""
+        assert self.offset is not None
+        return offsets.group_shape(self.offset, anchors, tags)
 
     @functools.cached_property
     def never_fails(self) -> bool:
@@ -137,7 +161,7 @@ def measure(
     link_model: LinkModel | None = None,
     uniforms: FloatArray | None = None,
 ) -> Measurement:
-    """One epoch of measurements from true distances and given random numbers.
+    """One epoch of measurements from true distances and given random numbers; without offsets.
 
     Parameters
     ----------
@@ -174,6 +198,18 @@ def lose_links(
     if link_model.reach_m is not None:
         links &= true_distances <= link_model.reach_m
     return Measurement(np.where(links, ranges, 0.0), links, nlos & links)
+
+
+def with_offsets(
+    measurement: Measurement, link_model: LinkModel, normals: FloatArray
+) -> Measurement:
+    """Measured ranges with offsets of standard normals (..., 1 or M, 1 or N) added.
+
+    The normals are cut at six: six standard deviations are the most that an offset ever is.
+    """
+    ranges, links, nlos = measurement
+    added = link_model.offset_std_m * np.clip(normals, -6.0, 6.0)
+    return Measurement(np.where(links, ranges + added, 0.0), links, nlos)
 
 
 def sample(
@@ -241,4 +277,8 @@ def simulate(
     uniforms = None
     if link_model is not None and link_model.is_random:
         uniforms = rng.random((*true.shape[:-2], 2, *true.shape[-2:]))
-    return measure(true, noise, normals, link_model, uniforms)
+    measured = measure(true, noise, normals, link_model, uniforms)
+    if link_model is None or link_model.offset is None:
+        return measured
+    shape = link_model.offset_shape(*true.shape[-2:])
+    return with_offsets(measured, link_model, rng.standard_normal((*true.shape[:-2], *shape)))

@@ -114,6 +114,11 @@ class PlacementTask:
             raise ValueError(
                 f"scene must have a volume with an extent, {self.scene.name!r} has none"
             )
+        if self.scene.links.offset is not None:
+            raise ValueError(
+                f"scene must have ranges without an offset, got links.offset "
+                f"{self.scene.links.offset!r}"
+            )
         if self.racks and not isinstance(self.scene.anchor_region, Walls):
             raise ValueError(
                 f"racks must be 0 in a scene without walls, got {self.racks} in {self.scene.name!r}"

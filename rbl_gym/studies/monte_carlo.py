@@ -148,7 +148,7 @@ def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators
         As `estimators.make`; and for a filter that takes no law of an epoch, in a scene whose
         obstacles give one to every epoch.
     """
-    options = {**inertial_options(name, scene), **options}
+    options = {**scene.links.options, **inertial_options(name, scene), **options}
     filter = estimators.make(
         name, tags=scene.tags, noise=scene.noise, process=scene.process, **options
     )

@@ -227,7 +227,7 @@ class Scene:
 
     @functools.cached_property
     def range_limit_m(self) -> float:
-        """A range that no measurement of this scene exceeds (measurements are clipped to it)."""
+        """What no measurement of this scene exceeds, but for offsets (measurements are clipped)."""
         duration = self.steps * self.dt
         places = (*(self.anchors or ()), *filter(None, [self.start_translation]))
         corners = np.array([*self.volume.bounds(), *self.anchor_region.bounds(), *places])
@@ -240,6 +240,14 @@ class Scene:
         if self.obstacles and self.blocked_information > 0:
             noise /= math.sqrt(self.blocked_information)
         return float(reach[0, 0]) + noise + self.links.nlos_bias_m
+
+    @property
+    def range_bounds_m(self) -> tuple[float, float]:
+        """Between which all ranges lie: with offsets they may be negative."""
+        if self.links.offset is None:
+            return 0.0, self.range_limit_m
+        offset = 6 * self.links.offset_std_m
+        return -offset - 1e-9, self.range_limit_m + offset
 
 
 def _names(kinds: tuple[type, ...]) -> str:

@@ -48,6 +48,8 @@ def posterior_step(
     assert law is not None  # the laws of scenes have numbers
     if scene.inertial is not None:
         return _with_inertial(scene, at, anchors, links, previous, prior_covariance)
+    if scene.links.offset is not None:
+        return _with_offsets(scene, at, anchors, links, previous, prior_covariance)
     information, score = posterior.step_of_ranges(
         np.linalg.inv(prior_covariance) if previous is None else previous,
         at.twist,
@@ -85,11 +87,36 @@ def _with_inertial(
         felt = at.readings - at.bias[..., None, :]
         steps = np.full(felt.shape[-2], scene.dt / felt.shape[-2])
         before = inertial.predict_information(previous, at.rotation, felt, steps, sensor)
+    information = inertial.with_pose(before, _seen(scene, at, anchors, links))
+    return _scored(scene, at, information)
+
+
+def _with_offsets(
+    scene: Scene,
+    at: simulation.Epoch,
+    anchors: FloatArray,
+    links: BoolArray,
+    previous: FloatArray | None,
+    prior_covariance: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """`posterior_step` of ranges with offsets."""
+    if previous is None:
+        before = np.linalg.inv(prior_covariance)
+    else:
+        before = bounds.predict_information(previous, at.twist, scene.dt, scene.process)
+    return _scored(scene, at, before + _seen(scene, at, anchors, links))
+
+
+def _seen(scene: Scene, at: simulation.Epoch, anchors: FloatArray, links: BoolArray) -> FloatArray:
+    """What the ranges tell about the pose (..., 6, 6)."""
     share = simulation.shares(scene, at, anchors, links)
-    seen = bounds.information_at(
-        anchors, scene.body, at.rotation, at.translation, scene.noise, share
-    )
-    information = inertial.with_pose(before, seen)
+    places = anchors, scene.body, at.rotation, at.translation
+    return bounds.information_at(*places, scene.noise, share, scene.links.offset)
+
+
+def _scored(
+    scene: Scene, at: simulation.Epoch, information: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     if not all_finite(information):
         raise ValueError("the information about the pose is singular or not finite")
     covariance = np.linalg.inv(information)[..., :6, :6]

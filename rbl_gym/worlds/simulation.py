@@ -50,6 +50,8 @@ class Episode(NamedTuple):
         Of a scene with an inertial sensor, else None: true velocity (..., T + 1, 3); readings
         (..., T + 1, S, 6) of the interval that ends at each epoch, zero at epoch 0; the sensor's
         biases (..., T + 1, 6) at the epochs.
+    offsets
+        Where ranges have offsets, else None: their standard normals (..., T + 1, 1 or M, 1 or N).
     prior_rotation, prior_translation, prior_covariance
         Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
     anchors
@@ -64,6 +66,7 @@ class Episode(NamedTuple):
     velocity: FloatArray | None
     readings: FloatArray | None
     bias: FloatArray | None
+    offsets: FloatArray | None
     prior_rotation: FloatArray
     prior_translation: FloatArray
     prior_covariance: FloatArray
@@ -71,7 +74,7 @@ class Episode(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An episode at one epoch: the first eight fields of `Episode` without their time axis."""
+    """An episode at one epoch: the first nine fields of `Episode` without their time axis."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -81,6 +84,7 @@ class Epoch(NamedTuple):
     velocity: FloatArray | None = None
     readings: FloatArray | None = None
     bias: FloatArray | None = None
+    offsets: FloatArray | None = None
 
 
 class Motion(NamedTuple):
@@ -148,11 +152,12 @@ def _links(scene: Scene) -> int:
     return scene.n_anchors * len(scene.tags)
 
 
-def _normal_sizes(scene: Scene) -> tuple[int, int, int, int, int]:
-    """Normals of the start, the process, the ranges, the random twists, the inertial sensor."""
+def _normal_sizes(scene: Scene) -> tuple[int, int, int, int, int, int]:
+    """Normals of start, process, ranges, random twists, inertial sensor, offsets of the ranges."""
     held = -(-scene.steps_of_motion // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
     ranges, felt = (scene.steps + 1) * _links(scene), inertial_motion.normals_of(scene)
-    return _START_NORMALS, 6 * scene.steps_of_motion, ranges, held, felt
+    offsets = (scene.steps + 1) * scene.links.n_offsets(scene.n_anchors, len(scene.tags))
+    return _START_NORMALS, 6 * scene.steps_of_motion, ranges, held, felt, offsets
 
 
 def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
@@ -165,7 +170,7 @@ def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
 def build_episode(scene: Scene, draws: Draws) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, _, held, felt = _split(draws.normals, _normal_sizes(scene))
+    start, process, _, held, felt, common = _split(draws.normals, _normal_sizes(scene))
     places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = scene.steps_of_motion
@@ -204,8 +209,11 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     else:
         anchors = np.full((*batch, scene.n_anchors, 3), scene.anchors)
     covariance = np.full((*batch, 6, 6), covariance)
-    random = of_ranges(scene, draws)
-    return Episode(*path, twists, *random, *inertial, *prior, covariance, anchors)
+    random, offsets = of_ranges(scene, draws), None
+    if scene.links.offset is not None:
+        shape = scene.links.offset_shape(scene.n_anchors, len(scene.tags))
+        offsets = common.reshape((*batch, scene.steps + 1, *shape))
+    return Episode(*path, twists, *random, *inertial, offsets, *prior, covariance, anchors)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
@@ -264,6 +272,7 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
         episode.normals[..., epoch, :, :],
         None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
         *inertial,
+        None if episode.offsets is None else episode.offsets[..., epoch, :, :],
     )
 
 
@@ -297,7 +306,12 @@ def measure(
     if quality is not None and not scene.blocked_information:
         links &= quality[..., None] > 0
         ranges[~links] = 0.0
-    return ranging.Measurement(ranges, links, nlos)
+    measured = ranging.Measurement(ranges, links, nlos)
+    if scene.links.offset is None:
+        return measured
+    if at.offsets is None:
+        raise ValueError("links.offset is for episodes of a scene, and these are none")
+    return ranging.with_offsets(measured, scene.links, at.offsets)
 
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:

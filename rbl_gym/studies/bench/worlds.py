@@ -153,8 +153,9 @@ def off_by(points: FloatArray, distance_m: float, rng: np.random.Generator) -> F
 def pose_rank(world: BenchWorld) -> int:
     """How many of the 6 directions of the pose the first epoch's full links determine."""
     information = bounds.information_at(
-        world.anchors, world.tags, world.rotation[0], world.translation[0], world.told.noise
-    )
+        world.anchors, world.tags, world.rotation[0], world.translation[0], world.told.noise,
+        offset=world.told.links.offset,
+    )  # fmt: skip
     return int(bounds.information_rank(information).min())
 
 
