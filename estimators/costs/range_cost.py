@@ -166,7 +166,7 @@ class RangeCost:
         residual = np.where(self.weights > 0, distance - self.ranges, 0.0)
         if self.offset is None:
             return residual
-        found = _offset_of(residual, self.weights, self.loss, self.offset)
+        found = offset_of(residual, self.weights, self.loss, self.offset)
         return np.where(self.weights > 0, residual - found, 0.0)
 
     def offsets(self) -> np.ndarray | int:
@@ -220,7 +220,7 @@ def squared_residuals(cost: RangeCost, rotation: FloatArray, translation: FloatA
     return cost.weights * cost.residuals(distance) ** 2
 
 
-def _offset_of(
+def offset_of(
     residual: FloatArray, weights: FloatArray, loss: FloatArray, offset: str
 ) -> FloatArray:
     """The offsets of least cost: weighted means, of another loss than squares from the median on.

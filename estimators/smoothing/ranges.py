@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.costs.range_cost import loss_of
+from rbl_gym.estimators.costs.range_cost import SQUARES, loss_of, offset_of
 from rbl_gym.estimators.smoothing.equations import Equations, LogState, Rows
 from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.measurements.offsets import axes_of
 
 # Share of a bias that is new after an interval, at least: two epochs of one time.
 _LEAST_NEW = 1e-12
@@ -115,6 +116,8 @@ class LogRanges:
         (M, N).
     blocks
         Of the biases.
+    offset
+        Whose ranges have an unknown offset in common, new at every epoch; None: nobody's.
     """
 
     link: np.ndarray
@@ -124,6 +127,7 @@ class LogRanges:
     tags: FloatArray
     shape: tuple[int, int]
     blocks: list[BiasBlock]
+    offset: str | None = None
 
     @classmethod
     def gathered(
@@ -134,6 +138,7 @@ class LogRanges:
         anchors: FloatArray,
         tags: FloatArray,
         blocks: list[BiasBlock],
+        offset: str | None = None,
     ) -> LogRanges:
         """Of arrays (..., K, M, N), anchors (..., K or 1, M, 3) and tags (N, 3)."""
         M, N = ranges.shape[-2:]
@@ -151,10 +156,15 @@ class LogRanges:
         places = np.take_along_axis(places, (link // N)[..., None], axis=-2)
         weights = np.where(pick(mask), 1 / pick(variance), 0.0)
         tags_of = tags[link % N]
-        return cls(link, pick(ranges), weights, places, tags_of, (M, N), blocks)
+        return cls(link, pick(ranges), weights, places, tags_of, (M, N), blocks, offset)
 
-    def residual(self, state: LogState) -> tuple[FloatArray, FloatArray]:
-        """Range less prediction (..., K, S) [m], and the derivative (..., K, S, 6) of distances."""
+    def residual(
+        self, state: LogState, loss: FloatArray = SQUARES
+    ) -> tuple[FloatArray, FloatArray]:
+        """Prediction less range (..., K, S) [m], and the derivative (..., K, S, 6) of distances.
+
+        Without the offsets that the loss likes best.
+        """
         turned = np.einsum("...ij,...sj->...si", state.rotation, self.tags)
         gap = turned + state.translation[..., None, :] - self.anchors
         distance = np.sqrt(np.einsum("...i,...i->...", gap, gap))
@@ -171,16 +181,36 @@ class LogRanges:
                 values = np.broadcast_to(values, (*self.link.shape[:-1], values.shape[-1]))
                 values = np.take_along_axis(values, self.link, axis=-1)
             total += values
-        return np.where(self.weights > 0, distance + total - self.ranges, 0.0), J
+        residual = np.where(self.weights > 0, distance + total - self.ranges, 0.0)
+        if self.offset is not None:
+            weights = self.spread(self.weights)
+            found = offset_of(self.spread(residual), weights, loss, self.offset)
+            found = np.broadcast_to(found, weights.shape).reshape((*weights.shape[:-2], -1))
+            found = np.take_along_axis(found, self.link, axis=-1)
+            residual = np.where(self.weights > 0, residual - found, 0.0)
+        return residual, J
+
+    def _centred(self, values: FloatArray, weights: FloatArray) -> FloatArray:
+        """Values (..., K, S, n) less the weighted means of those with the same offset."""
+        if self.offset is None:
+            return values
+        n_tags = self.shape[1]
+        groups = {"tag": self.link % n_tags, "anchor": self.link // n_tags}
+        group = groups.get(self.offset, np.zeros_like(self.link))
+        of = (group[..., None] == np.arange(max(self.shape))).astype(np.float64)
+        total = np.einsum("...ks,...ksg->...kg", weights, of)[..., None]
+        mean = np.swapaxes(of, -1, -2) @ (weights[..., None] * values)
+        return values - of @ (mean / np.where(total > 0, total, 1.0))
 
     def rows(self, state: LogState, loss: FloatArray) -> tuple[Rows, FloatArray]:
         """Rows of the ranges, by weights that a loss leaves at the state, and its cost (...).
 
         Derivatives by constants are by all of the log.
         """
-        residual, J = self.residual(state)
+        residual, J = self.residual(state, loss)
         cost, share = loss_of(self.weights * residual**2, loss, residual < 0)
-        root = np.sqrt(self.weights * share)
+        weights = self.weights * share
+        root = np.sqrt(weights)
         before = np.zeros((*residual.shape, 6 + state.extra.shape[-1]))
         before[..., :6] = J
         constants = np.zeros((*residual.shape, state.constants.shape[-1]))
@@ -190,8 +220,8 @@ class LogRanges:
             columns[...] = 1.0
             if block.each:
                 columns[...] = self.link[..., None] == np.arange(columns.shape[-1])
-        before *= root[..., None]
-        constants *= root[..., None]
+        before = self._centred(before, weights) * root[..., None]
+        constants = self._centred(constants, weights) * root[..., None]
         rows = Rows(root * residual, before, None, constants)
         return rows, cost.sum(axis=(-2, -1))
 
@@ -218,7 +248,11 @@ class LogRanges:
         fitted = np.einsum("...ksi,...kij,...ksj->...ks", A, P, A, optimize=True)
         fitted += 2 * np.einsum("...ksi,...kia,...ksa->...ks", A, crossed, C, optimize=True)
         fitted += np.einsum("...ksa,...ab,...ksb->...ks", C, constants, C, optimize=True)
-        return (r**2).sum(axis=-1), (self.weights > 0).sum(axis=-1) - fitted.sum(axis=-1)
+        free = (self.weights > 0).sum(axis=-1) - fitted.sum(axis=-1)
+        if self.offset is not None:
+            there = (self.spread(self.weights) > 0).any(axis=axes_of(self.offset), keepdims=True)
+            free = free - there.sum(axis=(-2, -1))
+        return (r**2).sum(axis=-1), free
 
     def spread(self, values: FloatArray) -> FloatArray:
         """Values (..., K, S) as (..., K, M, N), zero where nothing was measured."""

@@ -18,7 +18,12 @@ from numpy.typing import ArrayLike
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count
 from rbl_gym.estimators.costs.map_problem import PoseState, positive_inverse
 from rbl_gym.estimators.costs.range_cost import SQUARES, huber
-from rbl_gym.estimators.inputs import check_covariance, check_epoch, epoch_variance
+from rbl_gym.estimators.inputs import (
+    check_covariance,
+    check_epoch,
+    check_offset_epoch,
+    epoch_variance,
+)
 from rbl_gym.estimators.smoothing.equations import (
     Equations,
     Factor,
@@ -30,6 +35,7 @@ from rbl_gym.estimators.smoothing.equations import (
 from rbl_gym.estimators.smoothing.motion import Motion
 from rbl_gym.estimators.smoothing.ranges import LogRanges, add_biases, bias_blocks, bias_of
 from rbl_gym.geometry import rotations
+from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.noise_laws import NoiseLaw
 
@@ -89,6 +95,9 @@ class LogModel:
     loss
         Of the ranges' residuals, of `rbl_gym.estimators.costs.range_cost`: squares, or `huber`.
         One that is not convex is started with Huber's.
+    offset
+        Whose ranges have an unknown offset in common, new at every epoch, as `IteratedEkf`;
+        variances are then taken at the distances from the start.
     """
 
     tags: FloatArray
@@ -97,12 +106,14 @@ class LogModel:
     biases: tuple[LinkBias, ...] = ()
     factors: tuple[Factor, ...] = ()
     loss: FloatArray = dataclasses.field(default_factory=lambda: SQUARES)
+    offset: str | None = None
 
     def __post_init__(self) -> None:
         tags = check_array("tags", self.tags, ("N", 3))
         if tags.ndim != 2:
             raise ValueError(f"tags must be (N, 3), got shape {tags.shape}")
         object.__setattr__(self, "tags", tags)
+        offsets.check_offset(self.offset)
         for law in self.biases:
             if not isinstance(law, LinkBias):
                 raise ValueError(f"biases must be a tuple of LinkBias, got {law!r:.80}")
@@ -192,13 +203,14 @@ def smooth(
     if model.motion.turning:
         P = _of_errors(P, state)
     e = 6 + len(model.motion.extra_std)
-    spread, shape = problem.ranges.spread, problem.ranges.shape
+    shape = problem.ranges.shape
+    residuals = problem.ranges.spread(-problem.ranges.residual(state, losses[-1])[0])
     biases = bias_of(problem.ranges.blocks, state, shape[0] * shape[1])
     return Smoothed(
         state.rotation, state.translation, P[..., :6, :6],
         state.extra[..., : e - 6], P[..., 6:e, 6:e],
         biases.reshape((*biases.shape[:-1], *shape)), state.constants, constants,
-        spread(-problem.ranges.residual(state)[0]), squares, freedom, equations.cost, converged,
+        residuals, squares, freedom, equations.cost, converged,
     )  # fmt: skip
 
 
@@ -294,8 +306,11 @@ def _checked(
     times = check_array("times", log.times, ("K",))
     if (np.diff(times) < 0).any():
         raise ValueError("times must not decrease")
-    ranges, anchors, mask = check_epoch(log.ranges, log.anchors, log.links, model.tags)
-    variance = epoch_variance(log.noise, model.noise, ranges, mask)
+    if model.offset is None:
+        ranges, anchors, mask = check_epoch(log.ranges, log.anchors, log.links, model.tags)
+    else:
+        epoch = log.ranges, log.anchors, log.links, model.tags
+        ranges, anchors, mask = check_offset_epoch(*epoch, model.offset)
     rotation, translation, covariance = prior
     rotation = rotations.check_rotation("prior rotation", rotation)
     translation = check_array("prior translation", translation, (3,))
@@ -316,11 +331,15 @@ def _checked(
             f"log, prior and start must fit {K} times, got ranges {ranges.shape}, anchors "
             f"{anchors.shape}, start {Q.shape} and {t.shape}, prior {covariance.shape}"
         ) from error
+    told = ranges
+    if model.offset is not None:
+        told = ranging.distances(anchors, ranging.tag_positions(Q, t, model.tags))
+    variance = epoch_variance(log.noise, model.noise, told, mask)
     motion, factors = model.motion, model.factors
     M, N = ranges.shape[-2:]
     constants = sum(len(factor.constants_std) for factor in (motion, *factors))
     blocks, extra, constants = bias_blocks(model.biases, M * N, len(motion.extra_std), constants)
-    gathered = LogRanges.gathered(ranges, variance, mask, anchors, model.tags, blocks)
+    gathered = LogRanges.gathered(ranges, variance, mask, anchors, model.tags, blocks, model.offset)
     state = LogState(Q, t, np.zeros((*batch, K, extra)), np.zeros((*batch, constants)))
     pose = PoseState(rotation, translation, covariance)
     information = positive_inverse(covariance)
