@@ -270,8 +270,9 @@ def test_the_command_writes_what_replay_reads(tmp_path, capsys):
     figures = json.loads(capsys.readouterr().out)
     assert len(figures["nodes"]) == 10
     assert main(["calibrate", *arguments, "--calibration", str(out / "calibration.csv")]) == 2
-    assert main(["calibrate", *arguments[:2], *arguments[4:]]) == 2
-    assert "--truth is missing" in capsys.readouterr().err
+    assert "without --calibration" in capsys.readouterr().err
+    assert main(["calibrate", *arguments, "--start", "ranges"]) == 2
+    assert "--start means nothing with --truth" in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.reading_options import add_reading, read_runs
@@ -14,12 +13,15 @@ def add_calibrate(commands: Any) -> None:
     """The parser of ``rbl-gym calibrate``."""
     calibrate = commands.add_parser(
         "calibrate",
-        help="biases of links, lever arms, clock and noise from a recording with truth",
-        description="Calibrate radios by a recording with truth. See docs/calibration.md.",
+        help="biases, lever arms, clock and noise by truth; without truth the anchors' places",
+        description="With --truth: biases and slopes of links, tags, clock, noise. Without it: "
+        "anchors surveyed by the ranges of a moving body. See docs/calibration.md.",
     )
     add_reading(calibrate)
-    _add_links(calibrate.add_argument_group("what is estimated"))
+    _add_plane(calibrate.add_argument_group("what is known of the body's place"))
+    _add_links(calibrate.add_argument_group("what is estimated with --truth"))
     _add_truth(calibrate.add_argument_group("the truth"))
+    _add_anchors(calibrate.add_argument_group("anchors surveyed without --truth"))
     output = calibrate.add_argument_group("output")
     output.add_argument(
         "--out", metavar="DIR", help="folder of calibration.csv and tags.csv, which replay reads"
@@ -51,17 +53,21 @@ def _add_links(group: Any) -> None:
         help="the table of tags holds; is turned and shifted as a whole (default); or every tag is "
         "found by itself",
     )
+
+
+def _add_plane(group: Any) -> None:
     group.add_argument(
         "--planar",
         action="store_true",
         default=None,
-        help="a body in a level plane: only the heading of the truth is read",
+        help="a body in a level plane: only the heading of the truth is read; anchors keep their "
+        "heights",
     )
     group.add_argument(
         "--height-offset-m",
         type=float,
         metavar="X",
-        help="of the tags' mean height below the anchors', where the truth has no heights",
+        help="of the tags' mean height below the anchors', where no truth tells heights",
     )
 
 
@@ -86,36 +92,95 @@ def _add_truth(group: Any) -> None:
     )
 
 
-def _calibrate(options: argparse.Namespace) -> int:
-    from rbl_gym.studies import calibrate
+def _add_anchors(group: Any) -> None:
+    group.add_argument(
+        "--start",
+        choices=("table", "ranges"),
+        help="the places in --anchors are rough (default); or nothing is known of them",
+    )
+    group.add_argument(
+        "--known", type=_names, metavar="ID,ID,...", help="anchors whose places in --anchors hold"
+    )
+    group.add_argument(
+        "--anchor-ranges", metavar="F", help="anchor_a,anchor_b,range: between anchors"
+    )
+    for name, text in (
+        ("--bias-m", "bias that all ranges have in common, default 0"),
+        ("--bias-std-m", "how well it is known, default 0.5"),
+        ("--link-std-m", "of what each link has beside it, default 0.05"),
+    ):
+        group.add_argument(name, type=float, metavar="X", help=text)
 
-    if options.truth is None:
-        raise ValueError("--truth is missing: links are calibrated by truth")
+
+_WITH_TRUTH = {
+    "biases": "--model",
+    "slopes": "--no-slopes",
+    "tags_model": "--arms",
+    "time_offset": "--time-offset",
+    "truth_gap_s": "--truth-gap-s",
+    "truth_exclude": "--truth-exclude",
+}
+_WITHOUT = {
+    "start": "--start",
+    "known": "--known",
+    "bias_m": "--bias-m",
+    "bias_std_m": "--bias-std-m",
+    "link_std_m": "--link-std-m",
+    "anchor_ranges": "--anchor-ranges",
+}
+
+
+def _calibrate(options: argparse.Namespace) -> int:
     if options.calibration is not None:
         raise ValueError("calibrate takes ranges as the radios gave them, without --calibration")
-    names = ("biases", "slopes", "planar", "height_offset_m", "time_offset", "truth_gap_s")
+    mine, others = (_WITH_TRUTH, _WITHOUT) if options.truth else (_WITHOUT, _WITH_TRUTH)
+    if wrong := [option for name, option in others.items() if getattr(options, name) is not None]:
+        raise ValueError(f"{wrong[0]} means nothing with{'' if options.truth else 'out'} --truth")
+    names = [*mine, "planar", "height_offset_m"]
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.tags_model:
-        given["tags"] = options.tags_model
-    if options.truth_exclude:
-        given["truth_exclude"] = tuple(options.truth_exclude)
-    settings = calibrate.LinkSettings(**given)
-    runs = read_runs(options)
-    with progress("calibrate", 4) as advance:
-        found = calibrate.calibrate_links(runs, settings, advance)
-    files = {}
-    if options.out:
-        folder = Path(options.out)
-        files = {name: str(folder / f"{name}.csv") for name in ("calibration", "tags")}
-        calibrate.write_link_table(files["calibration"], found.fit, *found[3:5])
-        calibrate.write_points(files["tags"], "tag", found.tag_ids, found.fit.tags)
+    found = (_links if options.truth else _anchors)(options, given)
+    files = found.write(options.out) if options.out else {}
     if options.plot:
         from rbl_gym.app import calibrate_figures, figures
 
-        figures.save_figure(calibrate_figures.links_figure(found), options.plot)
+        figures.save_figure(calibrate_figures.figure_of(found), options.plot)
     if write_json(found.figures, options.json):
         from rbl_gym.app import calibrate_report
 
-        calibrate_report.print_links(found.figures)
+        calibrate_report.print_calibrated(found.figures)
         print_files(**files, picture=options.plot)
     return 0
+
+
+def _links(options: argparse.Namespace, given: dict[str, Any]) -> Any:
+    from rbl_gym.studies import calibrate
+
+    if "tags_model" in given:
+        given["tags"] = given.pop("tags_model")
+    if "truth_exclude" in given:
+        given["truth_exclude"] = tuple(given["truth_exclude"])
+    settings = calibrate.LinkSettings(**given)
+    runs = read_runs(options)
+    with progress("calibrate", 4) as advance:
+        return calibrate.calibrate_links(runs, settings, advance)
+
+
+def _anchors(options: argparse.Namespace, given: dict[str, Any]) -> Any:
+    from rbl_gym.studies import calibrate
+
+    path = given.pop("anchor_ranges", None)
+    settings = calibrate.AnchorSettings(**given)
+    runs = read_runs(options)
+    if len(runs) > 1:
+        raise ValueError(
+            f"anchors are surveyed by one run, and {options.ranges} has {len(runs)}, "
+            f"{[*runs]!r:.200}: choose one by --run"
+        )
+    (recording,) = runs.values()
+    pairs = None if path is None else calibrate.read_anchor_ranges(path, recording.anchor_ids)
+    with progress("calibrate", 3) as advance:
+        return calibrate.survey_anchors(recording, settings, pairs, advance)
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(part.strip() for part in text.split(","))

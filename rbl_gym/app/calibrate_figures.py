@@ -7,14 +7,51 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from rbl_gym.app.figures import new_figure, styled
-from rbl_gym.studies.calibrate import CalibratedLinks
+from rbl_gym.app.figures import ellipse, new_figure, styled
+from rbl_gym.studies.calibrate import CalibratedLinks, SurveyedAnchors
 
 _MOST_POINTS = 20_000
 
 
 @styled
-def links_figure(found: CalibratedLinks) -> Figure:
+def figure_of(found: CalibratedLinks | SurveyedAnchors) -> Figure:
+    """The picture of either kind of calibration."""
+    return _links_figure(found) if isinstance(found, CalibratedLinks) else _anchors_figure(found)
+
+
+def _anchors_figure(found: SurveyedAnchors) -> Figure:
+    """Anchors with their ellipses, magnified, and the body's path; residuals by anchor."""
+    figure = new_figure(12, 5.6)
+    left, right = figure.subplots(1, 2, width_ratios=[1.2, 1])
+    state, cov = found.survey.state, found.survey.covariance
+    left.plot(*state.translation[:, :2].T, ".", ms=1.5, color="0.6", label="body")
+    left.plot(*state.anchors[:, :2].T, "k^", ms=6, label="anchors")
+    size = float(np.ptp(state.anchors[:, :2], axis=0).max())
+    widest = 2.5 * float(np.sqrt(max(np.diag(cov)[:-1].max(), 1e-12)))
+    magnify = 10.0 ** np.floor(np.log10(max(0.15 * size / widest, 1.0)))
+    for m, name in enumerate(found.anchor_ids):
+        ring = magnify * ellipse(cov[3 * m : 3 * m + 2, 3 * m : 3 * m + 2])
+        left.plot(*(ring + state.anchors[m, :2]).T, color="#1b7f5c", lw=1.2)
+        left.annotate(name, state.anchors[m, :2], xytext=(5, 5), textcoords="offset points")
+    left.set_aspect("equal", adjustable="datalim")
+    left.set_title(f"95 % ellipses x {magnify:g}", fontsize=9)
+    left.set_xlabel("x [m]")
+    left.set_ylabel("y [m]")
+    left.legend(frameon=False, fontsize=8)
+    left.grid(alpha=0.25, lw=0.5)
+    e = found.survey.residuals
+    by_anchor = [e[:, m][e[:, m] != 0] for m in range(len(found.anchor_ids))]
+    if any(len(values) for values in by_anchor):
+        right.boxplot(by_anchor, showfliers=False, whis=(2.5, 97.5))
+        right.set_xticks(range(1, len(by_anchor) + 1), found.anchor_ids)
+    right.axhline(0, color="0.4", lw=0.6)
+    right.set_xlabel("anchor")
+    right.set_ylabel("residual [m]: quartiles, 95 %")
+    right.grid(alpha=0.25, lw=0.5)
+    return figure
+
+
+def _links_figure(found: CalibratedLinks) -> Figure:
     """Biases of the links, residuals over distance, their histogram; tags in the body frame."""
     figure = new_figure(12, 7.2)
     axes = figure.subplots(2, 2)

@@ -8,7 +8,33 @@ from typing import Any
 from rbl_gym.app.tables import new_console, new_table
 
 
-def print_links(figures: dict[str, Any]) -> None:
+def print_calibrated(figures: dict[str, Any]) -> None:
+    """Links, or anchors, and what is not determined."""
+    (_print_links if "links" in figures else _print_anchors)(figures)
+
+
+def _print_anchors(figures: dict[str, Any]) -> None:
+    console = new_console()
+    table = new_table(f"{figures['ranges']} ranges of {figures['epochs']} epochs [m]")
+    table.add_column("anchor")
+    for heading in ("x", "y", "z", "+-x", "+-y", "+-z"):
+        table.add_column(heading, justify="right")
+    for row in figures["anchors"]:
+        std = ["known"] * 3 if row["known"] else [f"{x:.3f}" for x in row["std_m"]]
+        table.add_row(row["anchor"], *(f"{x:.3f}" for x in row["place_m"]), *std)
+    console.print(table)
+    console.print(f"Frame: {figures['frame']}.")
+    console.print(
+        f"Common bias: {figures['common_bias_m']:.3f} m, +- {figures['common_bias_std_m']:.3f}; "
+        f"size of the layout +- {100 * figures['scale_std']:.2g} %, correlation of the two "
+        f"{figures['scale_bias_correlation']:.2f}."
+    )
+    console.print(f"Noise of a range: {figures['noise_std_m']:.3f} m.")
+    for what in figures["not_determined"]:
+        console.print(f"Not determined: {what}.")
+
+
+def _print_links(figures: dict[str, Any]) -> None:
     """Links, tags, clock, and what is not determined."""
     console = new_console()
     title = f"{figures['ranges']} ranges, biases by {figures['biases']}"

@@ -1,13 +1,23 @@
 """Calibration from logs: links, tags and clocks by truth; anchors without it."""
 
+from rbl_gym.studies.calibrate.anchors import (
+    AnchorSettings,
+    SurveyedAnchors,
+    read_anchor_ranges,
+    survey_anchors,
+)
 from rbl_gym.studies.calibrate.files import write_link_table, write_points
 from rbl_gym.studies.calibrate.links import CalibratedLinks, calibrate_links
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
 __all__ = [
+    "AnchorSettings",
     "CalibratedLinks",
     "LinkSettings",
+    "SurveyedAnchors",
     "calibrate_links",
+    "read_anchor_ranges",
+    "survey_anchors",
     "write_link_table",
     "write_points",
 ]

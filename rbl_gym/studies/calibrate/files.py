@@ -4,38 +4,43 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.estimators.calibration import LinkFit
 
 __all__ = ["write_link_table", "write_points"]
 
 
 def write_link_table(
-    path: str | os.PathLike[str], fit: LinkFit, anchor_ids: Sequence[str], tag_ids: Sequence[str]
+    path: str | os.PathLike[str],
+    anchor_ids: Sequence[str],
+    tag_ids: Sequence[str],
+    columns: Mapping[str, FloatArray],
+    told: ArrayLike,
 ) -> None:
-    """Write ``anchor,tag,bias_m,slope,sigma_m,bias_std_m,slope_std``, a row a link.
+    """Write ``anchor,tag,bias_m,...``, a row a link.
 
     Parameters
     ----------
     path
         File; its folder is made.
-    fit
-        Of `calibrate_links`; links without ranges are left out.
     anchor_ids, tag_ids
-        In the order of its arrays.
+        In the order of the arrays.
+    columns
+        (M, N) each, by the names in the header.
+    told
+        (M, N) links that have a row.
     """
-    columns = fit.bias_m, fit.slope, fit.noise_std_m, fit.bias_std_m, fit.slope_std
     _write(
         path,
-        ("anchor", "tag", "bias_m", "slope", "sigma_m", "bias_std_m", "slope_std"),
+        ("anchor", "tag", *columns),
         [
-            [anchor_ids[m], tag_ids[n], *(f"{column[m, n]:.6f}" for column in columns)]
-            for m, n in np.argwhere(fit.counts > 0)
+            [anchor_ids[m], tag_ids[n], *(f"{column[m, n]:.6f}" for column in columns.values())]
+            for m, n in np.argwhere(np.asarray(told))
         ],
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from rbl_gym.estimators.calibration.clock import Clock
 from rbl_gym.estimators.calibration.link_equations import ARM_M, BIAS_M, SLOPE, TURN_RAD
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.calibrate.files import write_link_table, write_points
 from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_of, path_at
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
@@ -40,6 +42,8 @@ class CalibratedLinks(NamedTuple):
         Of the truth; None where it was told or the ranges do not tell it.
     anchor_ids, tag_ids
         In the order of the arrays.
+    distances
+        (K, M, N) along the path, metres; NaN where there is no range.
     figures
         Plain numbers: what `rbl-gym calibrate --json` writes.
     """
@@ -51,6 +55,22 @@ class CalibratedLinks(NamedTuple):
     tag_ids: tuple[str, ...]
     distances: Any
     figures: dict[str, Any]
+
+    def write(self, folder: str | os.PathLike[str]) -> dict[str, str]:
+        """Write ``calibration.csv`` and ``tags.csv`` into a folder; their paths by name."""
+        paths = {name: os.path.join(folder, f"{name}.csv") for name in ("calibration", "tags")}
+        fit = self.fit
+        columns = {
+            "bias_m": fit.bias_m,
+            "slope": fit.slope,
+            "sigma_m": fit.noise_std_m,
+            "bias_std_m": fit.bias_std_m,
+            "slope_std": fit.slope_std,
+        }
+        ids = self.anchor_ids, self.tag_ids
+        write_link_table(paths["calibration"], *ids, columns, fit.counts > 0)
+        write_points(paths["tags"], "tag", self.tag_ids, fit.tags)
+        return paths
 
 
 def calibrate_links(

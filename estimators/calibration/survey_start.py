@@ -1,0 +1,160 @@
+"""Where a survey of anchors starts: poses from rough anchors, or anchors from nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.estimators.calibration.survey import SurveyState
+from rbl_gym.geometry import rotations
+
+__all__ = ["anchors_from_pairs", "anchors_from_points", "start_from_anchors"]
+
+
+def start_from_anchors(
+    ranges: FloatArray,
+    links: BoolArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    bias_m: float = 0.0,
+    planar: bool = False,
+    height_m: float = 0.0,
+) -> SurveyState:
+    """Poses by rough anchors: each tag by squared ranges, the body by its tags.
+
+    Parameters
+    ----------
+    ranges, links
+        (K, M, N) metres, and where there is a range.
+    anchors, tags
+        (M, 3) and (N, 3), metres.
+    bias_m
+        That is taken off the ranges.
+    planar, height_m
+        The body is level, its origin at this height.
+    """
+    points = _multilaterated(ranges - bias_m, links, anchors, planar)
+    K, N = points.shape[:2]
+    if planar:
+        points[..., 2] = height_m + tags[:, 2]
+    told = np.isfinite(points).all(axis=-1)
+    points = np.where(told[..., None], points, np.nan)
+    centre = np.nanmean(np.where(told.any(axis=1)[:, None, None], points, 0.0), axis=1)
+    rotation = np.broadcast_to(np.eye(3), (K, 3, 3)).copy()
+    if N > 1:
+        arms = tags - tags.mean(axis=0)
+        apart = np.where(told[..., None], points - centre[:, None], 0.0)
+        spread = np.einsum("kni,nj->kij", apart, arms)
+        if planar:
+            angle = np.arctan2(spread[:, 1, 0] - spread[:, 0, 1], spread[:, 0, 0] + spread[:, 1, 1])
+            rotation = rotations.exp(angle[:, None] * np.array([0.0, 0.0, 1.0]))
+        else:
+            rotation = rotations.nearest(spread)
+    translation = centre - np.einsum("kij,j->ki", rotation, tags.mean(axis=0))
+    if planar:
+        translation[:, 2] = height_m
+    return SurveyState(anchors.copy(), rotation, translation, bias_m, np.zeros(ranges.shape[1:]))
+
+
+def _multilaterated(
+    ranges: FloatArray, links: BoolArray, anchors: FloatArray, planar: bool
+) -> FloatArray:
+    """Places (K, N, 3) of tags by linear least squares of squared ranges; NaN where too few."""
+    D = 2 if planar else 3
+    centre = anchors.mean(axis=0)
+    A = (anchors - centre)[:, :D]
+    # r^2 - |a|^2 = -2 a s + c, with c = |s|^2 and what the heights add.
+    columns = np.concatenate([-2 * A, np.ones((len(A), 1))], axis=1)
+    y = ranges**2 - (A**2).sum(axis=1)[:, None]
+    w = links / np.maximum(ranges, 0.1) ** 2
+    H = np.einsum("kmn,mi,mj->knij", w, columns, columns)
+    g = np.einsum("kmn,mi,kmn->kni", w, columns, y)
+    enough = links.sum(axis=1) > D
+    H = np.where(enough[..., None, None], H, np.eye(D + 1))
+    # Anchors in a line or a plane: the rest is left at the centre.
+    H = H + 1e-9 * np.trace(H, axis1=-2, axis2=-1)[..., None, None] * np.eye(D + 1)
+    s = np.linalg.solve(H, g[..., None])[..., :D, 0]
+    points = np.full((*s.shape[:2], 3), centre)
+    points[..., :D] += s
+    points[~enough] = np.nan
+    return points
+
+
+def anchors_from_points(
+    ranges: FloatArray, links: BoolArray, bias_m: float = 0.0, planar: bool = False
+) -> FloatArray | None:
+    """Anchors (M, 3) by ranges (P, M) to points of which nothing is known.
+
+    The matrix of squared distances, rows and columns centred, has the rank of space. Its factors
+    are anchors and points but for an affine map, which the anchors' own squares tell linearly.
+
+    Parameters
+    ----------
+    ranges, links
+        (P, M) metres, and where there is a range. Points that miss an anchor are left out.
+    bias_m
+        That is taken off the ranges.
+    planar
+        Anchors at one height, and points at another.
+
+    Returns
+    -------
+    anchors
+        About their centre, turned anyhow, maybe a mirror image; height 0 where `planar`. None where
+        it does not come out: fewer than 6 anchors (10 in space), or ranges too noisy.
+
+    Notes
+    -----
+    Crocco, Del Bue, Murino, "A bilinear approach to the position self-calibration of multiple
+    sensors", IEEE TSP 60 (2012).
+    """
+    D = 2 if planar else 3
+    full = links.all(axis=1)
+    squared = (ranges[full] - bias_m) ** 2
+    M, need = ranges.shape[1], D + D * (D + 1) // 2
+    if need > M - 1 or len(squared) < 2 * need:
+        return None
+    centred = squared - squared.mean(axis=1, keepdims=True)
+    middle = centred.mean(axis=0)
+    right = np.linalg.svd(centred - middle, full_matrices=False)[2]
+    factor = right[:D].T  # (M, D): anchors about their centre are factor @ C
+    # Mean over points: |a_m|^2 - 2 a_m s0 + const, quadratic in the factor by B = C C^T.
+    upper = np.triu_indices(D)
+    products = factor[:, upper[0]] * factor[:, upper[1]] * np.where(upper[0] == upper[1], 1, 2)
+    columns = np.concatenate([products, factor, np.ones((M, 1))], axis=1)
+    solved = np.linalg.lstsq(columns, middle, rcond=None)[0]
+    B = np.zeros((D, D))
+    B[upper] = solved[: len(upper[0])]
+    B = B + np.triu(B, 1).T
+    eigen, vectors = np.linalg.eigh(B)
+    if eigen[0] <= 1e-3 * eigen[-1]:
+        return None
+    anchors = np.zeros((M, 3))
+    anchors[:, :D] = factor @ vectors * np.sqrt(eigen)
+    return anchors - anchors.mean(axis=0)
+
+
+def anchors_from_pairs(pairs: FloatArray, bias_m: float = 0.0, planar: bool = False) -> FloatArray:
+    """Anchors (M, 3) by the ranges between them: classical scaling; maybe a mirror image.
+
+    Pairs (M, M) without a range (0) get the shortest way over others.
+
+    Raises
+    ------
+    ValueError
+        If the anchors fall apart into groups without ranges between them.
+    """
+    from scipy.sparse.csgraph import shortest_path
+
+    d = np.maximum(pairs, pairs.T)
+    d = np.where(d > 0, np.maximum(d - bias_m, 1e-3), 0.0)
+    d = shortest_path(d, directed=False)
+    if not np.isfinite(d).all():
+        raise ValueError("pairs must connect all anchors, got groups without a range between them")
+    M, D = len(d), 2 if planar else 3
+    J = np.eye(M) - 1 / M
+    values, vectors = np.linalg.eigh(-0.5 * J @ d**2 @ J)
+    anchors = np.zeros((M, 3))
+    D = min(D, M)
+    anchors[:, :D] = vectors[:, -D:] * np.sqrt(np.maximum(values[-D:], 0.0))
+    return anchors
