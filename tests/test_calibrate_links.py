@@ -210,6 +210,14 @@ def test_clock_by_hand():
     assert clock.std_s < 0.01
 
 
+def test_a_table_of_links_has_a_row_of_every_link_that_is_told(tmp_path):
+    bias = np.array([[0.1, 0.2], [0.3, 0.4]])
+    path = tmp_path / "new" / "calibration.csv"
+    calibrate.write_link_table(path, "AB", "xy", {"bias_m": bias}, bias > 0.15)
+    rows = path.read_text().splitlines()
+    assert rows == ["anchor,tag,bias_m", "A,y,0.200000", "B,x,0.300000", "B,y,0.400000"]
+
+
 def test_spread_of_residuals_leaves_biases_out():
     rng = np.random.default_rng(1)
     times = 0.1 * np.arange(300)
