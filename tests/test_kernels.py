@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import pickle
+import subprocess
 import sys
 import types
 
@@ -129,14 +130,20 @@ def factor():
 """
 
 
-@needs_numba
-def test_a_kernel_on_disk_is_stale_when_a_helper_in_another_file_changes(tmp_path):
+def package_of_its_own(tmp_path):
+    """A copy of how kernels are compiled, with one kernel; its folder."""
     package = tmp_path / "rbl_gym" / "kernels"
     package.mkdir(parents=True)
     (tmp_path / "rbl_gym" / "__init__.py").touch()
     for file in ("__init__.py", "jit.py"):
         (package / file).write_bytes((ROOT / "rbl_gym" / "kernels" / file).read_bytes())
     (package / "kernel.py").write_text(_KERNEL)
+    return package
+
+
+@needs_numba
+def test_a_kernel_on_disk_is_stale_when_a_helper_in_another_file_changes(tmp_path):
+    package = package_of_its_own(tmp_path)
     code = f"""
 sys.path.insert(0, {str(tmp_path)!r})
 from rbl_gym.kernels import kernel
@@ -151,6 +158,32 @@ print(kernel.scaled.build()(1.0))
     assert len(saved) == 2
     assert len({len(files) for files in saved}) == 1
     assert all(files for files in saved)
+
+
+@needs_numba
+def test_one_process_compiles_at_a_time(tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    package = package_of_its_own(tmp_path)
+    (package / "helper.py").write_text(_HELPER.format(2.0))
+    code = f"""
+import sys
+sys.path.insert(0, {str(tmp_path)!r})
+from rbl_gym.kernels import kernel
+print("ready", flush=True)
+print(kernel.scaled.build()(1.0))
+"""
+    cache = package / "__pycache__"
+    cache.mkdir()
+    with (cache / "kernels.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        other = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert other.stdout is not None
+        assert other.stdout.readline() == "ready\n"
+        with pytest.raises(subprocess.TimeoutExpired):
+            other.wait(0.5)
+        assert not list(cache.glob("*scaled*"))
+    assert other.communicate(timeout=120)[0] == "2.0\n"
+    assert list(cache.glob("*scaled*"))
 
 
 # --- small matrices and rotations -------------------------------------------------------------

@@ -5,13 +5,19 @@ Only modules of kernels import this one; it imports numba.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import numba
+
+try:
+    import fcntl
+except ImportError:  # not on Windows
+    fcntl = None
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -47,8 +53,8 @@ def _keyed(base: Any, stamp: str) -> Any:
     return Locator
 
 
-def _find_cache() -> bool:
-    """Whether kernels can be kept on disk.
+def _find_cache() -> Path | None:
+    """The folder in which kernels are kept; None: they are not.
 
     numba takes a kernel for stale when its own file changes; ours are when any file of this
     package does. Nothing public lets us say so: where the private names are gone, or no folder
@@ -65,19 +71,49 @@ def _find_cache() -> bool:
         )
         ours = [_keyed(base, stamp) for base in bases]
         caching.CacheImpl._locator_classes[:0] = ours
+        for locator in ours:
+            found = locator.from_function(contents_hash, __file__)
+            if found is not None:
+                found.ensure_cache_path()
+                return Path(found.get_cache_path())
     except (ImportError, AttributeError, OSError):
-        return False
-    return any(locator.from_function(contents_hash, __file__) for locator in ours)
+        pass
+    return None
 
 
 _CACHE = _find_cache()
+_KEPT = _CACHE is not None
+
+
+@contextlib.contextmanager
+def _alone() -> Iterator[None]:
+    """One process compiles at a time, and the others find on disk what it made.
+
+    A kernel is kept in several files. Those of one process call functions by names that those of
+    another do not have: a mixture crashes the interpreter.
+    """
+    with _lock_file() as file:
+        if file is not None and fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX)  # released as the file closes
+        yield
+
+
+def _lock_file() -> contextlib.AbstractContextManager[IO[str] | None]:
+    if _CACHE is None or fcntl is None:
+        return contextlib.nullcontext()
+    try:
+        return (_CACHE / "kernels.lock").open("w")
+    except OSError:
+        return contextlib.nullcontext()
+
+
 # numba's annotations leave out options that it takes.
 _njit: Any = numba.njit
 
 
 def helper(function: F) -> F:
     """Compile a function that kernels call; division by zero gives inf, as in NumPy."""
-    return _njit(error_model="numpy", cache=_CACHE, no_cfunc_wrapper=True)(function)
+    return _njit(error_model="numpy", cache=_KEPT, no_cfunc_wrapper=True)(function)
 
 
 def inlined(function: F) -> F:
@@ -85,7 +121,7 @@ def inlined(function: F) -> F:
 
     A call takes 0.1 us and more, as an array is passed as seven numbers.
     """
-    return _njit(error_model="numpy", cache=_CACHE, no_cfunc_wrapper=True, forceinline=True)(
+    return _njit(error_model="numpy", cache=_KEPT, no_cfunc_wrapper=True, forceinline=True)(
         function
     )
 
@@ -116,8 +152,9 @@ def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
                 rank = rank if place < inputs else max(rank, 1)
                 kind = _TYPES[letter]
                 arguments.append(kind[(slice(None),) * rank] if rank else kind)
-            made = numba.guvectorize([tuple(arguments)], signature, nopython=True, cache=_CACHE)
-            made = made(function)
+            with _alone():
+                made = numba.guvectorize([tuple(arguments)], signature, nopython=True, cache=_KEPT)
+                made = made(function)
             # What numba wraps around NumPy's own takes a microsecond a call.
             return getattr(made, "ufunc", made)
 
