@@ -1,0 +1,107 @@
+"""The commands rbl-gym demo and rbl-gym reproduce: the experiments of the papers."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from rbl_gym.app.terminal import (
+    add_html,
+    add_json,
+    add_trials,
+    check_html,
+    print_files,
+    progress,
+    write_json,
+)
+
+
+def add_demo(commands: Any) -> None:
+    """The parser of ``rbl-gym demo``."""
+    demo = commands.add_parser(
+        "demo",
+        help="the tracking paper's experiment: five filters against the bound",
+        description="Monte-Carlo tracking of a rigid body (CAMSAP 2013): a table, a picture.",
+    )
+    add_trials(demo)
+    demo.add_argument("--plot", default="out/demo.png", metavar="F", help="default out/demo.png")
+    add_html(demo, "3-D page of a trial, charts and tables")
+    add_json(demo)
+    demo.set_defaults(run=_demo)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from rbl_gym.studies.papers import camsap2013
+
+    check_html(options)
+    with progress("tracking") as advance:
+        result = camsap2013.tracking_experiment(options.trials, options.seed, advance)
+    from rbl_gym.app import figures, reports
+
+    example = camsap2013.example(options.seed)
+    figures.save_figure(figures.camsap2013_figure(result, example), options.plot)
+    if options.html:
+        from rbl_gym.app import page, track_pages
+
+        page.write(track_pages.demo_page(result, example), options.html)
+    if write_json(result, options.json):
+        reports.print_camsap2013(result)
+        print_files(picture=options.plot, page=options.html)
+    return 0
+
+
+def add_reproduce(commands: Any) -> None:
+    """The parser of ``rbl-gym reproduce``."""
+    from rbl_gym.app.papers import experiments
+
+    reproduce = commands.add_parser(
+        "reproduce",
+        help="an experiment of a paper, or our own: tables, figures, CSV",
+        description="; ".join(f"{name}: {e.summary}" for name, e in experiments().items()),
+    )
+    reproduce.add_argument("experiment", choices=sorted(experiments()))
+    add_trials(reproduce)
+    reproduce.add_argument("--plot", metavar="F", help="default out/EXPERIMENT.png")
+    reproduce.add_argument("--csv", metavar="F", help="every figure as a row")
+    network = reproduce.add_argument_group("network2009")
+    network.add_argument(
+        "--positions", metavar="F", help="CSV, header x,y: fixed points, the reference first"
+    )
+    network.add_argument(
+        "--footprint",
+        dest="footprints",
+        metavar="R",
+        type=float,
+        nargs="+",
+        help="sensing radii, in the unit of the positions",
+    )
+    network.add_argument(
+        "--variance",
+        metavar="S2",
+        type=float,
+        help="of a bearing, rad^2; default 0.1, in Figs 5 and 6 0.01",
+    )
+    add_json(reproduce)
+    reproduce.set_defaults(run=_reproduce)
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    from rbl_gym.app import papers
+
+    experiment = papers.experiments()[options.experiment]
+    named = ("positions", "footprints", "variance")
+    given = {name: getattr(options, name) for name in named if getattr(options, name) is not None}
+    if wrong := [name for name in given if name not in experiment.options]:
+        raise ValueError(f"{options.experiment} takes no {' and no '.join(wrong)}")
+    with progress(options.experiment) as advance:
+        result = experiment.run(options.trials, options.seed, advance, **given)
+    from rbl_gym.app import figures
+
+    plot = options.plot or f"out/{options.experiment}.png"
+    figures.save_figure(experiment.figure(result, options.seed), plot)
+    if options.csv:
+        papers.write_csv(result, options.csv)
+    if write_json(result, options.json):
+        experiment.show(result)
+        print_files(picture=plot)
+    return 0
