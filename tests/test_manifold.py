@@ -7,8 +7,9 @@ import pytest
 
 from rbl_gym import bounds, estimators, metrics, motion
 from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.costs.losses import SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
-from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, huber
+from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.geometry import bodies, rotations

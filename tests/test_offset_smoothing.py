@@ -8,7 +8,7 @@ from scipy import optimize
 
 from rbl_gym import metrics, ranging
 from rbl_gym.bounds import smoothing as bound
-from rbl_gym.estimators.costs.range_cost import huber
+from rbl_gym.estimators.costs.losses import huber
 from rbl_gym.estimators.smoothing import KnownTwist, LogModel, RangeLog, causal_track, smooth
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets

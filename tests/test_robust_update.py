@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import estimators, metrics, motion
-from rbl_gym.estimators.costs.range_cost import cut_huber, huber, loss_of, redescending
+from rbl_gym.estimators.costs.losses import cut_huber, huber, loss_of, redescending
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import monte_carlo

@@ -10,7 +10,7 @@ from scipy import optimize
 
 from rbl_gym import estimators, metrics, ranging
 from rbl_gym.bounds import smoothing as bound
-from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, huber
+from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.smoothing import (
     Factor,
     KnownTwist,

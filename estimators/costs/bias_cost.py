@@ -22,8 +22,8 @@ from rbl_gym.estimators.costs.levenberg_marquardt import (
     Solution,
     minimize_pose,
 )
+from rbl_gym.estimators.costs.losses import loss_of
 from rbl_gym.estimators.costs.map_problem import positive_inverse
-from rbl_gym.estimators.costs.range_cost import loss_of
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations

@@ -14,7 +14,8 @@ import numpy as np
 from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization
-from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, loss_of
+from rbl_gym.estimators.costs.losses import SQUARES, loss_of
+from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.measurements import bearing
 
 
@@ -31,7 +32,7 @@ class DoaCost:
     station
         (..., 3), the base station, metres.
     loss
-        Of the squared whitened residuals, (..., 5), as of `range_cost.loss_of`.
+        Of the squared whitened residuals, (..., 5), as of `losses.loss_of`.
     """
 
     angles: FloatArray

@@ -20,8 +20,8 @@ from rbl_gym.bounds.twist import covariance_after
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
+from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
-from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, huber
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state

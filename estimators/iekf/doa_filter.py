@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_one_of
 from rbl_gym.estimators.costs.doa_cost import DoaCost, SumCost
+from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import (
     MapProblem,
     PoseState,
@@ -19,7 +20,7 @@ from rbl_gym.estimators.costs.map_problem import (
     minimize,
     positive_inverse,
 )
-from rbl_gym.estimators.costs.range_cost import LATE, SQUARES, RangeCost, huber
+from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import register
 from rbl_gym.estimators.iekf.manifold import IteratedEkf

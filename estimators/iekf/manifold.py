@@ -24,8 +24,9 @@ from rbl_gym.checks import (
     check_duration,
     kernel,
 )
+from rbl_gym.estimators.costs.losses import SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState, map_problem
-from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, huber
+from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.filter import PoseBelief
 from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, as_state, predict_pose, update_pose
 from rbl_gym.estimators.iekf.robust_update import (

@@ -9,8 +9,9 @@ import numpy as np
 
 from rbl_gym.checks import HUGE, FloatArray, kernel
 from rbl_gym.estimators.costs.levenberg_marquardt import minimize_pose
+from rbl_gym.estimators.costs.losses import SQUARES, cut_huber
 from rbl_gym.estimators.costs.map_problem import PoseState, map_problem, positive_inverse
-from rbl_gym.estimators.costs.range_cost import SQUARES, RangeCost, cut_huber
+from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.iekf.robust_update import GATE, HUBER, late_solution, robust_solution
 from rbl_gym.estimators.inputs import plain

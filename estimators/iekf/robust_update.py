@@ -15,14 +15,9 @@ import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution, minimize_pose
+from rbl_gym.estimators.costs.losses import LATE, cut_huber, huber
 from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
-from rbl_gym.estimators.costs.range_cost import (
-    LATE,
-    RangeCost,
-    cut_huber,
-    huber,
-    squared_residuals,
-)
+from rbl_gym.estimators.costs.range_cost import RangeCost, squared_residuals
 
 # Whitened residual at which Huber's loss turns from squares to absolute values.
 HUBER = 1.5

@@ -7,8 +7,9 @@ import itertools
 import numpy as np
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.costs.losses import loss_of
 from rbl_gym.estimators.costs.map_problem import minimize
-from rbl_gym.estimators.costs.range_cost import RangeCost, loss_of, squared_residuals
+from rbl_gym.estimators.costs.range_cost import RangeCost, squared_residuals
 
 # Places to begin at, on every axis in halves of the anchors' extent; flat ones are as deep as this
 # share of their longest axis.

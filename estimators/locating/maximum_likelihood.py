@@ -13,12 +13,9 @@ import numpy as np
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray, are_finite, kernel
 from rbl_gym.estimators.costs.levenberg_marquardt import Linearization, Solution
+from rbl_gym.estimators.costs.losses import loss_of
 from rbl_gym.estimators.costs.map_problem import minimize, positive_inverse
-from rbl_gym.estimators.costs.range_cost import (
-    RangeCost,
-    loss_of,
-    squared_residuals,
-)
+from rbl_gym.estimators.costs.range_cost import RangeCost, squared_residuals
 from rbl_gym.estimators.linear.least_squares import points_fit
 from rbl_gym.estimators.linear.squared_range import statistic
 from rbl_gym.estimators.locating.differences import places_of_differences

@@ -9,14 +9,9 @@ import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray, are_finite
 from rbl_gym.estimators.costs.levenberg_marquardt import Solution
+from rbl_gym.estimators.costs.losses import LATE, geman_mcclure, huber
 from rbl_gym.estimators.costs.map_problem import minimize
-from rbl_gym.estimators.costs.range_cost import (
-    LATE,
-    RangeCost,
-    geman_mcclure,
-    huber,
-    squared_residuals,
-)
+from rbl_gym.estimators.costs.range_cost import RangeCost, squared_residuals
 from rbl_gym.estimators.linear.least_squares import points_fit
 from rbl_gym.estimators.linear.squared_range import statistic
 from rbl_gym.estimators.locating.maximum_likelihood import (

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators.costs.range_cost import SQUARES, loss_of, offset_of
+from rbl_gym.estimators.costs.losses import SQUARES, loss_of
+from rbl_gym.estimators.costs.range_cost import offset_of
 from rbl_gym.estimators.smoothing.equations import Equations, LogState, Rows
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.offsets import axes_of

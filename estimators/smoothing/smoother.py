@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count
+from rbl_gym.estimators.costs.losses import SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState, positive_inverse
-from rbl_gym.estimators.costs.range_cost import SQUARES, huber
 from rbl_gym.estimators.inputs import (
     check_covariance,
     check_epoch,

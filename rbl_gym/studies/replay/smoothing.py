@@ -12,7 +12,7 @@ import numpy as np
 from rbl_gym import estimators
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import smoothing
-from rbl_gym.estimators.costs.range_cost import LATE, SQUARES
+from rbl_gym.estimators.costs.losses import LATE, SQUARES
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.unknown_twist import WanderingTwist
