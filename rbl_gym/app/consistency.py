@@ -143,7 +143,7 @@ def _charts(replayed: Replayed) -> Any:
         1,
         3,
         column_widths=[0.46, 0.27, 0.27],
-        horizontal_spacing=0.1,
+        horizontal_spacing=0.13,
         subplot_titles=["NIS per degree of freedom", "mean residual (m)", "refused (%)"],
     )
     for values, fill in ((high, None), (low, "tonexty")):
@@ -153,7 +153,7 @@ def _charts(replayed: Replayed) -> Any:
         )
     line = {"color": _HONEST, "width": 1.2}
     shown.add_trace(go.Scatter(x=when, y=np.maximum(ratio, 1e-3), mode="lines", line=line), 1, 1)
-    shown.update_yaxes(type="log", row=1, col=1)
+    shown.update_yaxes(type="log", dtick=1, row=1, col=1)
     shown.update_xaxes(title_text="time (s)", title_standoff=4, row=1, col=1)
     rows = replayed.figures["consistency"]["residuals"]["links"]
     anchors, tags = (list(dict.fromkeys(row[kind] for row in rows)) for kind in ("anchor", "tag"))
@@ -163,10 +163,11 @@ def _charts(replayed: Replayed) -> Any:
         mean[at] = np.nan if row["mean_m"] is None else row["mean_m"]
         refused[at] = 100 * row["refused_share"]
     largest = max(float(np.nanmax(np.abs(mean), initial=0.0)), 0.01)
-    for column, values, scale, ends, place in (
-        (2, mean, "RdBu", (-largest, largest), 0.615),
-        (3, refused, "Reds", (0.0, max(float(np.nanmax(refused, initial=0.0)), 1.0)), 1.0),
-    ):
+    for column, values, scale, ends, axis in (
+        (2, mean, "RdBu", (-largest, largest), shown.layout.xaxis2),
+        (3, refused, "Reds", (0.0, max(float(np.nanmax(refused, initial=0.0)), 1.0)),
+         shown.layout.xaxis3),
+    ):  # fmt: skip
         shown.add_trace(
             go.Heatmap(
                 z=values,
@@ -176,7 +177,7 @@ def _charts(replayed: Replayed) -> Any:
                 reversescale=scale == "RdBu",
                 zmin=ends[0],
                 zmax=ends[1],
-                colorbar={"x": place, "thickness": 10, "len": 0.9},
+                colorbar={"x": axis.domain[1], "thickness": 10, "len": 0.9},
                 hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
             ),
             1,

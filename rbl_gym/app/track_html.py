@@ -308,7 +308,7 @@ def _close_title(story: Story) -> str:
     factor = enlargement(story)
     scale = "to scale" if factor == 1 else f"enlarged x {factor:g}"
     centre = "true place" if story.truth is not None else "estimate"
-    return f"close up, about the {centre}: beliefs with 95 % regions, errors {scale}"
+    return f"about the {centre}: 95 % regions, errors {scale}"
 
 
 def _world(story: Story) -> dict[str, Any]:
