@@ -156,10 +156,10 @@ def _notes(
         if outside:
             notes.append(f"Note: the track is outside the volume in {outside} of {count} epochs.")
     if found is not None:
-        nearer = _nearer(recording, track, found, settings)
-        if nearer is not track:
+        if _truth_at_mirror(recording, track, found, settings):
             notes.append("Note: the truth is at the mirror pose.")
-        notes += [f"Note: {hint}." for hint in _fault_hints(recording, nearer, settings)]
+        else:
+            notes += [f"Note: {hint}." for hint in _fault_hints(recording, track, settings)]
     return {**result, "notes": notes}
 
 
@@ -169,16 +169,18 @@ def _stamp_hints(recording: Recording, track: Track, settings: Settings) -> list
     return [*stamp_hints(track.times, truth)]
 
 
-def _nearer(recording: Recording, track: Track, found: TrackErrors, settings: Settings) -> Track:
-    """The track, or that of the mirror pose where both are alive and the truth is at that one."""
+def _truth_at_mirror(
+    recording: Recording, track: Track, found: TrackErrors, settings: Settings
+) -> bool:
+    """Whether the mirror pose is alive, and much nearer to the truth than the track."""
     if track.other is None:
-        return track
+        return False
     image = Track(track.times, *track.other[:3])
     off = track_errors(recording, image, settings)
     assert off is not None
     where = found.known & track.other.alive
     far, near = (np.square(e.position[where]).sum() for e in (found, off))
-    return image if near < _NEARER * far else track
+    return bool(near < _NEARER * far)
 
 
 def _mirror_note(found: dict[str, Any], count: int) -> str:
