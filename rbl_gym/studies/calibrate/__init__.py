@@ -7,14 +7,17 @@ from rbl_gym.studies.calibrate.anchors import (
     survey_anchors,
 )
 from rbl_gym.studies.calibrate.files import write_link_table, write_points
+from rbl_gym.studies.calibrate.inertial import CalibratedInertial, calibrate_inertial
 from rbl_gym.studies.calibrate.links import CalibratedLinks, calibrate_links
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
 __all__ = [
     "AnchorSettings",
+    "CalibratedInertial",
     "CalibratedLinks",
     "LinkSettings",
     "SurveyedAnchors",
+    "calibrate_inertial",
     "calibrate_links",
     "read_anchor_ranges",
     "survey_anchors",

@@ -1,0 +1,80 @@
+"""How an inertial sensor sits on a body, and its clock, by the turns of a truth or a track."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.calibration.turn_rates import SensorTurn, align_turn_rates
+from rbl_gym.geometry import rotations
+from rbl_gym.recordings import InertialLog, TimeOffset, Truth, time_offset
+
+__all__ = ["CalibratedInertial", "calibrate_inertial"]
+
+# Rates of both are those of a grid of this spacing, smoothed by so many points of it.
+_STEP_S, _SMOOTH = 0.02, 5.0
+_LONGEST_GAP_S = 0.2
+
+
+class CalibratedInertial(NamedTuple):
+    """An inertial sensor as the turns tell it.
+
+    Attributes
+    ----------
+    turn
+        Rotation from the sensor's axes to the body's, bias of the gyroscope.
+    clock
+        How far the sensor's clock is ahead of the truth's.
+    """
+
+    turn: SensorTurn
+    clock: TimeOffset
+
+
+def calibrate_inertial(
+    log: InertialLog, truth: Truth, search_s: float | None = None
+) -> CalibratedInertial:
+    """Rotation of a sensor on its body, and its clock, by turn rates.
+
+    Parameters
+    ----------
+    log
+        Of `rbl_gym.recordings.read_inertial`.
+    truth
+        Poses of the body; or the track of a filter, as `Truth(times, rotation, translation)`.
+    search_s
+        Offsets of the clock that are tried, as of `rbl_gym.recordings.time_offset`.
+
+    Raises
+    ------
+    ValueError
+        If the poses have no rotations, the clocks do not come out, or the body turns about one
+        axis.
+    """
+    if truth.rotation is None:
+        raise ValueError("truth must have rotations, got positions alone")
+    middle = 0.5 * (truth.times[1:] + truth.times[:-1])
+    step = np.diff(truth.times)
+    world = rotations.error(truth.rotation[1:], truth.rotation[:-1]) / step[:, None]
+    body = np.einsum("kji,kj->ki", truth.rotation[:-1], world)
+    gyro = log.readings[:, :3]
+    lengths = (np.linalg.norm(a, axis=1) for a in (body, gyro))
+    clock = time_offset(middle, next(lengths), log.times, next(lengths), search_s)
+    stamps = log.times - clock.offset_s
+    grid = np.arange(max(middle[0], stamps[0]), min(middle[-1], stamps[-1]), _STEP_S)
+    known = np.ones(len(grid), dtype=bool)
+    rates = []
+    for times, values in ((stamps, gyro), (middle, body)):
+        after = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
+        known &= times[after] - times[after - 1] <= _LONGEST_GAP_S
+        rates.append(_smoothed(times, values, grid))
+    return CalibratedInertial(align_turn_rates(rates[0][known], rates[1][known]), clock)
+
+
+def _smoothed(times: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
+    """Values (n, 3) on a grid."""
+    columns = [np.interp(grid, times, column) for column in values.T]
+    return gaussian_filter1d(np.stack(columns, axis=-1), _SMOOTH, axis=0, mode="nearest")
