@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.filter import Filter
-from rbl_gym.estimators.inputs import check_epoch, check_variance
+from rbl_gym.estimators.inputs import check_epoch, check_offset_epoch, check_variance
 from rbl_gym.geometry import rotations
+from rbl_gym.measurements import offsets
 from rbl_gym.measurements.ranging import NoiseLaw
 
 # Standard deviations of a range beyond which it contradicts the pose after the update: it is
@@ -83,7 +84,9 @@ def innovations(
     filter
         Any filter. One whose states bias the ranges has a method ``biases_of(state, (M, N))``: the
         states besides the pose (..., K), the covariance (..., 6 + K, 6 + K) of the pose's error
-        and theirs, and by how much (M N, K) each of them lengthens every range.
+        and theirs, and by how much (M N, K) each of them lengthens every range. One whose ranges
+        have an offset in common has an attribute ``offset``; NIS and likelihood are then those of
+        what the offsets leave, and so are the residuals.
     before, after
         Its states, as `predict` and as `update` gave them.
     ranges, anchors, links
@@ -98,16 +101,24 @@ def innovations(
     ValueError
         As `update`.
     """
-    ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
-    variance = check_variance(noise.variance(ranges, mask), mask)
+    offset = getattr(filter, "offset", None)
+    if offset is None:
+        ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
+    else:
+        ranges, anchors, mask = check_offset_epoch(ranges, anchors, links, tags, offset)
     pose, x, P, S = _states(filter, before, ranges.shape[-2:])
     new, y, _, _ = _states(filter, after, ranges.shape[-2:])
     distance, H = bounds.range_jacobian(anchors, tags, *new)
+    variance = check_variance(noise.variance(ranges if offset is None else distance, mask), mask)
     shape = np.broadcast_shapes(distance.shape, ranges.shape, (*P.shape[:-2], 1, 1))
     flat = (*shape[:-2], shape[-2] * shape[-1])
     links = np.broadcast_to(True if mask is None else mask, shape).reshape(flat)
     variance = np.broadcast_to(variance, shape).reshape(flat)
     residual = np.broadcast_to(ranges - distance, shape).reshape(flat) - y @ S.T
+    if offset is not None:
+        grid = residual.reshape(shape)
+        common = offsets.median(grid, links.reshape(shape), offset)
+        residual = (grid - common).reshape(flat)
     moved = np.concatenate([rotations.error(new[0], pose[0]), new[1] - pose[1], y - x], axis=-1)
     H = np.swapaxes(H, -1, -2)
     H = np.concatenate([H, np.broadcast_to(S, (*H.shape[:-1], S.shape[-1]))], axis=-1)
@@ -124,11 +135,22 @@ def innovations(
     spread = np.where(sound[..., None, None], spread, 0.0) + np.eye(flat[-1])
     root = np.linalg.cholesky(spread)
     u = np.where(used & sound[..., None], v * scale, 0.0)
-    nis = (np.linalg.solve(root, u[..., None])[..., 0] ** 2).sum(axis=-1)
+    white = np.linalg.solve(root, u[..., None])
+    nis = (white[..., 0] ** 2).sum(axis=-1)
     log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
     log_det = log_det + np.where(used, np.log(variance), 0.0).sum(axis=-1)
     dof = used.sum(axis=-1)
     refused = links.sum(axis=-1) - dof
+    if offset is not None:
+        U = offsets.columns(offset, *shape[-2:]) * np.where(used, scale, 0.0)[..., None]
+        U = np.linalg.solve(root, U)
+        total = np.swapaxes(U, -1, -2) @ U
+        empty = np.diagonal(total, axis1=-2, axis2=-1) == 0
+        total = total + empty[..., None] * np.eye(U.shape[-1])
+        found = np.linalg.solve(total, np.swapaxes(U, -1, -2) @ white)
+        nis = nis - (found * (total @ found)).sum(axis=(-2, -1))
+        log_det = log_det + np.linalg.slogdet(total)[1]
+        dof = dof - (~empty).sum(axis=-1)
     likelihood = dof * LOG_USED - 0.5 * (nis + log_det) + refused * LOG_REFUSED
     std = np.sqrt(variance * (1 + own))
     v, std, residual = (np.where(links, a, 0.0).reshape(shape) for a in (v, std, residual))

@@ -210,13 +210,14 @@ def iekf_imu(
     drift_std_m: float = 0.0,
     drift_time_s: float = 20.0,
     headings: int = 1,
+    offset: str | None = None,
 ) -> Filter:
     """The filter ``"iekf-imu"``: pose, velocity and the biases of an inertial sensor.
 
     Parameters
     ----------
-    tags, noise, iterations, robust
-        As `IteratedEkf`.
+    tags, noise, iterations, robust, offset
+        As `IteratedEkf`; an offset goes with one heading.
     process
         Not used: what moves the body is measured.
     inertial
@@ -230,13 +231,15 @@ def iekf_imu(
     headings
         1, or how many hypotheses of the heading there are at the start.
     """
+    if offset is not None and headings != 1:
+        raise ValueError(f"offset goes with headings 1, got {headings!r}")
     biases = []
     if bias_std_m or common_std_m:
         biases.append(LinkBias(bias_std_m, None, common_std_m))
     if drift_std_m:
         biases.append(LinkBias(drift_std_m, drift_time_s))
     filter = InertialEkf(
-        IteratedEkf(tags, noise, process, iterations, robust),
+        IteratedEkf(tags, noise, process, iterations, robust, offset),
         biases=tuple(biases),
         inertial=sensor_of(inertial),
         speed_m_s=speed_m_s,

@@ -28,6 +28,7 @@ from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
+from rbl_gym.measurements import offsets
 
 # Behind the doors: what comes to these was checked, or made here.
 _ERROR = kernel(rotations.error)
@@ -75,7 +76,10 @@ class BiasProblem:
     anchors, tags
         (..., M, 3), (N, 3).
     weight
-        (..., L, L), inverse covariance of nu; zero where a link is missing.
+        (..., L, L), inverse covariance of nu; zero where a link is missing. Where ranges have
+        offsets in common, less what these take of it.
+    offset
+        Their kind, as of `measurements.offsets`; None: there are none.
     """
 
     rotation: FloatArray
@@ -91,6 +95,7 @@ class BiasProblem:
     anchors: FloatArray
     tags: FloatArray
     weight: FloatArray
+    offset: str | None = None
 
     def innovation(
         self, rotation: FloatArray, translation: FloatArray
@@ -141,6 +146,14 @@ class BiasProblem:
         S = S + ((own + self.variance) / share - own)[..., None] * np.eye(n)
         both = self.links[..., None] & self.links[..., None, :]
         weight = np.where(both, inverse(np.where(both, S, np.eye(n))), 0.0)
+        if self.offset is not None:
+            # W - W U (U^T W U)^-1 U^T W: U says which links have each offset.
+            U = offsets.columns(self.offset, self.anchors.shape[-2], self.tags.shape[-2])
+            taken = weight @ U
+            total = U.T @ taken
+            empty = np.diagonal(total, axis1=-2, axis2=-1)[..., None] == 0
+            total = total + np.where(empty, np.eye(U.shape[1]), 0.0)
+            weight = weight - taken @ np.linalg.solve(total, np.swapaxes(taken, -1, -2))
         return dataclasses.replace(self, weight=weight)
 
     def shares(
@@ -152,6 +165,10 @@ class BiasProblem:
     ) -> FloatArray:
         """Weights (..., L) by a loss of the innovations at a pose of covariance P (None: 0)."""
         nu, H, _, _ = self.innovation(rotation, translation)
+        if self.offset is not None:
+            grid = (*nu.shape[:-1], self.anchors.shape[-2], self.tags.shape[-2])
+            common = offsets.median(nu.reshape(grid), self.links.reshape(grid), self.offset)
+            nu = nu - np.broadcast_to(common, grid).reshape(nu.shape)
         variance = np.diagonal(self._own, axis1=-2, axis2=-1) + self.variance
         if P is not None:
             variance = variance + np.einsum("...la,...ab,...lb->...l", H, P, H)
@@ -198,6 +215,30 @@ def update_augmented(
     The fields of the state. The covariance is NaN where the information about the pose is not
     positive definite.
     """
+    return update_any(
+        rotation, translation, extra, covariance, ranges, weights, anchors, tags, start_rotation,
+        start_translation, start_covariance, iterations, loss, n_twist, None,
+    )  # fmt: skip
+
+
+def update_any(
+    rotation: FloatArray,
+    translation: FloatArray,
+    extra: FloatArray,
+    covariance: FloatArray,
+    ranges: FloatArray,
+    weights: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    start_rotation: FloatArray,
+    start_translation: FloatArray,
+    start_covariance: FloatArray,
+    iterations: int,
+    loss: FloatArray,
+    n_twist: int,
+    offset: str | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """`update_augmented` of ranges that may have an `offset` in common."""
     n_links = ranges.shape[-2] * ranges.shape[-1]
     sums = sums_of(n_twist, (extra.shape[-1] - n_twist) // n_links, n_links)
     batch = np.broadcast_shapes(
@@ -213,6 +254,7 @@ def update_augmented(
     )
     links = weights > 0
     problem = _problem(state, sums, ranges, weights, anchors, tags)
+    problem = dataclasses.replace(problem, offset=offset)
     start = start_rotation, start_translation
     share = problem.shares(*start, loss, start_covariance)
     problem = problem.weighed(share)

@@ -19,7 +19,7 @@ from rbl_gym import bounds
 from rbl_gym.bounds.twist import covariance_after
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 from rbl_gym.estimators.costs import bias_cost
-from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_augmented
+from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_any, update_augmented
 from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
 from rbl_gym.estimators.filter import PoseBelief
@@ -27,9 +27,7 @@ from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state
 from rbl_gym.estimators.inputs import (
     check_batches,
-    check_epoch,
     check_one_process,
-    epoch_variance,
     plain,
 )
 from rbl_gym.geometry import rotations
@@ -69,6 +67,11 @@ class AugmentedEkf:
 
     def __post_init__(self) -> None:
         check_one_process(self.pose.process)
+
+    @property
+    def offset(self) -> str | None:
+        """Whose ranges have an unknown offset in common: as the filter of the pose has it."""
+        return self.pose.offset
 
     @property
     def _n_twist(self) -> int:
@@ -158,8 +161,7 @@ class AugmentedEkf:
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
         if not self.biases:
             return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))
-        ranges, anchors, mask = check_epoch(ranges, anchors, links, self.pose.tags)
-        variance = epoch_variance(noise, self.pose.noise, ranges, mask)
+        ranges, variance, anchors, mask = self.pose.measured(state, ranges, anchors, links, noise)
         ranges, variance = np.broadcast_arrays(ranges, variance)
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         state = self._with_biases(state, ranges.shape[-2:])
@@ -173,20 +175,14 @@ class AugmentedEkf:
                 np.where(vague[..., None], found.translation, start[1]),
             )
             covariance = np.where(vague[..., None, None], found.covariance, covariance)
-        found = AugmentedState(
-            *update_augmented(
-                *state,
-                ranges,
-                weights,
-                anchors,
-                self.pose.tags,
-                *start,
-                covariance,
-                self.pose.iterations,
-                LOSSES[self.pose.robust],
-                self._n_twist,
-            )
-        )
+        epoch = (
+            *state, ranges, weights, anchors, self.pose.tags, *start, covariance,
+            self.pose.iterations, LOSSES[self.pose.robust], self._n_twist,
+        )  # fmt: skip
+        if self.offset is None:
+            found = AugmentedState(*update_augmented(*epoch))
+        else:
+            found = AugmentedState(*update_any(*epoch, self.offset))
         as_state(*found[:2], found.covariance)
         return found
 
@@ -227,7 +223,10 @@ class AugmentedEkf:
         biases = (state.extra @ sums.T).reshape((*state.extra.shape[:-1], *ranges.shape[-2:]))
         spread = np.einsum("lk,...kj,lj->...l", sums, state.covariance[..., 6:, 6:], sums)
         law = ranging.LinkNoise(np.sqrt(variance + spread.reshape(biases.shape)))
-        return self.pose.update(prior, np.maximum(ranges - biases, 1e-6), anchors, mask, law)
+        left = ranges - biases
+        if self.offset is None:
+            left = np.maximum(left, 1e-6)
+        return self.pose.update(prior, left, anchors, mask, law)
 
     def biases_of(
         self, state: AugmentedState, shape: tuple[int, ...]

@@ -27,12 +27,13 @@ def iekf_cv(
     gyro_std_rad_s: float | None = None,
     speed_std_m_s: float | None = None,
     frame: str = "world",
+    offset: str | None = None,
 ) -> AugmentedEkf:
     """The filter ``"iekf-cv"``: pose and twist of a body without odometry (12 error states).
 
     Parameters
     ----------
-    tags, noise, process, iterations, robust
+    tags, noise, process, iterations, robust, offset
         As `IteratedEkf`; `process` moves the pose beyond what the twist does.
     turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration
         As `WanderingTwist`.
@@ -42,7 +43,7 @@ def iekf_cv(
     law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
     sensor = TwistSensor(gyro_std_rad_s, speed_std_m_s, frame)
     measured = gyro_std_rad_s is not None or speed_std_m_s is not None
-    pose = IteratedEkf(tags, noise, process, iterations, robust)
+    pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
     return AugmentedEkf(pose, law, sensor if measured else None)
 
 
@@ -55,18 +56,19 @@ def iekf_bias(
     bias_std_m: float = 0.05,
     bias_time_s: float | None = None,
     common_std_m: float = 0.1,
+    offset: str | None = None,
 ) -> AugmentedEkf:
     """The filter ``"iekf-bias"``: the pose, and a bias of every link that it learns on the way.
 
     Parameters
     ----------
-    tags, noise, process, iterations, robust
+    tags, noise, process, iterations, robust, offset
         As `IteratedEkf`; `noise` is what remains of a range beside its bias.
     bias_std_m, bias_time_s, common_std_m
         As `LinkBias`. A short time marginalises errors that are correlated rather than learning
         them.
     """
-    pose = IteratedEkf(tags, noise, process, iterations, robust)
+    pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
     return AugmentedEkf(pose, biases=(LinkBias(bias_std_m, bias_time_s, common_std_m),))
 
 
@@ -84,6 +86,7 @@ def iekf_log(
     constant_common_m: float = 0.1,
     drift_std_m: float = 0.05,
     drift_time_s: float = 3.0,
+    offset: str | None = None,
 ) -> AugmentedEkf:
     """The filter ``"iekf-log"``: a log of raw ranges of which nothing else is known.
 
@@ -93,7 +96,7 @@ def iekf_log(
 
     Parameters
     ----------
-    tags, noise, process, iterations
+    tags, noise, process, iterations, offset
         As `IteratedEkf`; `noise` is what remains of a range beside its biases, and `process` moves
         the pose beyond what the twist does.
     robust
@@ -108,7 +111,7 @@ def iekf_log(
     law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
     stays = LinkBias(constant_std_m, None, constant_common_m)
     moves = LinkBias(drift_std_m, drift_time_s)
-    pose = IteratedEkf(tags, noise, process, iterations, robust)
+    pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
     return AugmentedEkf(pose, law, None, (stays, moves))
 
 

@@ -82,6 +82,13 @@ def median(values: FloatArray, there: BoolArray, offset: str) -> FloatArray:
     return np.where(count > 0, found, 0.0)
 
 
+def columns(offset: str, anchors: int, tags: int) -> FloatArray:
+    """Which of the M N links have each of the G offsets: ones and zeros (M N, G)."""
+    shape = group_shape(offset, anchors, tags)
+    group = np.broadcast_to(np.arange(shape[0] * shape[1]).reshape(shape), (anchors, tags))
+    return np.eye(shape[0] * shape[1])[group.ravel()]
+
+
 def axes_of(offset: str) -> tuple[int, ...]:
     """Over which axes of (..., M, N) the links of one group lie."""
     return _AXES[offset]
