@@ -278,7 +278,7 @@ def test_squared_ranges_with_an_offset_need_five_anchors():
 # --- filters -----------------------------------------------------------------------------------
 
 
-def track(offset, batch=100, steps=8, seed=0, prior=(0.2, 0.5), size=30.0, **options):
+def track(offset, batch=100, steps=8, seed=0, prior=(0.2, 0.5), size=30.0, name="iekf", **options):
     """A filter over epochs with new offsets: errors (K, B, 6), its covariances, the bounds."""
     rng = np.random.default_rng(seed)
     anchors = bodies.octahedron(18.0) + rng.uniform(-3, 3, (M, 3))
@@ -286,7 +286,7 @@ def track(offset, batch=100, steps=8, seed=0, prior=(0.2, 0.5), size=30.0, **opt
     rotation, translation = rotations.random(rng, (batch,)), rng.normal(0, 2, (batch, 3))
     P = np.diag([prior[0] ** 2] * 3 + [prior[1] ** 2] * 3)
     filter = estimators.make(
-        "iekf", tags=tags, noise=NOISE, process=process, offset=offset, **options
+        name, tags=tags, noise=NOISE, process=process, offset=offset, **options
     )
     state = filter.initial(
         rotations.exp(prior[0] * rng.standard_normal((batch, 3))) @ rotation,
@@ -368,3 +368,48 @@ def test_a_filter_refuses_what_is_no_offset():
         estimators.make("iekf", offset="clock", **options)
     with pytest.raises(ValueError, match="offset"):
         estimators.make("kf", offset="tag", **options)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_a_filter_with_biases_that_are_nothing_is_the_plain_one(robust):
+    (plain, P, _), (biased, R, _) = (
+        track("tag", 5, name=name, robust=robust, **law)
+        for name, law in (("iekf", {}), ("iekf-bias", {"bias_std_m": 1e-6, "common_std_m": 0.0}))
+    )
+    # Of squares the same; the losses differ.
+    tolerance = {"atol": 1e-5} if not robust else {"atol": 0.1}
+    np.testing.assert_allclose(plain, biased, **tolerance)
+    if not robust:
+        np.testing.assert_allclose(P, R, rtol=1e-3, atol=1e-9)
+
+
+@every_offset
+def test_innovations_are_those_of_differences(offset):
+    """NIS by differences to the first link of every group, whose noise they share."""
+    ranges, anchors, tags, rotation, translation = readings(13, offset)
+    filter = estimators.make(
+        "iekf", tags=tags, noise=NOISE, process=ProcessNoise(0.1, 0.1), offset=offset
+    )
+    P = 1e-4 * np.diag([1.0, 2, 1, 3, 1, 2])
+    before = filter.initial(rotation, translation, P)
+    after = filter.update(before, ranges, anchors)
+    found = estimators.innovations(filter, before, after, ranges, anchors, tags, NOISE)
+    d = distances(anchors, tags, after.rotation, after.translation)
+    H = numeric_jacobian(anchors, tags, after.rotation, after.translation)
+    moved = np.concatenate(
+        [rotations.error(after.rotation, rotation), after.translation - translation]
+    )
+    v = (ranges - d).ravel() + H @ moved
+    R = np.diag(NOISE.variance(d).ravel())
+    U = groups(offset)
+    differences = []
+    for column in U.T:
+        first, *others = np.flatnonzero(column)
+        for i in others:
+            row = np.zeros(len(v))
+            row[i], row[first] = 1.0, -1.0
+            differences.append(row)
+    D = np.array(differences)
+    S = D @ (H @ P @ H.T + R) @ D.T
+    np.testing.assert_allclose(found.nis, D @ v @ np.linalg.solve(S, D @ v), rtol=1e-6)
+    assert found.dof == len(D)

@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from rbl_gym.measurements.offsets import OFFSETS
+
 if TYPE_CHECKING:
     from rbl_gym.recordings import Recording
 
@@ -16,7 +18,11 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     """The options that `read_runs` reads."""
     files = parser.add_argument_group("files")
     for name, text in (
-        ("ranges", "t,anchor,tag,range[,std,valid,run], or t,a0t0,a0t1,..."),
+        (
+            "ranges",
+            "t,anchor,tag,range[,std,valid,run], or t,a0t0,a0t1,..., or differences "
+            "t,anchor_a,anchor_b,tag,difference",
+        ),
         ("anchors", "anchor,x,y,z; anchor,t,x,y,z where they move; without it ax,ay,az in ranges"),
         ("tags", "tag,x,y,z; without it one tag at the body's origin"),
         ("truth", "TUM, EuRoC/ASL, t,x,y,z,qw,qx,qy,qz, or t,x,y[,z][,yaw_deg]"),
@@ -47,6 +53,12 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         help="of the ranges: s, ms, us, ns or iso; default as the header tells, else found",
     )
     reading.add_argument("--unit", metavar="UNIT", help="of the ranges: m, cm or mm; default m")
+    reading.add_argument(
+        "--offset",
+        choices=OFFSETS,
+        help="whose ranges have an unknown offset in common (pseudo-ranges): each tag's, each "
+        "anchor's, or all of an epoch; they may be zero and negative",
+    )
     reading.add_argument("--run", dest="which_run", metavar="NAME", help="one of several runs")
     reading.add_argument(
         "--relative",
@@ -72,6 +84,7 @@ def read_runs(options: argparse.Namespace) -> dict[str, Recording]:
             where=_joined(options.where),
             time_unit=options.time_unit,
             unit=options.unit,
+            offset=options.offset,
             strict=options.strict,
         ),
     }

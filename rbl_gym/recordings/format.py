@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+from rbl_gym.measurements.offsets import check_offset
 from rbl_gym.recordings.stamps import TIME_UNITS
 from rbl_gym.recordings.tables import METRES, Source
 
@@ -33,6 +34,9 @@ class Format:
     unit
         Of the ranges and their standard deviations: ``"m"``, ``"cm"`` or ``"mm"``; None: as the
         header tells, else metres.
+    offset
+        Whose ranges have an unknown offset in common, and may be zero or negative: ``"tag"``,
+        ``"anchor"`` or ``"epoch"``; None: nobody's. Differences have that of their tag.
     strict
         Refuse, by its line, what is dropped, sorted or counted otherwise.
 
@@ -46,9 +50,11 @@ class Format:
     where: Mapping[str, str] = dataclasses.field(default_factory=dict)
     time_unit: str | None = None
     unit: str | None = None
+    offset: str | None = None
     strict: bool = False
 
     def __post_init__(self) -> None:
+        check_offset(self.offset)
         for name, known in (("time_unit", [*TIME_UNITS, "iso"]), ("unit", [*METRES])):
             if getattr(self, name) not in (None, *known):
                 raise ValueError(f"{name} must be one of {known}, got {getattr(self, name)!r}")

@@ -16,6 +16,8 @@ from rbl_gym.recordings.tables import MAX_RANGE_M, METRES, Ids, IntArray, Table,
 
 # A log of which more than this share is no measurement is not what it is taken for.
 _MOST_BAD = 0.2
+# No offset is larger (m): a light-second is 3e8.
+_FARTHEST_M = 1e9
 _WIDE = "a{anchor}t{tag}"
 
 # Why a range is no link; those of `_FINE` are no fault of the log. What it must be, and where.
@@ -28,9 +30,12 @@ _CAUSES = {
     "zero": ("range must be positive", "range"),
     "negative": ("range must be positive", "range"),
     "too long": (f"must be at most {MAX_RANGE_M:.0f} m (looks like millimetres?)", "range"),
+    "far too long": ("must be at most 1e9 m", "range"),
     "without a standard deviation": ("must be positive and no longer than a range", "std"),
     "of an unknown anchor": ("unknown anchor", "anchor"),
     "of an unknown tag": ("unknown tag", "tag"),
+    "to an unknown anchor": ("unknown anchor", "anchor_b"),
+    "of an anchor to itself": ("must be of two anchors", "anchor_b"),
     "twice with two values": ("each link may come once at a time", "range"),
     "of an anchor whose place is not known then": ("the anchor's place must be known", "t"),
 }
@@ -86,18 +91,18 @@ def read_measured(
         return _read_wide(table, anchors, tags, format, said)
     table.require("t", "range")
     read = {"t", "range", "run"}
-    anchor_ids = _ids_of(table, "anchor", anchors)
+    anchor_ids = ids_of(table, "anchor", anchors)
     if anchors is None:
         table.require("ax", "ay")
         read |= {"ax", "ay", "az"}
-    ids = anchor_ids, _ids_of(table, "tag", tags)
+    ids = anchor_ids, ids_of(table, "tag", tags)
     none = np.zeros(len(table.lines), dtype=np.intp)
     anchor, tag = (
         table.positions(column, known) if column in table.columns else none
         for column, known in zip(("anchor", "tag"), ids, strict=True)
     )
     read |= {"anchor", "tag"}
-    scale = _scale(table, "range", format, said)
+    scale = scale_of(table, "range", format, said)
     values = scale * table.numbers("range", may_be_missing=True)
     std, std_column = None, next((c for c in ("std", "var") if c in table.columns), "")
     if std_column:
@@ -114,11 +119,11 @@ def read_measured(
         table.check(np.isin(valid, (0, 1)), "valid", "must be 0 or 1")
         measured.drop(valid == 0, "marked as not valid")
     said.read(table, read)
-    _judge(measured, table)
+    judge(measured, table, format.offset is not None)
     return measured, ids
 
 
-def _ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
+def ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
     """Ids of the points of a long table."""
     if points is None:
         if column not in table.columns:
@@ -150,7 +155,7 @@ def _read_wide(
             f"{table.path}, line {table.header_line}: must have columns {pattern!r} of "
             f"{ids!r:.200}, or t, anchor, tag, range; got {[*table.names.values()]!r:.200}"
         )
-    scale = _scale(table, "range", format, said)
+    scale = scale_of(table, "range", format, said)
     rows, width = len(table.lines), len(names)
     values = scale * np.stack([table.numbers(n, may_be_missing=True) for n in names], axis=1)
     std, std_names = None, []
@@ -179,7 +184,7 @@ def _read_wide(
         names,
         std_names,
     )
-    _judge(measured, table)
+    judge(measured, table, format.offset is not None)
     return measured, ids
 
 
@@ -220,7 +225,7 @@ def _tags_named(table: Table, pattern: str, anchors: tuple[str, ...]) -> tuple[s
     return tuple(found) or ("0",)
 
 
-def _scale(table: Table, column: str, format: Format, said: Said) -> float:
+def scale_of(table: Table, column: str, format: Format, said: Said) -> float:
     """Metres of a unit of the ranges."""
     told = "" if format.unit else table.unit(column, METRES)
     if told in ("cm", "mm"):
@@ -228,8 +233,8 @@ def _scale(table: Table, column: str, format: Format, said: Said) -> float:
     return METRES.get(format.unit or told, 1.0)
 
 
-def _judge(measured: Measured, table: Table) -> None:
-    """Find the ranges that are no measurement by themselves."""
+def judge(measured: Measured, table: Table, signed: bool) -> None:
+    """Find the ranges that are no measurement by themselves; `signed`: they may be negative."""
     range, std = measured.range, measured.std
     if np.isnan(range).any():
         at = np.flatnonzero(np.isnan(range))
@@ -242,9 +247,12 @@ def _judge(measured: Measured, table: Table) -> None:
         measured.drop(np.isnan(range), "not a number")
     measured.drop(measured.anchor < 0, "of an unknown anchor")
     measured.drop(measured.tag < 0, "of an unknown tag")
-    measured.drop(range == 0, "zero")
-    measured.drop(range < 0, "negative")
-    measured.drop(range > MAX_RANGE_M, "too long")
+    if signed:
+        measured.drop(np.abs(range) > _FARTHEST_M, "far too long")
+    else:
+        measured.drop(range == 0, "zero")
+        measured.drop(range < 0, "negative")
+        measured.drop(range > MAX_RANGE_M, "too long")
     if std is not None:
         measured.drop(~((std > 0) & (std <= MAX_RANGE_M)), "without a standard deviation")
 
@@ -290,6 +298,7 @@ def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str
     row = int(measured.row[at])
     name = {"range": measured.columns, "std": measured.std_columns}.get(column, [column])
     name = name[measured.column[at]] if len(name) > 1 else name[0]
+    name = "anchor_a" if name == "anchor" and "anchor_a" in table.columns else name
     got = repr(table.columns[name][row])
     if column in ("anchor", "tag"):
         must += f", must be of {ids[column == 'tag']!r:.200}"

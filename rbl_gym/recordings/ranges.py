@@ -6,7 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.recordings.differences import (
+    check_lengths,
+    leveled,
+    mark_double_differences,
+    pseudo_ranges,
+    read_differences,
+)
 from rbl_gym.recordings.format import Format
 from rbl_gym.recordings.measured import Measured, mark_doubles, read_measured, settle
 from rbl_gym.recordings.points import Points, moving
@@ -18,14 +25,19 @@ _LATE_S = 1.0
 
 
 class Log(NamedTuple):
-    """Times (K,), ranges (K, M, N), 0 where no link, their deviations, anchors and tags."""
+    """Times (K,), ranges (K, M, N), 0 where no link, their deviations, anchors and tags.
+
+    `offset`: whose ranges have an unknown one in common.
+    """
 
     times: FloatArray
     ranges: FloatArray
+    links: BoolArray
     range_std: FloatArray | None
     anchors: Points
     anchor_places: FloatArray  # (K, M, 3)
     tags: Points
+    offset: str | None = None
 
 
 def read_log(
@@ -44,7 +56,16 @@ def read_log(
     table.require("t")
     if format.strict and table.cut:
         raise ValueError(f"{table.path}, line {table.cut}: the last line is cut off")
-    measured, ids = read_measured(table, anchors, tags, format, said)
+    other = None
+    if "difference" in table.columns:
+        if format.offset not in (None, "tag"):
+            raise ValueError(
+                f"{table.path}: differences have the offset of their tag, got offset "
+                f"{format.offset!r}"
+            )
+        measured, other, ids = read_differences(table, anchors, tags, format, said)
+    else:
+        measured, ids = read_measured(table, anchors, tags, format, said)
     times, note = table.seconds(format.time_unit)
     said.note(table.path, note)
     _sort(measured, table, times, format, said)
@@ -57,19 +78,41 @@ def read_log(
     known = anchors.at(times)[1][measured.row, measured.anchor]
     measured.drop(~known, "of an anchor whose place is not known then")
     epochs, epoch = np.unique(times[measured.row], return_inverse=True)
-    mark_doubles(measured, epoch)
+    if other is None:
+        mark_doubles(measured, epoch)
+    else:
+        known = anchors.at(times)[1][measured.row, other]
+        measured.drop(~known, "of an anchor whose place is not known then")
+        mark_double_differences(measured, other, epoch)
     settle(measured, table, ids, format, said)
     used = measured.cause == 0
     if not used.any():
         raise ValueError(f"{table.path}: must have an epoch with a link, got none")
+    shape = len(epochs), len(ids[0]), len(ids[1])
+    places = anchors.at(epochs)[0]
+    if other is not None:
+        ranges, links, std, lost = pseudo_ranges(measured, other, epoch, shape)
+        if lost:
+            said.drop("of anchors that hang together with no other", lost)
+            said.note(table.path, f"{lost} differences hang together with none of the others")
+        return _leveled(Log(epochs, ranges, links, std, anchors, places, tags, "tag"), table)
     cells = epoch[used], measured.anchor[used], measured.tag[used]
-    ranges = np.zeros((len(epochs), len(ids[0]), len(ids[1])))
-    ranges[cells] = measured.range[used]
+    ranges, links = np.zeros(shape), np.zeros(shape, dtype=np.bool_)
+    ranges[cells], links[cells] = measured.range[used], True
     std = None
     if measured.std is not None:
         std = np.zeros_like(ranges)
         std[cells] = measured.std[used]
-    return Log(epochs, ranges, std, anchors, anchors.at(epochs)[0], tags)
+    log = Log(epochs, ranges, links, std, anchors, places, tags, format.offset)
+    return log if format.offset is None else _leveled(log, table)
+
+
+def _leveled(log: Log, table: Table) -> Log:
+    """Ranges with offsets in common at a level that means nothing, or a ValueError of units."""
+    assert log.offset is not None
+    points = log.tags.places[None] if log.offset == "anchor" else log.anchor_places
+    check_lengths(table.path, log.ranges, log.links, points, log.offset)
+    return log._replace(ranges=leveled(log.ranges, log.links, log.anchor_places, log.offset))
 
 
 def _sort(measured: Measured, table: Table, times: FloatArray, format: Format, said: Said) -> None:

@@ -63,7 +63,9 @@ def read_recording(
         where `valid` (0 or 1) is 0, range and std may be any number or empty. Or wide,
         ``t,a{anchor}t{tag},...``: a row is an epoch. Seconds and metres. A link whose range is
         empty, or that has no row or column, is missing. Without `anchors`, the place of the
-        anchor stands beside every range: ``ax,ay[,az]``.
+        anchor stands beside every range: ``ax,ay[,az]``. Or differences of the distances to two
+        anchors, ``t,anchor_a,anchor_b,tag,difference[,std or var]``, that of `anchor_a` less that
+        of `anchor_b`: they become ranges with an unknown offset of the tag.
     anchors, tags
         ``anchor,x,y,z`` and ``tag,x,y,z`` (or ``id,x,y,z``), metres; ids are any unique text.
         Anchors that move have a row for every place and time: ``anchor,t,x,y,z``. Without `tags`
@@ -166,8 +168,10 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
     ids = log.anchors.ids, log.tags.ids
     if files.calibration is not None:
         biases = read_table(files.calibration, format.of("calibration"))
+        if log.offset is not None:
+            raise ValueError("calibration is of ranges, and these have an unknown offset in common")
         ranges, std = calibrated(log.ranges, log.range_std, biases, ids, said)
-        log = log._replace(ranges=ranges, range_std=std)
+        log = log._replace(ranges=ranges, links=ranges > 0, range_std=std)
     places = log.anchors.places if log.anchors.tracks is None else log.anchor_places
     poses = None
     if files.truth is not None:
@@ -178,16 +182,17 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
             log, places = _carried(log, places, frame, said, os.fspath(files.carrier))
         elif poses is not None:
             poses = _seen_from(frame, poses, os.fspath(files.carrier))
-    links = log.ranges > 0
+    links = log.links
     if not links.any():
         raise ValueError(f"{table.path}: must have an epoch with a link, got none")
     paths = [table.path if p is None else os.fspath(p) for p in files[:3]]
     how = "carried" if files.carrier else "stand" if log.anchors.tracks is None else "move"
     points = log.anchors.places, log.tags.places
-    check_units((paths[0], paths[1], paths[2]), log.times, log.ranges, links, *points, how)
+    if log.offset is None:
+        check_units((paths[0], paths[1], paths[2]), log.times, log.ranges, links, *points, how)
     return Recording(
         log.times, log.ranges, links, log.range_std, places, log.tags.places, *ids, poses,
-        said.report(),
+        said.report(), log.offset,
     )  # fmt: skip
 
 
@@ -198,11 +203,12 @@ def _carried(
     rotation, translation, known = _frame_at(carrier, log.times, path)
     places = np.swapaxes(rotation @ np.swapaxes(arms, -1, -2), -1, -2) + translation[:, None]
     if not known.all():
-        lost = int((log.ranges[~known] > 0).sum())
+        lost = int(log.links[~known].sum())
         said.drop("where the carrier's pose is not known", lost)
         said.note(path, f"{lost} ranges are left out where the carrier's pose is not known")
-    kept = [None if a is None else a[known] for a in (log.times, log.ranges, log.range_std)]
-    log = log._replace(times=kept[0], ranges=kept[1], range_std=kept[2])
+    std = None if log.range_std is None else log.range_std[known]
+    kept = [a[known] for a in (log.times, log.ranges, log.links)]
+    log = log._replace(times=kept[0], ranges=kept[1], links=kept[2], range_std=std)
     return log, places[known]
 
 

@@ -26,6 +26,7 @@ class Recording(NamedTuple):
     tag_ids: tuple[str, ...]  # in the order of `tags`
     truth: Truth | None  # at times of its own, see `truth_at`
     report: Report = Report()  # what was dropped, sorted and found while it was read
+    offset: str | None = None  # whose ranges have an unknown offset in common, and any sign
 
     @property
     def anchors_by_epoch(self) -> FloatArray:

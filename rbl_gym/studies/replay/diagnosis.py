@@ -36,20 +36,28 @@ def diagnose(
                 f"freedom {ratio:.2f}): right where the errors of a link last, else see --tune."
             )
         return {**figures, "causes": []}, notes
+    if recording.offset is not None:
+        # What is supposed of ranges does not hold of their differences.
+        text = _subject(figures) + "Look at the residuals of anchors, tags and links; see --tune."
+        return {**figures, "causes": []}, [text]
     causes = likely_causes(recording, settings, found)
     return {**figures, "causes": [cause._asdict() for cause in causes]}, [_warning(figures, causes)]
 
 
-def _warning(figures: dict[str, Any], causes: list[Cause]) -> str:
+def _subject(figures: dict[str, Any]) -> str:
     ratio, refused = figures["nis_per_dof"], figures["refused_share"]
     # Of one link among many neither figure tells.
     subject = "the filter contradicts its data"
     if ratio < MOST_NIS and refused < MOST_REFUSED:
         subject = "a part of the ranges contradicts the filter"
-    text = (
+    return (
         f"WARNING: {subject}: NIS per degree of freedom {ratio:.2f} (1: honest), "
         f"{100 * refused:.0f} % of the ranges refused. "
     )
+
+
+def _warning(figures: dict[str, Any], causes: list[Cause]) -> str:
+    text = _subject(figures)
     if not causes:
         return text + (
             "No one fault explains it (tried: motion, deviation of the ranges, swaps, places of "

@@ -8,7 +8,7 @@ import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry import mirror, rotations
-from rbl_gym.measurements import ranging
+from rbl_gym.measurements import offsets, ranging
 from rbl_gym.recordings.recording import Recording
 
 # Anchors whose distance from their plane is below this share of their width in it are tried.
@@ -167,7 +167,10 @@ def _update(
     law = ranging.LinkNoise(told)
     state = filter.update(before, np.where(links, ranges, 1.0), anchors, links, noise=law)
     points = ranging.tag_positions(state.rotation, state.translation, recording.tags)
-    residual = (ranging.distances(anchors, points) - ranges) / told
+    residual = ranging.distances(anchors, points) - ranges
+    if recording.offset is not None:
+        residual = offsets.centred(residual, links / told**2, recording.offset)
+    residual = residual / told
     squares = np.minimum(residual**2, _MOST_RESIDUAL) * links
     error = np.concatenate(
         [rotations.error(state.rotation, before.rotation), state.translation - before.translation],

@@ -190,6 +190,8 @@ def named_filter(
         # The bank looks for a lost body in its volume, which is finite.
         box = np.clip(volume, *reach_of(recording))
         options = {"volume": box - origin_of(recording), **options}
+    if recording.offset is not None:
+        options = {"offset": recording.offset, **options}
     laws = {"tags": recording.tags, "noise": _noise(settings), "process": process}
     filter = estimators.make(name, **laws, **options)
     if has_own_std(recording, settings):
