@@ -237,10 +237,16 @@ def update_any(
     loss: FloatArray,
     n_twist: int,
     offset: str | None,
+    sums: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """`update_augmented` of ranges that may have an `offset` in common."""
+    """`update_augmented` of ranges that may have an `offset` in common.
+
+    `sums` (M N, K): by how much each extra state lengthens every range, where they are no biases
+    of links one by one.
+    """
     n_links = ranges.shape[-2] * ranges.shape[-1]
-    sums = sums_of(n_twist, (extra.shape[-1] - n_twist) // n_links, n_links)
+    if sums is None:
+        sums = sums_of(n_twist, (extra.shape[-1] - n_twist) // n_links, n_links)
     batch = np.broadcast_shapes(
         extra.shape[:-1], ranges.shape[:-2], weights.shape[:-2], anchors.shape[:-2]
     )

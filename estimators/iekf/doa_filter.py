@@ -23,6 +23,7 @@ from rbl_gym.estimators.costs.map_problem import (
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import register
+from rbl_gym.estimators.iekf.clock import ClockEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state
 from rbl_gym.estimators.iekf.robust_update import HUBER
@@ -30,6 +31,7 @@ from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, settles,
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.locating.doa_global import global_search
 from rbl_gym.measurements import bearing
+from rbl_gym.measurements.offsets import Clock
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -204,7 +206,8 @@ def iterated_ekf(
     measurement: str = "ranges",
     range_noise: NoiseLaw | None = None,
     offset: str | None = None,
-) -> IteratedEkf:
+    clock: Clock | None = None,
+) -> IteratedEkf | ClockEkf:
     """The filter ``"iekf"``: `IteratedEkf` on ranges, `DoaEkf` on directions of arrival.
 
     Parameters
@@ -215,15 +218,21 @@ def iterated_ekf(
         Of ``"doa"``: the law of ranges that an update may bring besides.
     tags, process, iterations, robust, offset
         As `IteratedEkf`.
+    clock
+        Law of offsets that last, in place of `offset`: their clocks are states then (`ClockEkf`).
     """
     check_one_of("measurement", measurement, MEASUREMENTS)
     if measurement == "doa":
-        if offset is not None:
-            raise ValueError(f"offset must be None where angles are measured, got {offset!r:.80}")
+        if offset is not None or clock is not None:
+            told = offset if clock is None else clock
+            raise ValueError(
+                f"offset and clock must be None where angles are measured, got {told!r:.80}"
+            )
         return DoaEkf(tags, noise, process, iterations, robust, range_noise)
     if range_noise is not None:
         raise ValueError("range_noise must be None where noise is the law of the ranges")
-    return IteratedEkf(tags, noise, process, iterations, robust, offset)
+    filter = IteratedEkf(tags, noise, process, iterations, robust, offset)
+    return filter if clock is None else ClockEkf(filter, clock)
 
 
 register("iekf", iterated_ekf)

@@ -11,15 +11,95 @@ ranges: the noise of the reference, common to all differences, is counted right 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_count,
+    check_generator,
+    check_number,
+    check_one_of,
+)
 
-__all__ = ["OFFSETS", "centred", "common"]
+__all__ = ["OFFSETS", "Clock", "centred", "common", "simulate_clocks"]
 
 # Over which axes of (..., M, N) the ranges with one offset lie.
 _AXES = {"tag": (-2,), "anchor": (-1,), "epoch": (-2, -1)}
 OFFSETS = tuple(_AXES)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Law of offsets that last: clocks that drift, in metres of range (0.3 m are a nanosecond).
+
+    Parameters
+    ----------
+    offset
+        Whose clocks: ``"tag"``, ``"anchor"`` or ``"epoch"``, one for all.
+    std_m, drift_m_s
+        Standard deviations at first: of the offset about a guess by the first ranges, and of its
+        drift (one part in 10^8 is 3 m/s).
+    walk_m, drift_walk_m_s
+        Random walks of offset and drift: standard deviations after 1 s.
+    """
+
+    offset: str = "tag"
+    std_m: float = 100.0
+    drift_m_s: float = 3.0
+    walk_m: float = 0.1
+    drift_walk_m_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_one_of("offset", self.offset, OFFSETS)
+        for name in ("std_m", "drift_m_s"):
+            check_number(name, getattr(self, name), low=1e-6, high=1e4)
+        for name in ("walk_m", "drift_walk_m_s"):
+            check_number(name, getattr(self, name), low=0.0)
+
+    def transition(self, dt: float) -> tuple[FloatArray, FloatArray]:
+        """F and Q (2, 2) of offset and drift over `dt` seconds."""
+        walk, wander = self.walk_m**2, self.drift_walk_m_s**2
+        Q = [
+            [walk * dt + wander * dt**3 / 3, wander * dt**2 / 2],
+            [wander * dt**2 / 2, wander * dt],
+        ]
+        return np.array([[1.0, dt], [0.0, 1.0]]), np.array(Q)
+
+
+def simulate_clocks(
+    law: Clock,
+    times: ArrayLike,
+    groups: int,
+    rng: np.random.Generator,
+    batch: tuple[int, ...] = (),
+) -> FloatArray:
+    """Offsets (..., K, groups) in metres at times (K,), drawn from the law about zero.
+
+    Raises
+    ------
+    ValueError
+        On times that decrease, and on a law, a number of groups or a generator that is none.
+    """
+    if not isinstance(law, Clock):
+        raise ValueError(f"law must be a Clock, got {law!r:.80}")
+    times = check_array("times", times, ("K",))
+    if times.ndim != 1 or (np.diff(times) < 0).any():
+        raise ValueError(f"times must be (K,) and not decrease, got {times!r:.80}")
+    groups = check_count("groups", groups)
+    check_generator("rng", rng)
+    normals = rng.standard_normal((len(times), *batch, groups, 2))
+    states = [normals[0] * [law.std_m, law.drift_m_s]]
+    for dt, normal in zip(np.diff(times), normals[1:], strict=True):
+        F, Q = law.transition(float(dt))
+        values, vectors = np.linalg.eigh(Q)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        states.append(states[-1] @ F.T + normal @ root.T)
+    return np.stack([state[..., 0] for state in states], axis=-2)
 
 
 def check_offset(offset: str | None) -> str | None:
