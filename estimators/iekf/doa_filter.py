@@ -228,7 +228,7 @@ def iterated_ekf(
             raise ValueError(
                 f"offset and clock must be None where angles are measured, got {told!r:.80}"
             )
-        return DoaEkf(tags, noise, process, iterations, robust, range_noise)
+        return DoaEkf(tags, noise, process, iterations, robust, range_noise=range_noise)
     if range_noise is not None:
         raise ValueError("range_noise must be None where noise is the law of the ranges")
     filter = IteratedEkf(tags, noise, process, iterations, robust, offset)

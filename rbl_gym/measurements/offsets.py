@@ -80,6 +80,13 @@ def simulate_clocks(
 ) -> FloatArray:
     """Offsets (..., K, groups) in metres at times (K,), drawn from the law about zero.
 
+    Parameters
+    ----------
+    law, times, groups
+        `Clock`, seconds (K,) that do not decrease, and how many clocks there are.
+    rng, batch
+        Source of the normals, and the leading axes.
+
     Raises
     ------
     ValueError
