@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -133,7 +135,15 @@ def test_the_height_of_a_planar_body():
     assert not found["contradicts"]
     found = replay.replay_recording(log, known.changed(height_offset_m=0.0)).figures["consistency"]
     assert [cause["kind"] for cause in found["causes"]] == ["height"]
-    assert "--height-offset-m 0.4" in found["causes"][0]["text"]
+    assert "--height-offset-m=0.4" in found["causes"][0]["text"]
+    # The same said by the height of the body's origin.
+    offset = float(log.anchors[:, 2].mean() - log.tags[:, 2].mean())
+    held = SETTINGS.changed(planar=True, height_m=offset)
+    found = replay.replay_recording(log, held).figures["consistency"]
+    assert [cause["kind"] for cause in found["causes"]] == ["height"]
+    named = re.search(r"--height-m=([\d.]+)", found["causes"][0]["text"])
+    assert named is not None
+    assert float(named[1]) == pytest.approx(offset - 0.42, abs=0.05)
 
 
 def test_noise_that_nothing_explains_has_no_cause():

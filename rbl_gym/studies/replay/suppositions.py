@@ -221,10 +221,14 @@ def _common_bias(trial: Trial, bias: float) -> Supposition:
 
 
 def _height(trial: Trial, step: float) -> Supposition:
-    offset = (trial.settings.knowledge.height_offset_m or 0.0) + step
-    settings = trial.settings.changed(height_offset_m=offset)
-    text = f"the tags look to be at another height: --height-offset-m {offset:.2f} or so"
-    return Supposition("height", text, trial._replace(settings=settings))
+    known = trial.settings.knowledge
+    if known.height_m is None:
+        told = {"height_offset_m": (known.height_offset_m or 0.0) + step}
+    else:
+        told = {"height_m": known.height_m - step}
+    ((name, value),) = told.items()
+    text = f"the tags look to be at another height: --{name.replace('_', '-')}={value:.2f} or so"
+    return Supposition("height", text, trial._replace(settings=trial.settings.changed(**told)))
 
 
 def _about(places: list[float], values: list[float]) -> FloatArray:
