@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,16 @@ def path_of(times, planar=False):
     return rotation, np.column_stack([place, height])
 
 
-def ranges_of(times, rng, tags=TAGS, bias=0.0, slope=0.0, noise=0.05, late=0.0, planar=False):
+def ranges_of(
+    times: Any,
+    rng: Any,
+    tags: Any = TAGS,
+    bias: Any = 0.0,
+    slope: Any = 0.0,
+    noise: float = 0.05,
+    late: float = 0.0,
+    planar: bool = False,
+):
     """Ranges at exact poses, by a loop over links."""
     rotation, place = path_of(times, planar)
     M, N = len(ANCHORS), len(tags)
@@ -140,6 +150,7 @@ def test_nodes_share_the_delays_of_antennas():
     fit = fit_links(ranges, None, ANCHORS, TAGS, path, LinkModel("node", slopes=False, tags="held"))
     assert isinstance(fit, LinkFit)
     assert fit.node_delay_m is not None
+    assert fit.node_delay_std_m is not None
     want = np.concatenate([of_anchors, of_tags])
     assert (np.abs(fit.node_delay_m - want) < 4 * fit.node_delay_std_m).all()
     assert fit.node_delay_m[6:].sum() == pytest.approx(0, abs=1e-12)

@@ -251,7 +251,8 @@ def _normal(
             path=KnownPath(*(a[part] for a in problem.path)),
         )
         e, d, J = _residual_of(piece, parameters, rotation, True)
-        e, d, J, used = (a.reshape(len(e), L, *a.shape[3:]) for a in (e, d, J, piece.links))
+        used = piece.links.reshape(len(e), L)
+        e, d, J = (a.reshape(len(e), L, *a.shape[3:]) for a in (e, d, J))
         one_and_d = np.stack([np.ones_like(d), d], axis=-1)
         columns = np.concatenate([one_and_d, J, e[..., None]], axis=-1)
         whitened = whitener.whitened(columns, used, share[part])

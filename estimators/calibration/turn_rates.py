@@ -79,7 +79,7 @@ def align_turn_rates(sensor: ArrayLike, body: ArrayLike) -> SensorTurn:
     rates = (sensor - np.average(sensor, axis=0, weights=w)) @ R.T
     H = np.einsum("k,kij,kil->jl", w, rotations.hat(rates), rotations.hat(rates))
     # Rates of one gyroscope that are smoothed alike stand for fewer: the errors' autocorrelation.
-    lasting = _lasting(left / std)
+    lasting = _lasting(np.asarray(left / std))
     turn = np.linalg.inv(H) * std**2 * lasting
     of_bias = std**2 * lasting / w.sum() * np.eye(3)
     mean = np.average(sensor - bias, axis=0, weights=w) @ R.T

@@ -63,7 +63,9 @@ def write_points(
     _write(path, (kind, "x", "y", "z"), rows)
 
 
-def _write(path: str | os.PathLike[str], header: Sequence[str], rows: Iterable[list[str]]) -> None:
+def _write(
+    path: str | os.PathLike[str], header: Sequence[str], rows: Iterable[Iterable[str]]
+) -> None:
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
