@@ -164,7 +164,7 @@ class Asynchronous:
         if std_m is not None:
             if noise is not None:
                 raise ValueError("std_m and noise say the same: give one")
-            noise = LinkNoise([[check_number("std_m", std_m, low=1e-9)]])
+            noise = LinkNoise(np.array([[check_number("std_m", std_m, low=1e-9)]]))
         if anchors is not None:
             anchors = check_array("anchors", anchors, ("M", 3))
             if anchors.shape[-2] != len(self.anchors):

@@ -180,7 +180,7 @@ def test_anchors_that_move_and_a_deviation_for_every_range():
         state = links.filter.predict(state, np.zeros(6), t - time)
         mask = np.zeros((5, 4), dtype=bool)
         mask[m, n] = True
-        law = ranging.LinkNoise([[0.05 + 0.01 * n]])
+        law = ranging.LinkNoise(np.array([[0.05 + 0.01 * n]]))
         state, time = links.filter.update(state, value * mask, anchors, mask, noise=law), t
     order = [*range(8), 9, 8, 10, 11]
     for k in order:

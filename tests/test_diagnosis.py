@@ -48,7 +48,7 @@ def recording(ranges, anchors=ANCHORS, tags=TAGS):
 RANGES = walked(1)[0]
 
 
-def only(anchor=slice(None), tag=slice(None)):
+def only(anchor: int | slice = slice(None), tag: int | slice = slice(None)):
     mask = np.zeros((7, 5))
     mask[anchor, tag] = 1.0
     return mask
@@ -159,11 +159,11 @@ def test_honest_logs_are_not_doubted():
     ranges = walked(7, logs=200, epochs=40)
     logs = [recording(r) for r in ranges]
     filter = replay.recording_filter(logs[0], SETTINGS)
-    prior = tuple(np.broadcast_to(a, (200, *a.shape)) for a in start_of(logs[0], SETTINGS))
+    Q, t, P = (np.broadcast_to(a, (200, *a.shape)) for a in start_of(logs[0], SETTINGS))
     readings = (
         Reading(ranges[:, k], ANCHORS, twist=np.zeros(6) if k else None, dt=0.1) for k in range(40)
     )
-    steps = track_epochs(filter, prior, readings)
+    steps = track_epochs(filter, (Q, t, P), readings)
     noise = ranging.RangeNoise(0.1)
     each = [found for _, found in innovations_of(filter, steps, TAGS, noise)]
     columns = [np.stack(column, axis=1) for column in zip(*each, strict=True)]
@@ -234,7 +234,7 @@ def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
     assert axes.get_ylabel() == "NIS / dof"
     found = replayed.track.innovations
     assert found is not None
-    np.testing.assert_allclose(axes.lines[0].get_ydata(), found.nis / found.dof)
+    np.testing.assert_allclose(np.asarray(axes.lines[0].get_ydata()), found.nis / found.dof)
     reports.print_replay(replayed.figures)
     out = capsys.readouterr().out
     assert "anchor A3" in out

@@ -103,6 +103,7 @@ def test_a_recording_with_its_own_noise_is_weighed_by_it(name):
         track = replay.track_recording(log(std), settings)
         errors = replay.track_errors(log(std), track, settings)
         assert errors is not None
+        assert errors.tags is not None
         found.append(errors.tags[-1])
     told_wrong, told_right = found
     assert told_right < 0.02

@@ -28,7 +28,7 @@ G = inertial.GRAVITY_M_S2
 PRIOR = np.diag([0.05] * 3 + [0.2] * 3) ** 2
 
 
-def made(**options):
+def made(**options) -> Any:
     return estimators.make(
         "iekf-imu", tags=TAGS, noise=NOISE, process=motion.ProcessNoise(),
         inertial=options.pop("inertial", SENSOR), **options,

@@ -37,7 +37,7 @@ def tracked(column, yaw_off_rad, headings):
     sensed = sensed._replace(
         times=sensed.times - AHEAD_S, readings=inertial.turned(sensed.readings, axes)
     )
-    filter = estimators.make(
+    filter: Any = estimators.make(
         "iekf-imu", tags=log.tags, noise=ranging.RangeNoise(0.1), process=motion.ProcessNoise(),
         robust="late", inertial=SENSOR, gravity_tilt_rad=np.deg2rad(1), common_std_m=0.073,
         drift_std_m=0.05, drift_time_s=20.0, headings=headings,

@@ -42,6 +42,8 @@ def test_the_factor_against_finite_differences():
         0.1 * rng.standard_normal((3, 9)), np.array([0.05, -0.02]),
     )  # fmt: skip
     rows = factor.linearize(state, np.arange(3.0), state.constants)
+    assert rows.after is not None
+    assert rows.constants is not None
     e = 1e-6
 
     def slope(change, tilt):
@@ -70,6 +72,7 @@ def run():
     trials = monte_carlo.simulate_trials(scene, 40, np.random.default_rng(1))
     episode: Any = trials.episode
     steps = list(monte_carlo.trial_steps(trials, monte_carlo.scene_filter(scene, "iekf-imu", {})))
+    assert scene.inertial is not None
     motion = InertialMotion(
         episode.readings[:, 1:], scene.dt / 10, scene.inertial, scene.speed_std_m_s
     )
@@ -120,6 +123,6 @@ def test_it_is_honest_and_better_than_the_filter_before(run):
 
 def test_what_is_no_factor():
     with pytest.raises(ValueError, match="sensor must be an InertialSensor, got 'best'"):
-        InertialMotion(np.zeros((1, 2, 6)), 0.1, "best")
+        InertialMotion(np.zeros((1, 2, 6)), 0.1, "best")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="steps must be one, or one for each of 2 samples"):
         InertialMotion(np.zeros((1, 2, 6)), np.zeros((1, 3)), SENSOR)

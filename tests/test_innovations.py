@@ -106,7 +106,8 @@ def test_wrong_ranges_are_refused_at_a_constant_price():
 def test_a_state_that_is_not_finite_has_no_likelihood():
     anchors, tags, prior, ranges, _ = epoch(4)
     filter = estimators.make("iekf", tags=tags, noise=NOISE, process=motion.ProcessNoise())
-    before = filter.initial(*(np.stack([a, a]) for a in prior), SMALL)
+    rotation, translation = (np.stack([a, a]) for a in prior)
+    before = filter.initial(rotation, translation, SMALL)
     after = filter.update(before, ranges, anchors)
     lost = after._replace(translation=after.translation * [[1.0], [np.nan]])
     found = innovations(filter, before, lost, ranges, anchors, tags, NOISE)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -35,8 +37,8 @@ def tracked(robust, late, trials=100, steps=25, dt=0.1, seed=0):
     shape = (trials, len(ANCHORS), len(TAGS))
     times, links = dt * np.arange(steps + 1), shape[1] * shape[2]
     laws = LinkBias(0.05, None, 0.1), LinkBias(0.05, 3.0)
-    biases = sum(simulate_biases(law, times, links, rng, (trials,)) for law in laws)
-    filter = estimators.make(
+    biases = np.sum([simulate_biases(law, times, links, rng, (trials,)) for law in laws], axis=0)
+    filter: Any = estimators.make(
         "iekf-log", tags=TAGS, noise=NOISE, process=STILL, robust=robust,
         turn_rate_rad_s=0.3, speed_m_s=0.5,
     )  # fmt: skip

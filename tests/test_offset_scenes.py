@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -38,7 +40,7 @@ def test_a_scene_checks_and_its_ranges_have_any_sign(offset):
 
 @every_offset
 def test_many_worlds_are_single_ones(offset):
-    arguments = {"scene": spec(offset, drop_probability=0.2)}
+    arguments: dict[str, Any] = {"scene": spec(offset, drop_probability=0.2)}
     mode = AutoresetMode.NEXT_STEP
     native = TrackingVectorEnv(3, **arguments, autoreset_mode=mode)
     tolerance = {"rtol": 1e-9, "atol": 1e-9}
@@ -62,7 +64,7 @@ def test_the_bound_of_an_episode_knows_the_offset():
     env = TrackingEnv(scene=spec("tag"))
     info = env.reset(seed=3)[1]
     at = bounds.range_information(
-        env.unwrapped._anchors, env.scene.body, info["rotation"], info["translation"],
+        env._anchors, env.scene.body, info["rotation"], info["translation"],
         env.scene.noise, offset="tag",
     )  # fmt: skip
     information = np.linalg.inv(info["prior_covariance"]) + at

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import optimize
@@ -21,7 +23,9 @@ NOISE = ranging.RangeNoise(0.05)
 PROCESS = ProcessNoise(0.5, 1.0)
 
 
-def world(offset: str, seed: int = 0, K: int = 3, m: int = 6, n: int = 4):
+def world(
+    offset: str, seed: int = 0, K: int = 3, m: int = 6, n: int = 4
+) -> tuple[Any, Any, Any, Any]:
     rng = np.random.default_rng(seed)
     anchors, tags = rng.uniform(-8, 8, (m, 3)), rng.normal(0, 0.5, (n, 3))
     walk = 0.1 * rng.standard_normal((K, 6))
@@ -90,7 +94,7 @@ def test_reaches_its_bound_with_honest_beliefs():
     """60 trials of 31 epochs: the ratio's deviation is about 2 %, that of NEES/6 about 1 %."""
     scene = scenes.get({"name": "uwb_room", "steps": 30, "links": {"offset": "tag"}})
     trials = monte_carlo.simulate_trials(scene, 60, np.random.default_rng(2))
-    told = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
+    told: Any = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
     episode = trials.episode
     times = np.cumsum([reading.dt for reading in told])
     twists = np.stack([reading.twist for reading in told[1:]], axis=1)

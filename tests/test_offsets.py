@@ -129,9 +129,9 @@ def test_recursions_take_the_offset():
     J = twist.posterior_crb_step(np.eye(12), *places, zero, 0.1, process, law, offset="tag")
     plain = twist.posterior_crb_step(np.eye(12), *places, zero, 0.1, process, law, np.zeros((M, N)))
     np.testing.assert_allclose(J[:6, :6] - plain[:6, :6], seen, atol=1e-9 * seen.max())
-    several = tuple(np.stack([x] * 3) for x in (rotation, translation))
+    Q, t = (np.stack([x] * 3) for x in (rotation, translation))
     P = smoothing.smoothing_crb(
-        anchors, tags, *several, NOISE, np.zeros((2, 6)), 1.0,
+        anchors, tags, Q, t, NOISE, np.zeros((2, 6)), 1.0,
         ProcessNoise(1e-7, 1e-7), np.eye(6), offset="tag",
     )  # fmt: skip
     # A body that stands: all epochs add up.
@@ -185,11 +185,11 @@ def test_locate_finds_what_a_fit_of_pose_and_offsets_finds(offset):
 @every_offset
 @pytest.mark.parametrize("method", ["ml", "robust"])
 def test_a_constant_more_changes_nothing(offset, method):
-    ranges, *places = readings(5, offset, (4,), size=0.0)
+    ranges, anchors, tags, *_ = readings(5, offset, (4,), size=0.0)
     shape = offsets.group_shape(offset, M, N)
     more = 1e4 * np.random.default_rng(0).standard_normal((4, *shape))
     plain, shifted = (
-        estimators.locate(r, *places[:2], NOISE, method=method, offset=offset)
+        estimators.locate(r, anchors, tags, NOISE, method=method, offset=offset)
         for r in (ranges, ranges + more)
     )
     assert (ranges + more < 0).any()

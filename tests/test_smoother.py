@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ PRIOR_STD = np.array([0.2] * 3 + [0.4] * 3)
 BIASES = (LinkBias(0.1, None, 0.2), LinkBias(0.05, 1.5))
 
 
-def world(seed, K=5, m=5, n=4, noise_m=0.05):
+def world(seed, K=5, m=5, n=4, noise_m=0.05) -> tuple[Any, Any, Any, Any]:
     """A log of a wandering body, and its truth."""
     rng = np.random.default_rng(seed)
     anchors, tags, rotation, translation = random_world(rng, m, n)
@@ -228,6 +229,7 @@ def test_derivatives_of_ranges_by_finite_differences():
         rng.normal(0, 0.1, constants),
     )  # fmt: skip
     rows, _ = gathered.rows(state, huber(np.inf))
+    assert rows.constants is not None
     h = 1e-6
     for i in range(6 + extra):
         x = np.zeros((3, 6 + extra))
@@ -268,7 +270,9 @@ def test_a_batch_of_logs_is_each_of_them_and_anchors_may_move():
     )
     drift = 0.1 * np.arange(6)[:, None, None]
     each = [w[0]._replace(anchors=w[0].anchors + drift) for w in logs]
-    both = RangeLog(*(np.stack(column) for column in list(zip(*each, strict=True))[:4]))
+    columns = (np.stack(column) for column in list(zip(*each, strict=True))[:4])
+    times, measured, anchors, links = columns
+    both = RangeLog(times, measured, anchors, links)
     start = [np.stack([w[3][i] for w in logs]) for i in (0, 1)]
     model = LogModel(tags, NOISE, KnownTwist(ProcessNoise(1.0, 2.0)), BIASES)
     together = smooth(both, model, prior, start)
@@ -313,7 +317,7 @@ def test_ranges_with_a_time_each_and_a_deviation_each():
 def test_reaches_its_bound_with_honest_beliefs(name, seed):
     scene = SCENES[name]
     trials = monte_carlo.simulate_trials(scene, 40, np.random.default_rng(seed))
-    told = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
+    told: Any = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
     episode = trials.episode
     times = np.cumsum([reading.dt for reading in told])
     twists = np.stack([reading.twist for reading in told[1:]], axis=1)
@@ -385,7 +389,7 @@ def test_laws_are_factors_and_motions():
 def test_bad_models_are_named():
     _, tags, _, _ = world(12)
     with pytest.raises(ValueError, match="biases"):
-        LogModel(tags, NOISE, UnknownTwist(WANDER, PROCESS), (0.1,))
+        LogModel(tags, NOISE, UnknownTwist(WANDER, PROCESS), (0.1,))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="height"):
         Level(1.0)
     with pytest.raises(ValueError, match="tilt_std_rad"):

@@ -193,7 +193,8 @@ def _pruned(state: HeadingState) -> HeadingState:
         return state
     weights = state.log_weights.copy()
     weights[best] = np.log(np.exp(weights[same]).sum())
-    return HeadingState(*(field[kept] for field in state[:4]), _normal(weights[kept]))
+    filtered = AugmentedState(*(field[kept] for field in state[:4]))
+    return HeadingState(*filtered, _normal(weights[kept]))
 
 
 def iekf_imu(
@@ -245,7 +246,8 @@ def iekf_imu(
         speed_m_s=speed_m_s,
         gravity_tilt_rad=gravity_tilt_rad,
     )
-    return filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
+    found = filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
+    return found  # pyright: ignore[reportReturnType]
 
 
 register("iekf-imu", iekf_imu)

@@ -7,7 +7,7 @@ second are free of what lasts longer: biases, slow multipath, lever arms that ar
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -111,7 +111,8 @@ def _refined(changes: _Changes, start: float) -> Clock | None:
     if not np.isfinite(std):
         return None
     bounds = start - 1.5 * _SEARCH_STEP_S, start + 1.5 * _SEARCH_STEP_S
-    offset = float(minimize_scalar(cost, bounds=bounds, options={"xatol": 1e-4}).x)
+    found: Any = minimize_scalar(cost, bounds=bounds, options={"xatol": 1e-4})
+    offset = float(found.x)
     e, known = changes.left(offset)
     rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]
     rate = (rate / (2 * _HALF_S * std))[known]

@@ -268,11 +268,11 @@ def update_any(
     again = problem.shares(found.rotation, found.translation, loss)
     changed = (np.abs(again - share) > _SAME_SHARE) & problem.links
     if changed.any():
-        changed = changed.any(axis=-1)
+        changed = np.asarray(changed.any(axis=-1))
         second = problem.weighed(np.where(changed[..., None], again, share))
         better = minimize_pose(second, found.rotation, found.translation, iterations)
         found, problem = _chosen(changed, better, found), second
-    return _solved(problem, found, links.any(axis=-2))
+    return _solved(problem, found, np.asarray(links.any(axis=-2)))
 
 
 def sums_of(n_twist: int, n_laws: int, links: int) -> FloatArray:

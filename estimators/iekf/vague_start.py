@@ -110,7 +110,7 @@ def net_of_starts(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
     # Of differences the linear problem tells little, or nothing: other places as well.
     places = places_of_differences(data, ROTATION_NET)[:, :, None]
     places = places - (rotation @ data.tags.mean(axis=-2)[..., None])[..., 0][:, None]
-    near = [problem.prior.translation + np.zeros(rotation.shape[:-1])]
+    near: list[FloatArray] = [problem.prior.translation + np.zeros(rotation.shape[:-1])]
     if data.offset != "anchor":
         near.append(_translation_given(rotation, problem.prior, data))
     translation = np.concatenate([*near, *np.moveaxis(places, 1, 0)], axis=1)

@@ -150,7 +150,8 @@ def locate(
     ranging.check_law("noise", noise)
     tags = check_array("tags", tags, ("N", 3))
     tag_std_m = check_number("tag_std_m", tag_std_m, low=0.0, high=1e5)
-    if offsets.check_offset(offset) is not None:
+    offsets.check_offset(offset)
+    if offset is not None:
         _check_offset(method, offset, tag_std_m)
         ranges, anchors, mask = check_offset_epoch(ranges, anchors, links, tags, offset)
     else:
@@ -183,7 +184,12 @@ def _in_blocks(
     if method in _NEEDS and not all(np.isfinite(block[1]).all() for block in blocks):
         _check_geometry(method, epoch)
     fields = joined(blocks, batch)
-    return PoseEstimate(*fields[:6], Alternatives(*fields[6:9]), fields[9], np.zeros(batch, int))
+    return PoseEstimate(
+        *fields[:6],
+        alternatives=Alternatives(*fields[6:9]),
+        matrix=fields[9],
+        iterations=np.zeros(batch, int),
+    )
 
 
 def joined(blocks: list[tuple[np.ndarray, ...]], batch: tuple[int, ...]) -> list[np.ndarray]:
@@ -239,7 +245,8 @@ def _rank_of_tags(tags: FloatArray) -> np.ndarray:
 
 def _rows(epoch: StaticEpoch, rows: slice) -> StaticEpoch:
     """Some of the trials."""
-    return StaticEpoch(*(array[rows] for array in epoch[:5]), *epoch[5:])  # pyright: ignore[reportArgumentType]
+    ranges, anchors, tags, weights, squared_weights = (array[rows] for array in epoch[:5])
+    return StaticEpoch(ranges, anchors, tags, weights, squared_weights, *epoch[5:])
 
 
 def _epoch(

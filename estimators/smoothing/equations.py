@@ -20,7 +20,7 @@ from rbl_gym.geometry import rotations
 
 __all__ = ["Factor", "LogState", "Rows"]
 
-_EXP, _ERROR, _HAT = (kernel(f) for f in (rotations.exp, rotations.error, rotations.hat))
+_EXP, _ERROR, _HAT = kernel(rotations.exp), kernel(rotations.error), kernel(rotations.hat)
 
 
 class LogState(NamedTuple):
@@ -177,7 +177,7 @@ class Equations:
         found = solve_blocks(diagonal, self.above, right)
         x, X = found[..., 0], found[..., 1:]
         y = np.zeros(self.corner_gradient.shape)
-        if y.shape[-1]:
+        if self.corner_gradient.shape[-1]:
             schur = self.corner - np.einsum("...kia,...kib->...ab", self.border, X)
             right = self.corner_gradient + np.einsum("...kia,...ki->...a", self.border, x)
             y = -np.linalg.solve(schur, right[..., None])[..., 0]

@@ -53,7 +53,7 @@ class Level:
         """Rows of the height, and of the level parts of the body's upright axis."""
         upright = state.rotation[..., :, 2]
         residuals, rows = [], []
-        if self.height_std_m is not None:
+        if self.height_m is not None and self.height_std_m is not None:
             A = np.zeros((*upright.shape[:-1], 1, 6))
             A[..., 5] = 1 / self.height_std_m
             residuals.append((state.translation[..., 2:] - self.height_m) / self.height_std_m)

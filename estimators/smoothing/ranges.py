@@ -149,7 +149,7 @@ class LogRanges:
         # Measured ones first, in their order.
         link = np.argsort(~mask.reshape(flat), axis=-1, kind="stable")[..., :most]
 
-        def pick(array: FloatArray | BoolArray) -> FloatArray:
+        def pick(array: FloatArray | BoolArray) -> np.ndarray:
             flattened = np.broadcast_to(array, ranges.shape).reshape(flat)
             return np.take_along_axis(flattened, link, axis=-1)
 

@@ -267,9 +267,9 @@ def from_quaternion(q: ArrayLike) -> FloatArray:
     if np.count_nonzero(norm < 1e-12):
         index = tuple(int(i) for i in np.argwhere(norm < 1e-12)[0])
         raise ValueError(f"q must not be zero, got {q[index].tolist()} at index {index}")
-    q = q / norm[..., None]
-    w, v = q[..., 0], q[..., 1:]
-    if q.ndim == 1:
+    unit = q / norm[..., None]
+    w, v = unit[..., 0], unit[..., 1:]
+    if unit.ndim == 1:
         return _one_series(v, 2 * w, 2.0, 2 * w * w - 1)
     return _series(v, 2 * w, np.asarray(2.0), 2 * w * w - 1)
 

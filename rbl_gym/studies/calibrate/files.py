@@ -39,7 +39,11 @@ def write_link_table(
         path,
         ("anchor", "tag", *columns),
         [
-            [anchor_ids[m], tag_ids[n], *(f"{column[m, n]:.6f}" for column in columns.values())]
+            [
+                anchor_ids[int(m)],
+                tag_ids[int(n)],
+                *(f"{column[m, n]:.6f}" for column in columns.values()),
+            ]
             for m, n in np.argwhere(np.asarray(told))
         ],
     )

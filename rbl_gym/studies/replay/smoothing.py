@@ -100,16 +100,22 @@ def smooth_recording(recording: Recording, settings: Settings, track: Track) -> 
     return SmoothedRecording(smoothed, best, time.process_time() - began)
 
 
+def _along(axes: tuple[int, int, int], size: float) -> tuple[float, float, float]:
+    """`size` on the axes that are 1, zero on the others."""
+    x, y, z = axes
+    return size * x, size * y, size * z
+
+
 def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
     """What the settings take for true of a recording."""
     laws, planar = settings.smoothing, settings.knowledge.planar
     level = level_of(settings, origin_of(recording))
     turn, shift = ((0, 0, 1), (1, 1, 0)) if planar else ((1, 1, 1), (1, 1, 1))
     wander = WanderingTwist(
-        tuple(_ANY_TURN * axis for axis in turn),
-        tuple(_ANY_SPEED * axis for axis in shift),
-        tuple(math.radians(laws.smooth_accel_deg) * axis for axis in turn),
-        tuple(laws.smooth_accel_m * axis for axis in shift),
+        _along(turn, _ANY_TURN),
+        _along(shift, _ANY_SPEED),
+        _along(turn, math.radians(laws.smooth_accel_deg)),
+        _along(shift, laws.smooth_accel_m),
     )
     return smoothing.LogModel(
         recording.tags,
