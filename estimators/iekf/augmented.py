@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -175,7 +176,7 @@ class AugmentedEkf:
                 np.where(vague[..., None], found.translation, start[1]),
             )
             covariance = np.where(vague[..., None, None], found.covariance, covariance)
-        epoch = (
+        epoch: tuple[Any, ...] = (
             *state, ranges, weights, anchors, self.pose.tags, *start, covariance,
             self.pose.iterations, LOSSES[self.pose.robust], self._n_twist,
         )  # fmt: skip
