@@ -50,6 +50,8 @@ class DoaEkf(IteratedEkf):
         Law of the angles.
     range_noise
         Law of the ranges, where an update is given some besides.
+    offset
+        None: angles have no unknown offset.
     """
 
     noise: Any  # bearing.AngleNoise, where the base class has a law of ranges
@@ -59,6 +61,8 @@ class DoaEkf(IteratedEkf):
         super().__post_init__()
         if not isinstance(self.noise, bearing.AngleNoise):
             raise ValueError(f"noise must be a bearing.AngleNoise, got {self.noise!r:.80}")
+        if self.offset is not None:
+            raise ValueError(f"offset must be None for angles, got {self.offset!r:.80}")
 
     def update(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,

@@ -106,8 +106,8 @@ class InertialEkf(AugmentedEkf):
             On wrong shapes, NaN, negative times.
         """
         readings = check_array("readings", readings, ("S", 6))
-        if np.ndim(dt):
-            steps = navigation.check_steps(dt, readings)
+        if isinstance(dt, list | tuple) or getattr(dt, "ndim", 0):
+            steps = navigation.check_steps(dt, readings, "dt")
         else:
             count = readings.shape[-2]
             steps = np.full(count, check_number("dt", dt, low=0.0) / count)

@@ -97,15 +97,15 @@ def preintegrate(
     return integrate(readings, steps, bias, sensor.numbers)
 
 
-def check_steps(steps: ArrayLike, readings: FloatArray) -> FloatArray:
-    """Lengths (..., S) of the samples of readings (..., S, 6), or a ValueError."""
-    steps = check_array("steps", steps, ())
+def check_steps(steps: ArrayLike, readings: FloatArray, name: str = "steps") -> FloatArray:
+    """Lengths (..., S) of the samples of readings (..., S, 6), or a ValueError with `name`."""
+    steps = check_array(name, steps, ())
     if (steps < 0).any():
-        raise ValueError(f"steps must not be negative, got {steps.min():g}")
+        raise ValueError(f"{name} must not be negative, got {steps.min():g}")
     count = readings.shape[-2]
     if steps.ndim and steps.shape[-1] != count:
         raise ValueError(
-            f"steps must be one, or one for each of {count} samples, got {steps.shape}"
+            f"{name} must be one, or one for each of {count} samples, got {steps.shape}"
         )
     return steps if steps.ndim else np.full(count, steps)
 

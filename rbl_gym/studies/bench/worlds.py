@@ -170,9 +170,9 @@ def mirrored(world: BenchWorld) -> FloatArray | None:
     return world.translation - 2 * height[..., None] * normal
 
 
-# Fields that scenes got after the first leaderboard. They count where they are set: the other
-# scenes keep their hash, from which the seed of their trials comes.
-_YOUNGER_FIELDS = frozenset({"inertial", "offset"})
+# Fields that scenes got after the first leaderboard. They count where they differ from their
+# default: the other scenes keep their hash, from which the seed of their trials comes.
+_YOUNGER_FIELDS = frozenset({"inertial", "offset", "offset_std_m"})
 
 
 def scene_hash(scene: Scene) -> str:
@@ -184,8 +184,11 @@ def scene_hash(scene: Scene) -> str:
 def scene_facts(value: Any) -> Any:
     """A scene as plain numbers, lists and dicts; parts of several kinds carry their `kind`."""
     if dataclasses.is_dataclass(value):
-        fields = {f.name: scene_facts(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        fields = {k: v for k, v in fields.items() if v is not None or k not in _YOUNGER_FIELDS}
+        fields = {
+            f.name: scene_facts(getattr(value, f.name))
+            for f in dataclasses.fields(value)
+            if f.name not in _YOUNGER_FIELDS or getattr(value, f.name) != f.default
+        }
         return {"kind": type(value).__name__, **fields}
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
