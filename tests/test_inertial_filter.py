@@ -194,7 +194,7 @@ def test_what_is_no_filter(options, message):
         (np.zeros(6), 0.1, r"readings must have shape \(..., S, 6\), got \(6,\)"),
         (np.full((2, 6), np.nan), 0.1, "readings must be finite"),
         (np.zeros((2, 6)), -0.1, "dt must be a finite number in"),
-        (np.zeros((2, 6)), [0.1, -0.1], "steps must not be negative"),
+        (np.zeros((2, 6)), [0.1, -0.1], "dt must not be negative"),
         (np.zeros((2, 6)), "soon", "dt must be a number, got 'soon'"),
     ],
 )

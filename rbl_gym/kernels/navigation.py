@@ -47,7 +47,7 @@ def integrate(
                 N[k, i, j] = 0.0
     for k in range(readings.shape[0]):
         h = steps[k]
-        if h == 0:
+        if h < 1e-100:  # no length, and 1 / h is finite beyond
             continue
         seconds += h
         hh = 0.5 * h * h
