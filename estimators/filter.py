@@ -194,7 +194,7 @@ def check_takes_noise(name: str, filter: Filter, why: str) -> None:
 
 
 def reads(filter: Filter) -> str:
-    """What the `predict` of a filter is told: the ``"twist"``, or ``"inertial"`` readings."""
+    """What the `predict` of a filter is told: ``"twist"``, ``"inertial"`` or ``"odometry"``."""
     return getattr(filter, "reads", "twist")
 
 

@@ -152,6 +152,8 @@ def innovations(
         log_det = log_det + np.linalg.slogdet(total)[1]
         dof = dof - (~empty).sum(axis=-1)
     likelihood = dof * LOG_USED - 0.5 * (nis + log_det) + refused * LOG_REFUSED
+    if hasattr(after, "log_evidence"):
+        likelihood = after.log_evidence - before.log_evidence
     std = np.sqrt(variance * (1 + own))
     v, std, residual = (np.where(links, a, 0.0).reshape(shape) for a in (v, std, residual))
     return Innovations(
@@ -169,6 +171,9 @@ def _states(
     filter: Filter, state: Any, shape: tuple[int, ...]
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray]:
     """Pose, further states x, covariance P of both, and what x adds to the ranges (M N, K)."""
+    if hasattr(filter, "leader"):
+        # Of several hypotheses, what the likeliest has foretold.
+        filter, state = filter.filter, filter.leader(state)  # pyright: ignore[reportAttributeAccessIssue]
     own = getattr(filter, "biases_of", None)
     if own is not None:
         return (state.rotation, state.translation), *own(state, shape)

@@ -46,7 +46,12 @@ def hold_level(before: Any, predicted: Any, level: Level) -> Any:
     >>> state = hold_level(state, filter.predict(state, twist, dt), level)
     """
     fields = getattr(predicted, "_fields", ())
-    if fields[:2] != ("rotation", "translation") or set(fields[2:]) - {"extra", "covariance"}:
+    if fields[:2] != ("rotation", "translation") or set(fields[2:]) - {
+        "extra",
+        "covariance",
+        "log_weights",
+        "log_evidence",
+    }:
         raise ValueError(
             "level must be of an iterated EKF ('iekf', 'iekf-cv', 'iekf-bias', 'iekf-log'), got a "
             f"state of {', '.join(fields) or type(predicted).__name__}"

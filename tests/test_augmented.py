@@ -11,7 +11,7 @@ from rbl_gym import bounds, estimators, metrics, motion
 from rbl_gym.bounds import twist as twist_bounds
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
-from rbl_gym.estimators.iekf.named import iekf_bias, iekf_cv
+from rbl_gym.estimators.named import iekf_bias, iekf_cv
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import link_bias, ranging
 from rbl_gym.measurements.link_bias import LinkBias

@@ -10,7 +10,7 @@ import pytest
 from rbl_gym import estimators, metrics, motion
 from rbl_gym.estimators import hold_level
 from rbl_gym.estimators.costs.map_problem import PoseState
-from rbl_gym.estimators.iekf.named import iekf_log
+from rbl_gym.estimators.named import iekf_log
 from rbl_gym.estimators.smoothing import Level
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging

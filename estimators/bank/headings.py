@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import special
 
-from rbl_gym.checks import FloatArray, check_array, check_count
+from rbl_gym.checks import FloatArray, check_count
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
 from rbl_gym.estimators.filter import Filter, PoseBelief, reads, register
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf
@@ -32,19 +33,24 @@ from rbl_gym.motion.kinematics import ProcessNoise
 
 # Hypotheses with less than this share of the weight have lost.
 _LOST = 1e-8
+# Standard deviation of a heading anywhere around the circle.
+_ANY_RAD = 1.8
 # Nearer to the leader than so many of its standard deviations, squared and over six states, a
 # hypothesis is the same.
-_SAME = 0.3
+_SAME = 0.1
 
 
 class HeadingState(NamedTuple):
-    """Hypotheses (..., H): the fields of `AugmentedState`, and the logarithms of their weights."""
+    """Hypotheses (..., H): fields of `AugmentedState`, logarithms of their weights; and (...) that
+    of the density of all ranges so far, by the hypotheses together.
+    """
 
     rotation: FloatArray
     translation: FloatArray
     extra: FloatArray
     covariance: FloatArray
     log_weights: FloatArray
+    log_evidence: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +91,8 @@ class HeadingBank:
         std = np.sqrt(start.covariance[..., 2, 2])[..., None]
         spacing = np.minimum(5 * std, 2 * math.pi) / self.headings
         yaw = spacing * (np.arange(self.headings) - 0.5 * (self.headings - 1))
-        log_weights = -0.5 * (yaw / std) ** 2
+        # As wide as the circle, no heading is likelier than another.
+        log_weights = np.where(std < _ANY_RAD, -0.5 * (yaw / std) ** 2, 0.0)
         turn = rotations.exp(yaw[..., None] * np.array([0.0, 0.0, 1.0]))
         n = start.covariance.shape[-1]
         # The yaw of a hypothesis is known to its share of the spread; the rest follows.
@@ -101,6 +108,7 @@ class HeadingBank:
         return HeadingState(
             turn @ start.rotation[..., None, :, :], each(start.translation, 1),
             each(start.extra, 1), each(P, 2), _normal(np.broadcast_to(log_weights, batch)),
+            np.zeros(batch[:-1]),
         )  # fmt: skip
 
     def predict(self, state: HeadingState, twist: ArrayLike, dt: Any) -> HeadingState:
@@ -111,13 +119,17 @@ class HeadingBank:
         state, dt
             The state, and seconds.
         twist
-            What the filter reads: a twist (..., 6), or inertial readings (..., S, 6).
+            What the filter reads: a twist (..., 6), or readings (..., S, 6) of a sensor.
         """
-        told, shape = ("readings", ("S", 6)) if self.reads == "inertial" else ("twist", (6,))
-        twist = np.expand_dims(check_array(told, twist, shape), -1 - len(shape))
+        trailing = 1 if self.reads == "twist" else 2
+        told = np.asarray(twist, dtype=np.float64)
+        if told.ndim < trailing:
+            shape = "(..., 6)" if trailing == 1 else "(..., S, 6)"
+            raise ValueError(f"readings must have shape {shape}, got {told.shape}")
+        twist = np.expand_dims(told, -1 - trailing)
         steps = np.expand_dims(np.asarray(dt), -2) if np.ndim(dt) else dt
         moved: AugmentedState = self.filter.predict(_filtered(state), twist, steps)  # pyright: ignore[reportArgumentType]
-        return HeadingState(*moved, state.log_weights)
+        return HeadingState(*moved, *state[4:])
 
     def update(
         self,
@@ -138,10 +150,12 @@ class HeadingBank:
         before = _filtered(state)
         after = self.filter.update(before, measured, places, mask, law)
         told = innovations(self.filter, before, after, measured, places, pose.tags, law, mask)
-        return _pruned(HeadingState(*after, _normal(state.log_weights + told.log_likelihood)))
+        weights = state.log_weights + told.log_likelihood
+        evidence = state.log_evidence + special.logsumexp(weights, axis=-1)
+        return _pruned(HeadingState(*after, _normal(weights), evidence))
 
     def belief(self, state: HeadingState) -> PoseBelief:
-        """The likeliest pose, with a covariance that covers the others by their weights."""
+        """Mean place of all, heading of the likeliest, with the covariance of all about these."""
         best = np.argmax(state.log_weights, axis=-1)
         weights = np.exp(state.log_weights)[..., None, None]
 
@@ -149,7 +163,8 @@ class HeadingBank:
             index = best.reshape(*best.shape, *[1] * (trailing + 1))
             return np.take_along_axis(field, index, axis=-1 - trailing).squeeze(-1 - trailing)
 
-        rotation, translation = leading(state.rotation, 2), leading(state.translation, 1)
+        rotation = leading(state.rotation, 2)
+        translation = (weights[..., 0] * state.translation).sum(axis=-2)
         turn = rotations.error(rotation[..., None, :, :], state.rotation)
         gap = np.concatenate([turn, translation[..., None, :] - state.translation], axis=-1)
         spread = state.covariance[..., :6, :6] + gap[..., :, None] * gap[..., None, :]
@@ -180,8 +195,15 @@ def _normal(log_weights: FloatArray) -> FloatArray:
 
 def _pruned(state: HeadingState) -> HeadingState:
     """One body's state without what has lost or has become the leader; a batch keeps its shape."""
-    if state.log_weights.ndim > 1 or len(state.log_weights) == 1:
+    batch = state.log_weights.shape[:-1]
+    if math.prod(batch) != 1 or state.log_weights.shape[-1] == 1:
         return state
+    kept = _kept(HeadingState(*(field[(0,) * len(batch)] for field in state)))
+    return HeadingState(*(np.asarray(field)[(None,) * len(batch)] for field in kept))
+
+
+def _kept(state: HeadingState) -> HeadingState:
+    """One body's state (H, ...) without these."""
     best = int(np.argmax(state.log_weights))
     turn = rotations.error(state.rotation, state.rotation[best])
     gap = np.concatenate([turn, state.translation - state.translation[best]], axis=-1)
@@ -194,7 +216,7 @@ def _pruned(state: HeadingState) -> HeadingState:
     weights = state.log_weights.copy()
     weights[best] = np.log(np.exp(weights[same]).sum())
     filtered = AugmentedState(*(field[kept] for field in state[:4]))
-    return HeadingState(*filtered, _normal(weights[kept]))
+    return HeadingState(*filtered, _normal(weights[kept]), state.log_evidence)
 
 
 def iekf_imu(

@@ -3,6 +3,7 @@
 from rbl_gym.estimators.smoothing.equations import Factor, LogState, Rows
 from rbl_gym.estimators.smoothing.knowledge import Level
 from rbl_gym.estimators.smoothing.motion import KnownTwist, Motion, UnknownTwist
+from rbl_gym.estimators.smoothing.odometry import OdometryMotion, padded
 from rbl_gym.estimators.smoothing.smoother import LogModel, RangeLog, Smoothed, smooth
 from rbl_gym.estimators.smoothing.starts import causal_track
 
@@ -13,10 +14,12 @@ __all__ = [
     "LogModel",
     "LogState",
     "Motion",
+    "OdometryMotion",
     "RangeLog",
     "Rows",
     "Smoothed",
     "UnknownTwist",
     "causal_track",
+    "padded",
     "smooth",
 ]

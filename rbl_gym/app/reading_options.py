@@ -11,7 +11,17 @@ from rbl_gym.measurements.offsets import OFFSETS
 if TYPE_CHECKING:
     from rbl_gym.recordings import Recording
 
-_FILES = ("ranges", "anchors", "tags", "truth", "calibration", "carrier")
+_FILES = (
+    "ranges",
+    "anchors",
+    "tags",
+    "truth",
+    "calibration",
+    "carrier",
+    "odometry",
+    "imu",
+    "imu_frame",
+)
 
 
 def add_reading(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +38,9 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         ("truth", "TUM, EuRoC/ASL, t,x,y,z,qw,qx,qy,qz, or t,x,y[,z][,yaw_deg]"),
         ("calibration", "anchor,tag,bias_m[,slope]"),
         ("carrier", "poses, as of the truth, of a body that carries the anchors"),
+        ("odometry", "t,vx[,vy,vz][,wx,wy],wz in the body frame, or t,left,right of wheels"),
+        ("imu", "t,wx,wy,wz,ax,ay,az, rad/s and m/s^2"),
+        ("imu-frame", "its axes in the body's: rotation vector in degrees, or a file qw,qx,qy,qz"),
     ):
         files.add_argument(f"--{name}", required=name == "ranges", metavar="F", help=text)
     reading = parser.add_argument_group("reading (see docs/recordings.md)")
@@ -38,7 +51,8 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         metavar="WHAT=NAME,...",
         help="what columns are called: time=time_s,anchor=to_id,range=dist; of another file "
         "truth.x=px, anchors.anchor=name; wide: range=r_{anchor}_{tag},std=sd_{anchor}_{tag}; "
-        "all that begin so: truth.*=B_*; may be given more than once",
+        "all that begin so: truth.*=B_*; without a header by number, odometry.t=1; may be given "
+        "more than once",
     )
     reading.add_argument(
         "--where",
@@ -58,6 +72,15 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         choices=OFFSETS,
         help="whose ranges have an unknown offset in common (pseudo-ranges): each tag's, each "
         "anchor's, or all of an epoch; they may be zero and negative",
+    )
+    reading.add_argument(
+        "--wheelbase-m",
+        type=float,
+        metavar="X",
+        help="distance between the wheels of --odometry with left and right, unless it has width",
+    )
+    reading.add_argument(
+        "--turn-unit", metavar="UNIT", default="rad/s", help="of turn rates: rad/s or deg/s"
     )
     reading.add_argument("--run", dest="which_run", metavar="NAME", help="one of several runs")
     reading.add_argument(
@@ -85,6 +108,8 @@ def read_runs(options: argparse.Namespace) -> dict[str, Recording]:
             time_unit=options.time_unit,
             unit=options.unit,
             offset=options.offset,
+            wheelbase_m=options.wheelbase_m,
+            turn_unit=options.turn_unit,
             strict=options.strict,
         ),
     }

@@ -7,11 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from rbl_gym.app.reading_options import add_reading, read_runs
+from rbl_gym.app.sensor_options import (
+    add_clocks,
+    add_inertial,
+    add_odometry,
+    found_clocks,
+    told_clocks,
+)
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
     check_html,
-    offset,
     print_files,
     progress,
     window,
@@ -37,6 +43,8 @@ def add_replay(commands: Any) -> None:
     _add_knowledge(replay.add_argument_group("what is known of the body's place"))
     _add_filter(replay.add_argument_group("filter"))
     _add_motion(replay.add_argument_group("how the body moves"))
+    add_odometry(replay.add_argument_group("odometry"))
+    add_inertial(replay.add_argument_group("inertial sensor (filter iekf-imu)"))
     _add_tuning(replay.add_argument_group("settings by the likelihood of the log"))
     _add_biases(replay.add_argument_group("biases of the links"))
     _add_smoothing(replay.add_argument_group("the smoothed track"))
@@ -178,13 +186,7 @@ def _add_comparison(group: Any) -> None:
         help="seconds (of the ranges' clock) in which the truth is wrong: not judged; may be "
         "given more than once",
     )
-    group.add_argument(
-        "--time-offset",
-        type=offset,
-        metavar="S",
-        help="how far the truth's clock is ahead of that of the ranges, seconds; auto: found by "
-        "the motion",
-    )
+    add_clocks(group)
     group.add_argument(
         "--align",
         choices=("none", "position", "yaw", "se3"),
@@ -221,13 +223,16 @@ def _replay(options: argparse.Namespace) -> int:
     # What is wrong is said before the work begins.
     for recording in runs.values() if len(runs) == 1 else ():
         replay.check_replay(recording, settings)
+    settings, clocks = found_clocks(options, runs, settings)
+    runs = {run: replay.covered(recording, settings) for run, recording in runs.items()}
     tuned = _tuned(options, runs, settings)
     settings = settings if tuned is None else tuned.settings
     if len(runs) > 1:
-        return _replay_runs(options, runs, settings, tuned)
+        return _replay_runs(options, runs, settings, tuned, clocks)
     (recording,) = runs.values()
     with progress("replay", len(recording.times)) as advance:
         replayed = replay.replay_recording(recording, settings, advance)
+    replayed.figures.update(clocks)
     if tuned is not None:
         replayed.figures["tuned"] = tuned.figures()
     if options.track:
@@ -258,7 +263,7 @@ def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
     longest = max(runs.values(), key=lambda run: len(run.times))
     length = {} if options.tune_s is None else {"seconds": options.tune_s}
     filters: tuple[str, ...] = ()
-    if not options.filter and settings.filter in ("iekf", "iekf-log"):
+    if not options.filter and not options.odometry and settings.filter in ("iekf", "iekf-log"):
         # Where no filter is named the likelihood chooses one too. What a calibration leaves is
         # small and moves with the pose: the law of iekf-bias.
         filters = ("iekf-bias",) if options.calibration else ("iekf-log", "iekf", "iekf-bias")
@@ -266,7 +271,9 @@ def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
         return replay.tune(longest, settings, filters=filters, advance=advance, **length)
 
 
-def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any, tuned: Any) -> int:
+def _replay_runs(
+    options: argparse.Namespace, runs: Any, settings: Any, tuned: Any, clocks: Mapping[str, Any]
+) -> int:
     from rbl_gym.app import reports
     from rbl_gym.studies import replay
 
@@ -277,6 +284,7 @@ def _replay_runs(options: argparse.Namespace, runs: Any, settings: Any, tuned: A
         )
     with progress("replay", sum(len(run.times) for run in runs.values())) as advance:
         replayed = replay.replay_runs(runs, settings, advance)
+    replayed.figures.update(clocks)
     if tuned is not None:
         replayed.figures["tuned"] = tuned.figures()
     if write_json(replayed.figures, options.json):
@@ -293,18 +301,19 @@ def _settings(options: argparse.Namespace) -> Any:
         for name in replay.Settings().flat()
         if getattr(options, name, None) is not None
     }
+    given |= told_clocks(options)
     biases = {name: value for name, value in given.items() if name in _RAW}
     if options.raw:
         if options.calibration:
             raise ValueError("--raw means ranges without --calibration")
         biases = {**_RAW, **biases}
-    name = options.filter or _filter_for(given, biases)
+    name = options.filter or ("iekf-imu" if options.imu else _filter_for(given, biases))
     if biases and name != "iekf-bias":
         raise ValueError(
             f"{name} knows no biases of that law: --raw and --bias-... are of iekf-bias"
         )
     of_log = [key for key in given if key.startswith(("constant_", "drift_"))]
-    if of_log and name != "iekf-log":
+    if of_log and name not in ("iekf-log", "iekf-imu"):
         option = of_log[0].replace("_", "-")
         raise ValueError(f"--{option} is of iekf-log, not of {name}")
     return replay.Settings.of(**{**given, **biases, "filter": name})

@@ -185,6 +185,14 @@ def compared(result: dict[str, Any]) -> list[str]:
     ]
     if "epochs_excluded" in result:
         parts.append(f"{result['epochs_excluded']} more are left out (truth_exclude)")
+    for what in ("odometry", "imu"):
+        if (found := result.get(f"{what}_clock")) is None:
+            continue
+        parts.append(
+            f"the clock of --{what} is ahead by {found['offset_s']:.3f} s "
+            f"+- {found['std_s']:.3f} s by the likelihood of the ranges "
+            f"(higher by {found['gain']:.1f})"
+        )
     if "time_offset" in result:
         found = result["time_offset"]
         parts.append(

@@ -3,8 +3,9 @@
 from rbl_gym.recordings.align import ALIGNMENTS, Alignment, align_positions, apply_alignment
 from rbl_gym.recordings.bags import convert_bag, list_topics, show_message
 from rbl_gym.recordings.format import Format
-from rbl_gym.recordings.inertial import InertialLog, read_inertial, samples_between
+from rbl_gym.recordings.inertial import InertialLog, read_frame, read_inertial, samples_between
 from rbl_gym.recordings.motion_offset import motion_offset
+from rbl_gym.recordings.odometry import OdometryLog, odometry_between, read_odometry
 from rbl_gym.recordings.reading import read_recording, read_runs
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.recordings.report import Report
@@ -17,6 +18,7 @@ __all__ = [
     "Alignment",
     "Format",
     "InertialLog",
+    "OdometryLog",
     "Recording",
     "Report",
     "TimeOffset",
@@ -28,7 +30,10 @@ __all__ = [
     "convert_bag",
     "list_topics",
     "motion_offset",
+    "odometry_between",
+    "read_frame",
     "read_inertial",
+    "read_odometry",
     "read_recording",
     "read_runs",
     "read_track",

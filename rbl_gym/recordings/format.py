@@ -11,7 +11,7 @@ from rbl_gym.recordings.tables import METRES, Source
 
 __all__ = ["Format"]
 
-FILES = ("ranges", "anchors", "tags", "truth", "calibration", "carrier")
+FILES = ("ranges", "anchors", "tags", "truth", "calibration", "carrier", "odometry", "imu")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +25,8 @@ class Format:
         "to_id"}`` of the ranges, ``{"truth.x": "px", "anchors.anchor": "name"}`` of another file.
         ``{"truth.*": "B_*"}`` stands for all columns that begin so. ``{"range":
         "r_{anchor}_{tag}", "std": "sd_{anchor}_{tag}"}`` are the columns of a wide table. A unit
-        may stand in brackets: ``"stamp[ms]"``.
+        may stand in brackets: ``"stamp[ms]"``. Columns of a file without a header go by number,
+        from 1: ``{"odometry.t": "2"}``.
     where
         Cells of the rows that are meant, by column, as in `columns`: ``{"anchors.agent": "1"}``.
     time_unit
@@ -37,6 +38,10 @@ class Format:
     offset
         Whose ranges have an unknown offset in common, and may be zero or negative: ``"tag"``,
         ``"anchor"`` or ``"epoch"``; None: nobody's. Differences have that of their tag.
+    wheelbase_m
+        Of odometry of two wheels: the distance between them.
+    turn_unit
+        Of turn rates, of odometry and inertial sensors: ``"rad/s"`` or ``"deg/s"``.
     strict
         Refuse, by its line, what is dropped, sorted or counted otherwise.
 
@@ -51,6 +56,8 @@ class Format:
     time_unit: str | None = None
     unit: str | None = None
     offset: str | None = None
+    wheelbase_m: float | None = None
+    turn_unit: str = "rad/s"
     strict: bool = False
 
     def __post_init__(self) -> None:

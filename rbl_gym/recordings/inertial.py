@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_number, check_one_of
+from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
+from rbl_gym.geometry import rotations
 from rbl_gym.measurements.inertial import GRAVITY_M_S2
 from rbl_gym.recordings.tables import AnyPath, Source, read_table
 
-__all__ = ["InertialLog", "read_inertial", "samples_between"]
+__all__ = ["InertialLog", "read_frame", "read_inertial", "samples_between"]
 
 _COLUMNS = ("t", "wx", "wy", "wz", "ax", "ay", "az")
 TURN_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
@@ -73,6 +75,34 @@ def read_inertial(
             f"(looks like {'g, or gravity was taken off' if usual < 1 else 'm/s^2'}?)"
         )
     return InertialLog(times, readings)
+
+
+def read_frame(told: AnyPath) -> FloatArray:
+    """Rotation (3, 3) that turns the axes of a sensor into those of the body.
+
+    Parameters
+    ----------
+    told
+        A rotation vector in degrees, ``"179.0,0.2,13.6"``; or a file with one row, of
+        ``qw,qx,qy,qz``.
+
+    Raises
+    ------
+    ValueError
+        On anything else.
+    """
+    try:
+        vector = [float(part) for part in os.fspath(told).split(",")]
+    except ValueError:
+        vector = []
+    if len(vector) == 3:
+        return rotations.exp(np.deg2rad(check_array("frame", vector, (3,))))
+    table = read_table(told)
+    table.require("qw", "qx", "qy", "qz")
+    q = np.stack([table.numbers(name) for name in ("qw", "qx", "qy", "qz")], axis=-1)
+    if len(q) != 1 or abs(np.linalg.norm(q) - 1) > 1e-2:
+        raise ValueError(f"{table.path}: must have one row, a quaternion of norm 1, got {q!r:.80}")
+    return rotations.from_quaternion(q[0])
 
 
 def samples_between(

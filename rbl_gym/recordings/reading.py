@@ -15,8 +15,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.measurements.inertial import turned
 from rbl_gym.recordings.calibration import calibrated
 from rbl_gym.recordings.format import Format
+from rbl_gym.recordings.inertial import InertialLog, read_frame, read_inertial
+from rbl_gym.recordings.odometry import read_odometry
 from rbl_gym.recordings.points import read_points
 from rbl_gym.recordings.ranges import Log, read_log
 from rbl_gym.recordings.recording import Recording
@@ -40,6 +43,9 @@ class _Files(NamedTuple):
     calibration: AnyPath | None
     carrier: AnyPath | None
     relative: bool
+    odometry: AnyPath | None = None
+    imu: AnyPath | None = None
+    imu_frame: AnyPath | None = None
 
 
 def read_recording(
@@ -51,6 +57,9 @@ def read_recording(
     *,
     carrier: AnyPath | None = None,
     relative: bool = False,
+    odometry: AnyPath | None = None,
+    imu: AnyPath | None = None,
+    imu_frame: AnyPath | None = None,
     run: str | None = None,
     format: Format = _AS_DESCRIBED,
 ) -> Recording:
@@ -84,6 +93,11 @@ def read_recording(
     relative
         Of a `carrier`: the body's pose is wanted in the carrier's frame. The anchors stay where
         they are on it, and the truth is taken relative to it.
+    odometry
+        As of `rbl_gym.recordings.read_odometry`: ``t,vx,vy,vz,wx,wy,wz``, or speeds of two wheels.
+    imu, imu_frame
+        As of `rbl_gym.recordings.read_inertial`, ``t,wx,wy,wz,ax,ay,az``, and of `read_frame`: the
+        rotation of its axes into the body's.
     run
         Of several runs in one file (column `run`) the one to read; see `read_runs`.
     format
@@ -104,7 +118,9 @@ def read_recording(
         units do not fit together, or if no epoch has a link; with `format.strict`, at the first
         range or row that would be dropped or sorted.
     """
-    files = _Files(ranges, anchors, tags, truth, calibration, carrier, relative)
+    files = _Files(
+        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame
+    )
     said = Said()
     table = read_table(ranges, format.of("ranges"))
     runs = _runs_of(table)
@@ -129,6 +145,9 @@ def read_runs(
     *,
     carrier: AnyPath | None = None,
     relative: bool = False,
+    odometry: AnyPath | None = None,
+    imu: AnyPath | None = None,
+    imu_frame: AnyPath | None = None,
     format: Format = _AS_DESCRIBED,
 ) -> dict[str, Recording]:
     """The runs of a log, each a recording, by the names in column `run` and in their order.
@@ -137,7 +156,9 @@ def read_runs(
     the name ``""``. A truth with that column too is each run's own; one without time and with a
     single pose of a run is of a body that stands.
     """
-    files = _Files(ranges, anchors, tags, truth, calibration, carrier, relative)
+    files = _Files(
+        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame
+    )
     table = read_table(ranges, format.of("ranges"))
     runs = _runs_of(table)
     return {
@@ -182,6 +203,10 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
             log, places = _carried(log, places, frame, said, os.fspath(files.carrier))
         elif poses is not None:
             poses = _seen_from(frame, poses, os.fspath(files.carrier))
+    odometry = None
+    if files.odometry is not None:
+        how = {"wheelbase_m": format.wheelbase_m, "turn_unit": format.turn_unit}
+        odometry = read_odometry(files.odometry, format.of("odometry"), said, **how)
     links = log.links
     if not links.any():
         raise ValueError(f"{table.path}: must have an epoch with a link, got none")
@@ -192,8 +217,21 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
         check_units((paths[0], paths[1], paths[2]), log.times, log.ranges, links, *points, how)
     return Recording(
         log.times, log.ranges, links, log.range_std, places, log.tags.places, *ids, poses,
-        said.report(), log.offset,
+        said.report(), log.offset, odometry, _inertial(files, format),
     )  # fmt: skip
+
+
+def _inertial(files: _Files, format: Format) -> InertialLog | None:
+    """Readings of the inertial sensor in the body's axes."""
+    if files.imu is None:
+        if files.imu_frame is not None:
+            raise ValueError("imu_frame means nothing without imu")
+        return None
+    columns = dict(format.of("imu").columns)
+    log = read_inertial(files.imu, columns=columns, turn_unit=format.turn_unit)
+    if files.imu_frame is None:
+        return log
+    return log._replace(readings=turned(log.readings, read_frame(files.imu_frame)))
 
 
 def _carried(

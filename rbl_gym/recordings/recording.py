@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.recordings.inertial import InertialLog
+from rbl_gym.recordings.odometry import OdometryLog
 from rbl_gym.recordings.report import Report
 from rbl_gym.recordings.truth import Truth
 
@@ -27,6 +29,8 @@ class Recording(NamedTuple):
     truth: Truth | None  # at times of its own, see `truth_at`
     report: Report = Report()  # what was dropped, sorted and found while it was read
     offset: str | None = None  # whose ranges have an unknown offset in common, and any sign
+    odometry: OdometryLog | None = None  # on the clock of `times`
+    inertial: InertialLog | None = None  # in the body frame, on the clock of `times`
 
     @property
     def anchors_by_epoch(self) -> FloatArray:

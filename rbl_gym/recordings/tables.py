@@ -196,6 +196,7 @@ class Table(NamedTuple):
 
 def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str] = ()) -> Table:
     """The cells of a file with a header; `headless` names the columns of a table without one.
+    Columns that `source` names by numbers are those of a table without a header, from 1.
 
     Raises
     ------
@@ -203,7 +204,9 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
         If it cannot be read, a row does not fit the header, a column that `source` names is not
         there, or no row is left.
     """
-    cells = read_cells(os.fspath(path), headless)
+    asked = {_name_and_unit(name)[0] for name in source.columns.values()}
+    numbered = bool(asked) and all(name.isdigit() for name in asked)
+    cells = read_cells(os.fspath(path), headless, numbered)
     where = f"{cells.path}, line {cells.header_line}"
     header, units = [], {}
     for i, cell in enumerate(cells.header, 1):

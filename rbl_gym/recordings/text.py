@@ -37,14 +37,15 @@ def is_number(cell: str) -> bool:
         return False
 
 
-def read_cells(path: str, headless: Sequence[str] = ()) -> Cells:
+def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) -> Cells:
     """Read a text file: UTF-8 with or without a byte order mark, any line ending.
 
     Cells are separated by commas, semicolons, tabs or, where the header has none of these, by
     white space; with semicolons and tabs, a comma may be the decimal point. Blank lines and lines
     that begin with ``#`` are skipped, unless the first row below holds numbers only a comment can
     name: then the last comment above it whose cells fit the row is the header. A file of numbers
-    between white space with neither has the names `headless`, if there are as many.
+    between white space with neither has the names `headless`, if there are as many. With `numbered`
+    the columns of any table without a header are 1, 2 and so on.
 
     Raises
     ------
@@ -62,7 +63,9 @@ def read_cells(path: str, headless: Sequence[str] = ()) -> Cells:
         raise ValueError(f"{path}: must have a header and rows, got 0 lines")
     comma = _delimiter(lines[first], lines[second] if count == 2 else lines[first])
     start, header = first, _split(lines[first], comma)
-    if any(map(_is_numeric, header)):
+    if numbered and any(map(_is_numeric, header)):
+        start, header = first - 1, [str(k + 1) for k in range(len(header))]
+    elif any(map(_is_numeric, header)):
         for i in reversed(above):
             words = _split(lines[i].strip().lstrip("#").strip(), comma)
             if len(words) == len(header) and not any(map(_is_numeric, words)):

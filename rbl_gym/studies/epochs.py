@@ -35,6 +35,8 @@ __all__ = [
     "track_epochs",
 ]
 
+_SENSORS = {"inertial": "an inertial sensor", "odometry": "odometry"}
+
 Prior = tuple[ArrayLike, ArrayLike, ArrayLike]
 
 
@@ -57,6 +59,11 @@ class Reading(NamedTuple):
     inertial
         Readings (..., S, 6) of an inertial sensor in that interval, for a filter that takes them
         in place of the twist.
+    odometry
+        Readings (..., S, 6) of odometry in that interval, for a filter that takes them; NaN where
+        there is none.
+    steps
+        Seconds (S,) for which each of these readings counts; None: they share `dt` alike.
     """
 
     ranges: FloatArray
@@ -66,6 +73,8 @@ class Reading(NamedTuple):
     twist: FloatArray | None = None
     dt: float = 0.0
     inertial: FloatArray | None = None
+    odometry: FloatArray | None = None
+    steps: FloatArray | None = None
 
 
 class Step(NamedTuple):
@@ -110,12 +119,14 @@ def track_epochs(
     state = filter.initial(*prior)
     for reading in readings:
         told = reading.twist
-        if reads(filter) == "inertial":
-            if told is not None and reading.inertial is None:
-                raise ValueError("the filter reads an inertial sensor, and there is none here")
-            told = reading.inertial
+        dt: Any = reading.dt
+        if (sensor := reads(filter)) != "twist":
+            measured = getattr(reading, sensor)
+            if told is not None and measured is None:
+                raise ValueError(f"the filter reads {_SENSORS[sensor]}, and there is none here")
+            told, dt = measured, reading.dt if reading.steps is None else reading.steps
         if told is not None:
-            moved = filter.predict(state, told, reading.dt)
+            moved = filter.predict(state, told, dt)
             state = moved if hold is None else hold(state, moved)
         predicted, state = state, _updated(filter, state, reading)
         belief = filter.belief(state)

@@ -1,12 +1,14 @@
 """A recording through a filter: the track, its mirror image, errors against the truth, hints."""
 
 from rbl_gym.studies.replay.causes import Cause, likely_causes
+from rbl_gym.studies.replay.clocks import CLOCK_TRIALS, SensorClock, sensor_clock
 from rbl_gym.studies.replay.consistency import (
     contradicts,
     nis_curve,
     residual_tables,
 )
 from rbl_gym.studies.replay.figures import track_figures
+from rbl_gym.studies.replay.inertial import covered
 from rbl_gym.studies.replay.judging import (
     Reference,
     TrackErrors,
@@ -18,6 +20,7 @@ from rbl_gym.studies.replay.judging import (
 from rbl_gym.studies.replay.mirror import Mirror, covering, other_pose
 from rbl_gym.studies.replay.place import height_offset, origin_of, volume_of
 from rbl_gym.studies.replay.runs import ReplayedRuns, replay_runs
+from rbl_gym.studies.replay.sensors import Inertial, Odometry
 from rbl_gym.studies.replay.settings import (
     DEFAULT_RANGE_STD_M,
     Biases,
@@ -43,18 +46,22 @@ from rbl_gym.studies.replay.truth import check_overlap
 from rbl_gym.studies.replay.tuning import TUNING_ROUNDS, Tuned, tune
 
 __all__ = [
+    "CLOCK_TRIALS",
     "DEFAULT_RANGE_STD_M",
     "TUNING_ROUNDS",
     "Biases",
     "Cause",
     "Comparison",
+    "Inertial",
     "Knowledge",
     "Loss",
     "Mirror",
     "Motion",
+    "Odometry",
     "Reference",
     "Replayed",
     "ReplayedRuns",
+    "SensorClock",
     "Settings",
     "SmoothedRecording",
     "Smoothing",
@@ -64,6 +71,7 @@ __all__ = [
     "check_overlap",
     "check_replay",
     "contradicts",
+    "covered",
     "covering",
     "epoch_ranks",
     "find_offset",
@@ -79,6 +87,7 @@ __all__ = [
     "replay_recording",
     "replay_runs",
     "residual_tables",
+    "sensor_clock",
     "smooth_recording",
     "track_errors",
     "track_figures",

@@ -17,7 +17,7 @@ from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
 from rbl_gym.studies.replay.place import level_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
-from rbl_gym.studies.replay.tracking import has_own_std, recording_filter, start_of
+from rbl_gym.studies.replay.tracking import has_own_std, prior_of, recording_filter, sensed
 
 # Trials that run at once: more fall out of the processor's caches.
 _TOGETHER = 64
@@ -106,7 +106,7 @@ def _tried(trials: list[Trial]) -> Iterator[tuple[FloatArray, ...]]:
 
 def _together(trials: list[Trial]) -> list[tuple[FloatArray, ...]]:
     filter = _stacked([recording_filter(*trial) for trial in trials])
-    prior = tuple(map(np.array, zip(*(start_of(*trial) for trial in trials), strict=True)))
+    prior = tuple(map(np.array, zip(*(prior_of(*trial) for trial in trials), strict=True)))
     tags = np.stack([trial.recording.tags for trial in trials])
     level = level_of(trials[0].settings, np.zeros(3))
     hold = None if level is None else partial(hold_level, level=level)
@@ -146,6 +146,7 @@ def _readings(trials: list[Trial]) -> Iterator[Reading]:
             LinkNoise(np.where(links[:, k], std[:, k], 1.0)),
             np.zeros(6) if dt > 0 else None,
             dt,
+            **sensed(logs[0], trials[0].settings, times[k] - dt, times[k]),
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from rbl_gym.checks import check_number, check_one_of
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.recordings.align import ALIGNMENTS
+from rbl_gym.studies.replay.sensors import Inertial, Odometry
 
 __all__ = [
     "DEFAULT_RANGE_STD_M",
@@ -33,7 +34,8 @@ class Motion:
         The pose is a random walk of this standard deviation after 1 s.
     accel_m, accel_deg
         Of the filters ``"iekf-log"`` and ``"iekf-cv"``: how much speed (m/s) and turn rate (deg/s)
-        change in 1 s; None: 30 deg/s, and 1 m/s, of ``"iekf-cv"`` 0.5.
+        change in 1 s; None: 30 deg/s, and 1 m/s, of ``"iekf-cv"`` 0.5; with odometry, which
+        tells of every change, 1000 deg/s and 3 m/s.
     """
 
     walk_m: float = 0.1
@@ -240,7 +242,7 @@ class Settings:
     range_std_m
         Standard deviation of a range; None: the recording's own where it has one, else
         `DEFAULT_RANGE_STD_M`, which covers link biases that change with the pose.
-    motion, biases, loss, knowledge, comparison, smoothing
+    motion, biases, odometry, inertial, loss, knowledge, comparison, smoothing
         The rest, by subject.
 
     Examples
@@ -253,6 +255,8 @@ class Settings:
     range_std_m: float | None = None
     motion: Motion = Motion()
     biases: Biases = Biases()
+    odometry: Odometry = dataclasses.field(default_factory=Odometry)
+    inertial: Inertial = dataclasses.field(default_factory=Inertial)
     loss: Loss = Loss()
     knowledge: Knowledge = Knowledge()
     comparison: Comparison = Comparison()

@@ -16,6 +16,7 @@ from rbl_gym.estimators.costs.losses import LATE, SQUARES
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.unknown_twist import WanderingTwist
+from rbl_gym.recordings.odometry import OdometryLog
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import stack_beliefs
 from rbl_gym.studies.replay.mirror import covering
@@ -23,6 +24,7 @@ from rbl_gym.studies.replay.place import has_own_std, level_of, origin_of, start
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import (
     Track,
+    readings_of,
     recording_filter,
     recording_steps,
     robust_of,
@@ -117,10 +119,14 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
         _along(turn, math.radians(laws.smooth_accel_deg)),
         _along(shift, laws.smooth_accel_m),
     )
+    motion = smoothing.UnknownTwist(wander)
+    if recording.odometry is not None:
+        told = smoothing.padded(readings_of(recording, settings))
+        motion = smoothing.OdometryMotion(*told, settings.odometry.sensor())
     return smoothing.LogModel(
         recording.tags,
         ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M),
-        smoothing.UnknownTwist(wander),
+        motion,
         (
             LinkBias(laws.smooth_constant_m, None, laws.smooth_common_m),
             LinkBias(laws.smooth_bias_std_m, laws.smooth_bias_time_s),
@@ -145,7 +151,9 @@ def _starts(
         range_std=None if recording.range_std is None else recording.range_std[::-1],
         anchors=recording.anchors[::-1] if moving else recording.anchors,
         truth=None,
+        odometry=_backwards(recording, settings),
     )
+    settings = settings.changed(odometry_offset_s=0.0)
     filter = recording_filter(backwards, settings)
     steps = recording_steps(backwards, settings, filter)
     belief = stack_beliefs(step.belief for step in steps)
@@ -153,6 +161,15 @@ def _starts(
     rotation, translation, _ = start_of(recording, settings)
     K = len(times)
     yield np.broadcast_to(rotation, (K, 3, 3)), np.broadcast_to(translation, (K, 3))
+
+
+def _backwards(recording: Recording, settings: Settings) -> OdometryLog | None:
+    """Odometry of a body that goes the same way backwards, on the clock of its ranges."""
+    log, times = recording.odometry, recording.times
+    if log is None:
+        return None
+    own = log.times - settings.odometry.odometry_offset_s
+    return OdometryLog(times[-1] + times[0] - own[::-1], -log.readings[::-1])
 
 
 def _check_size(recording: Recording, settings: Settings) -> None:

@@ -65,6 +65,8 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
     offset = height_offset(recording, settings)
     settings = settings.changed(height_offset_m=offset, robust=robust_of(settings))
     recording_filter(recording, settings)
+    if settings.filter == "iekf-imu" and settings.smoothing.smooth:
+        raise ValueError("smooth knows no imu: leave out one of them")
     comparison = settings.comparison
     if recording.truth is not None and comparison.time_offset != "auto":
         truth = in_clock(recording.truth, settings)

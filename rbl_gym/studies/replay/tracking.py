@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +17,11 @@ from rbl_gym.estimators.filter import check_takes_noise
 from rbl_gym.estimators.level import hold_level
 from rbl_gym.geometry.mirror import mirror_pose
 from rbl_gym.measurements import ranging
+from rbl_gym.recordings.inertial import samples_between
+from rbl_gym.recordings.odometry import odometry_between
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import Reading, Step, innovations_of, stack_beliefs, track_epochs
+from rbl_gym.studies.replay.inertial import clocked, standing
 from rbl_gym.studies.replay.mirror import Mirror, covering, is_outside, other_pose
 from rbl_gym.studies.replay.place import (
     has_own_std,
@@ -113,7 +117,7 @@ def recording_steps(
     level = level_of(settings, origin)
     hold = None if level is None else partial(hold_level, level=level)
     readings = _readings(local, settings)
-    rotation, translation, covariance = start_of(recording, settings)
+    rotation, translation, covariance = prior_of(recording, settings)
     prior = rotation, translation - origin, covariance
     for step in track_epochs(filter, prior, readings, restart, hold):
         belief = step.belief
@@ -121,7 +125,7 @@ def recording_steps(
 
 
 def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
-    """The epochs of a recording, without odometry."""
+    """The epochs of a recording."""
     own = recording.range_std if has_own_std(recording, settings) else None
     elapsed = np.diff(recording.times, prepend=recording.times[0])
     anchors = recording.anchors_by_epoch
@@ -133,7 +137,35 @@ def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
             None if own is None else ranging.LinkNoise(own[k]),
             np.zeros(6) if dt > 0 else None,
             dt,
+            **sensed(recording, settings, recording.times[k] - dt, recording.times[k]),
         )
+
+
+def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotation, translation and covariance of the body before the first ranges."""
+    prior = start_of(recording, settings)
+    return standing(recording, settings, prior) if settings.filter == "iekf-imu" else prior
+
+
+def readings_of(recording: Recording, settings: Settings) -> list[tuple[FloatArray, FloatArray]]:
+    """Readings of the odometry and the seconds that they count for, between all epochs."""
+    found = (sensed(recording, settings, *ends) for ends in pairwise(recording.times.tolist()))
+    return [(one["odometry"], one["steps"]) for one in found]
+
+
+def sensed(
+    recording: Recording, settings: Settings, start_s: float, end_s: float
+) -> dict[str, FloatArray]:
+    """Fields of a `Reading`: what the recording's sensors read between two times."""
+    if settings.filter == "iekf-imu" and recording.inertial is not None:
+        log = clocked(recording, settings)
+        readings, steps = samples_between(log, start_s, end_s)  # pyright: ignore[reportArgumentType]
+        return {"inertial": readings, "steps": steps}
+    if recording.odometry is None:
+        return {}
+    ahead = settings.odometry.odometry_offset_s
+    readings, steps = odometry_between(recording.odometry, start_s + ahead, end_s + ahead)
+    return {"odometry": readings, "steps": steps}
 
 
 def _image_inside(
@@ -158,8 +190,19 @@ def range_std_of(recording: Recording, settings: Settings) -> float | str:
 
 
 def recording_filter(recording: Recording, settings: Settings) -> estimators.Filter:
-    """The named filter with the recording's tags, a random walk and the range noise."""
-    return named_filter(recording, settings, settings.filter, _options(settings))
+    """The named filter with the recording's tags, its motion and the range noise.
+
+    Raises
+    ------
+    ValueError
+        As `named_filter`, and where the recording has odometry that the filter does not read.
+    """
+    if (recording.inertial is None) == (settings.filter == "iekf-imu"):
+        what = "iekf-imu needs imu" if recording.inertial is None else "imu is read by iekf-imu"
+        raise ValueError(f"{what}, and the filter is {settings.filter!r}")
+    if recording.odometry is not None and settings.filter != "iekf-log":
+        raise ValueError(f"odometry is read by the filter iekf-log, not by {settings.filter!r}")
+    return named_filter(recording, settings, settings.filter, _options(recording, settings))
 
 
 def named_filter(
@@ -185,6 +228,9 @@ def named_filter(
         process = motion.ProcessNoise((0.0, 0.0, turn), (walk, walk, 0.0))
     else:
         process = motion.ProcessNoise(turn, walk)
+    if options.get("odometry") is not None:
+        # How far the way that it tells is off is said by its own law.
+        process = motion.ProcessNoise(0.0, 0.0)
     volume = volume_of(recording, settings)
     if name == "iekf-bank" and volume is not None:
         # The bank looks for a lost body in its volume, which is finite.
@@ -200,11 +246,11 @@ def named_filter(
     return filter
 
 
-def accel_of(settings: Settings) -> tuple[float, float]:
-    """How much speed (m/s) and turn rate (deg/s) of an unknown twist change in 1 s."""
-    told = settings.motion.accel_m, settings.motion.accel_deg
-    usual = _ACCEL.get(settings.filter, _ACCEL["iekf-log"])
-    accel_m, accel_deg = (a if b is None else b for a, b in zip(usual, told, strict=True))
+def accel_of(settings: Settings, told: bool = False) -> tuple[float, float]:
+    """How much speed (m/s) and turn rate (deg/s) change in 1 s; `told`: odometry tells of it."""
+    given = settings.motion.accel_m, settings.motion.accel_deg
+    usual = _TOLD if told else _ACCEL.get(settings.filter, _ACCEL["iekf-log"])
+    accel_m, accel_deg = (a if b is None else b for a, b in zip(usual, given, strict=True))
     return accel_m, accel_deg
 
 
@@ -216,6 +262,7 @@ def _noise(settings: Settings) -> ranging.RangeNoise:
 # Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
 _ANY_TURN, _ANY_SPEED = 1.0, 3.0
 # How much they change in 1 s (m/s, deg/s), where it is not told.
+_TOLD = (3.0, 1000.0)
 _ACCEL = {"iekf-log": (1.0, 30.0), "iekf-cv": (0.5, 30.0)}
 
 
@@ -223,10 +270,10 @@ def robust_of(settings: Settings) -> bool | str:
     """The loss of the filter."""
     if settings.loss.robust is not None:
         return settings.loss.robust
-    return "late" if settings.filter == "iekf-log" else True
+    return "late" if settings.filter in ("iekf-log", "iekf-imu") else True
 
 
-def _options(settings: Settings) -> dict[str, Any]:
+def _options(recording: Recording, settings: Settings) -> dict[str, Any]:
     """What the settings say to the named filter."""
     robust, biases = {"robust": robust_of(settings)}, settings.biases
     if settings.filter in ("iekf", "iekf-bank"):
@@ -239,16 +286,39 @@ def _options(settings: Settings) -> dict[str, Any]:
             "common_std_m": biases.bias_common_m,
         }
     if settings.filter == "iekf-cv":
-        return {**robust, **_twist(settings)}
+        return {**robust, **_twist(settings, accel_of(settings))}
+    if settings.filter == "iekf-imu":
+        return {
+            **robust,
+            "inertial": settings.inertial.sensor(),
+            "gravity_tilt_rad": math.radians(settings.inertial.gravity_tilt_deg),
+            "bias_std_m": biases.constant_std_m,
+            "common_std_m": biases.constant_common_m,
+            "drift_std_m": biases.drift_std_m,
+            "drift_time_s": biases.drift_time_s,
+            "headings": _headings(settings),
+        }
     if settings.filter == "iekf-log":
         names = ("constant_std_m", "constant_common_m", "drift_std_m", "drift_time_s")
-        return {**robust, **_twist(settings), **{name: getattr(biases, name) for name in names}}
+        options = {**robust, **{name: getattr(biases, name) for name in names}}
+        if recording.odometry is None:
+            return {**options, **_twist(settings, accel_of(settings))}
+        accel = accel_of(settings, told=True)
+        options |= {**_twist(settings, accel), "odometry": settings.odometry.sensor()}
+        return {**options, "headings": _headings(settings)}
     return {}
 
 
-def _twist(settings: Settings) -> dict[str, Any]:
+def _headings(settings: Settings) -> int:
+    """How many headings the filter starts from."""
+    known = settings.knowledge
+    told = known.start is not None and len(known.start) == 4
+    return 1 if told or known.prior_rotation_deg is not None else settings.odometry.headings
+
+
+def _twist(settings: Settings, accel: tuple[float, float]) -> dict[str, Any]:
     """Law of an unknown twist."""
-    accel_m, accel_deg = accel_of(settings)
+    accel_m, accel_deg = accel
     turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.knowledge.planar else ((1, 1, 1), (1, 1, 1))
     return {
         "turn_rate_rad_s": tuple(_ANY_TURN * axis for axis in turn),

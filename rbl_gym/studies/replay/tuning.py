@@ -23,6 +23,10 @@ _LIMITS = {
     "walk_deg": (0.2, 1e3),
     "accel_m": (1e-2, 100.0),
     "accel_deg": (1.0, 1e4),
+    "odometry_m": (5e-3, 10.0),
+    "odometry_deg": (0.5, 1e3),
+    "constant_std_m": (1e-2, 1.0),
+    "drift_std_m": (1e-3, 1.0),
 }
 # Factors between the values that are tried of each setting, round by round.
 _FACTORS = (4.0, 3.0, 2.0, 1.5, 1.25, 1.15)
@@ -74,7 +78,9 @@ def tune(
     for those refused, so that refusing has its price. Tuned are ``range_std_m``, ``walk_m`` and
     ``walk_deg``, and of filters that estimate a twist ``accel_m`` and ``accel_deg``; a walk of zero
     stays zero. The laws of the biases stay as they are: left free they take over what the body
-    does. The truth is not looked at.
+    does. With odometry, which tells what the body does, they are tuned in place of the motion:
+    ``odometry_m``, ``odometry_deg``, ``constant_std_m`` and ``drift_std_m``. The truth is not
+    looked at.
 
     Parameters
     ----------
@@ -109,6 +115,10 @@ def tune(
     value, found = tried[best]
     if best != settings.filter or len(names) > 1:
         found = {"filter": best, **found}
+    if recording.odometry is not None:
+        # The smoother has the same laws.
+        same = {"constant_std_m": "smooth_constant_m", "drift_std_m": "smooth_bias_std_m"}
+        found |= {there: found[here] for here, there in same.items() if here in found}
     # Without the filter's name other options may mean another filter.
     options = " ".join(
         f"--{name.replace('_', '-')} {value if isinstance(value, str) else f'{value:g}'}"
@@ -163,6 +173,11 @@ def _start(trial: Trial) -> dict[str, float]:
     if std is None and recording.range_std is not None:
         std = float(np.median(recording.range_std[recording.links]))
     start: dict[str, Any] = {"range_std_m": std or DEFAULT_RANGE_STD_M}
+    if recording.odometry is not None:
+        known = settings.flat()
+        names = ("odometry_m", "odometry_deg", "constant_std_m", "drift_std_m")
+        start |= {name: known[name] for name in names}
+        return {name: value for name, value in start.items() if value > 0}
     start |= {name: getattr(settings.motion, name) for name in ("walk_m", "walk_deg")}
     if getattr(recording_filter(recording, settings), "twist", None) is not None:
         start |= dict(zip(("accel_m", "accel_deg"), accel_of(settings), strict=True))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from rbl_gym.checks import FloatArray
-from rbl_gym.estimators.filter import register
+from rbl_gym.checks import FloatArray, check_count
+from rbl_gym.estimators.bank.headings import HeadingBank
+from rbl_gym.estimators.filter import Filter, register
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
+from rbl_gym.estimators.iekf.odometry import OdometryEkf
 from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.measurements.odometry import OdometrySensor
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
@@ -87,7 +90,9 @@ def iekf_log(
     drift_std_m: float = 0.05,
     drift_time_s: float = 3.0,
     offset: str | None = None,
-) -> AugmentedEkf:
+    odometry: Mapping[str, float] | OdometrySensor | None = None,
+    headings: int = 1,
+) -> Filter:
     """The filter ``"iekf-log"``: a log of raw ranges of which nothing else is known.
 
     Pose and twist, and of every link two biases: one that stays, of cables and antennas, and one
@@ -107,12 +112,24 @@ def iekf_log(
         Standard deviations of the biases that stay: of each link, and of what all have in common.
     drift_std_m, drift_time_s
         Of the biases that move: standard deviation of each link's, and how long it lasts.
+    odometry
+        Law of the odometry that `predict` is then told, an `OdometrySensor` or its fields; the
+        twist is that of the body's axes. None: there is none.
+    headings
+        1, or how many hypotheses of the heading there are at the start, as of `iekf-imu`.
     """
     law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
     stays = LinkBias(constant_std_m, None, constant_common_m)
     moves = LinkBias(drift_std_m, drift_time_s)
     pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
-    return AugmentedEkf(pose, law, None, (stays, moves))
+    if odometry is None:
+        filter = AugmentedEkf(pose, law, None, (stays, moves))
+    else:
+        sensor = odometry if isinstance(odometry, OdometrySensor) else OdometrySensor(**odometry)
+        # A bias that cannot be needs no states.
+        biases = tuple(bias for bias in (stays, moves) if bias.std_m or bias.common_std_m)
+        filter = OdometryEkf(pose, law, None, biases, sensor)
+    return filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
 
 
 register("iekf-cv", iekf_cv)

@@ -1,0 +1,192 @@
+"""The iterated EKF of a body with odometry: its twist in its own axes, and the sensor's faults.
+
+Error states: rotation (global), place, turn rate and speed in the body's axes (12); scales of turn
+rate and speed and biases of the turn rates, which are constant (5); then biases of the links. The
+twist wanders by white acceleration, and every reading of the odometry measures it: where readings
+are missing, the body goes on as it did.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, check_number, kernel
+from rbl_gym.estimators.costs.bias_cost import AugmentedState
+from rbl_gym.estimators.iekf.augmented import AugmentedEkf
+from rbl_gym.estimators.iekf.inertial import fade
+from rbl_gym.estimators.inputs import check_batches, plain
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements.odometry import OdometrySensor, expected
+from rbl_gym.motion import navigation
+from rbl_gym.motion.unknown_twist import WanderingTwist
+
+_EXP, _HAT = kernel(rotations.exp), kernel(rotations.hat)
+_LEFT_JACOBIAN = kernel(rotations.left_jacobian)
+_TWIST, _CALIBRATION = slice(6, 12), slice(12, 17)
+_STATES = 11
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryEkf(AugmentedEkf):
+    """Iterated extended Kalman filter of pose, twist in the body frame, odometry and biases.
+
+    Parameters
+    ----------
+    pose, biases
+        As `AugmentedEkf`.
+    twist
+        Law of the twist, per axis of the body.
+    sensor
+        None.
+    odometry
+        Law of the readings.
+    """
+
+    twist: WanderingTwist | None = field(default_factory=WanderingTwist)
+    odometry: OdometrySensor = field(default_factory=OdometrySensor)
+    reads: ClassVar[str] = "odometry"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.twist, WanderingTwist):
+            raise ValueError(f"twist must be a WanderingTwist, got {self.twist!r:.80}")
+        if not isinstance(self.odometry, OdometrySensor):
+            raise ValueError(f"odometry must be an OdometrySensor, got {self.odometry!r:.80}")
+
+    @property
+    def _n_twist(self) -> int:
+        return _STATES
+
+    def initial(
+        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
+    ) -> AugmentedState:
+        """State of a prior of the pose, covariance (..., 6, 6); at rest, with a perfect sensor.
+
+        Raises
+        ------
+        ValueError
+            As `IteratedEkf.initial`.
+        """
+        assert self.twist is not None
+        pose = self.pose.initial(rotation, translation, covariance)
+        batch, n = pose.translation.shape[:-1], 6 + _STATES
+        P = np.zeros((*batch, n, n))
+        P[..., :6, :6] = pose.covariance
+        std = np.concatenate([self.twist.prior_std(), self.odometry.calibration_std()])
+        P[..., range(6, n), range(6, n)] = std**2
+        return AugmentedState(pose.rotation, pose.translation, np.zeros((*batch, _STATES)), P)
+
+    def predict(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, state: AugmentedState, readings: ArrayLike, dt: ArrayLike
+    ) -> AugmentedState:
+        """State after the readings of an interval.
+
+        Parameters
+        ----------
+        readings
+            (..., S, 6): turn rate (rad/s) and speed (m/s) in the body frame, NaN where there is
+            none.
+        dt
+            Seconds of the interval, which its readings share alike; or of each reading, (..., S).
+
+        Raises
+        ------
+        ValueError
+            On wrong shapes, infinite readings, negative times.
+        """
+        readings = np.asarray(readings, dtype=np.float64)
+        if readings.ndim < 2 or readings.shape[-1] != 6 or np.isinf(readings).any():
+            raise ValueError(
+                f"readings must be finite or NaN and (..., S, 6), got shape {readings.shape}"
+            )
+        if np.ndim(dt):
+            steps = navigation.check_steps(dt, readings)
+        else:
+            count = readings.shape[-2]
+            steps = np.full(count, check_number("dt", dt, low=0.0) / max(count, 1))
+        state = plain(state)
+        check_batches(state=state.translation.shape[:-1], readings=readings.shape[:-2])
+        for k in range(readings.shape[-2]):
+            step = steps[..., k]
+            state = self._jumped(state, step)
+            # A reading of no time tells nothing.
+            told = np.where(step[..., None] > 0, readings[..., k, :], np.nan)
+            if not np.isnan(told).all():
+                state = _sensed(state, told, step, self.odometry)
+            state = self._moved(state, step)
+        if any(law.time_s is not None for law in self.biases):
+            faded = fade(*state[2:], self._laws, steps.sum(axis=-1), _STATES)
+            state = AugmentedState(*state[:2], *faded)
+        return state
+
+    def _jumped(self, state: AugmentedState, dt: FloatArray) -> AugmentedState:
+        """State whose twist has changed by what it does in `dt` seconds (...)."""
+        P = state.covariance
+        P = np.broadcast_to(P, (*np.broadcast_shapes(P.shape[:-2], np.shape(dt)), *P.shape[-2:]))
+        P = P.copy()
+        P[..., _TWIST, _TWIST] += np.asarray(dt)[..., None, None] * np.diag(self._wander)
+        return state._replace(covariance=P)
+
+    def _moved(self, state: AugmentedState, dt: FloatArray) -> AugmentedState:
+        """State after `dt` seconds (...) of its twist, which stays."""
+        Q, extra = state.rotation, state.extra
+        dt = np.asarray(dt)[..., None]
+        turn, speed = extra[..., :3] * dt, extra[..., 3:6]
+        J = Q @ _LEFT_JACOBIAN(turn)
+        way = _times(J, speed) * dt
+        dt = dt[..., None]
+        P = state.covariance
+        batch = np.broadcast_shapes(P.shape[:-2], dt.shape[:-2])
+        F = np.zeros((*batch, 6, 12))
+        F[..., :, :6] = np.eye(6)
+        F[..., :3, 6:9] = F[..., 3:, 9:] = J * dt
+        F[..., 3:, :3] = -_HAT(way)
+        F[..., 3:, 6:9] = -0.5 * dt**2 * Q @ _HAT(speed)
+        P = np.broadcast_to(P, (*batch, *P.shape[-2:])).copy()
+        P[..., :6, :] = F @ P[..., :12, :]
+        P[..., :, :6] = P[..., :, :12] @ np.swapaxes(F, -1, -2)
+        P[..., :6, :6] += dt * np.diag(self._process)
+        translation = state.translation + way
+        extra = np.broadcast_to(extra, (*translation.shape[:-1], extra.shape[-1]))
+        return AugmentedState(Q @ _EXP(turn), translation, extra, P)
+
+
+def _sensed(
+    state: AugmentedState, reading: FloatArray, dt: FloatArray, sensor: OdometrySensor
+) -> AugmentedState:
+    """The state after a reading (..., 6) that counts for `dt` seconds (...)."""
+    known, P = np.isfinite(reading), state.covariance
+    twist, calibration = state.extra[..., :6], state.extra[..., 6:11]
+    scale = 1 + np.repeat(calibration[..., :2], 3, axis=-1)
+    error = np.where(known, reading, 0.0) - np.where(known, expected(twist, calibration), 0.0)
+    variance = sensor.noise() ** 2 / np.where(dt > 0, dt, 1.0)[..., None]
+    # The scales are seen at the twist that the reading makes likely: the body may have been
+    # believed at rest.
+    own = np.diagonal(P, axis1=-2, axis2=-1)[..., _TWIST]
+    likely = twist + own * scale / (own * scale**2 + variance) * error
+    H = np.zeros((*np.broadcast_shapes(error.shape, scale.shape), _STATES))
+    axes = np.arange(6)
+    H[..., axes, axes] = scale
+    H[..., :3, 6], H[..., 3:, 7] = likely[..., :3], likely[..., 3:]
+    H[..., range(3), range(8, 11)] = 1.0
+    H = np.where(known[..., None], H, 0.0)
+    crossed = P[..., :, 6 : 6 + _STATES] @ np.swapaxes(H, -1, -2)
+    S = H @ crossed[..., 6 : 6 + _STATES, :]
+    S[..., axes, axes] += variance
+    gain = np.swapaxes(np.linalg.solve(S, np.swapaxes(crossed, -1, -2)), -1, -2)
+    step = _times(gain, error)
+    P = P - gain @ np.swapaxes(crossed, -1, -2)
+    return AugmentedState(
+        _EXP(step[..., :3]) @ state.rotation,
+        state.translation + step[..., 3:6],
+        state.extra + step[..., 6:],
+        0.5 * (P + np.swapaxes(P, -1, -2)),
+    )
+
+
+def _times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    return (matrix @ vector[..., None])[..., 0]

@@ -1,0 +1,164 @@
+"""Readings of odometry between neighbouring epochs, as a factor of the smoother."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import FloatArray, kernel
+from rbl_gym.estimators.smoothing.equations import LogState, Rows
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements.odometry import OdometrySensor, expected
+from rbl_gym.motion import navigation
+
+__all__ = ["OdometryMotion", "padded"]
+
+# Behind the doors: what comes to these was checked, or made here.
+_EXP, _LOG, _HAT = kernel(rotations.exp), kernel(rotations.log), kernel(rotations.hat)
+_LEFT_JACOBIAN = kernel(rotations.left_jacobian)
+_LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
+
+
+@dataclass(frozen=True, eq=False)
+class OdometryMotion:
+    """A pose moved by readings of odometry: `Motion` of a `LogModel`.
+
+    Of the whole log the scales of turn rate and speed and the biases of the turn rates are
+    estimated. Between two epochs the readings are put together; what they do not read moves by a
+    random walk.
+
+    Parameters
+    ----------
+    readings, steps
+        (..., K - 1, S, 6) and seconds (..., K - 1, S), of the intervals between epochs: turn rate
+        (rad/s), then speed (m/s), in the body frame, NaN where there is none. Fewer readings than
+        S in one are filled up with readings of no length.
+    sensor
+        Law of the readings.
+    unread
+        By how much an axis that is not read moves in 1 s: turns (rad), ways (m).
+    """
+
+    readings: ArrayLike
+    steps: ArrayLike
+    sensor: OdometrySensor
+    unread: tuple[float, float] = (1.0, 1.0)
+
+    extra_std = np.zeros(0)
+    turning = False
+
+    def __post_init__(self) -> None:
+        readings = np.asarray(self.readings, dtype=np.float64)
+        if readings.ndim < 3 or readings.shape[-1] != 6 or np.isinf(readings).any():
+            raise ValueError(
+                f"readings must be finite or NaN and (..., K - 1, S, 6), got shape {readings.shape}"
+            )
+        object.__setattr__(self, "readings", readings)
+        object.__setattr__(self, "steps", navigation.check_steps(self.steps, readings))
+        if not isinstance(self.sensor, OdometrySensor):
+            raise ValueError(f"sensor must be an OdometrySensor, got {self.sensor!r:.80}")
+
+    @property
+    def constants_std(self) -> FloatArray:
+        """Standard deviations (5,) of scales and biases."""
+        return np.maximum(self.sensor.calibration_std(), 1e-9)
+
+    def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
+        """Rows of what lies between two poses beyond what the readings tell, whitened."""
+        turn, way, by = _together(self.readings, self.steps, constants)  # pyright: ignore[reportArgumentType]
+        Q, Q_new = state.rotation[..., :-1, :, :], state.rotation[..., 1:, :, :]
+        back = np.swapaxes(Q, -1, -2)
+        error = _LOG(np.swapaxes(turn, -1, -2) @ back @ Q_new)
+        moved = _times(back, np.diff(state.translation, axis=-2))
+        residual = np.concatenate([error, moved - way], axis=-1)
+        # E = R^T Q^T Q'; an error w' of Q' turns it by (Q R)^T w', one of Q by minus as much.
+        inner = _LEFT_JACOBIAN_INVERSE(error) @ np.swapaxes(Q @ turn, -1, -2)
+        A, B = (np.zeros((*residual.shape, 6)) for _ in range(2))
+        A[..., :3, :3], B[..., :3, :3] = -inner, inner
+        A[..., 3:, :3] = back @ _HAT(_times(Q, moved))
+        A[..., 3:, 3:], B[..., 3:, 3:] = -back, back
+        C = np.zeros((*residual.shape, 5))
+        C[..., :3, :] = -_LEFT_JACOBIAN_INVERSE(error) @ by[..., :3, :]
+        C[..., 3:, :] = -by[..., 3:, :]
+        L = self._whitener
+        return Rows(_times(L, residual), L @ A, L @ B, L @ C)
+
+    @functools.cached_property
+    def _whitener(self) -> FloatArray:
+        """Inverse Cholesky factors (..., K - 1, 6, 6) of the noise of readings put together."""
+        _, way, _ = _together(self.readings, self.steps, np.zeros(5))  # pyright: ignore[reportArgumentType]
+        steps = np.asarray(self.steps)[..., None]
+        known = np.isfinite(np.asarray(self.readings))
+        unread = np.repeat(self.unread, 3)
+        variance = (np.where(known, self.sensor.noise(), unread) ** 2 * steps).sum(axis=-2)
+        variance = np.maximum(variance, 1e-12)
+        P = variance[..., None] * np.eye(6)
+        # A turn at an unknown moment of the interval moves its end by half of what is left.
+        lever = -0.5 * _HAT(way)
+        P[..., 3:, :3] = lever * variance[..., None, :3]
+        P[..., :3, 3:] = np.swapaxes(P[..., 3:, :3], -1, -2)
+        # The mean of squares of such moments is a third.
+        P[..., 3:, 3:] += 4 / 3 * (P[..., 3:, :3] @ np.swapaxes(lever, -1, -2))
+        return np.linalg.inv(np.linalg.cholesky(P))
+
+
+def padded(intervals: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Readings (J, S, 6) and seconds (J, S) of J intervals, as the laws of motion take them.
+
+    Parameters
+    ----------
+    intervals
+        Readings (S, 6) and seconds (S,) of each; those with fewer than the most are filled up with
+        zeros that last no time.
+    """
+    most = max((len(steps) for _, steps in intervals), default=0)
+    readings, seconds = np.zeros((len(intervals), most, 6)), np.zeros((len(intervals), most))
+    for k, (values, steps) in enumerate(intervals):
+        readings[k, : len(steps)], seconds[k, : len(steps)] = values, steps
+    return readings, seconds
+
+
+def _together(
+    readings: FloatArray, steps: FloatArray, constants: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Turn (..., 3, 3), way (..., 3) in the first frame, and derivatives (..., 6, 5) by constants.
+
+    The derivative of the turn is that of its last frame's error, ``R exp(d)``.
+    """
+    constants = constants[..., None, :]
+    scale = 1 + np.repeat(constants[..., :2], 3, axis=-1)
+    known = np.isfinite(readings)
+    batch = np.broadcast_shapes(readings.shape[:-2], constants.shape[:-1])
+    R, p = np.broadcast_to(np.eye(3), (*batch, 3, 3)), np.zeros((*batch, 3))
+    D = np.zeros((*batch, 6, 5))
+    none = expected(np.zeros(6), constants)
+    for s in range(readings.shape[-2]):
+        dt = steps[..., s, None]
+        seen = known[..., s, :]
+        twist = np.where(seen, (readings[..., s, :] - none) / scale, 0.0)
+        moved = twist * dt
+        # By the constants: the scales, then the biases.
+        slope = np.zeros((*twist.shape, 5))
+        slope[..., :3, 0], slope[..., 3:, 1] = -twist[..., :3], -twist[..., 3:]
+        slope[..., range(3), range(2, 5)] = -1.0
+        slope = np.where(seen[..., None], slope / scale[..., None] * dt[..., None], 0.0)
+        J = _LEFT_JACOBIAN(moved[..., :3])
+        step = _EXP(moved[..., :3])
+        way = _times(J, moved[..., 3:])
+        bent = -0.5 * _HAT(moved[..., 3:]) @ slope[..., :3, :]
+        new = np.empty_like(D)
+        new[..., 3:, :] = D[..., 3:, :] + R @ (
+            J @ slope[..., 3:, :] + bent - _HAT(way) @ D[..., :3, :]
+        )
+        back = np.swapaxes(step, -1, -2)
+        new[..., :3, :] = back @ (D[..., :3, :] + J @ slope[..., :3, :])
+        p, R, D = p + _times(R, way), R @ step, new
+    return R, p, D
+
+
+def _times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+    return (matrix @ vector[..., None])[..., 0]

@@ -1,0 +1,103 @@
+"""Sensors on the body and their clocks, on the command line of ``rbl-gym replay``."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from rbl_gym.app.terminal import offset, progress
+
+if TYPE_CHECKING:
+    from rbl_gym.recordings import Recording
+    from rbl_gym.studies.replay import Settings
+
+# Settings that are the offsets of clocks.
+_CLOCKS = {"truth": "time_offset", "odometry": "odometry_offset_s", "imu": "imu_offset_s"}
+
+
+def add_odometry(group: Any) -> None:
+    """Options of `rbl_gym.studies.replay.Odometry`."""
+    for name, text in (
+        ("odometry-m", "by how much its way is off after 1 s, default 0.05"),
+        ("slip-m", "the same sideways and vertically, default 0.03"),
+        ("odometry-deg", "of its turns, default 6"),
+        ("odometry-scale", "of its scale errors, default 0.03"),
+        ("odometry-bias-deg-s", "of the biases of its turn rates, default 0.5"),
+    ):
+        group.add_argument(f"--{name}", type=float, metavar="X", help=text)
+    group.add_argument(
+        "--headings",
+        type=int,
+        metavar="N",
+        help="headings to start from where --start tells none, default 12",
+    )
+
+
+def add_inertial(group: Any) -> None:
+    """Options of `rbl_gym.studies.replay.Inertial`."""
+    for name, text in (
+        ("gyro-noise", "density of its white noise, rad/s/sqrt(Hz), default 0.003"),
+        ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.11"),
+        ("gravity-tilt-deg", "of the world's z axis against the vertical, default 1"),
+    ):
+        group.add_argument(f"--{name}", type=float, metavar="X", help=text)
+
+
+def add_clocks(group: Any) -> None:
+    """The option ``--time-offset``."""
+    group.add_argument(
+        "--time-offset",
+        type=_clock,
+        action="append",
+        dest="time_offsets",
+        metavar="[WHAT=]S",
+        help="how far the truth's clock is ahead of that of the ranges, seconds; auto: found by "
+        "the motion; odometry=S and imu=S of those, odometry=auto and imu=auto by the likelihood "
+        "of the ranges, to 1.6 s; may be given more than once",
+    )
+
+
+def told_clocks(options: argparse.Namespace) -> dict[str, Any]:
+    """Settings of the clocks that are told; that of the truth may be ``"auto"``.
+
+    Raises
+    ------
+    ValueError
+        On the clock of a sensor that there is not.
+    """
+    told = dict(options.time_offsets or ())
+    for what in told:
+        if what != "truth" and getattr(options, what) is None:
+            raise ValueError(f"--time-offset {what}=... means nothing without --{what}")
+    return {
+        _CLOCKS[what]: value for what, value in told.items() if what == "truth" or value != "auto"
+    }
+
+
+def found_clocks(
+    options: argparse.Namespace, runs: Mapping[str, Recording], settings: Settings
+) -> tuple[Settings, dict[str, Any]]:
+    """The settings with the clocks of sensors that are to be found, and figures of these."""
+    from rbl_gym.studies import replay
+
+    figures: dict[str, Any] = {}
+    for what, value in dict(options.time_offsets or ()).items():
+        if what == "truth" or value != "auto":
+            continue
+        longest = max(runs.values(), key=lambda run: len(run.times))
+        with progress(f"clock of {what}", replay.CLOCK_TRIALS) as advance:
+            clock = replay.sensor_clock(longest, settings, _CLOCKS[what], advance)
+        settings = settings.changed(**{_CLOCKS[what]: clock.offset_s})
+        figures[f"{what}_clock"] = clock._asdict()
+    return settings, figures
+
+
+def _clock(text: str) -> tuple[str, float | str]:
+    what, equal, value = text.rpartition("=")
+    what = what if equal else "truth"
+    if what not in _CLOCKS:
+        raise argparse.ArgumentTypeError(
+            f"must be of one of {', '.join(_CLOCKS)}, as in odometry=0.1, got {text!r}"
+        )
+    return what, offset(value)

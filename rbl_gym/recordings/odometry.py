@@ -1,0 +1,176 @@
+"""The log of odometry: speeds and turn rates in the body's axes, cut at the times of epochs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_number, check_one_of
+from rbl_gym.recordings.inertial import TURN_UNITS
+from rbl_gym.recordings.report import Said
+from rbl_gym.recordings.tables import AS_NAMED, AnyPath, Source, Table, read_table
+
+__all__ = ["OdometryLog", "odometry_between", "read_odometry"]
+
+_COLUMNS = ("wx", "wy", "wz", "vx", "vy", "vz")
+_WHEELS = ("left", "right")
+# No body turns or drives as fast (rad/s, m/s).
+_MAX_RATE, _MAX_SPEED = 50.0, 150.0
+
+
+class OdometryLog(NamedTuple):
+    """Readings of odometry: times (K,) in seconds, and (K, 6), rad/s then m/s, of the body's axes.
+
+    What the sensor does not read is NaN.
+    """
+
+    times: FloatArray
+    readings: FloatArray
+
+
+def read_odometry(
+    path: AnyPath,
+    source: Source = AS_NAMED,
+    said: Said | None = None,
+    *,
+    wheelbase_m: float | None = None,
+    turn_unit: str = "rad/s",
+) -> OdometryLog:
+    """The log of odometry: a table ``t,vx,vy,vz,wx,wy,wz``, or of two wheels ``t,left,right``.
+
+    Columns that are not there are not measured (NaN), but for what wheels cannot do: where there
+    is `vx` and neither `vy` nor `vz`, the body moves forwards alone, and where there is `wz` and
+    neither `wx` nor `wy` besides, it stays level. These are zeros then. A row whose time has come
+    before is left out.
+
+    Parameters
+    ----------
+    path, source, said
+        The file, how its columns are named, and who takes down what was found. A file without a
+        header has its columns by number, from 1: ``{"t": "2", "left": "3"}``.
+    wheelbase_m
+        Of `left` and `right`, speeds of wheels or tracks: the distance between them, metres, or
+        the column `width`. The turn rate is ``(right - left) / width``.
+    turn_unit
+        ``"rad/s"`` or ``"deg/s"``: what the file has.
+
+    Raises
+    ------
+    ValueError
+        On a cell that is no number, times that decrease (by file, line and column), a column that
+        is not there, and readings that cannot be in these units.
+    """
+    unit = TURN_UNITS[check_one_of("turn_unit", turn_unit, list(TURN_UNITS))]
+    said = said or Said()
+    table = read_table(path, source)
+    times, note = table.seconds()
+    said.note(table.path, note)
+    later = np.diff(times, prepend=-np.inf)
+    table.check(later >= 0, "t", "time must not decrease from row to row")
+    if any(name in table.columns for name in _WHEELS):
+        readings, names = _of_wheels(table, wheelbase_m)
+    else:
+        readings, names = _of_axes(table, unit)
+        if wheelbase_m is not None:
+            raise ValueError(f"{table.path}: wheelbase_m is of the columns left and right")
+    said.read(table, ("t", *names))
+    if (again := int((later == 0).sum())) > 0:
+        said.note(table.path, f"{again} rows whose time has come before are left out")
+    most = np.nan_to_num(np.abs(readings)).max(axis=0)
+    if most[:3].max() > _MAX_RATE:
+        raise ValueError(
+            f"{table.path}: turn rates of {most[:3].max():.3g} rad/s (looks like deg/s, or a "
+            "width in other units?)"
+        )
+    if most[3:].max() > _MAX_SPEED:
+        raise ValueError(
+            f"{table.path}: speeds of {most[3:].max():.3g} m/s (looks like millimetres?)"
+        )
+    return OdometryLog(times[later > 0], readings[later > 0])
+
+
+def _of_axes(table: Table, unit: float) -> tuple[FloatArray, tuple[str, ...]]:
+    names = tuple(name for name in _COLUMNS if name in table.columns)
+    if not names:
+        raise ValueError(
+            f"{table.path}, line {table.header_line}: must have some of the columns "
+            f"{', '.join(_COLUMNS)}, or left and right, got {[*table.names.values()]!r:.200}; say "
+            "which they are by columns, odometry.vx=NAME"
+        )
+    readings = np.full((len(table.lines), 6), np.nan)
+    for name in names:
+        k = _COLUMNS.index(name)
+        readings[:, k] = table.numbers(name, may_be_missing=True) * (unit if k < 3 else 1.0)
+    if "vx" in names and not {"vy", "vz"} & {*names}:
+        readings[:, 4:] = 0.0
+        if "wz" in names and not {"wx", "wy"} & {*names}:
+            readings[:, :2] = 0.0
+    return readings, names
+
+
+def _of_wheels(table: Table, wheelbase_m: float | None) -> tuple[FloatArray, tuple[str, ...]]:
+    table.require(*_WHEELS)
+    left, right = (table.numbers(name) for name in _WHEELS)
+    names, width = _WHEELS, wheelbase_m
+    if width is None:
+        if "width" not in table.columns:
+            raise ValueError(
+                f"{table.path}: speeds of wheels need wheelbase_m, the distance between them, or "
+                "a column width"
+            )
+        names = (*_WHEELS, "width")
+        width = table.numbers("width")
+        table.check(width > 0, "width", "must be positive")
+    else:
+        width = check_number("wheelbase_m", width, low=1e-6)
+    readings = np.zeros((len(left), 6))
+    readings[:, 2], readings[:, 3] = (right - left) / width, 0.5 * (left + right)
+    return readings, names
+
+
+def odometry_between(
+    log: OdometryLog, start_s: float, end_s: float, hold_s: float = 0.5
+) -> tuple[FloatArray, FloatArray]:
+    """Readings (S, 6) between two times, and the seconds (S,) for which each of them counts.
+
+    A reading counts from half way to the one before until half way to the next, but no further
+    from its own time than half of `hold_s`; in longer gaps, and outside the log, there are rows of
+    NaN.
+
+    Parameters
+    ----------
+    log, start_s, end_s
+        The log, and two times on its clock, the second not before the first.
+    hold_s
+        Longest gap that is bridged.
+
+    Raises
+    ------
+    ValueError
+        If the times are not in order.
+    """
+    start_s = check_number("start_s", start_s)
+    end_s = check_number("end_s", end_s, low=start_s)
+    reach = 0.5 * check_number("hold_s", hold_s, low=0.0)
+    times = log.times
+    first = max(int(np.searchsorted(times, start_s - reach)) - 1, 0)
+    last = int(np.searchsorted(times, end_s + reach, side="right")) + 1
+    near, values = times[first:last], log.readings[first:last]
+    middle = 0.5 * (near[1:] + near[:-1])
+    begins = np.maximum(near - reach, np.concatenate([[-np.inf], middle]))
+    ends = np.minimum(near + reach, np.concatenate([middle, [np.inf]]))
+    edges, rows = [start_s], []
+    for begin, end, value in zip(begins, ends, values, strict=True):
+        begin, end = max(begin, edges[-1]), min(end, end_s)
+        if end <= begin:
+            continue
+        if begin > edges[-1]:
+            edges.append(begin)
+            rows.append(np.full(6, np.nan))
+        edges.append(end)
+        rows.append(value)
+    if edges[-1] < end_s or not rows:
+        edges.append(end_s)
+        rows.append(np.full(6, np.nan))
+    return np.array(rows), np.diff(edges)

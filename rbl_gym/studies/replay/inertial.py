@@ -1,0 +1,81 @@
+"""A recording with an inertial sensor: the epochs it covers, and how the body stands at first."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry import rotations
+from rbl_gym.motion import navigation
+from rbl_gym.recordings.inertial import InertialLog, samples_between
+from rbl_gym.recordings.recording import Recording
+from rbl_gym.studies.replay.settings import Settings
+
+__all__ = ["covered"]
+
+# Seconds of readings that tell how the body stands; deviation of what they tell, at the least: it
+# may be moving.
+_LOOK_S, _TILT_RAD = 0.25, np.deg2rad(3.0)
+
+
+def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> Recording:
+    """The epochs for which there are readings of the inertial sensor, and a margin.
+
+    Parameters
+    ----------
+    recording, settings
+        A log, and by how much the sensor's clock is ahead.
+    margin_s
+        Readings that are there beyond the epochs, seconds on both sides.
+
+    Raises
+    ------
+    ValueError
+        Where there are none.
+    """
+    log = clocked(recording, settings)
+    if log is None:
+        return recording
+    low, high = log.times[0] + _LOOK_S + margin_s, log.times[-1] - margin_s
+    inside = np.flatnonzero((recording.times >= low) & (recording.times <= high))
+    if not len(inside):
+        raise ValueError(
+            f"imu has readings from {log.times[0]:.6g} to {log.times[-1]:.6g} s of the ranges' "
+            f"clock, which are of {recording.times[0]:.6g} to {recording.times[-1]:.6g} s: see "
+            "--time-offset imu=S"
+        )
+    part = slice(inside[0], inside[-1] + 1)
+    std, anchors = recording.range_std, recording.anchors
+    return recording._replace(
+        times=recording.times[part],
+        ranges=recording.ranges[part],
+        links=recording.links[part],
+        range_std=None if std is None else std[part],
+        anchors=anchors[part] if anchors.ndim == 3 else anchors,
+    )
+
+
+def clocked(recording: Recording, settings: Settings) -> InertialLog | None:
+    """The readings on the clock of the ranges."""
+    log = recording.inertial
+    return None if log is None else log._replace(times=log.times - settings.inertial.imu_offset_s)
+
+
+def standing(
+    recording: Recording,
+    settings: Settings,
+    prior: tuple[FloatArray, FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A prior with roll and pitch by gravity; its yaw stays, and how well that is known."""
+    log = clocked(recording, settings)
+    assert log is not None
+    rotation, translation, covariance = prior
+    first = recording.times[0]
+    readings, _ = samples_between(log, first - _LOOK_S, first)
+    level, spread = navigation.attitude(readings, settings.inertial.sensor())
+    yaw = float(rotations.yaw(rotation) - rotations.yaw(level))
+    std = np.sqrt(np.maximum(np.diag(spread), _TILT_RAD**2))
+    P = covariance.copy()
+    P[:3, :] = P[:, :3] = 0.0
+    P[[0, 1], [0, 1]], P[2, 2] = std[:2] ** 2, covariance[2, 2]
+    return rotations.exp([0.0, 0.0, yaw]) @ level, translation, P

@@ -1,0 +1,96 @@
+"""Settings of the sensors on a recorded body."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from rbl_gym.checks import check_count, check_number
+from rbl_gym.measurements.inertial import InertialSensor
+from rbl_gym.measurements.odometry import OdometrySensor
+
+__all__ = ["Inertial", "Odometry"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Odometry:
+    """What the recording's odometry is worth, and its clock.
+
+    Parameters
+    ----------
+    odometry_m, slip_m, odometry_deg
+        By how much the way it tells is off after 1 s: forwards; sideways and vertically; turned.
+    odometry_scale
+        Standard deviation of its scale errors, of speeds and of turn rates, which are estimated.
+    odometry_bias_deg_s
+        Standard deviation of the biases of its turn rates, which are estimated (deg/s).
+    odometry_offset_s
+        How far its clock is ahead of that of the ranges.
+    headings
+        How many headings the filter starts from, where none is told.
+    """
+
+    odometry_m: float = 0.05
+    slip_m: float = 0.03
+    odometry_deg: float = 6.0
+    odometry_scale: float = 0.03
+    odometry_bias_deg_s: float = 0.5
+    odometry_offset_s: float = 0.0
+    headings: int = 12
+
+    def __post_init__(self) -> None:
+        check_number("odometry_offset_s", self.odometry_offset_s)
+        check_count("headings", self.headings)
+        self.sensor()
+
+    def sensor(self) -> OdometrySensor:
+        """The law of its readings."""
+        for name in ("odometry_m", "slip_m", "odometry_deg"):
+            check_number(name, getattr(self, name), low=1e-6)
+        for name in ("odometry_scale", "odometry_bias_deg_s"):
+            check_number(name, getattr(self, name), low=0.0)
+        return OdometrySensor(
+            self.odometry_m,
+            self.slip_m,
+            math.radians(self.odometry_deg),
+            self.odometry_scale,
+            self.odometry_scale,
+            math.radians(self.odometry_bias_deg_s),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Inertial:
+    """What the recording's inertial sensor is worth, and its clock.
+
+    Parameters
+    ----------
+    gyro_noise, accel_noise
+        Densities of its white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz). The defaults are ten times
+        and more those of a data sheet: they stand for vibration, and for what the sensor's place
+        off the body's origin adds.
+    gravity_tilt_deg
+        Standard deviation of the angle between the world's z axis and the vertical.
+    imu_offset_s
+        How far its clock is ahead of that of the ranges.
+    """
+
+    gyro_noise: float = 3e-3
+    accel_noise: float = 0.11
+    gravity_tilt_deg: float = 1.0
+    imu_offset_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_number("imu_offset_s", self.imu_offset_s)
+        check_number("gravity_tilt_deg", self.gravity_tilt_deg, low=0.0, high=20.0)
+        self.sensor()
+
+    def sensor(self) -> InertialSensor:
+        """The law of its readings."""
+        return InertialSensor(
+            gyro_noise=self.gyro_noise,
+            accel_noise=self.accel_noise,
+            gyro_walk=1e-4,
+            accel_walk=2e-3,
+            accel_bias_m_s2=0.06,
+        )
