@@ -111,7 +111,7 @@ def test_one_linear_update():
     F = np.kron([[1, 0.5], [0, 1]], np.eye(M))
     moved = filter.predict(state, np.zeros(6), 0.5)
     np.testing.assert_allclose(moved.extra, F @ state.extra)
-    walk = filter.clock.transition(0.5)[1]
+    walk = LAW.transition(0.5)[1]
     np.testing.assert_allclose(
         moved.covariance[6:, 6:], F @ state.covariance[6:, 6:] @ F.T + np.kron(walk, np.eye(M))
     )

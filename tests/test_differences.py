@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ def write(folder, name: str, header: str, rows) -> str:
     return str(path)
 
 
-def tables(folder) -> dict[str, str]:
+def tables(folder) -> dict[str, Any]:
     return {
         "anchors": write(folder, "a.csv", "anchor,x,y,z", ([i, *p] for i, p in enumerate(ANCHORS))),
         "tags": write(folder, "b.csv", "tag,x,y,z", ([i, *p] for i, p in enumerate(TAGS))),
@@ -90,6 +91,7 @@ def test_a_deviation_of_a_difference_is_that_of_two_arrivals(tmp_path):
     rows = [[*row, 0.1] for row in difference_rows(t, arrivals, REFERENCE)]
     path = write(tmp_path, "r.csv", HEADER + ",std", rows)
     log = recordings.read_recording(path, **tables(tmp_path))
+    assert log.range_std is not None
     np.testing.assert_allclose(log.range_std, 0.1 / np.sqrt(2))
 
 

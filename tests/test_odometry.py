@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from rbl_gym.recordings import (
 from rbl_gym.recordings.tables import Source
 from rbl_gym.recordings.truth import Truth
 from rbl_gym.studies import replay
+from rbl_gym.studies.replay import smoothing as replay_smoothing
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "labyrinth_single_tag"
 ANCHORS = np.array([[0.0, 0, 0], [6, 0, 2], [6, 5, 0], [0, 5, 2]])
@@ -65,7 +67,8 @@ def test_the_filter_moves_along_the_arc_and_its_jacobian_is_that_of_differences(
     none, dt = np.full((1, 6), np.nan), 0.2
 
     def step(pose, further, P):
-        return filter.predict(AugmentedState(*pose, further, P), none, dt)
+        state = AugmentedState(pose[0], pose[1], further, P)
+        return filter.predict(state, none, dt)
 
     base = step((Q, t), extra, np.zeros((17, 17)))
     # A screw, by scipy in a hundred short pieces.
@@ -274,7 +277,7 @@ START = (4.0, 3.5, 0.0, 143.0)
 
 def test_odometry_finds_the_heading_of_one_tag_and_halves_the_error():
     log = a_log()
-    errors = {
+    errors: dict[str, Any] = {
         name: replay.replay_recording(recording, SETTINGS).errors
         for name, recording in (("with", log), ("without", log._replace(odometry=None)))
     }
@@ -289,13 +292,14 @@ def test_the_smoother_with_odometry_is_better_than_the_filter():
     settings = SETTINGS.changed(
         smooth=True, smooth_bias_std_m=0.0, smooth_constant_m=0.01, smooth_common_m=0.0
     )
-    found = replay.replay_recording(log, settings)
+    found: Any = replay.replay_recording(log, settings)
     rms = [np.sqrt(np.mean(e.position**2)) for e in (found.errors, found.smoothed_errors)]
     assert rms[1] < 0.6 * rms[0]
     assert rms[1] < 0.05
     # Odometry of the way back is that of a body that goes it backwards.
-    backwards = replay.smoothing._backwards(log, settings)
-    assert np.allclose(backwards.readings[0], -log.odometry.readings[-1])
+    backwards: Any = replay_smoothing._backwards(log, settings)
+    there: Any = log.odometry
+    assert np.allclose(backwards.readings[0], -there.readings[-1])
 
 
 def test_rows_of_the_smoother_have_the_derivatives_of_differences():
@@ -314,7 +318,7 @@ def test_rows_of_the_smoother_have_the_derivatives_of_differences():
         state = smoothing.LogState(Qx, t + x[:, 3:], np.zeros((4, 0)), own + y)
         return law.linearize(state, np.zeros(4), own + y)
 
-    base = at(np.zeros((4, 6)), np.zeros(5))
+    base: Any = at(np.zeros((4, 6)), np.zeros(5))
     for i in range(6):
         x = np.zeros((4, 6))
         x[1, i] = small
@@ -343,7 +347,7 @@ def test_tuning_finds_the_noise_of_the_odometry():
     rough = SETTINGS.changed(odometry_m=0.5, odometry_deg=60.0, start=START)
     tuned = replay.tune(log, rough)
     assert {*tuned.found} >= {"range_std_m", "odometry_m", "odometry_deg", "constant_std_m"}
-    assert tuned.found["odometry_m"] < 0.2
+    assert float(tuned.found["odometry_m"]) < 0.2
     assert tuned.log_likelihood > tuned.log_likelihood_before
 
 
@@ -389,7 +393,7 @@ INERTIAL = replay.Settings.of(
 
 
 def test_replay_with_an_inertial_sensor_finds_the_pose():
-    errors = replay.replay_recording(an_inertial_log(), INERTIAL).errors
+    errors: Any = replay.replay_recording(an_inertial_log(), INERTIAL).errors
     assert np.sqrt(np.mean(errors.position[30:] ** 2)) < 0.05
     assert np.degrees(np.sqrt(np.mean(errors.rotation[30:] ** 2))) < 4
 

@@ -257,6 +257,14 @@ def _features(
     return np.stack(columns, axis=-1)
 
 
+class _Told(NamedTuple):
+    """What is known of height and tilt."""
+
+    height_m: float
+    height_std_m: float
+    tilt_std_rad: float
+
+
 class _Found(NamedTuple):
     cost: FloatArray  # (H, K)
     residual: FloatArray  # (H, K, M, N) over the deviation
@@ -297,8 +305,11 @@ def locate_by_directions(
     ranges = check_array("ranges", ranges, ("K", "M", "N"))
     mask = np.asarray(links, dtype=bool) & (ranges > 0)
     anchors, tags = check_array("anchors", anchors, ("M", 3)), check_array("tags", tags, ("N", 3))
+    if level.height_m is None or level.height_std_m is None or level.tilt_std_rad is None:
+        raise ValueError(f"level must tell height and tilt, got {level!r:.200}")
     rotation, translation = _starts(ranges, mask, anchors, level.height_m)
-    data = (ranges, mask, anchors, tags, model, level)
+    told = _Told(level.height_m, level.height_std_m, level.tilt_std_rad)
+    data = (ranges, mask, anchors, tags, model, told)
     now = _cost(*data, rotation, translation)
     damping = np.full(now.cost.shape, 1e-2)
     for _ in range(_ITERATIONS):
@@ -346,7 +357,7 @@ def _starts(
 
 def _cost(
     ranges: FloatArray, mask: BoolArray, anchors: FloatArray, tags: FloatArray,
-    model: DirectionModel, level: Level, rotation: FloatArray, translation: FloatArray,
+    model: DirectionModel, level: _Told, rotation: FloatArray, translation: FloatArray,
 ) -> _Found:  # fmt: skip
     d = _rays(rotation, translation, anchors, tags)[1]
     bias, std = direction_model_at(model, rotation, translation, anchors, tags)
@@ -359,7 +370,7 @@ def _cost(
 
 def _step(
     ranges: FloatArray, mask: BoolArray, anchors: FloatArray, tags: FloatArray,
-    model: DirectionModel, level: Level, rotation: FloatArray, translation: FloatArray,
+    model: DirectionModel, level: _Told, rotation: FloatArray, translation: FloatArray,
     now: _Found, damping: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """Steps (H, K, 6) of the pose error."""

@@ -183,7 +183,7 @@ class AugmentedEkf:
         if self.offset is None:
             found = AugmentedState(*update_augmented(*epoch))
         else:
-            found = AugmentedState(*update_any(*epoch, self.offset))
+            found = AugmentedState(*update_any(*epoch, self.offset))  # pyright: ignore[reportCallIssue]
         as_state(*found[:2], found.covariance)
         return found
 

@@ -163,10 +163,11 @@ def _charts(replayed: Replayed) -> Any:
         mean[at] = np.nan if row["mean_m"] is None else row["mean_m"]
         refused[at] = 100 * row["refused_share"]
     largest = max(float(np.nanmax(np.abs(mean), initial=0.0)), 0.01)
+    layout: Any = shown.layout
     for column, values, scale, ends, axis in (
-        (2, mean, "RdBu", (-largest, largest), shown.layout.xaxis2),
+        (2, mean, "RdBu", (-largest, largest), "xaxis2"),
         (3, refused, "Reds", (0.0, max(float(np.nanmax(refused, initial=0.0)), 1.0)),
-         shown.layout.xaxis3),
+         "xaxis3"),
     ):  # fmt: skip
         shown.add_trace(
             go.Heatmap(
@@ -177,7 +178,7 @@ def _charts(replayed: Replayed) -> Any:
                 reversescale=scale == "RdBu",
                 zmin=ends[0],
                 zmax=ends[1],
-                colorbar={"x": axis.domain[1], "thickness": 10, "len": 0.9},
+                colorbar={"x": layout[axis].domain[1], "thickness": 10, "len": 0.9},
                 hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
             ),
             1,
