@@ -39,7 +39,10 @@ def check_filters() -> None:
     names = rbl_gym.estimators.names()
     assert {"kf", "uc-kf", "et-kf", "kf-ortho", "iekf"} <= set(names)
     for name in names:
-        env = gym.make("rbl_gym:RBL/Tracking-v0", scene={"name": "uwb_room", "steps": 20})
+        scene = {"name": "uwb_room", "steps": 20}
+        if name == "iekf-imu":
+            scene["inertial"] = "consumer"
+        env = gym.make("rbl_gym:RBL/Tracking-v0", scene=scene)
         env = rbl_gym.wrappers.EstimatePose(env, name)
         _, info = env.reset(seed=0)
         truncated, steps = False, 0
