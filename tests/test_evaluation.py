@@ -345,6 +345,7 @@ def test_transfer_prints_tables_or_json(tmp_path, capsys, monkeypatch):
     assert re.findall("greedy\\S*|random", table) == ["greedy"] * 4
 
 
+@needs("cmaes")
 def test_errors_are_one_line(tmp_path, capsys):
     good, same = tmp_path / "mine.npz", tmp_path / "other" / "mine.npz"
     for path in (good, same):

@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym.app import track_pages
 from rbl_gym.app.figures import replay_figure
 from rbl_gym.app.reports import compared, print_replay
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+
+pytest.importorskip("plotly", reason="needs the extra viz")
+from rbl_gym.app import track_pages
 
 STD_RAD, STD_M = 0.03, 0.03
 ANCHORS = np.array([[0, 0, 0], [8, 0, 3], [8, 8, 0], [0, 8, 3.0]])

@@ -14,6 +14,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from tests.helpers import needs
 
 ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2], [8, 3, 0.5]])
 CEILING = np.array([[0, 0, 2], [0, 3, 2], [4, 3, 2], [4, 0, 2], [1.3, 1, 2], [2.6, 1.5, 2.0]])
@@ -177,6 +178,7 @@ def test_the_note_is_printed(capsys):
     assert "a mirror pose behind the anchors' plane" in shown
 
 
+@needs("plotly")
 def test_the_command_takes_a_volume(tmp_path, capsys):
     recording = record(CEILING, FLAT, epochs=6)
     columns = [f"a{m}t{n}" for m in range(6) for n in range(4)]

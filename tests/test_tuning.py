@@ -7,10 +7,14 @@ import json
 import numpy as np
 import pytest
 
+from rbl_gym import kernels
 from rbl_gym.app import cli
 from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
 from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording
+
+# Many filters run side by side: a minute in kernels, five without.
+pytestmark = pytest.mark.skipif(not kernels.enabled(), reason="slow without kernels")
 
 DEFAULTS = replay.Settings()
 
