@@ -6,6 +6,7 @@ import dataclasses
 import inspect
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -181,6 +182,7 @@ def test_the_verdict_is_that_of_the_chi_square_interval():
 
 def test_differences_have_the_interval_of_the_paired_bootstrap():
     old = "rng" not in inspect.signature(stats.bootstrap).parameters
+    draws: dict[str, Any] = {"random_state" if old else "rng": np.random.default_rng(2)}
     rng = np.random.default_rng(1)
     base = np.abs(rng.standard_normal(150))
     errors = {"good": base, "bad": base * 1.1 + 0.05, "none": np.full(150, np.nan)}
@@ -192,7 +194,7 @@ def test_differences_have_the_interval_of_the_paired_bootstrap():
     want = stats.bootstrap(
         (errors["bad"], errors["good"]), lambda a, b, axis: monte_carlo.rms(a, axis)
         - monte_carlo.rms(b, axis), paired=True, method="percentile", n_resamples=4000,
-        **{"random_state" if old else "rng": np.random.default_rng(2)},
+        **draws,
     ).confidence_interval  # fmt: skip
     row = found["bad"]["tags_m"]
     np.testing.assert_allclose([row["low"], row["high"]], want, rtol=0.05)
