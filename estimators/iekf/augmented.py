@@ -78,10 +78,18 @@ class AugmentedEkf:
     def _n_twist(self) -> int:
         return 0 if self.twist is None else 6
 
+    @property
+    def _prior_std(self) -> FloatArray:
+        """Standard deviations of the states between the pose and the biases of links."""
+        return np.zeros(0) if self.twist is None else self.twist.prior_std()
+
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
     ) -> AugmentedState:
-        """State of a prior of the pose, covariance (..., 6, 6); the twist is at rest.
+        """State of a prior of the pose, covariance (..., 6, 6).
+
+        The further states are zero, as wide as their laws say; biases of links come with the
+        first ranges.
 
         Raises
         ------
@@ -89,12 +97,11 @@ class AugmentedEkf:
             As `IteratedEkf.initial`.
         """
         pose = self.pose.initial(rotation, translation, covariance)
-        batch = pose.translation.shape[:-1]
-        n = 6 + self._n_twist
+        batch, std = pose.translation.shape[:-1], self._prior_std
+        n = 6 + len(std)
         P = np.zeros((*batch, n, n))
         P[..., :6, :6] = pose.covariance
-        if self.twist is not None:
-            P[..., range(6, 12), range(6, 12)] = self.twist.prior_std() ** 2
+        P[..., range(6, n), range(6, n)] = std**2
         return AugmentedState(pose.rotation, pose.translation, np.zeros((*batch, n - 6)), P)
 
     def predict(self, state: AugmentedState, twist: ArrayLike | None, dt: float) -> AugmentedState:

@@ -71,23 +71,6 @@ class InertialEkf(AugmentedEkf):
         tilt = [self.gravity_tilt_rad] * (self._n_twist - _NAVIGATION)
         return np.concatenate([[self.speed_m_s] * 3, self.inertial.prior_std, tilt])
 
-    def initial(
-        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
-    ) -> AugmentedState:
-        """State of a prior of the pose, covariance (..., 6, 6); at rest, without biases.
-
-        Raises
-        ------
-        ValueError
-            As `IteratedEkf.initial`.
-        """
-        pose = self.pose.initial(rotation, translation, covariance)
-        batch, n = pose.translation.shape[:-1], 6 + self._n_twist
-        P = np.zeros((*batch, n, n))
-        P[..., :6, :6] = pose.covariance
-        P[..., range(6, n), range(6, n)] = self._prior_std**2
-        return AugmentedState(pose.rotation, pose.translation, np.zeros((*batch, n - 6)), P)
-
     def predict(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, state: AugmentedState, readings: ArrayLike, dt: ArrayLike
     ) -> AugmentedState:

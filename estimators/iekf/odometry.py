@@ -61,24 +61,10 @@ class OdometryEkf(AugmentedEkf):
     def _n_twist(self) -> int:
         return _STATES
 
-    def initial(
-        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
-    ) -> AugmentedState:
-        """State of a prior of the pose, covariance (..., 6, 6); at rest, with a perfect sensor.
-
-        Raises
-        ------
-        ValueError
-            As `IteratedEkf.initial`.
-        """
+    @property
+    def _prior_std(self) -> FloatArray:
         assert self.twist is not None
-        pose = self.pose.initial(rotation, translation, covariance)
-        batch, n = pose.translation.shape[:-1], 6 + _STATES
-        P = np.zeros((*batch, n, n))
-        P[..., :6, :6] = pose.covariance
-        std = np.concatenate([self.twist.prior_std(), self.odometry.calibration_std()])
-        P[..., range(6, n), range(6, n)] = std**2
-        return AugmentedState(pose.rotation, pose.translation, np.zeros((*batch, _STATES)), P)
+        return np.concatenate([self.twist.prior_std(), self.odometry.calibration_std()])
 
     def predict(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, state: AugmentedState, readings: ArrayLike, dt: ArrayLike

@@ -238,7 +238,7 @@ class AnchorPlacementEnv(ScalarEnv):
     ## Reward
     ``-log score`` with the last anchor, 0 before. ``"mounts"``: the drop of the log score with
     every anchor, from that of 3 m. ``gym.make(..., reward="filter")`` pays what a filter reaches
-    instead (`rbl_gym.wrappers.FilterReward`).
+    instead (the wrapper `FilterReward`).
 
     ## Episode end
     Terminates with the last anchor; `env.spec.max_episode_steps` says how many steps that is. (In

@@ -1,6 +1,6 @@
 """Prediction and update of a pose with an unknown twist and biased links, one body.
 
-The textbook forms are `rbl_gym.estimators.iekf.augmented` and `estimators.costs.bias_cost`.
+The textbook forms are `estimators/iekf/augmented.py` and `estimators/costs/bias_cost.py`.
 """
 
 from __future__ import annotations

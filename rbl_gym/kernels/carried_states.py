@@ -1,6 +1,6 @@
 """States beside the pose of one body: once its pose is known better, and as time passes.
 
-The textbook forms are in `rbl_gym.estimators.iekf`: `augmented` and `inertial`.
+The textbook forms are `augmented.py` and `inertial.py` in `estimators/iekf/`.
 """
 
 from __future__ import annotations

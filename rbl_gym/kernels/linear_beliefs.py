@@ -1,6 +1,6 @@
 """From the 12 states of the linear filters to poses: the constraint of UC-KF, and beliefs.
 
-The textbook forms stand in `rbl_gym.estimators`.
+The textbook forms stand in `estimators/linear/`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The state is ``[vec Q; t]``, columns of Q first; s_n = Q c_n + t are the tags. Weights are inverse
 variances of the squared ranges, (M, 1) where all tags share them, else (M, N); zero where a link is
-lost. The textbook forms stand in `rbl_gym.estimators`.
+lost. The textbook forms stand in `estimators/linear/`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Maximum likelihood of one body's pose, searched for where the first solution is in doubt.
 
-The textbook form is `rbl_gym.estimators.locating.maximum_likelihood`.
+The textbook form is `estimators/locating/maximum_likelihood.py`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Ranges with an unknown offset in common, one body: what they tell, and their cost.
 
 The textbook forms are `rbl_gym.measurements.offsets` in `rbl_gym.bounds.pose` and in
-`rbl_gym.estimators.costs.range_cost`. Kinds of offset: 1 by tag, 2 by anchor, 3 of the epoch.
+`estimators/costs/range_cost.py`. Kinds of offset: 1 by tag, 2 by anchor, 3 of the epoch.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Prediction and update of the iterated EKF, one body.
 
-The textbook forms are in `rbl_gym.estimators`: `manifold` and `robust_update`.
+The textbook forms are `pose_steps.py` and `robust_update.py` in `estimators/iekf/`.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def carry(A: Any, information: Any, sign: float, H: Any) -> None:
 def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any) -> None:
     """Let the prior's information turn with the body where the tags heard are about in a line.
 
-    `rbl_gym.estimators.costs.unseen_directions` says why.
+    `estimators/costs/unseen_directions.py` says why.
     """
     cx = cy = cz = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     heard = 0

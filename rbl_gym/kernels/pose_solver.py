@@ -1,6 +1,6 @@
 """The most likely pose of one body near a start: damped Gauss-Newton on SO(3) x R^3.
 
-The textbook forms are `rbl_gym.estimators.costs.levenberg_marquardt` and `map_problem`.
+The textbook forms are `levenberg_marquardt.py` and `map_problem.py` in `estimators/costs/`.
 """
 
 from __future__ import annotations

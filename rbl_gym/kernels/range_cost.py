@@ -1,6 +1,6 @@
 """The cost of one body's ranges at a pose, its gradient and Gauss-Newton Hessian.
 
-The textbook form is `rbl_gym.estimators.costs.range_cost`. Matrices are written below and on the
+The textbook form is `estimators/costs/range_cost.py`. Matrices are written below and on the
 diagonal only; a link of weight 0 was not measured, and its range may be anything.
 """
 

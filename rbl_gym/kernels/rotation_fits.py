@@ -1,7 +1,7 @@
 """Rotations nearest to a matrix: in Frobenius norm, and in a norm of its own (9 x 9).
 
 The textbook forms are `rbl_gym.geometry.rotations.nearest` and
-`rbl_gym.estimators.linear.least_squares.procrustes`.
+`procrustes` in `estimators/linear/least_squares.py`.
 """
 
 from __future__ import annotations

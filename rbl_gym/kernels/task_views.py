@@ -1,4 +1,4 @@
-"""What the policies of the learning tasks see. Textbook forms: `rbl_gym.wrappers.views`."""
+"""What the policies of the learning tasks see. Textbook forms: `wrappers/views.py`."""
 
 from __future__ import annotations
 
