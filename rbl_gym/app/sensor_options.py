@@ -54,7 +54,7 @@ def add_clocks(group: Any) -> None:
         metavar="[WHAT=]S",
         help="how far the truth's clock is ahead of that of the ranges, seconds; auto: found by "
         "the motion; odometry=S and imu=S of those, odometry=auto and imu=auto by the likelihood "
-        "of the ranges, to 1.6 s; may be given more than once",
+        "of the ranges, to 2.4 s; may be given more than once",
     )
 
 

@@ -16,10 +16,10 @@ from rbl_gym.studies.replay.settings import Settings
 __all__ = ["CLOCK_TRIALS", "SensorClock", "sensor_clock"]
 
 # Offsets that are tried: first this far apart, on both sides of what is told, then finer.
-_STEPS, _SIDE = (0.4, 0.1, 0.03), 3
+_STEPS, _SIDES = (0.4, 0.1, 0.03), (7, 3, 3)
 CLOCK_TRIALS = len(_STEPS)
 # How far that reaches (s).
-_REACH_S = _SIDE * sum(_STEPS)
+_REACH_S = sum(step * side for step, side in zip(_STEPS, _SIDES, strict=True))
 # Longest part that is looked at, in epochs.
 _MOST = 1_500
 
@@ -48,7 +48,7 @@ def sensor_clock(
 ) -> SensorClock:
     """The offset of a sensor's clock at which its readings make the ranges likeliest.
 
-    Looked for within about 1.6 s of the offset of the settings, on a grid that is made finer
+    Looked for within 2.4 s of the offset of the settings, on a grid that is made finer
     around its best. The truth is not looked at.
 
     Parameters
@@ -71,8 +71,8 @@ def sensor_clock(
     given = float(settings.flat()[name])
     seen: dict[float, float] = {}
     best = given
-    for step in _STEPS:
-        tried = [round(best + step * k, 6) for k in range(-_SIDE, _SIDE + 1)]
+    for step, side in zip(_STEPS, _SIDES, strict=True):
+        tried = [round(best + step * k, 6) for k in range(-side, side + 1)]
         new = [x for x in tried if x not in seen]
         trials = [trial._replace(settings=trial.settings.changed(**{name: x})) for x in new]
         seen |= dict(zip(new, evidence(trials).log_likelihood.sum(axis=1).tolist(), strict=True))
