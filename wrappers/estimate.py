@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,8 +18,8 @@ from rbl_gym.estimators.filter import check_takes_noise, factory_of, reads
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.noise_laws import WeakenedNoise
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
-REWARDS = ("belief", "error")
 OBSERVATIONS = ("dict", "flat")
 # A flat observation is of order one; what is far outside says no more than that.
 _FLAT_LIMIT = 10.0
@@ -50,7 +49,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     reward
         ``"belief"``: ``-log b`` of the posterior belief, b its root mean square tag error in
         metres (`rbl_gym.bounds.score`). ``"error"``: minus the real root mean square tag
-        error in metres.
+        error in metres. Others, options, and a function of one's own: `rewards.reward_of`.
     observation
         ``"dict"``: the environment's, with `belief_rotation` (3, 3), `belief_translation`
         (3,), `belief_covariance` (6, 6) added. ``"flat"``: one float32 vector for a policy, see
@@ -79,7 +78,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env: gym.Env[Any, Any],
         filter: str = "iekf",
         options: Mapping[str, Any] | None = None,
-        reward: str = "belief",
+        reward: RewardLike = "belief",
         observation: str = "dict",
     ) -> None:
         RecordConstructorArgs.__init__(
@@ -87,7 +86,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         )
         gym.Wrapper.__init__(self, env)
         self._scene = scene_of(env)
-        self._reward = check_one_of("reward", reward, REWARDS)
+        self._reward = reward_of(reward)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
         self._tags = self._scene.body
         self._rendered = getattr(env.unwrapped, "film", None) is not None
@@ -103,7 +102,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         prior = (info["prior_rotation"], info["prior_translation"], info["prior_covariance"])
         self._state = self._filter.initial(*prior)
         belief = self._update(observation)
-        info = self._judged(belief, info)
+        info, _ = self._judged(belief, info)
         return self._observation(observation, belief), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -112,22 +111,26 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         told = observation[reads(self._filter)]
         self._state = self._filter.predict(self._state, told, self._scene.dt)
         belief = self._update(observation)
-        info = self._judged(belief, info)
-        reward = -math.log(info["score_m"]) if self._reward == "belief" else -info["tag_error_m"]
+        info, figures = self._judged(belief, info)
+        truth = info["rotation"], info["translation"], info.get("bound_m")
+        outcome = Outcome(figures, belief, *truth, action, observation, self._scene)
+        reward = float(paid_of(self._reward, outcome))
         return self._observation(observation, belief), reward, terminated, truncated, info
 
     def _update(self, observation: dict[str, np.ndarray]) -> PoseBelief:
         self._state = update(self._filter, self._state, observation, self._scene)
         return self._filter.belief(self._state)
 
-    def _judged(self, belief: PoseBelief, info: dict[str, Any]) -> dict[str, Any]:
-        """The infos with the errors against the true pose."""
+    def _judged(
+        self, belief: PoseBelief, info: dict[str, Any]
+    ) -> tuple[dict[str, Any], metrics.Figures]:
+        """The infos with the errors against the true pose, and these."""
         figures = metrics.judge(*belief[:3], info["rotation"], info["translation"], self._tags)
         if self._rendered:
             rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
         info = with_bound(info)
         info.update(zip(figures._fields, map(float, figures), strict=True))
-        return info
+        return info, figures
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
         return present(self._kind, observation, belief, self._scene)

@@ -22,6 +22,7 @@ from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers import views
 from rbl_gym.wrappers.compositions import TaskEnv, VectorTaskEnv
 from rbl_gym.wrappers.estimate import EstimatePose, check_options_of
+from rbl_gym.wrappers.rewards import RewardLike
 from rbl_gym.wrappers.select_anchors import SelectAnchors, VectorSelectAnchors
 from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
@@ -120,6 +121,7 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
         sort_craft: bool = True,
         filter: str = "iekf",
         options: Mapping[str, Any] | None = None,
+        reward: RewardLike = "belief",
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -129,7 +131,7 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
         envs = TrackingVectorEnv(
             num_envs, self.scene, "none", render_mode, max_episode_steps, autoreset_mode
         )
-        self._compose(VectorEstimatePose(envs, filter, _options(filter, options)))
+        self._compose(VectorEstimatePose(envs, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> FloatArray:
         self._told()
@@ -158,7 +160,7 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     keeps their numbers.
 
     ## Reward
-    ``-log b`` of the belief after every step (`rbl_gym.bounds.score`).
+    ``-log b`` of the belief after every step (`rbl_gym.bounds.score`), or another `reward`.
 
     ## Episode end
     Truncates after 100 steps of 2 s.
@@ -178,7 +180,8 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     env = gym.make("rbl_gym:RBL/MobileAnchors-v0", difficulty="hard")
     ```
     `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`; the anchors must move.
-    `filter`, `options`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
+    `filter`, `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options`
+    say else.
 
     ## Version history
     * v0: first version.
@@ -191,12 +194,13 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
         sort_craft: bool = True,
         filter: str = "iekf",
         options: Mapping[str, Any] | None = None,
+        reward: RewardLike = "belief",
         render_mode: str | None = None,
     ) -> None:
         self._configure(difficulty, scene, sort_craft)
         self.observation_space, self.action_space = self._spaces()
         env = TrackingEnv(self.scene, "none", render_mode)
-        self._compose(EstimatePose(env, filter, _options(filter, options)))
+        self._compose(EstimatePose(env, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> FloatArray:
         self._told()
@@ -265,6 +269,7 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
         scene: str | Mapping[str, Any] | Scene = "hall",
         filter: str = "iekf",
         options: Mapping[str, Any] | None = None,
+        reward: RewardLike = "belief",
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -275,7 +280,7 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
             num_envs, self.scene, "none", render_mode, max_episode_steps, autoreset_mode
         )
         selected = VectorSelectAnchors(envs)
-        self._compose(VectorEstimatePose(selected, filter, _options(filter, options)))
+        self._compose(VectorEstimatePose(selected, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> np.ndarray:
         self._told()
@@ -302,7 +307,8 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     first two columns of the estimated rotation (6).
 
     ## Reward
-    ``-log b`` of the belief after every step; ``"priced"``: minus `price` for each anchor.
+    ``-log b`` of the belief after every step, or another `reward`; ``"priced"``: minus `price` for
+    each anchor.
 
     ## Episode end
     Truncates after 50 steps of 0.2 s.
@@ -323,8 +329,8 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", mode="priced", price=0.05)
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", filter="uc-kf", k=6)
     ```
-    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. `filter`, `options`: as
-    `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
+    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. `filter`, `options`, `reward`:
+    as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
 
     ## Version history
     * v0: first version.
@@ -338,12 +344,13 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
         scene: str | Mapping[str, Any] | Scene = "hall",
         filter: str = "iekf",
         options: Mapping[str, Any] | None = None,
+        reward: RewardLike = "belief",
         render_mode: str | None = None,
     ) -> None:
         self._configure(mode, k, price, scene)
         self.observation_space, self.action_space = self._spaces()
         env = SelectAnchors(TrackingEnv(self.scene, "none", render_mode))
-        self._compose(EstimatePose(env, filter, _options(filter, options)))
+        self._compose(EstimatePose(env, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> np.ndarray:
         self._told()

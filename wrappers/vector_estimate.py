@@ -16,7 +16,6 @@ from rbl_gym.estimators import PoseBelief
 from rbl_gym.estimators.filter import reads
 from rbl_gym.wrappers.estimate import (
     OBSERVATIONS,
-    REWARDS,
     make_filter,
     measured_of,
     observation_space,
@@ -25,6 +24,7 @@ from rbl_gym.wrappers.estimate import (
     update,
     with_bound,
 )
+from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
 
 class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
@@ -51,7 +51,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         env: VectorEnv[Any, Any, Any],
         filter: str = "iekf",
         options: Mapping[str, Any] | None = None,
-        reward: str = "belief",
+        reward: RewardLike = "belief",
         observation: str = "dict",
     ) -> None:
         RecordConstructorArgs.__init__(
@@ -59,7 +59,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         )
         VectorWrapper.__init__(self, env)
         self._scene = scene_of(env)
-        self._reward = check_one_of("reward", reward, REWARDS)
+        self._reward = reward_of(reward)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
         self._tags = self._scene.body
         self._filter = make_filter(env, self._scene, filter, options)
@@ -76,7 +76,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         info = with_bound(info)
         self._start(observation, info, info["_prior_rotation"])
-        self._report(self._figures(info, np.zeros(self.num_envs, dtype=np.bool_)), info)
+        self._report(self._figures(info), info)
         return self._present(observation), info
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
@@ -87,36 +87,25 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         same_step = self.env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
         last = terminated | truncated if same_step else np.zeros_like(fresh)
         moved = ~fresh | last
+        reached, truth = _reached(observation, info, last)
         if moved.any():
-            self._advance(observation, info, moved, last)
-        reward = np.zeros(self.num_envs)
-        figures = self._figures(info, last)
-        if self._reward == "belief":
-            reward[moved] = -np.log(figures["score_m"][moved])
-        else:
-            reward[moved] = -figures["tag_error_m"][moved]
+            self._advance(reached, moved)
+        figures = self._figures(truth)
+        assert self._belief is not None
+        poses = truth["rotation"], truth["translation"], truth.get("bound_m")
+        outcome = Outcome(figures, self._belief, *poses, actions, reached, self._scene)
+        reward = np.where(moved, paid_of(self._reward, outcome), 0.0)
         if last.any():
             self._finish(info, figures, last)
         if fresh.any():
             self._start(observation, info, fresh)
-            figures = self._figures(info, np.zeros_like(last))
+            figures = self._figures(info)
         self._report(figures, info)
         return self._present(observation), reward, terminated, truncated, info
 
-    def _advance(
-        self,
-        observation: dict[str, np.ndarray],
-        info: dict[str, Any],
-        moved: BoolArray,
-        last: BoolArray,
-    ) -> None:
-        """Predict and update the worlds that stepped, the ended ones with their final ranges."""
+    def _advance(self, observation: dict[str, np.ndarray], moved: BoolArray) -> None:
+        """Predict and update the worlds that stepped."""
         measured = measured_of(observation)
-        if last.any():
-            final = info["final_obs"][last]
-            for key in measured:
-                measured[key] = measured[key].copy()
-                measured[key][last] = np.stack([one[key] for one in final])
         everywhere = bool(moved.all())
         state = self._state if everywhere else _rows(self._state, moved)
         if not everywhere:
@@ -143,19 +132,13 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             self._state = _merged(self._state, state, where)
             self._belief = _merged(self._belief, belief, where)
 
-    def _figures(self, info: dict[str, Any], last: BoolArray) -> dict[str, FloatArray]:
-        """Errors of the beliefs, of ended worlds against their final poses."""
-        rotation, translation = info["rotation"], info["translation"]
-        if last.any():
-            final = info["final_info"]
-            rotation = np.where(last[:, None, None], final["rotation"], rotation)
-            translation = np.where(last[:, None], final["translation"], translation)
+    def _figures(self, info: Mapping[str, Any]) -> metrics.Figures:
+        """Errors of the beliefs against the true poses of the infos."""
         assert self._belief is not None
-        return metrics.judge(*self._belief[:3], rotation, translation, self._tags)._asdict()
+        truth = info["rotation"], info["translation"]
+        return metrics.judge(*self._belief[:3], *truth, self._tags)
 
-    def _finish(
-        self, info: dict[str, Any], figures: dict[str, FloatArray], last: BoolArray
-    ) -> None:
+    def _finish(self, info: dict[str, Any], figures: metrics.Figures, last: BoolArray) -> None:
         """The last beliefs of ended episodes into copies of `final_obs` and `final_info`."""
         assert self._belief is not None
         info["final_obs"] = info["final_obs"].copy()
@@ -163,12 +146,12 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         for i in np.flatnonzero(last):
             belief = PoseBelief(*(field[i].copy() for field in self._belief))
             info["final_obs"][i] = present(self._kind, info["final_obs"][i], belief, self._scene)
-        for name, value in figures.items():
+        for name, value in figures._asdict().items():
             info["final_info"][name] = np.where(last, value, 0.0)
             info["final_info"][f"_{name}"] = last.copy()
 
-    def _report(self, figures: dict[str, FloatArray], info: dict[str, Any]) -> None:
-        for name, value in figures.items():
+    def _report(self, figures: metrics.Figures, info: dict[str, Any]) -> None:
+        for name, value in figures._asdict().items():
             info[name], info[f"_{name}"] = value, np.ones(self.num_envs, dtype=np.bool_)
 
     def _present(self, observation: dict[str, np.ndarray]) -> Any:
@@ -176,6 +159,22 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         rendering.tell(self.env, rendering.Pose(*self._belief[:3]))
         belief = PoseBelief(*(field.copy() for field in self._belief))
         return present(self._kind, observation, belief, self._scene)
+
+
+def _reached(
+    observation: dict[str, np.ndarray], info: dict[str, Any], last: BoolArray
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Observations and truth that the steps led to: those of ended worlds are the final ones."""
+    if not last.any():
+        return observation, info
+    final, ended = info["final_obs"][last], with_bound(info["final_info"])
+    reached = {key: value.copy() for key, value in observation.items()}
+    for key, value in reached.items():
+        value[last] = np.stack([one[key] for one in final])
+    truth = {key: info[key].copy() for key in ("rotation", "translation", "bound_m") if key in info}
+    for key, value in truth.items():
+        value[last] = ended[key][last]
+    return reached, truth
 
 
 def _rows(state: Any, where: BoolArray) -> Any:

@@ -1,0 +1,174 @@
+"""What a step of `EstimatePose` pays: named rewards, and rewards of one's own."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds
+from rbl_gym.checks import FloatArray, all_finite, check_number
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.metrics import Figures
+from rbl_gym.worlds.scene import Scene
+
+__all__ = ["REWARDS", "Outcome", "reward_of"]
+
+
+class Outcome(NamedTuple):
+    """A step as a reward sees it. In a vector environment every array has a leading axis (B,).
+
+    Attributes
+    ----------
+    figures
+        Errors of the belief, its NEES and its score (`rbl_gym.metrics.Figures`).
+    belief
+        The belief after the step.
+    rotation, translation
+        The true pose: (..., 3, 3) and (..., 3), metres.
+    bound_m
+        b of the posterior Cramer-Rao bound (...), metres; None where the environment does not
+        compute it (``reward="none"``).
+    action
+        What `step` was given.
+    observation
+        The environment's observation: `ranges`, `links`, `anchors`, `twist` and so on.
+    scene
+        The world.
+    """
+
+    figures: Figures
+    belief: PoseBelief
+    rotation: FloatArray
+    translation: FloatArray
+    bound_m: FloatArray | None
+    action: Any
+    observation: Mapping[str, np.ndarray]
+    scene: Scene
+
+
+Reward = Callable[[Outcome], Any]
+RewardLike = str | Mapping[str, Any] | Reward
+
+
+def belief(outcome: Outcome) -> FloatArray:
+    """``-log b`` of the belief, b its root mean square tag error in metres."""
+    return -np.log(outcome.figures.score_m)
+
+
+def error(outcome: Outcome) -> FloatArray:
+    """Minus the real root mean square tag error, metres."""
+    return -outcome.figures.tag_error_m
+
+
+def worst_tag(outcome: Outcome) -> FloatArray:
+    """``-log`` of the expected error of the tag that the belief knows least, metres."""
+    J = bounds.tag_jacobian(outcome.belief.rotation, outcome.scene.body)
+    P = outcome.belief.covariance[..., None, :, :]
+    squares = np.einsum("...nia,...nab,...nib->...n", J, P, J)
+    return -0.5 * np.log(squares.max(axis=-1))
+
+
+def requirement(
+    outcome: Outcome, position_m: float = math.inf, rotation_deg: float = math.inf
+) -> FloatArray:
+    """1 where the real errors are within both limits, else 0."""
+    figures = outcome.figures
+    within = (figures.position_error_m <= position_m) & (
+        figures.rotation_error_rad <= math.radians(rotation_deg)
+    )
+    return np.asarray(within, dtype=np.float64)
+
+
+REWARDS: dict[str, Callable[..., FloatArray]] = {
+    "belief": belief,
+    "error": error,
+    "worst-tag": worst_tag,
+    "requirement": requirement,
+}
+
+
+def reward_of(reward: RewardLike) -> Reward:
+    """The reward function of a name, a dict, a dotted path or a function.
+
+    Parameters
+    ----------
+    reward
+        A name of `REWARDS`. Or a dict: ``{"kind": NAME, ...}`` with the options of that reward
+        and `action_price`, which is subtracted times the sum of the squares of the action. Or
+        ``"module:function"``. Or a function of an `Outcome` that returns a number for each world.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name or option, a path that cannot be imported, anything else.
+    """
+    if callable(reward):
+        return reward
+    if isinstance(reward, Mapping):
+        return _with_options(dict(reward))
+    if isinstance(reward, str) and reward in REWARDS and reward != "requirement":
+        return REWARDS[reward]
+    if isinstance(reward, str) and ":" in reward:
+        module, _, name = reward.partition(":")
+        try:
+            found = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise ValueError(f"reward {reward!r:.80} cannot be imported: {error}") from error
+        if not callable(found):
+            raise ValueError(f"reward {reward!r:.80} must be callable, got {found!r:.80}")
+        return found
+    if reward == "requirement":
+        raise ValueError(
+            "reward 'requirement' needs limits: "
+            '{"kind": "requirement", "position_m": ..., "rotation_deg": ...}'
+        )
+    raise ValueError(
+        f"reward must be one of {', '.join(map(repr, REWARDS))}, a dict with a kind, "
+        f"'module:function' or a function, got {reward!r:.80}"
+    )
+
+
+def _with_options(options: dict[str, Any]) -> Reward:
+    kind = options.pop("kind", None)
+    if not isinstance(kind, str) or kind not in REWARDS:
+        raise ValueError(
+            f"reward must have a kind, one of {', '.join(map(repr, REWARDS))}, got {kind!r:.80}"
+        )
+    function = REWARDS[kind]
+    known = [*inspect.signature(function).parameters][1:]
+    price = check_number("reward.action_price", options.pop("action_price", 0.0), low=0.0)
+    for name, value in options.items():
+        if name not in known:
+            raise ValueError(
+                f"reward {kind!r} has no option {name!r:.80}; it has "
+                f"{', '.join([*known, 'action_price'])}"
+            )
+        check_number(f"reward.{name}", value, low=0.0)
+    if kind == "requirement" and not options:
+        raise ValueError("reward 'requirement' needs position_m, rotation_deg or both")
+
+    def paid(outcome: Outcome) -> FloatArray:
+        value = function(outcome, **options)
+        if not price:
+            return value
+        action = np.asarray(outcome.action, dtype=np.float64)
+        entries = action.ndim - value.ndim
+        return value - price * np.square(action).sum(axis=tuple(range(-entries, 0)))
+
+    return paid
+
+
+def paid_of(reward: Reward, outcome: Outcome) -> FloatArray:
+    """What a reward gives for a step: finite numbers, one for each world; or a ValueError."""
+    value = np.asarray(reward(outcome), dtype=np.float64)
+    shape = np.shape(outcome.figures.score_m)
+    if value.shape != shape:
+        raise ValueError(f"reward must return shape {shape}, got {value.shape}")
+    if not all_finite(value):
+        raise ValueError(f"reward must be finite, got {value!r:.80}")
+    return value
