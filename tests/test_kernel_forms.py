@@ -14,7 +14,7 @@ from rbl_gym.geometry import obstacles, regions, rotations
 from rbl_gym.measurements import bearing, noise_laws, ranging
 from rbl_gym.metrics import Figures
 from rbl_gym.motion import kinematics
-from rbl_gym.placement import gradient
+from rbl_gym.placement import Gain, gradient
 from rbl_gym.placement import problem as placement
 from rbl_gym.worlds import simulation
 
@@ -394,9 +394,34 @@ def test_scores_of_layouts(law, batch, m):
         anchors, poses.rotation, poses.translation, world.tags, 0.1 * np.eye(6), law.numbers, share
     )  # fmt: skip
     assert_equal_forms(placement._mean_square, *args)
-    square, *_ = assert_equal_forms(gradient._mean_square_and_gradient, *args)
-    np.testing.assert_allclose(square, placement._mean_square(*args), rtol=1e-12)
     assert_equal_forms(placement._mean_square_of, poses.matrix, poses.rotation, world.tags)
+
+
+@every_batch
+@every_law
+@pytest.mark.parametrize("limits", [(), (30.0, 20.0, 2.0, 1.5), (25.0, 0.0, 1.5, 0.0)])
+def test_gradients_of_layouts(law, batch, limits):
+    world, poses = World((), m=4), World((*batch, 6), seed=1)
+    anchors, normals = world.rng.normal(0, 15, (2, *batch, 4, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals[..., 0, :] = 0.0
+    gain = Gain(*limits)
+    weight = world.rng.random(6)
+    args = (
+        anchors,
+        normals,
+        poses.rotation,
+        poses.translation,
+        weight,
+        poses.matrix,
+        world.tags,
+        law.numbers,
+        gain.numbers,
+        world.rng.random((*batch, 6, 4, world.tags.shape[-2])),
+    )
+    square, slope = assert_equal_forms(gradient._square_and_gradient, *args)
+    assert (np.abs(slope).max(axis=(-1, -2)) > 0).all()
+    assert (square > 0).all()
 
 
 @every_batch

@@ -15,7 +15,6 @@ from rbl_gym.geometry import rotations
 from rbl_gym.placement import Context, PlacementTask
 from rbl_gym.placement import criteria as layout_criteria
 from rbl_gym.placement import problem as placement
-from rbl_gym.placement.gradient import score_and_gradient
 from rbl_gym.worlds import scenes
 from tests.test_obstacles import depth_by_sampling
 
@@ -289,33 +288,6 @@ def test_batches_are_loops(kind):
     )
     with pytest.raises(ValueError, match="anchors must not be empty"):
         placement.score(task, context, anchors[:0])
-
-
-@pytest.mark.parametrize(
-    "noise",
-    [
-        {},
-        {"proportional": 0.02, "reference_tag": 1},
-        {"kind": "squared-range", "sigma_m": 0.1},
-    ],
-    ids=["own", "reference", "squared"],
-)
-@pytest.mark.parametrize("kind", ["drone_yard", "room with racks"])
-def test_gradient_is_that_of_finite_differences(kind, noise):
-    task = make(kind)
-    task = dataclasses.replace(task, scene=scenes.get({"name": task.scene.name, "noise": noise}))
-    context, anchors = problem(task, 17, (3,))
-    score, gradient = score_and_gradient(task, context, anchors)
-    np.testing.assert_allclose(score, placement.score(task, context, anchors), rtol=1e-12)
-    step = 1e-4
-    for index in np.ndindex(*anchors.shape[1:]):
-        moved = np.zeros(anchors.shape)
-        moved[(slice(None), *index)] = step
-        above, below = (placement.score(task, context, anchors + s * moved) for s in (1, -1))
-        # Truncation, and the rounding of scores over the step.
-        np.testing.assert_allclose(
-            gradient[(slice(None), *index)], (above - below) / (2 * step), rtol=1e-4, atol=1e-9
-        )
 
 
 def test_moving_region_racks_and_anchors_together_changes_no_score():

@@ -1,5 +1,7 @@
 """Placement of anchors: the problem, layouts, search, criteria, files."""
 
+from rbl_gym.placement.gain import Gain
+from rbl_gym.placement.gradient import score_and_gradient
 from rbl_gym.placement.problem import (
     MAX_RACKS,
     Context,
@@ -18,11 +20,14 @@ from rbl_gym.placement.problem import (
     task,
     whole_volume,
 )
+from rbl_gym.placement.sample import Sample
 
 __all__ = [
     "MAX_RACKS",
     "Context",
+    "Gain",
     "PlacementTask",
+    "Sample",
     "build_contexts",
     "checked_context",
     "context_uniforms",
@@ -32,6 +37,7 @@ __all__ = [
     "mounts",
     "positions",
     "score",
+    "score_and_gradient",
     "score_of",
     "sight_fractions",
     "task",

@@ -5,66 +5,125 @@ from __future__ import annotations
 import numpy as np
 
 from rbl_gym import bounds
-from rbl_gym.checks import FloatArray, check_array
+from rbl_gym.checks import FloatArray, as_float, check_array, check_finite
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
-from rbl_gym.placement.problem import (
-    Context,
-    PlacementTask,
-    arguments,
-    checked_context,
-    root_of,
-)
+from rbl_gym.placement.gain import EVERYWHERE, Gain, share_and_slope
+from rbl_gym.placement.problem import root_of
+from rbl_gym.placement.sample import Sample
 
 __all__ = ["score_and_gradient"]
 
 
 def score_and_gradient(
-    task: PlacementTask, context: Context, anchors: FloatArray
+    anchors: FloatArray,
+    sample: Sample,
+    tags: FloatArray,
+    noise: ranging.NoiseLaw,
+    share: FloatArray | None = None,
+    gain: Gain = EVERYWHERE,
+    normals: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """`problem.score` (...) and its derivative (..., M, 3) by the places of the anchors.
+    """Score (...) of layouts and its derivative (..., M, 3) by the places of the anchors.
 
-    What blocks sight is taken as it is: an anchor that is about to lose sight of a pose is not
-    warned.
+    The score is the root of the weighted mean over the poses of b^2, ``b^2 = mean_n tr(J_n P
+    J_n^T)`` with ``P = (F + prior)^-1``. `share` and `normals` count as constant: what blocks
+    sight is taken as it is, and an anchor that is about to lose sight of a pose is not warned.
+
+    Parameters
+    ----------
+    anchors
+        (..., M, 3), metres.
+    sample
+        The poses, their weights and what is known at them before the first range.
+    tags
+        (N, 3) in the body frame, metres.
+    noise
+        The law of the ranges: one of `ranging.NOISE_LAWS`.
+    share
+        Of its information that each link has: (..., P, M), or (..., P, M, N) where it is known
+        for each tag. None: all.
+    gain
+        Limit of the range, and field of view.
+    normals
+        (..., M, 3) of the mounts, of unit length, for the field of view; None or zero: anchors
+        see everywhere.
+
+    Raises
+    ------
+    ValueError
+        On arrays of other shapes or that are not finite, on a law that is not of `NOISE_LAWS`,
+        and where the information is singular.
     """
-    anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
-    square, gradient = _mean_square_and_gradient(*arguments(task, context, anchors))
+    anchors, tags = check_array("anchors", anchors, ("M", 3)), check_array("tags", tags, ("N", 3))
+    law = ranging.numbers_of(noise, len(tags))
+    if law is None:
+        raise ValueError(f"noise must be a law of ranging.NOISE_LAWS, got {noise!r:.80}")
+    if normals is None:
+        normals = np.zeros((1, 3))
+    normals = np.broadcast_to(check_array("normals", normals, ("M", 3)), anchors.shape)
+    shares = _shares(share, len(sample.places), anchors.shape[-2], len(tags))
+    square, gradient = _square_and_gradient(
+        anchors, normals, *sample[:4], tags, law, gain.numbers, shares
+    )
     root = root_of(square)
     return root, gradient / (2 * root[..., None, None])
 
 
-@compiled("layout_score:mean_square_and_gradient")
-def _mean_square_and_gradient(
+def _shares(share: FloatArray | None, p: int, m: int, n: int) -> FloatArray:
+    """Shares (..., P, M, N) of the links."""
+    if share is None:
+        return np.ones((p, m, n))
+    share = check_finite("share", as_float("share", share))
+    if share.shape[-2:] == (p, m) and share.shape[-3:] != (p, m, n):
+        share = share[..., None]
+    if share.ndim < 3 or share.shape[-3:-1] != (p, m) or share.shape[-1] not in (1, n):
+        raise ValueError(
+            f"share must have shape (..., {p}, {m}) or (..., {p}, {m}, {n}), got {share.shape}"
+        )
+    return np.broadcast_to(share, (*share.shape[:-1], n))
+
+
+@compiled("layout_gradient:square_and_gradient")
+def _square_and_gradient(
     anchors: FloatArray,
+    normals: FloatArray,
     rotation: FloatArray,
     places: FloatArray,
-    tags: FloatArray,
+    weight: FloatArray,
     prior: FloatArray,
+    tags: FloatArray,
     law: FloatArray,
+    gain: FloatArray,
     share: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (...) of b^2 over poses, and its derivative (..., M, 3) by the anchors.
+    """Weighted sum (...) of b^2 over poses, and its derivative (..., M, 3) by the anchors.
 
     With ``K = P S P``, S the mean of ``J_n^T J_n``, b^2 falls by ``tr(K dF)``. A link tells
-    ``F = w q q^T`` with ``q = J_n^T d`` and ``w = 1 / (var r^2)``, of the offset ``d = s_n - a_m``.
+    ``F = w q q^T`` with ``q = J_n^T d`` and ``w = g / (var r^2)``, of the offset ``d = s_n - a_m``
+    and of its gain g.
     """
     noise = ranging.law_of(law)
     J = bounds.tag_jacobian(rotation, tags[..., None, :, :])
     s = ranging.tag_positions(rotation, places, tags[..., None, :, :])
     d = s[..., None, :, :] - anchors[..., None, :, None, :]
     distance = np.sqrt((d**2).sum(axis=-1))
-    w = share[..., None] / (noise.variance(distance) * distance**2)
+    full = share / (noise.variance(distance) * distance**2)
+    g, slope_of_gain = share_and_slope(gain, d, normals[..., None, :, None, :] + 0 * d)
+    w = full * g
     q = np.einsum("...nia,...mni->...mna", J, d)
-    P = np.linalg.inv(np.einsum("...mn,...mna,...mnb->...ab", w, q, q) + prior[..., None, :, :])
+    P = np.linalg.inv(np.einsum("...mn,...mna,...mnb->...ab", w, q, q) + prior)
     S = np.einsum("...nia,...nib->...ab", J, J) / tags.shape[-2]
     Kq = q @ (P @ S @ P)[..., None, :, :]
-    told = w * (q * Kq).sum(axis=-1)
+    told = (q * Kq).sum(axis=-1)
     by_link, by_reference, reference = _weight_slopes(noise, distance)
+    # The derivatives by the offset, of w without its gain, then of the gain.
     slope = np.einsum("...mn,...nia,...mna->...mi", w, J, Kq)
-    slope -= ((told * by_link)[..., None] * d).sum(axis=-2)
-    slope -= (told * by_reference).sum(axis=-1, keepdims=True) * d[..., reference, :]
+    slope -= ((w * told * by_link)[..., None] * d).sum(axis=-2)
+    slope -= (w * told * by_reference).sum(axis=-1, keepdims=True) * d[..., reference, :]
+    slope += 0.5 * ((full * told)[..., None] * slope_of_gain).sum(axis=-2)
     square = np.einsum("...ab,...ba->...", S, P)
-    return square.mean(axis=-1), 2 * slope.mean(axis=-3)
+    return (weight * square).sum(axis=-1), 2 * (weight[..., None, None] * slope).sum(axis=-3)
 
 
 def _weight_slopes(
