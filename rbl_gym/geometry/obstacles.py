@@ -1,25 +1,115 @@
-"""Boxes that block sight: what they leave of a link's information, by the slab test, batched.
+"""Obstacles that take information from links: boxes and prisms, batched.
 
-An obstacle is a row of six numbers, centre and half size of an axis-aligned box, metres.
+A box is a row of six numbers, centre and half size of an axis-aligned box, metres. A prism is a
+polygon in the plan between two heights. A segment that only touches an obstacle is not blocked.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, as_float, check_array
+from rbl_gym.checks import BoolArray, FloatArray, as_float, check_array, check_number
+from rbl_gym.geometry.polygons import TOUCH_M, check_polygon, contains
 from rbl_gym.kernels import compiled
 
-__all__ = ["Obstacles", "in_sight", "inside"]
+__all__ = ["Obstacles", "Prisms", "in_sight", "inside", "share_behind"]
+
+# A way inside a prism that is no longer than this is a touch, metres: links begin at its faces.
+_LEAST_WAY_M = 1e-6
+# A link that is shorter than this in the plan is vertical, metres.
+_VERTICAL_M = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Prisms:
+    """Polygons in the plan, each between two heights; made by `of`, which checks them.
+
+    Parameters
+    ----------
+    corners
+        (K, V, 2), counter-clockwise, metres; the last corner is repeated up to V.
+    low_m, high_m
+        (K,), metres.
+    share
+        (K,): share of its information that a link through one keeps. NaN: the one that obstacles
+        without their own have in common.
+    """
+
+    corners: FloatArray = field(default_factory=lambda: np.empty((0, 1, 2)))
+    low_m: FloatArray = field(default_factory=lambda: np.empty(0))
+    high_m: FloatArray = field(default_factory=lambda: np.empty(0))
+    share: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    @classmethod
+    def of(
+        cls,
+        polygons: Sequence[ArrayLike],
+        low_m: ArrayLike,
+        high_m: ArrayLike,
+        share: ArrayLike = np.nan,
+    ) -> Prisms:
+        """Prisms of polygons (V, 2) of any numbers of corners; the others (K,) or one for all.
+
+        Raises
+        ------
+        ValueError
+            On a polygon that crosses itself or has no area, heights that do not rise, a share
+            outside of 0 to 1.
+        """
+        rings = [check_polygon(f"polygons[{i}]", ring) for i, ring in enumerate(polygons)]
+        if not rings:
+            return cls()
+        most = max(map(len, rings))
+        corners = np.array([[*ring, *[ring[-1]] * (most - len(ring))] for ring in rings])
+        low, high, part = (
+            np.broadcast_to(np.asarray(value, float), len(rings)).copy()
+            for value in (low_m, high_m, share)
+        )
+        for index in range(len(rings)):
+            bottom = check_number(f"low_m[{index}]", low[index])
+            check_number(f"high_m[{index}]", high[index], low=bottom + 1e-6)
+            if not np.isnan(part[index]):
+                check_number(f"share[{index}]", part[index], low=0.0, high=1.0)
+        return cls(corners, low, high, part)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.corners)
+
+    @functools.cached_property
+    def limits(self) -> FloatArray:
+        """(K, 7): least and largest x, y, z of each, and its share, as `share_behind` takes them.
+
+        Heights are drawn in by a nanometre: a link along a face touches it.
+        """
+        low, high = self.corners.min(axis=1), self.corners.max(axis=1)
+        heights = self.low_m + TOUCH_M, self.high_m - TOUCH_M
+        pairs = (low[:, 0], high[:, 0], low[:, 1], high[:, 1], *heights)
+        return np.stack([*pairs, self.share], axis=-1)
+
+    def contain(self, points: FloatArray) -> BoolArray:
+        """Which points (..., 3) lie inside of a prism, further than a micrometre from its faces."""
+        found = np.zeros(points.shape[:-1], dtype=bool)
+        heights = points[..., 2]
+        for corners, low, high in zip(self.corners, self.low_m, self.high_m, strict=True):
+            level = (heights > low + _LEAST_WAY_M) & (heights < high - _LEAST_WAY_M) & ~found
+            found[level] = contains(corners, points[level][:, :2], _LEAST_WAY_M)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Boxes in the way of links, and what is left of a link behind one.
+    """Boxes and prisms in the way of links, and what is left of a link behind them.
 
-    Scenes, placement, its checks and transfer all ask this class.
+    Scenes, placement, its checks and transfer all ask this class. Obstacles without a share of
+    their own (all boxes are) leave `blocked_information` of a link, however many of them it
+    meets; the shares of prisms that have one multiply, with that and with each other. A prism
+    counts once, however often a link enters it.
 
     Parameters
     ----------
@@ -28,26 +118,36 @@ class Obstacles:
     blocked_information
         Share of its information that a link without line of sight keeps: the variance of its
         ranges is divided by it. 0: such a link gives no range.
+    prisms
+        The prisms, the same for all leading axes of the boxes.
     """
 
     boxes: FloatArray
     blocked_information: float
+    prisms: Prisms = field(default_factory=Prisms)
 
     def __bool__(self) -> bool:
         """Whether there are any."""
-        return self.boxes.shape[-2] > 0
+        return self.boxes.shape[-2] > 0 or len(self.prisms) > 0
+
+    def __len__(self) -> int:
+        """How many boxes and prisms there are."""
+        return self.boxes.shape[-2] + len(self.prisms)
 
     def share(self, anchors: FloatArray, points: FloatArray) -> FloatArray:
         """Share (..., P, M) of its information that a link from each anchor to each point has.
 
         Anchors (..., M, 3) and points (..., P, 3), metres: the link is that of a body with its
-        origin there.
+        origin there, or of a tag.
         """
-        return np.where(in_sight(anchors, points, self.boxes), 1.0, self.blocked_information)
+        if not len(self.prisms):
+            return np.where(in_sight(anchors, points, self.boxes), 1.0, self.blocked_information)
+        prisms, common = self.prisms, self.blocked_information
+        return share_behind(anchors, points, self.boxes, prisms.corners, prisms.limits, common)
 
     def contain(self, points: FloatArray) -> BoolArray:
-        """Which points (..., 3) lie in or on one of the boxes (K, 6)."""
-        return inside(points, self.boxes)
+        """Which points (..., 3) lie in or on one of the boxes (K, 6), or inside of a prism."""
+        return inside(points, self.boxes) | self.prisms.contain(points)
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
@@ -65,7 +165,7 @@ def check_obstacles(obstacles: object) -> FloatArray:
 
 @compiled("sight:in_sight")
 def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> BoolArray:
-    """Which points each anchor sees, (..., P, M) booleans.
+    """Which points each anchor sees past boxes, (..., P, M) booleans.
 
     A segment that only touches a box is not blocked; one that ends inside a box is.
 
@@ -91,3 +191,84 @@ def inside(points: FloatArray, obstacles: FloatArray) -> BoolArray:
     """Which points (..., 3) lie in or on a box of (K, 6)."""
     away = np.abs(points[..., None, :] - obstacles[:, :3]) - obstacles[:, 3:]
     return np.asarray((away.max(axis=-1) <= 1e-9).any(axis=-1))
+
+
+@compiled("sight:share_behind")
+def share_behind(
+    anchors: FloatArray,
+    points: FloatArray,
+    boxes: FloatArray,
+    corners: FloatArray,
+    limits: FloatArray,
+    blocked: FloatArray,
+) -> FloatArray:
+    """Share (..., P, M) of a link's information that boxes and prisms leave.
+
+    A link meets a prism where, between the heights, its way in the plan runs inside the polygon
+    for more than a micrometre.
+
+    Parameters
+    ----------
+    anchors, points, boxes
+        As `in_sight`.
+    corners, limits
+        (K, V, 2) and (K, 7), of `Prisms`.
+    blocked
+        What obstacles without their own share leave, once.
+    """
+    free = in_sight.textbook(anchors, points, boxes)
+    start, end = np.broadcast_arrays(anchors[..., None, :, :], points[..., :, None, :])
+    own = np.ones(start.shape[:-1])
+    least, most = np.minimum(start, end), np.maximum(start, end)
+    for polygon, limit in zip(corners, limits, strict=True):
+        # Most links pass beside its bounding box.
+        near = ((least < limit[1:6:2]) & (most > limit[0:6:2])).all(axis=-1)
+        met = np.zeros_like(near)
+        met[near] = _meets(start[near], end[near], polygon, limit[4], limit[5])
+        if np.isnan(limit[6]):
+            free = free & ~met
+        else:
+            own = np.where(met, limit[6] * own, own)
+    return np.where(free, 1.0, blocked) * own
+
+
+def _meets(
+    start: FloatArray, end: FloatArray, polygon: FloatArray, low: float, high: float
+) -> BoolArray:
+    """Which segments (S, 3) run inside of a prism.
+
+    The line of the segment, moved by nothing to its left and to its right, is inside the polygon
+    between odd and even crossings of its edges. What both have in common is inside: along an
+    edge one of them is not.
+    """
+    along = end - start
+    length = np.sqrt((along**2).sum(axis=-1))
+    to_low, to_high = (low - start[:, 2]) / along[:, 2], (high - start[:, 2]) / along[:, 2]
+    level = along[:, 2] == 0.0
+    enter = np.where(level, 0.0, np.maximum(0.0, np.minimum(to_low, to_high)))
+    leave = np.where(level, 1.0, np.minimum(1.0, np.maximum(to_low, to_high)))
+    square = along[:, 0] ** 2 + along[:, 1] ** 2
+    vertical = square < _VERTICAL_M**2
+    dx, dy = (np.where(vertical, unit, along[:, i])[:, None] for i, unit in ((0, 1.0), (1, 0.0)))
+    x, y = polygon[:, 0] - start[:, :1], polygon[:, 1] - start[:, 1:2]
+    # Where each corner stands along the line, and on which side of it.
+    ahead, side = dx * x + dy * y, dx * y - dy * x
+    reach = np.sqrt(dx * dx + dy * dy)
+    side = np.where(np.abs(side) <= TOUCH_M * reach, 0.0, side)
+    next_ahead, next_side = np.roll(ahead, -1, axis=1), np.roll(side, -1, axis=1)
+    first = np.abs(side) <= np.abs(next_side)
+    base, other = np.where(first, ahead, next_ahead), np.where(first, next_ahead, ahead)
+    near, far = np.where(first, side, next_side), np.where(first, next_side, side)
+    at = (base + near / (near - far) * (other - base)) / (reach * reach)
+    left = np.where((side > 0) != (next_side > 0), at, np.inf)
+    right = np.where((side >= 0) != (next_side >= 0), at, np.inf)
+    stops = np.concatenate([left, right, enter[:, None], leave[:, None]], axis=1)
+    stops = np.sort(stops.clip(enter[:, None], leave[:, None]), axis=1)
+    middle = 0.5 * (stops[:, 1:] + stops[:, :-1])[:, :, None]
+    within = ((left[:, None] < middle).sum(axis=-1) % 2 == 1) & (
+        (right[:, None] < middle).sum(axis=-1) % 2 == 1
+    )
+    found = ((np.diff(stops, axis=1) * length[:, None] > _LEAST_WAY_M) & within).any(axis=1)
+    # A vertical link stands at one place in the plan.
+    through = (leave - enter) * length > _LEAST_WAY_M
+    return np.where(vertical, through & contains(polygon, start[:, :2], TOUCH_M), found)

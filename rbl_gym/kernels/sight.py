@@ -1,8 +1,11 @@
-"""Which points anchors see past boxes; the textbook form is `rbl_gym.geometry.obstacles`."""
+"""What boxes and prisms leave of links; the textbook forms are `rbl_gym.geometry.obstacles`."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
+
+import numpy as np
 
 from rbl_gym.kernels.jit import gufunc, helper
 
@@ -31,3 +34,150 @@ def _blocks(box: Any, start: Any, end: Any) -> bool:
             return False
         enter, leave = max(enter, min(low, high)), min(leave, max(low, high))
     return enter < leave
+
+
+# As in the textbook form, metres.
+_TOUCH_M, _LEAST_WAY_M, _VERTICAL_M = 1e-9, 1e-6, 1e-12
+
+
+@gufunc("(m,d),(p,d),(k,b),(q,v,e),(q,l),()->(p,m)")
+def share_behind(
+    anchors: Any, points: Any, boxes: Any, corners: Any, limits: Any, blocked: Any, share: Any
+) -> None:
+    """What boxes and prisms leave of the information of each link."""
+    n_corners = corners.shape[1]
+    crossings = np.empty((2, n_corners))
+    stops = np.empty(2 * n_corners + 2)
+    for p in range(points.shape[0]):
+        for m in range(anchors.shape[0]):
+            start, end = anchors[m], points[p]
+            free, own = True, 1.0
+            for k in range(boxes.shape[0]):
+                if _blocks(boxes[k], start, end):
+                    free = False
+                    break
+            ax, ay, az = start[0], start[1], start[2]
+            dx, dy = end[0] - ax, end[1] - ay
+            west, east = min(ax, end[0]), max(ax, end[0])
+            south, north = min(ay, end[1]), max(ay, end[1])
+            bottom, top = min(az, end[2]), max(az, end[2])
+            for q in range(corners.shape[0]):
+                # Most links pass beside the bounding box.
+                if west >= limits[q, 1] or east <= limits[q, 0]:
+                    continue
+                if south >= limits[q, 3] or north <= limits[q, 2]:
+                    continue
+                if bottom >= limits[q, 5] or top <= limits[q, 4]:
+                    continue
+                # Or have all of it on one side of their line in the plan.
+                off = dx * (limits[q, 2] + limits[q, 3] - 2.0 * ay)
+                off -= dy * (limits[q, 0] + limits[q, 1] - 2.0 * ax)
+                half = abs(dx) * (limits[q, 3] - limits[q, 2])
+                if abs(off) > half + abs(dy) * (limits[q, 1] - limits[q, 0]):
+                    continue
+                common = limits[q, 6] != limits[q, 6]
+                if common and not free:
+                    continue
+                if _meets(start, end, corners[q], limits[q], crossings, stops):
+                    if common:
+                        free = False
+                    else:
+                        own *= limits[q, 6]
+            share[p, m] = own if free else own * blocked
+
+
+@helper
+def _meets(start: Any, end: Any, polygon: Any, limit: Any, crossings: Any, stops: Any) -> bool:
+    """Whether a segment runs inside a prism; the last two are overwritten."""
+    dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    enter, leave = 0.0, 1.0
+    if dz != 0.0:
+        low, high = (limit[4] - start[2]) / dz, (limit[5] - start[2]) / dz
+        enter, leave = max(enter, min(low, high)), min(leave, max(low, high))
+    if not (leave - enter) * length > _LEAST_WAY_M:
+        return False
+    if dx * dx + dy * dy < _VERTICAL_M * _VERTICAL_M:
+        return _holds(polygon, start[0], start[1])
+    left, right = crossings[0], crossings[1]
+    count = _crossings(start, dx, dy, polygon, left, right)
+    n_stops = 2
+    stops[0], stops[1] = enter, leave
+    for i in range(count):
+        for side in range(2):
+            at = crossings[side, i]
+            if enter < at < leave:
+                # Into its place among those before.
+                k = n_stops
+                while k > 0 and stops[k - 1] > at:
+                    stops[k] = stops[k - 1]
+                    k -= 1
+                stops[k] = at
+                n_stops += 1
+    for k in range(n_stops - 1):
+        if (stops[k + 1] - stops[k]) * length > _LEAST_WAY_M:
+            middle = 0.5 * (stops[k + 1] + stops[k])
+            if _is_odd(left, middle, count) and _is_odd(right, middle, count):
+                return True
+    return False
+
+
+@helper
+def _crossings(start: Any, dx: float, dy: float, polygon: Any, left: Any, right: Any) -> int:
+    """Where a line in the plan crosses the edges, moved by nothing to its left and to its right.
+
+    Infinity where one of the two does not; how many there are to look at.
+    """
+    ax, ay, reach = start[0], start[1], math.sqrt(dx * dx + dy * dy)
+    last = polygon.shape[0] - 1
+    x, y = polygon[last, 0] - ax, polygon[last, 1] - ay
+    ahead, side = dx * x + dy * y, dx * y - dy * x
+    if abs(side) <= _TOUCH_M * reach:
+        side = 0.0
+    count = 0
+    for i in range(polygon.shape[0]):
+        x, y = polygon[i, 0] - ax, polygon[i, 1] - ay
+        next_ahead, next_side = dx * x + dy * y, dx * y - dy * x
+        if abs(next_side) <= _TOUCH_M * reach:
+            next_side = 0.0
+        by_left, by_right = (side > 0) != (next_side > 0), (side >= 0) != (next_side >= 0)
+        if by_left or by_right:
+            if abs(side) <= abs(next_side):
+                at = ahead + side / (side - next_side) * (next_ahead - ahead)
+            else:
+                at = next_ahead + next_side / (next_side - side) * (ahead - next_ahead)
+            at /= reach * reach
+            left[count] = at if by_left else math.inf
+            right[count] = at if by_right else math.inf
+            count += 1
+        ahead, side = next_ahead, next_side
+    return count
+
+
+@helper
+def _is_odd(crossings: Any, place: float, count: int) -> bool:
+    """Whether an odd number of the crossings lies before a place."""
+    odd = False
+    for i in range(count):
+        if crossings[i] < place:
+            odd = not odd
+    return odd
+
+
+@helper
+def _holds(polygon: Any, px: float, py: float) -> bool:
+    """Whether a point in the plan lies inside of a polygon, and not on its edge."""
+    odd = False
+    last = polygon.shape[0] - 1
+    ax, ay = polygon[last, 0] - px, polygon[last, 1] - py
+    for i in range(polygon.shape[0]):
+        bx, by = polygon[i, 0] - px, polygon[i, 1] - py
+        dx, dy = bx - ax, by - ay
+        square = dx * dx + dy * dy
+        share = 0.0 if square == 0.0 else min(max(-(ax * dx + ay * dy) / square, 0.0), 1.0)
+        if math.hypot(ax + share * dx, ay + share * dy) <= _TOUCH_M:
+            return False
+        if (ay > 0.0) != (by > 0.0) and ax - ay / dy * dx > 0.0:
+            odd = not odd
+        ax, ay = bx, by
+    return odd

@@ -1,0 +1,134 @@
+"""Simple polygons in the plan: checks, and which points they hold. Corners (V, 2), metres."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rbl_gym.checks import BoolArray, FloatArray, check_array
+
+__all__ = ["area", "check_line", "check_polygon", "contains"]
+
+# Corners nearer to each other than this are one, and lines that come so close touch, metres.
+TOUCH_M = 1e-9
+
+
+def area(polygon: FloatArray) -> float:
+    """Area in square metres; positive where the corners run counter-clockwise."""
+    # About the first corner: far from the origin the products lose digits.
+    x, y = (polygon - polygon[0]).T
+    return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))
+
+
+def check_line(name: str, line: ArrayLike, closed: bool = False) -> FloatArray:
+    """A line of at least two corners (V, 2), those that repeat the one before left out.
+
+    Raises
+    ------
+    ValueError
+        On what is no list of [x, y], or has no length.
+    """
+    points = check_array(name, line, ("V", 2))
+    if points.ndim != 2:
+        raise ValueError(f"{name} must be a list of [x, y], got shape {points.shape}")
+    fresh = np.hypot(*np.diff(points, axis=0).T) > TOUCH_M
+    points = points[np.concatenate([[True], fresh])]
+    if closed and len(points) > 1 and np.hypot(*(points[-1] - points[0])) <= TOUCH_M:
+        points = points[:-1]
+    least = 3 if closed else 2
+    if len(points) < least:
+        raise ValueError(f"{name} must have at least {least} different points, got {len(points)}")
+    return points
+
+
+def check_polygon(name: str, polygon: ArrayLike) -> FloatArray:
+    """The corners (V, 2) of a simple polygon, counter-clockwise and without a repeated one.
+
+    Clockwise polygons are turned round, a last corner that repeats the first is left out.
+
+    Raises
+    ------
+    ValueError
+        If it is no list of [x, y], has no area, or crosses or touches itself; the message says
+        where.
+    """
+    ring = check_line(name, polygon, closed=True)
+    extent = float(np.ptp(ring, axis=0).max())
+    if abs(area(ring)) <= TOUCH_M * extent:
+        raise ValueError(f"{name} must have an area, its {len(ring)} corners lie on one line")
+    _check_simple(name, ring)
+    return ring if area(ring) > 0 else ring[::-1].copy()
+
+
+def _check_simple(name: str, ring: FloatArray) -> None:
+    """No two edges meet but neighbours at their common corner."""
+    count = len(ring)
+    start, end = ring, np.roll(ring, -1, axis=0)
+    along = end - start
+    length = np.hypot(*along.T)
+    after = np.roll(along, -1, axis=0)
+    turn = _cross(along, after) / np.maximum(length, np.roll(length, -1))
+    back = (np.abs(turn) <= TOUCH_M) & ((along * after).sum(axis=1) < 0)
+    if back.any():
+        where = end[back.argmax()]
+        raise ValueError(f"{name} must not fold back on itself, as it does at {_show(where)}")
+    for i in range(count - 2):
+        # Edges i and j, from the next but one to the last that is no neighbour.
+        j = np.arange(i + 2, count - (i == 0))
+        off = _distance(start[i], end[i], start[j], end[j])
+        if len(j) and off.min() <= TOUCH_M:
+            k = int(j[off.argmin()])
+            raise ValueError(
+                f"{name} must not cross or touch itself: edge {i + 1}, from {_show(start[i])} to "
+                f"{_show(end[i])}, meets edge {k + 1}, from {_show(start[k])} to {_show(end[k])}"
+            )
+
+
+def _distance(a: FloatArray, b: FloatArray, starts: FloatArray, ends: FloatArray) -> FloatArray:
+    """Distances (J,) between a segment and others (J, 2); 0 where they cross."""
+    sides = _cross(b - a, starts - a), _cross(b - a, ends - a)
+    others = _cross(ends - starts, a - starts), _cross(ends - starts, b - starts)
+    crossing = (sides[0] * sides[1] < 0) & (others[0] * others[1] < 0)
+    ends_off = [
+        to_segment(starts, a, b), to_segment(ends, a, b),
+        to_segment(a, starts, ends), to_segment(b, starts, ends),
+    ]  # fmt: skip
+    return np.where(crossing, 0.0, np.min(ends_off, axis=0))
+
+
+def to_segment(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+    """Distances (...) of points (..., 2) from segments between (..., 2), metres."""
+    along, away = end - start, points - start
+    square = (along**2).sum(axis=-1)
+    share = ((along * away).sum(axis=-1) / np.where(square > 0, square, 1.0)).clip(0.0, 1.0)
+    return np.hypot(*np.moveaxis(away - share[..., None] * along, -1, 0))
+
+
+def contains(polygon: FloatArray, points: FloatArray, margin_m: float = 1e-6) -> BoolArray:
+    """Which points (..., 2) lie inside of a polygon (V, 2), and not within a margin of its edge.
+
+    A negative margin counts those on the edge and so far outside of it too.
+    """
+    reach = max(0.0, -margin_m)
+    low, high = polygon.min(axis=0) - reach, polygon.max(axis=0) + reach
+    found = ((points >= low) & (points <= high)).all(axis=-1)
+    near = points[found]
+    start, end = polygon, np.roll(polygon, -1, axis=0)
+    x, y = near[:, None, 0], near[:, None, 1]
+    above = start[:, 1] > y
+    # Of edges that a ray in x meets, how many lie ahead: odd inside.
+    crosses = above != (end[:, 1] > y)
+    height = np.where(crosses, end[:, 1] - start[:, 1], 1.0)
+    ahead = start[:, 0] + (y - start[:, 1]) / height * (end - start)[:, 0] > x
+    inside = (crosses & ahead).sum(axis=1) % 2 == 1
+    off = to_segment(near[:, None], start, end).min(axis=1, initial=np.inf)
+    found[found] = inside & (off > margin_m) if margin_m >= 0 else inside | (off <= -margin_m)
+    return found
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _show(point: FloatArray) -> str:
+    return f"({point[0]:g}, {point[1]:g})"
