@@ -1,0 +1,85 @@
+"""Layouts of anchors from CSV files: one anchor a line, columns by their names."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+
+__all__ = ["Layout", "read_layout"]
+
+_AXES = ("x_m", "y_m", "z_m")
+
+
+class Layout(NamedTuple):
+    """Anchors of a file: names (M), places (M, 3) in metres."""
+
+    names: tuple[str, ...]
+    positions: FloatArray
+
+
+def read_layout(path: str) -> Layout:
+    """The anchors of a CSV file with the columns x_m, y_m, z_m and, if it has one, name.
+
+    Columns in any order, others are left alone; separated by commas or semicolons. Without names
+    the anchors are called 1, 2, ...
+
+    Parameters
+    ----------
+    path
+        Of the file.
+
+    Raises
+    ------
+    ValueError
+        On a file that is none, names the file, the line and the column.
+    """
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: must be a text in UTF-8, {error.reason}") from error
+    first = text.partition("\n")[0]
+    lines = csv.reader(io.StringIO(text), delimiter=";" if ";" in first else ",", strict=True)
+    try:
+        rows = [(lines.line_num, row) for row in lines if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {lines.line_num}: {error}") from error
+    header = [cell.strip().lower() for cell in rows[0][1]] if rows else []
+    missing = [name for name in _AXES if name not in header]
+    if missing:
+        raise ValueError(
+            f"{path}: the first line must name the columns x_m, y_m, z_m and may have name; "
+            f"{', '.join(missing)} not found in {first.strip()[:80]!r}"
+        )
+    columns = [header.index(name) for name in _AXES]
+    at_name = header.index("name") if "name" in header else None
+    names, positions = [], []
+    for line, row in rows[1:]:
+        if len(row) != len(header):
+            raise ValueError(f"{path}, line {line}: {len(header)} cells needed, got {len(row)}")
+        positions.append([_number(path, line, header[k], row[k]) for k in columns])
+        names.append(str(len(names) + 1) if at_name is None else row[at_name].strip())
+        if not names[-1] or names.index(names[-1]) < len(names) - 1:
+            raise ValueError(
+                f"{path}, line {line}, column name: every anchor must have its own name, "
+                f"got {names[-1]!r}"
+            )
+    if not positions:
+        raise ValueError(f"{path}: no anchor in it")
+    return Layout(tuple(names), np.array(positions))
+
+
+def _number(path: str, line: int, column: str, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{path}, line {line}, column {column}: must be a number, got {cell!r}")
+    return value

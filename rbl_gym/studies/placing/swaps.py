@@ -1,0 +1,293 @@
+"""Layouts from a list of candidates, by what each of them tells at the poses of the zones.
+
+Information is a sum over the anchors, so that of a candidate is computed once, and a layout is a
+choice of candidates. What is made small is how far the zones are from their requirements, or b
+where none has one; for layouts that must survive the loss of any one anchor, the worst that is
+left. The layouts are choices ``list[int]`` of candidates, those that stay come first.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.studies.placing.requirements import (
+    Errors,
+    Limits,
+    errors_of,
+    relative_errors,
+    value_at_share,
+)
+
+__all__ = ["Stock", "ZonePoses", "all_choices", "cheaper", "grown", "swapped", "value"]
+
+# An exchange must better the value by this share, so that rounding never goes round in circles.
+_GAIN = 1e-6
+# Weight of the mean beside the place that fills the share: which of two layouts is better where
+# that place does not tell, and a slope where no layout is near the requirement.
+_OF_MEAN = 1e-2
+# Layouts that are tried at a time.
+_CHUNK = 64
+
+
+class ZonePoses(NamedTuple):
+    """Poses of a zone, and what is asked of them.
+
+    Attributes
+    ----------
+    places, rotation
+        (L, 3), and turns (T, 3, 3) at each of them.
+    prior
+        Information (6, 6) before any range.
+    tags
+        (N, 3) on the body.
+    limits, share
+        What a place may have, and in which share of the zone.
+    weight
+        Of the zone in the mean of b^2.
+    """
+
+    places: FloatArray
+    rotation: FloatArray
+    prior: FloatArray
+    tags: FloatArray
+    limits: Limits
+    share: float
+    weight: float
+
+
+class Stock(NamedTuple):
+    """Candidates for anchors at the poses of the zones.
+
+    Attributes
+    ----------
+    zones
+        Poses of each zone.
+    parts
+        Of each zone (K, L, T, 6, 6): information of every candidate at every pose.
+    cost
+        Of every candidate (K,).
+    """
+
+    zones: tuple[ZonePoses, ...]
+    parts: tuple[FloatArray, ...]
+    cost: FloatArray
+
+    @property
+    def asks(self) -> bool:
+        """Whether any zone has a requirement."""
+        return any(zone.limits.any() for zone in self.zones)
+
+
+Base = list[FloatArray]  # information (L, T, 6, 6) of each zone
+
+
+def value(stock: Stock, chosen: Sequence[int], survive: int = 0) -> float:
+    """What the search makes small; with requirements, those are met where it is at most 1.
+
+    The relative error at the place that fills the share of its zone, of the zone where it is
+    largest, with a hundredth of the mean relative error. Without requirements, b.
+
+    Parameters
+    ----------
+    stock, chosen
+        Candidates, and which of them.
+    survive
+        1: the worst over the loss of any one of the chosen.
+    """
+    total = _total(stock, chosen)
+    if not survive:
+        return float(_values(stock, total)[0])
+    return max(float(_values(stock, _less(stock, total, k))[0]) for k in chosen)
+
+
+def grown(
+    stock: Stock, chosen: Sequence[int], count: int, survive: int = 0
+) -> Iterator[tuple[list[int], float]]:
+    """Layouts of more and more anchors, each the one before with the candidate that helps most.
+
+    Ends with `count` anchors, or where no candidate is left.
+
+    Parameters
+    ----------
+    stock, chosen
+        Candidates, and with which of them to begin.
+    count
+        The largest number of anchors.
+    survive
+        As in `value`: of the values that are told, and of the choice where two anchors stand.
+    """
+    found = list(chosen)
+    total = _total(stock, found)
+    while len(found) < min(count, len(stock.cost)):
+        scores = _of_candidates(stock, total, found, survive if len(found) > 2 else 0, math.inf)
+        scores[found] = math.inf
+        found = [*found, int(scores.argmin())]
+        total = [a + part[found[-1]] for a, part in zip(total, stock.parts, strict=True)]
+        yield found, value(stock, found, survive)
+
+
+def swapped(
+    stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0, sweeps: int = 20
+) -> tuple[list[int], float]:
+    """A layout after exchanges of one anchor for one candidate, as long as they help; its value.
+
+    Parameters
+    ----------
+    stock, chosen
+        Candidates, and with which of them to begin.
+    keep
+        So many of the first stay.
+    survive
+        As in `value`.
+    sweeps
+        At most so many times over all anchors.
+    """
+    found, best = list(chosen), value(stock, chosen, survive)
+    for _ in range(sweeps):
+        before = best
+        for k in range(keep, len(found)):
+            others = found[:k] + found[k + 1 :]
+            limit = best * (1 - _GAIN)
+            scores = _of_candidates(stock, _total(stock, others), others, survive, limit)
+            scores[found] = math.inf
+            new = int(scores.argmin())
+            if scores[new] < limit:
+                found[k], best = new, float(scores[new])
+        if best == before:
+            break
+    return found, best
+
+
+def dropped(
+    stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
+) -> tuple[list[int], float]:
+    """The layout without the anchor that is missed least; the first `keep` stay.
+
+    Arguments as `swapped`.
+    """
+    tried = [[*chosen[:k], *chosen[k + 1 :]] for k in range(keep, len(chosen))]
+    values = [value(stock, one, survive) for one in tried]
+    best = int(np.argmin(values))
+    return tried[best], values[best]
+
+
+def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0) -> list[int]:
+    """A layout that still meets the requirements, after exchanges that save most.
+
+    Arguments as `swapped`.
+    """
+    found = list(chosen)
+    if value(stock, found, survive) > 1:
+        return found
+    saved = True
+    while saved:
+        saved = False
+        for k in sorted(range(keep, len(found)), key=lambda k: -stock.cost[found[k]]):
+            others = found[:k] + found[k + 1 :]
+            scores = _of_candidates(stock, _total(stock, others), others, survive, 1 + 1e-12)
+            scores[found] = math.inf
+            good = np.flatnonzero((scores <= 1) & (stock.cost < stock.cost[found[k]] - 1e-12))
+            if len(good):
+                order = np.lexsort((scores[good], stock.cost[good]))
+                found[k], saved = int(good[order[0]]), True
+    return found
+
+
+def all_choices(
+    stock: Stock, count: int, keep: int = 0, survive: int = 0
+) -> tuple[list[int], float]:
+    """The best of all layouts of `count` candidates; the first `keep` candidates stay.
+
+    Arguments as `swapped`.
+    """
+    kept = list(range(keep))
+    best, least = kept, math.inf
+    rest = itertools.combinations(range(keep, len(stock.cost)), count - keep)
+    while some := list(itertools.islice(rest, _CHUNK)):
+        chosen = np.array([[*kept, *one] for one in some], dtype=int)
+        totals = [
+            zone.prior + np.stack([part[one].sum(axis=0) for one in chosen])
+            for zone, part in zip(stock.zones, stock.parts, strict=True)
+        ]
+        values = _values(stock, totals)
+        if survive:
+            for k in range(count):
+                less = [
+                    total - part[chosen[:, k]]
+                    for total, part in zip(totals, stock.parts, strict=True)
+                ]
+                left = _values(stock, less)
+                values = left if k == 0 else np.maximum(values, left)
+        if values.min() < least:
+            best, least = chosen[values.argmin()].tolist(), float(values.min())
+    return best, least
+
+
+# --- values --------------------------------------------------------------------------------------
+
+
+def _total(stock: Stock, chosen: Sequence[int]) -> Base:
+    index = list(chosen)
+    return [
+        zone.prior + part[index].sum(axis=0)
+        for zone, part in zip(stock.zones, stock.parts, strict=True)
+    ]
+
+
+def _less(stock: Stock, total: Base, k: int) -> Base:
+    return [a - part[k] for a, part in zip(total, stock.parts, strict=True)]
+
+
+def _of_candidates(
+    stock: Stock, base: Base, others: list[int], survive: int, limit: float
+) -> FloatArray:
+    """Value (K,) of `others`, whose information is `base`, with each candidate.
+
+    Where the loss of one matters, infinite for a candidate that is no better than `limit`.
+    """
+    if not survive:
+        return _values(stock, base, slice(None))
+    # The candidate itself may fail; then each of the others, the worst first, so that most
+    # candidates are left out early.
+    worst = np.full(len(stock.cost), float(_values(stock, base)[0]))
+    left = [(float(_values(stock, _less(stock, base, k))[0]), k) for k in others]
+    for _, k in sorted(left, reverse=True):
+        open_ = np.flatnonzero(worst < limit)
+        if not len(open_):
+            break
+        scores = _values(stock, _less(stock, base, k), open_)
+        worst[open_] = np.maximum(worst[open_], scores)
+    return np.where(worst < limit, worst, math.inf)
+
+
+def _values(stock: Stock, base: Base, added: slice | np.ndarray | None = None) -> FloatArray:
+    """Value (J,) of information (..., L, T, 6, 6) with each of the added candidates, or none."""
+    found = []
+    for zone, total, part in zip(stock.zones, base, stock.parts, strict=True):
+        more = None if added is None else part[added]
+        found.append(errors_of(total, zone.rotation, zone.tags, more))
+    return np.atleast_1d(_objective(stock, found))
+
+
+def _objective(stock: Stock, errors: list[Errors]) -> FloatArray:
+    """Value (...) of errors (..., L) at the places of every zone."""
+    if not stock.asks:
+        weights = np.array([zone.weight for zone in stock.zones])
+        squares = [(of_zone.score**2).mean(axis=-1) for of_zone in errors]
+        return np.sqrt(np.tensordot(weights / weights.sum(), squares, axes=1))
+    worst, mean = [], []
+    for zone, of_zone in zip(stock.zones, errors, strict=True):
+        if zone.limits.any():
+            relative = relative_errors(of_zone, zone.limits)
+            worst.append(value_at_share(relative, zone.share))
+            mean.append(relative.mean(axis=-1))
+    q, slope = np.max(worst, axis=0), _OF_MEAN * np.mean(mean, axis=0)
+    # On the side of 1 that the requirements say.
+    met = (1 - _OF_MEAN) * q + np.minimum(slope, _OF_MEAN)
+    return np.where(q <= 1, met, q + slope)
