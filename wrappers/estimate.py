@@ -17,6 +17,7 @@ from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import check_takes_noise, factory_of, reads
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.noise_laws import WeakenedNoise
+from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
@@ -90,6 +91,11 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
         self._tags = self._scene.body
         self._rendered = getattr(env.unwrapped, "film", None) is not None
+        self._named = filter, options
+        self._family = family_of(env)
+        if self._family is not None:
+            # Options that a scene of the family refuses are refused now.
+            self._scene = next((s for s in self._family.corners if s.obstacles), self._scene)
         self._filter = make_filter(env, self._scene, filter, options)
         self._state: Any = None
         self.observation_space = observation_space(self._kind, env.observation_space, self._scene)
@@ -99,6 +105,10 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ) -> tuple[Any, dict[str, Any]]:
         """Start the filter from the environment's prior and give it the first epoch."""
         observation, info = self.env.reset(seed=seed, options=options)
+        if self._family is not None:
+            self._scene = scene_of(self.env)
+            self._tags = self._scene.body
+            self._filter = make_filter(self.env, self._scene, *self._named)
         prior = (info["prior_rotation"], info["prior_translation"], info["prior_covariance"])
         self._state = self._filter.initial(*prior)
         belief = self._update(observation)
@@ -118,6 +128,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return self._observation(observation, belief), reward, terminated, truncated, info
 
     def _update(self, observation: dict[str, np.ndarray]) -> PoseBelief:
+        if self._family is not None:
+            observation = unpadded(observation, self._scene)
         self._state = update(self._filter, self._state, observation, self._scene)
         return self._filter.belief(self._state)
 
@@ -146,6 +158,29 @@ def scene_of(env: Any) -> Scene:
             f"filter of their own or without one have not, got {unwrapped!r}"
         )
     return scene
+
+
+def family_of(env: Any) -> SceneFamily | None:
+    """The family of scenes that an environment draws from; None where it has one scene."""
+    return getattr(env.unwrapped, "family", None)
+
+
+def unpadded(observation: Mapping[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
+    """What a filter reads of the anchors and tags of a scene of a family."""
+    told = {
+        key: observation[key]
+        for key in ("ranges", "links", "anchors", "quality", "twist")
+        if key in observation
+    }
+    m, n = scene.n_anchors, len(scene.tags)
+    for key in ("ranges", "links"):
+        told[key] = told[key][..., :m, :n]
+    told["anchors"] = told["anchors"][..., :m, :]
+    if scene.obstacles:
+        told["quality"] = told["quality"][..., :m]
+    else:
+        told.pop("quality", None)
+    return told
 
 
 def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
@@ -259,7 +294,8 @@ def observation_space(kind: str, inner: spaces.Space[Any], scene: Scene) -> spac
             f"space is {inner}"
         )
     if kind == "flat":
-        size = 21 + 4 * scene.n_anchors
+        m = scene.n_anchors if "station" in keys else inner["anchors"].shape[0]  # pyright: ignore[reportOptionalSubscript]
+        size = 21 + (5 if "anchor_mask" in keys else 4) * m
         return spaces.Box(-_FLAT_LIMIT, _FLAT_LIMIT, (size,), np.float32)
     # Beliefs have no bound of their own; these are finite and never met.
     return spaces.Dict(
@@ -276,6 +312,8 @@ def flat_observation(
     observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: Scene
 ) -> np.ndarray:
     """Belief and anchors as one float32 vector (..., 21 + 4 M), relative and of order one.
+
+    Of a family of scenes (..., 21 + 5 M): the mask of the anchors is the end of it.
 
     In order: estimated position scaled to the scene's volume (3); twist over pi/10 a step and
     over the speed (6); log standard deviations of the pose error (6); the first two columns
@@ -294,13 +332,18 @@ def flat_observation(
     relative = anchors - belief.translation[..., None, :]
     distance = metrics.length(relative)
     batch = belief.translation.shape[:-1]
+    far = np.log(np.maximum(distance / extent, 1e-6))
+    masks = [observation["anchor_mask"]] if "anchor_mask" in observation else []
+    for mask in masks:
+        relative, far = relative * mask[..., None], far * mask
     parts = [
         (belief.translation - 0.5 * (low + high)) / half,
         observation["twist"] / scale,
         np.log(np.maximum(std, 1e-12)),
         np.swapaxes(belief.rotation, -1, -2)[..., :2, :].reshape(*batch, 6),
         (relative / extent).reshape(*batch, -1),
-        np.log(np.maximum(distance / extent, 1e-6)),
+        far,
+        *masks,
     ]
     flat = np.concatenate(parts, axis=-1)
     return np.clip(flat, -_FLAT_LIMIT, _FLAT_LIMIT).astype(np.float32)

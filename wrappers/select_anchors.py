@@ -43,7 +43,8 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
-        self._n_anchors = scene_of(env).n_anchors
+        scene_of(env)
+        self._n_anchors = env.observation_space["links"].shape[0]
         self._rendered = getattr(env.unwrapped, "film", None) is not None
         self.action_space = spaces.MultiBinary(self._n_anchors)
         self._still = _zeros(env.action_space)

@@ -14,10 +14,13 @@ from numpy.typing import ArrayLike
 from rbl_gym import rendering
 from rbl_gym.checks import FloatArray, as_array, check_array, check_one_of
 from rbl_gym.envs.batch import StatedLength, check_options
-from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.worlds import families, scene_bounds, scenes, simulation
+from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 
 REWARDS = ("bound", "none")
+# Bound of what a family observes: its scenes have bounds of their own.
+_FAR = 1e9
 
 # Not a `ScalarEnv` of one world, as the other environments: a whole episode is made, and with fixed
 # anchors measured, in one go at reset, which makes an epoch several times as fast. The tests hold
@@ -91,6 +94,28 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
     `rbl_gym.worlds.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
 
+    `scenes`, in place of `scene`: a family of scenes, of which every reset draws one, see
+    `rbl_gym.worlds.families.SceneFamily`:
+    ```python
+    env = gym.make(
+        "rbl_gym:RBL/Tracking-v0",
+        scenes=[
+            "drone_yard",
+            {
+                "name": "uwb_room",
+                "n_anchors": {"integers": [3, 8]},
+                "noise": {"floor_m": {"log-uniform": [0.02, 0.5]}},
+            },
+        ],
+    )
+    ```
+    M and N are then the most anchors and tags of the family. Rows beyond those of the drawn scene
+    are zeros, and their links 0. The observation has three more keys: `anchor_mask` (M,) and
+    `tag_mask` (N,), int8, 1 for those that there are; `tags` (N, 3), metres, body frame. `quality`
+    is there if any scene has obstacles. `info["scene"]` of the reset holds the overrides that were
+    drawn. `env.unwrapped.scene` is the scene of the episode. Actions move the anchors that there
+    are; if no scene of the family moves its anchors, the action is ``Discrete(1)``.
+
     ## Version history
     * v0: first version.
     """  # noqa: E501 (a table row cannot be broken)
@@ -105,20 +130,21 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         scene: str | Mapping[str, Any] | Scene = "uwb_room",
         reward: str = "bound",
         render_mode: str | None = None,
+        scenes: Any = None,
     ) -> None:
-        self.scene = scenes.get(scene)
+        self.family, self.scene = worlds_of(scene, scenes)
         self.film = rendering.film_of(render_mode, self.scene)
         self.reward_mode = check_one_of("reward", reward, REWARDS)
         self.render_mode = render_mode
-        self.observation_space = observation_space(self.scene)
-        self.action_space = action_space(self.scene)
+        self.observation_space = observation_space(self.family or self.scene)
+        self.action_space = action_space(self.family or self.scene)
         self._episode: simulation.Episode | None = None
         self._epoch = 0
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode: the scene's."""
-        return self.scene.steps
+        """Steps of an episode: the scene's, of a family those of the longest."""
+        return (self.family or self.scene).steps
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -126,6 +152,10 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         """Start an episode; the measurements are those of epoch 0. `options` must be empty."""
         check_options(options)
         super().reset(seed=seed)
+        drawn = None
+        if self.family is not None:
+            self.scene, drawn = self.family.draw(self.np_random)
+            self.film = rendering.film_of(self.render_mode, self.scene)
         episode = simulation.draw_episode(self.scene, self.np_random)
         self._episode = episode
         self._epoch = 0
@@ -139,6 +169,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         info["prior_rotation"] = episode.prior_rotation.copy()
         info["prior_translation"] = episode.prior_translation.copy()
         info["prior_covariance"] = episode.prior_covariance.copy()
+        if drawn is not None:
+            info["scene"] = drawn
         return observation, info
 
     def step(
@@ -148,8 +180,11 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         if self._episode is None or self._epoch >= self.scene.steps:
             raise gym.error.ResetNeeded("the episode is over or never began: call reset()")
         if self.scene.anchor_speed_m_s > 0:
-            velocities = check_action(action, 3 * self.scene.n_anchors)
+            velocities = check_action(action, 3 * (self.family or self.scene).n_anchors)
+            velocities = velocities[: 3 * self.scene.n_anchors]
             self._anchors = simulation.move_anchors(self.scene, self._anchors, velocities)
+        elif isinstance(self.action_space, spaces.Box):
+            check_action(action, 3 * (self.family or self.scene).n_anchors)
         elif not are_zeros(as_array("action", action), ()):
             raise ValueError(f"action must be 0 where the anchors are fixed, got {action!r:.80}")
         self._epoch += 1
@@ -180,6 +215,9 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         if at.readings is not None and at.velocity is not None and at.bias is not None:
             observation["inertial"] = at.readings.copy()
             info["velocity"], info["inertial_bias"] = at.velocity.copy(), at.bias.copy()
+        if self.family is not None:
+            observation = self.family.padded(observation, self.scene)
+            info["nlos"] = families.padded(info["nlos"], self.family.fields["links"][0])
         return observation, info, reward
 
     def _shoot(self, at: simulation.Epoch, links: np.ndarray) -> None:
@@ -235,8 +273,27 @@ def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
     return action.shape == shape and action.dtype.kind in "iub" and not np.count_nonzero(action)
 
 
-def observation_space(scene: Scene) -> spaces.Dict:
+def worlds_of(scene: Any, family: Any) -> tuple[SceneFamily | None, Scene]:
+    """The family that `scenes` names, None without one, and a scene: the first of the family."""
+    if family is None:
+        return None, scenes.get(scene)
+    if scene != "uwb_room":
+        raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
+    found = families.family(family)
+    return found, found.corners[0]
+
+
+def observation_space(scene: Scene | SceneFamily) -> spaces.Dict:
     """Finite bounds of a scene's observations."""
+    if isinstance(scene, SceneFamily):
+        return spaces.Dict(
+            {
+                key: spaces.MultiBinary(shape)
+                if dtype is np.int8
+                else spaces.Box(-_FAR, _FAR, shape, np.float64)
+                for key, (shape, dtype) in scene.fields.items()
+            }
+        )
     links = (scene.n_anchors, len(scene.tags))
     low, high = scene.anchor_region.bounds()
     if scene.anchors is not None:
@@ -267,7 +324,7 @@ def observation_space(scene: Scene) -> spaces.Dict:
     return spaces.Dict(keys)
 
 
-def action_space(scene: Scene) -> spaces.Space[Any]:
+def action_space(scene: Scene | SceneFamily) -> spaces.Space[Any]:
     """Velocities of movable anchors, or the one action of fixed ones."""
     if scene.anchor_speed_m_s > 0:
         return spaces.Box(-1.0, 1.0, (3 * scene.n_anchors,), np.float32)

@@ -1,0 +1,232 @@
+"""Families of scenes: what is drawn, and environments that draw a world at every reset."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import seeding
+from gymnasium.utils.env_checker import check_env
+
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.worlds import scenes
+from rbl_gym.worlds.families import SceneFamily, family
+from rbl_gym.wrappers import EstimatePose, SelectAnchors
+from tests.helpers import assert_same
+from tests.test_tracking_env import ID
+
+ROOM: dict[str, Any] = {
+    "name": "uwb_room",
+    "n_anchors": {"integers": [3, 8]},
+    "noise": {"floor_m": {"log-uniform": [0.02, 0.5]}},
+    "links": {"drop_probability": {"uniform": [0.0, 0.3]}},
+    "steps": 6,
+}
+YARD: dict[str, Any] = {"name": {"choice": ["drone_yard", "satellite"]}, "steps": 4}
+MIXED = [{"name": "hall", "steps": 5}, ROOM, YARD]
+
+
+def draws(value: Any, count: int = 400, seed: int = 1):
+    rng = np.random.default_rng(seed)
+    return [family(value).draw(rng) for _ in range(count)]
+
+
+def test_laws_draw_what_they_say():
+    drawn = [overrides for _, overrides in draws(ROOM)]
+    counts = np.bincount([one["n_anchors"] for one in drawn], minlength=9)
+    assert set(np.flatnonzero(counts)) == {3, 4, 5, 6, 7, 8}
+    # 400 draws of six: 67 each, standard deviation 7.5.
+    assert (np.abs(counts[3:] - 400 / 6) < 4.5 * 7.5).all()
+    floor = np.log([one["noise"]["floor_m"] for one in drawn])
+    low, high = np.log([0.02, 0.5])
+    assert low <= floor.min() < floor.max() <= high
+    # Uniform of the logarithm: the mean within 4.5 standard deviations.
+    assert abs(floor.mean() - 0.5 * (low + high)) < 4.5 * (high - low) / np.sqrt(12 * 400)
+    drop = np.array([one["links"]["drop_probability"] for one in drawn])
+    assert 0 <= drop.min() < 0.05
+    assert 0.25 < drop.max() <= 0.3
+
+
+def test_members_and_choices_are_equally_likely():
+    names = [scene.name for scene, _ in draws(MIXED, 600)]
+    counts = {name: names.count(name) for name in set(names)}
+    assert set(counts) == {"hall", "uwb_room", "drone_yard", "satellite"}
+    assert abs(counts["uwb_room"] - 200) < 4.5 * np.sqrt(600 * 2 / 9)
+    assert abs(counts["satellite"] - 100) < 4.5 * np.sqrt(600 * 5 / 36)
+
+
+def test_the_overrides_make_the_scene_again():
+    for scene, overrides in draws(MIXED, 30):
+        again = scenes.get(json.loads(json.dumps(overrides)))
+        assert again == scene
+
+
+def test_the_same_generator_draws_the_same():
+    assert [o for _, o in draws(MIXED, 20, 5)] == [o for _, o in draws(MIXED, 20, 5)]
+
+
+def test_sizes_are_those_of_the_largest():
+    found = family(MIXED)
+    assert (found.n_anchors, found.n_tags, found.steps) == (12, 6, 6)
+    assert found.anchor_speed_m_s == scenes.get("satellite").anchor_speed_m_s
+
+
+def test_one_scene_is_a_family_too():
+    assert family("hall").draw(np.random.default_rng(1))[0] == scenes.get("hall")
+    assert family(scenes.get("hall")).n_anchors == 12
+    assert family(family(ROOM)).n_anchors == 8
+
+
+@pytest.mark.parametrize(
+    ("value", "named"),
+    [
+        ([], "scenes must hold at least one scene"),
+        (3, "scenes must be a list of scenes, a name or a dict of overrides, got 3"),
+        (["castle"], r"scenes\[0\]: scene must be one of"),
+        (["hall", {"name": "hall", "weight": 1}], r"scenes\[1\]: scene has no field 'weight'"),
+        ({"name": "hall", "dt": {"uniform": [2.0, 1.0]}}, r"dt.uniform must be \[low, high\]"),
+        ({"name": "hall", "dt": {"uniform": [1.0]}}, r"scenes\[0\].dt.uniform must have shape"),
+        ({"name": "hall", "dt": {"log-uniform": [0.0, 1.0]}}, "dt.log-uniform"),
+        ({"name": "hall", "n_anchors": {"integers": [3, 4.5]}}, "must be two whole numbers"),
+        ({"name": {"choice": []}}, "name.choice must be a list of values"),
+        ({"name": {"choice": "hall"}}, "name.choice must be a list of values"),
+        ({"name": "hall", "n_anchors": {"integers": [0, 4]}}, "n_anchors"),
+        ({"name": "hall", "inertial": "consumer"}, "scenes must have no inertial sensor"),
+    ],
+)
+def test_wrong_families_are_named(value, named):
+    with pytest.raises(ValueError, match=named):
+        family(value)
+
+
+def test_too_many_combinations_are_refused():
+    choices = {"choice": list(range(1, 102))}
+    with pytest.raises(ValueError, match="at most 10000 combinations of choices, got 10201"):
+        SceneFamily(({"name": "hall", "steps": choices, "n_anchors": choices},))
+
+
+# --- environments -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reward", ["bound", "none"])
+def test_check_env(reward):
+    check_env(gym.make(ID, scenes=MIXED, reward=reward).unwrapped)
+
+
+def episode(env, seed):
+    env.action_space.seed(seed)
+    results = [env.reset(seed=seed)]
+    while True:
+        results.append(env.step(env.action_space.sample()))
+        assert env.observation_space.contains(results[-1][0])
+        if results[-1][3]:
+            return results
+
+
+def test_an_episode_equals_that_of_its_scene_alone():
+    """The scene is drawn first; what follows is the scene's own episode, in larger arrays."""
+    seen = set()
+    for seed in range(12):
+        env = gym.make(ID, scenes=MIXED)
+        results = episode(env, seed)
+        scene = env.unwrapped.scene  # pyright: ignore[reportAttributeAccessIssue]
+        seen.add(scene.name)
+        alone = TrackingEnv(scene)
+        generator, _ = seeding.np_random(seed)
+        family(MIXED).draw(generator)
+        alone.np_random = generator
+        want = [alone.reset()]
+        env.action_space.seed(seed)
+        for _ in results[1:]:
+            action = env.action_space.sample()
+            own = action[: 3 * scene.n_anchors] if scene.anchor_speed_m_s > 0 else 0
+            want.append(alone.step(own))
+        m, n = scene.n_anchors, len(scene.tags)
+        assert len(results) == scene.steps + 1
+        for got, plain in zip(results, want, strict=True):
+            told = got[0]
+            np.testing.assert_array_equal(told["ranges"][:m, :n], plain[0]["ranges"])
+            np.testing.assert_array_equal(told["links"][:m, :n], plain[0]["links"])
+            np.testing.assert_array_equal(told["anchors"][:m], plain[0]["anchors"])
+            assert told["links"].sum() == plain[0]["links"].sum()
+            assert told["anchor_mask"].sum() == m
+            assert told["tag_mask"].sum() == n
+            np.testing.assert_array_equal(told["tags"][:n], scene.body)
+            if len(got) == 5:
+                assert got[1] == plain[1]
+        assert results[0][1]["scene"]["name"] == scene.name
+    assert len(seen) > 2
+
+
+@pytest.mark.parametrize("observation", ["dict", "flat"])
+def test_filters_run_in_drawn_worlds_and_are_honest(observation):
+    env = EstimatePose(gym.make(ID, scenes=MIXED, reward="none"), observation=observation)
+    nees = [step[-1]["nees"] for seed in range(40) for step in episode(env, seed)]
+    # About 220 epochs of 6 degrees of freedom, correlated within 40 episodes.
+    assert 4.5 < np.mean(nees) < 7.5
+
+
+def test_a_filter_has_no_more_than_the_scene_alone():
+    env = EstimatePose(gym.make(ID, scenes=MIXED, reward="none"))
+    results = episode(env, 3)
+    scene = env.unwrapped.scene  # pyright: ignore[reportAttributeAccessIssue]
+    plain = EstimatePose(TrackingEnv(scene, "none"))
+    filter = plain._filter
+    info = results[0][1]
+    state = filter.initial(
+        info["prior_rotation"], info["prior_translation"], info["prior_covariance"]
+    )
+    m, n = scene.n_anchors, len(scene.tags)
+    for k, (told, *_) in enumerate(results):
+        if k:
+            state = filter.predict(state, told["twist"], scene.dt)
+        assert not scene.obstacles
+        links = told["links"][:m, :n].astype(bool)
+        state = filter.update(state, told["ranges"][:m, :n], told["anchors"][:m], links)
+        belief = filter.belief(state)
+        np.testing.assert_allclose(told["belief_covariance"], belief.covariance, rtol=1e-9)
+
+
+def test_masks_stand_at_the_end_of_a_flat_observation():
+    env = EstimatePose(gym.make(ID, scenes=MIXED, reward="none"), observation="flat")
+    for seed in range(6):
+        flat, _ = env.reset(seed=seed)
+        m = env.unwrapped.scene.n_anchors  # pyright: ignore[reportAttributeAccessIssue]
+        np.testing.assert_array_equal(flat[-12:], np.arange(12) < m)
+        # Relative places and distances of anchors that are not there.
+        assert not flat[21 + 3 * m : 21 + 36].any()
+        assert not flat[21 + 36 + m : 21 + 48].any()
+
+
+def test_anchors_can_be_selected():
+    env = EstimatePose(SelectAnchors(gym.make(ID, scenes=["hall", ROOM], reward="none")))
+    env.reset(seed=2)
+    observation, *_ = env.step(np.r_[1, 1, np.zeros(10)].astype(np.int8))
+    assert set(np.flatnonzero(observation["links"].any(axis=1))) <= {0, 1}
+
+
+def test_pickling_and_specifications():
+    env = gym.make(ID, scenes=MIXED)
+    assert env.spec is not None
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    copy = pickle.loads(pickle.dumps(env))
+    want = episode(env, 7)
+    for other in (again, copy):
+        assert_same(episode(other, 7), want)
+
+
+def test_frames_are_those_of_the_drawn_scene():
+    env = gym.make(ID, scenes=MIXED, reward="none", render_mode="rgb_array")
+    for seed in range(2):
+        env.reset(seed=seed)
+        assert np.shape(env.render()) == (540, 960, 3)
+
+
+def test_scene_beside_scenes_is_refused():
+    with pytest.raises(ValueError, match="scene must not be given beside scenes, got 'hall'"):
+        gym.make(ID, scene="hall", scenes=MIXED)
