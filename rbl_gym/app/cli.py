@@ -16,6 +16,7 @@ from rbl_gym.app import (
     network_command,
     paper_commands,
     place_command,
+    plan_command,
     replay_command,
 )
 from rbl_gym.studies.extras import MissingExtraError
@@ -47,6 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="command")
     paper_commands.add_demo(commands)
     place_command.add_place(commands)
+    plan_command.add_plan(commands)
     learning_commands.add_train(commands)
     learning_commands.add_evaluate(commands)
     learning_commands.add_transfer(commands)

@@ -1,0 +1,58 @@
+"""The command rbl-gym plan."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rbl_gym.app.plan_options import add_plan_options, is_plan, picture, read_plan
+from rbl_gym.app.terminal import add_json, positive, print_files, write_json
+
+
+def add_plan(commands: Any) -> None:
+    """The parser of ``rbl-gym plan``."""
+    plan = commands.add_parser(
+        "plan",
+        help="a floor plan (DXF, GeoJSON, PNG) as a building file for place",
+        description="Write a building file (TOML, to be edited) of the layers of a drawing, or of "
+        "a picture. Without --out: show the layers. See docs/placement.md.",
+    )
+    plan.add_argument("plan", metavar="F", help=".dxf, .geojson, .png or .jpg; or a building file")
+    plan.add_argument("-o", "--out", metavar="F", help="the building file, .toml")
+    plan.add_argument("--anchors", type=positive, metavar="N", help="how many, default 8")
+    plan.add_argument("--plot", metavar="F", help="the building as it was read, with a metre grid")
+    add_plan_options(plan)
+    add_json(plan)
+    plan.set_defaults(run=_plan)
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from rbl_gym.app import plan_report
+    from rbl_gym.placement import scene_files
+    from rbl_gym.placement.plans import toml_text
+
+    path = options.plan
+    if is_plan(path):
+        plan = read_plan(path, options, options.anchors)
+        tables, said, layers = plan.tables, plan.said, plan_report.layer_rows(plan)
+    elif options.out:
+        raise ValueError(f"{path}: --out is of a drawing or a picture, not of a building file")
+    else:
+        tables, said, layers = scene_files.load(path), [], []
+        if options.picture:
+            tables["plan"] = tables.get("plan", {}) | picture(options)
+    if options.out:
+        if not options.out.lower().endswith(".toml"):
+            raise ValueError(f"--out must end in .toml, got {options.out}")
+        plan_report.write_building(tables, path, said, options.out)
+    result = {"plan": path, "layers": layers, "said": said, "tables": toml_text.plain(tables)}
+    if options.plot:
+        from rbl_gym.app import figures, place_plan
+
+        problem = scene_files.of_mapping(toml_text.plain(tables), name=Path(path).stem)
+        figures.save_figure(place_plan.building_figure(problem), options.plot)
+    if write_json(result, options.json):
+        plan_report.print_plan(layers, said)
+        print_files(building=options.out, picture=options.plot)
+    return 0

@@ -1,0 +1,122 @@
+"""Options that read a floor plan, of `plan` and of `place`: layers, units, scale, height."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from rbl_gym.placement.plans.drawing import Drawing
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+_HELP = {
+    "walls": "lines that weaken links: material=concrete, thickness_m=0.2, side_by_side_m=0.4 "
+    "(drawn as two lines)",
+    "obstacles": "areas that weaken links, and where no body is: material, low_m, high_m",
+    "zones": "where the body works: name, low_m, high_m, position_m=0.1, heading_deg, share",
+    "mounts": "where anchors may stand: kind=wall, ceiling, column, area or points; low_m, high_m, "
+    "height_m, side, cost",
+    "forbidden": "areas without anchors",
+    "fixed": "points of anchors that stay: height_m",
+}
+
+
+def add_plan_options(parser: argparse.ArgumentParser) -> None:
+    """What is said about a drawing or a picture."""
+    plan = parser.add_argument_group(
+        "floor plan",
+        "A drawing (.dxf, .geojson) or a picture (.png, .jpg). Each layer of a drawing is said to "
+        "be something, by LAYER,KEY=VALUE,...; * stands for any letters; an option can be given "
+        "several times. Without any, layers that are called so are taken so.",
+    )
+    for kind, text in _HELP.items():
+        plan.add_argument(f"--{kind}", action="append", default=[], metavar="LAYER", help=text)
+    plan.add_argument("--units", metavar="U", help="of the drawing: mm, cm, m, km, in, ft, degrees")
+    plan.add_argument(
+        "--zero",
+        type=_pair,
+        metavar="X,Y",
+        help="point of the drawing, in its units, that becomes (0, 0)",
+    )
+    plan.add_argument(
+        "--layer-property", metavar="P", help="GeoJSON: property that names the layer"
+    )
+    plan.add_argument(
+        "--height", type=float, default=3.0, metavar="M", help="floor to ceiling, default 3 m"
+    )
+    plan.add_argument("--picture", metavar="F", help="picture behind the drawing or the file")
+    plan.add_argument("--metres-per-pixel", type=float, metavar="M", help="scale of the picture")
+    plan.add_argument("--width", type=float, metavar="M", help="width of the picture, instead")
+    plan.add_argument(
+        "--origin",
+        type=_pair,
+        default=(0.0, 0.0),
+        metavar="X,Y",
+        help="where the picture's lower left corner is, metres; default 0,0",
+    )
+
+
+class Plan(NamedTuple):
+    """A plan as it was read: tables of a building file, layers and what they were taken for."""
+
+    tables: dict[str, Any]
+    said: list[str]
+    used: dict[str, list[str]]
+    drawing: Drawing | None
+
+
+def is_plan(path: str) -> bool:
+    """Whether a file is a drawing or a picture, and no building file."""
+    suffix = Path(path).suffix.lower()
+    if suffix != ".json":
+        return suffix in (".dxf", ".dwg", ".geojson", *_PICTURES)
+    with Path(path).open("rb") as file:
+        return b'"Feature' in file.read(4096)
+
+
+def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = None) -> Plan:
+    """The plan that a file and the options describe; a ValueError says what is wrong."""
+    from rbl_gym.placement.plans import drawing, layers, pictures, uses
+
+    told = [uses.parse_use(kind, text) for kind in uses.KINDS for text in getattr(options, kind)]
+    if not 0 < options.height < float("inf"):
+        raise ValueError(f"--height must be positive, got {options.height:g}")
+    n_anchors = 8 if n_anchors is None else n_anchors
+    if Path(path).suffix.lower() in _PICTURES:
+        if told:
+            raise ValueError(f"{path}: a picture has no layers: --{told[0].kind} means nothing")
+        shown = pictures.backdrop(path, scale(path, options), options.origin)
+        made = pictures.of_picture(shown, options.height, n_anchors)
+        return Plan(made.tables, made.said, made.used, None)
+    found = drawing.read_drawing(path, options.units, options.zero, options.layer_property)
+    made = layers.building(found, told, options.height, n_anchors)
+    if options.picture:
+        made.tables["plan"] |= picture(options)
+    return Plan(made.tables, [*found.said, *made.said], made.used, found)
+
+
+def picture(options: argparse.Namespace) -> dict[str, Any]:
+    """The table [plan] of the option --picture."""
+    from rbl_gym.placement.plans import pictures
+
+    return pictures.backdrop(options.picture, scale(options.picture, options), options.origin)
+
+
+def scale(path: str, options: argparse.Namespace) -> float:
+    """Metres per pixel, or a ValueError."""
+    from rbl_gym.placement.plans import pictures
+
+    if (options.metres_per_pixel is None) == (options.width is None):
+        raise ValueError(f"{path}: a picture needs --metres-per-pixel or --width, one of them")
+    if options.metres_per_pixel is not None:
+        return options.metres_per_pixel
+    return options.width / pictures.pixels(path)[0]
+
+
+def _pair(text: str) -> tuple[float, float]:
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be X,Y, got {text!r}") from None
+    return x, y

@@ -1,0 +1,76 @@
+"""What a floor plan held, on the terminal; the building file that is written of it."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from rbl_gym.app.plan_options import Plan
+from rbl_gym.app.tables import new_console, new_table
+from rbl_gym.placement.plans.toml_text import to_toml
+
+
+def layer_rows(plan: Plan) -> list[dict[str, Any]]:
+    """Each layer: what it was taken for, and how many entities of each kind it has."""
+    rows, drawing = [], plan.drawing
+    if drawing is None:
+        return rows
+    for layer in drawing.layers():
+        kinds = Counter(shape.kind for shape in drawing.shapes if shape.layer == layer)
+        rows.append(
+            {
+                "layer": layer,
+                "taken_for": plan.used.get(layer, []),
+                "entities": dict(sorted(kinds.items())),
+                "unread": dict(sorted(drawing.unread.get(layer, {}).items())),
+            }
+        )
+    return rows
+
+
+def print_plan(layers: list[dict[str, Any]], said: list[str]) -> None:
+    """The layers, those that nothing maps too, and what there is to know."""
+    console = new_console()
+    if layers:
+        table = new_table("layers of the drawing")
+        for heading in ("layer", "taken for", "entities", "not read"):
+            table.add_column(heading)
+        for row in layers:
+            table.add_row(
+                row["layer"],
+                ", ".join(row["taken_for"]) or "-",
+                _counts(row["entities"]) or "-",
+                _counts(row["unread"]) or "-",
+            )
+        console.print(table)
+        unused = [row for row in layers if not row["taken_for"]]
+        if unused:
+            count = sum(sum(row["entities"].values()) for row in unused)
+            names = ", ".join(row["layer"] for row in unused)
+            said = [*said, f"not used: {count} entities on {len(unused)} layers ({names})"]
+    for line in said:
+        console.print(line)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{count} {kind}" for kind, count in counts.items())
+
+
+def write_building(tables: dict[str, Any], source: str, said: list[str], path: str) -> None:
+    """Write a building file, making its folder; files of [plan] are named from there."""
+    folder = Path(path).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    plan = {
+        key: Path(os.path.relpath(value, folder)).as_posix()
+        if key in ("drawing", "image")
+        else value
+        for key, value in tables["plan"].items()
+    }
+    head = [
+        f"Read from {Path(source).name} by rbl-gym plan. Lengths are metres. Go on by editing, and",
+        f"look at it by: rbl-gym plan {Path(path).name} --plot plan.png",
+        *said,
+    ]
+    Path(path).write_text(to_toml({**tables, "plan": plan}, head), encoding="utf-8")

@@ -1,0 +1,364 @@
+"""Layers of a drawing mapped to the tables of a building file: walls, obstacles, zones, mounts."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.geometry.polygons import area, contains
+from rbl_gym.placement.plans.drawing import Drawing, Shape
+from rbl_gym.placement.plans.pairs import centre_lines
+from rbl_gym.placement.plans.parts import (
+    count_blocks,
+    lines_of,
+    outline_of,
+    points_of,
+    rectangle,
+    rounded,
+    spots_of,
+)
+from rbl_gym.placement.plans.uses import KEYS, KINDS, MATERIALS, TEXTS, Use, number
+
+__all__ = ["Building", "building"]
+
+# Heights that are taken where nothing says any, metres.
+ZONE_M, _MOUNT_LOW_M, _BELOW_CEILING_M = (0.5, 2.0), 2.0, 0.2
+# What other programs call the keys.
+_PROPERTIES = {
+    "height": "high_m",
+    "min_height": "low_m",
+    "base": "low_m",
+    "thickness": "thickness_m",
+}
+
+
+# What a plan does not tell.
+DEVICES: dict[str, Any] = {
+    "body": {"shape": "octahedron", "size_m": 0.8},
+    "noise": {"floor_m": 0.1, "proportional": 0.0},
+}
+
+
+class Building(NamedTuple):
+    """Tables of a building file, and what a reader should know of how they came about.
+
+    A table may have the key ``#``: a comment of the file.
+    """
+
+    tables: dict[str, Any]
+    used: dict[str, list[str]]
+    said: list[str]
+
+
+def building(
+    drawing: Drawing, uses: Iterable[Use] = (), height_m: float = 3.0, n_anchors: int = 8
+) -> Building:
+    """The tables of a building file, of the layers of a drawing.
+
+    Parameters
+    ----------
+    drawing
+        From `drawing.read_drawing`.
+    uses
+        What layers are taken for; of several for one layer and kind, the first. None at all:
+        layers that are called as `KINDS`, in any case, with or without the last letter.
+    height_m
+        From the floor to the ceiling: of walls, obstacles and mounts that say nothing else.
+    n_anchors
+        How many anchors are to be placed.
+
+    Raises
+    ------
+    ValueError
+        On a layer that there is not, and on a material without a share of information.
+    """
+    uses = list(uses)
+    made = _Maker(drawing, height_m)
+    for use in uses or _by_name(drawing):
+        layers = [name for name in drawing.layers() if _matches(name, use.layer)]
+        if not layers:
+            raise ValueError(
+                f"{drawing.path}: no layer is called {use.layer!r}; there are "
+                f"{', '.join(map(repr, drawing.layers()))}"
+            )
+        for layer in layers:
+            # The first that matches: LAYER before A-*.
+            if use.kind not in made.used.get(layer, []):
+                made.take(layer, use)
+    if not made.used:
+        made.said.append(
+            "nothing says what the layers are: give --walls LAYER, --obstacles LAYER, "
+            "--zones LAYER, --mounts LAYER"
+        )
+    made.complete()
+    return Building(made.tables(n_anchors), made.used, made.said)
+
+
+def _matches(name: str, pattern: str) -> bool:
+    return name == pattern or fnmatch.fnmatchcase(name.lower(), pattern.lower())
+
+
+def _by_name(drawing: Drawing) -> list[Use]:
+    """Layers called wall, walls, WALLS, zone, ..."""
+    return [
+        Use(kind, layer, {})
+        for kind in KINDS
+        for layer in drawing.layers()
+        if layer.lower() in (kind, kind.removesuffix("s"))
+    ]
+
+
+class _Maker:
+    """The tables so far."""
+
+    def __init__(self, drawing: Drawing, height_m: float) -> None:
+        self.drawing = drawing
+        self.height = height_m
+        self.found: dict[str, list[Any]] = {kind: [] for kind in KINDS}
+        self.used: dict[str, list[str]] = {}
+        self.said: list[str] = []
+
+    def take(self, layer: str, use: Use) -> None:
+        """The entries of one layer, of one kind."""
+        shapes = [shape for shape in self.drawing.shapes if shape.layer == layer]
+        lines, marks = lines_of(shapes)
+        entries, left = getattr(self, f"_{use.kind}")(lines, marks, layer, use)
+        self.found[use.kind] += entries
+        self.used.setdefault(layer, []).append(use.kind)
+        for count, what in left:
+            if count:
+                self.said.append(f"layer {layer}, taken for {use.kind}: {count} {what}")
+
+    # --- kinds: entries, and (count, what) of shapes that were left out --------------------------
+
+    def _walls(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
+        widest = use.values.get("side_by_side_m")
+        keys = [key for key in KEYS["walls"] if key != "side_by_side_m"]
+        rows = [
+            {"line": points_of(line.points), **({"closed": True} if line.closed else {})}
+            | self._values(line, use, keys, {"low_m": 0.0, "high_m": self.height})
+            for shape in lines
+            for line in (shape, *(shape._replace(points=hole) for hole in shape.holes))
+        ]
+        twins = []
+        if widest is not None:
+            rows, twins = self._centred(lines, use, widest)
+        note = (
+            f"pairs of lines less than {widest:g} m apart, each taken for one wall" if twins else ""
+        )
+        return _commented(rows, layer), [
+            (count_blocks(marks), "blocks taken by their lines, marks left out"),
+            (len(marks) - count_blocks(marks), "points left out"),
+            (len(twins), note),
+        ]
+
+    def _centred(self, lines: list[Shape], use: Use, widest: float) -> Any:
+        """Walls drawn as two lines each: their centre lines, and the lines that have no twin."""
+        rings = [(ring, shape.closed) for shape in lines for ring in (shape.points, *shape.holes)]
+        centred, single = centre_lines(rings, widest)
+        values = self._values(None, use, KEYS["walls"], {"low_m": 0.0, "high_m": self.height})
+        values.pop("side_by_side_m", None)
+        rows = [
+            {"line": points_of(line), **values, "thickness_m": round(width, 3)}
+            for line, width in centred
+        ]
+        return rows + [{"line": points_of(line), **values} for line in single], centred
+
+    def _obstacles(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
+        heights = {"low_m": 0.0, "high_m": self.height}
+        return self._rings(lines, marks, layer, use, KEYS["obstacles"], heights)
+
+    def _forbidden(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
+        heights = {"low_m": 0.0, "high_m": self.height}
+        return self._rings(lines, marks, layer, use, KEYS["forbidden"], heights)
+
+    def _zones(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
+        heights = dict(zip(("low_m", "high_m"), ZONE_M, strict=True))
+        rows, left = self._rings(lines, marks, layer, use, KEYS["zones"], heights)
+        texts = [label for label in self.drawing.labels if label.layer == layer]
+        for count, row in enumerate(rows, start=1):
+            ring = np.array(row["polygon"])
+            inside = [
+                label.text for label in texts if label.text and contains(ring, label.at[None])[0]
+            ]
+            plain = layer if len(rows) == 1 else f"{layer} {count}"
+            name = str(row.pop("name", inside[0] if len(inside) == 1 else plain))
+            rows[count - 1] = {key: row[key] for key in ("#",) if key in row} | {"name": name} | row
+        return rows, left
+
+    def _mounts(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
+        rows, left, kind = [], [], use.values.get("kind")
+        top = self.height - _BELOW_CEILING_M
+        sides = {"low_m": min(_MOUNT_LOW_M, 0.7 * self.height), "high_m": top}
+        name = {"name": layer}
+        if kind == "points" or (kind is None and (not lines or not count_blocks(marks))):
+            spots = spots_of(marks, lines if kind else [], use)
+            lines = [] if kind else lines
+            allowed = ("name", "cost")
+            if spots:
+                values = self._values(None, use, allowed, name)
+                rows.append({"kind": "points", "points": spots} | values)
+        for line in lines:
+            own = kind or line.properties.get("kind")
+            own = own if own in ("wall", "ceiling", "column", "area") else "wall"
+            if own == "wall":
+                allowed = ("name", "low_m", "high_m", "side", "cost")
+                side = {"side": "left" if line.closed else "both"}
+                ring = {"closed": True} if line.closed else {}
+                values = self._values(line, use, allowed, name | sides | side)
+                points = line.points
+                if line.closed and area(points) < 0:  # counter-clockwise: left is inside
+                    points = points[::-1]
+                rows.append({"kind": own, "line": points_of(points), **ring, **values})
+            elif not line.closed:
+                left.append(line)
+            else:
+                ring = outline_of(line)
+                flat = own == "ceiling"
+                allowed = ("name", "cost", *(("height_m",) if flat else ("low_m", "high_m")))
+                heights = {"height_m": self.height} if flat else sides
+                values = self._values(line, use, allowed, name | heights)
+                rows.append({"kind": own, "polygon": points_of(ring), **values})
+        return _commented(rows, layer), [(len(left), "shapes that are no ring were left out")]
+
+    def _fixed(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
+        return spots_of(marks, lines, use), [
+            (sum(not line.closed for line in lines), "lines left out")
+        ]
+
+    def _rings(
+        self,
+        lines: list[Shape],
+        marks: list[Shape],
+        layer: str,
+        use: Use,
+        keys: Iterable[str],
+        usual: dict[str, Any],
+    ) -> Any:
+        rows, failed = [], 0
+        for line in lines:
+            if not line.closed or abs(area(line.points)) < 1e-6:
+                continue
+            ring = outline_of(line)
+            failed += line.holes != () and len(ring) == len(line.points)
+            rows.append({"polygon": points_of(ring), **self._values(line, use, keys, usual)})
+        return _commented(rows, layer), [
+            (len(lines) - len(rows), "lines that close no area were left out"),
+            (failed, "holes could not be cut out"),
+            (len(marks) - count_blocks(marks), "points left out"),
+        ]
+
+    def _values(
+        self, shape: Shape | None, use: Use, keys: Iterable[str], usual: dict[str, Any]
+    ) -> dict[str, Any]:
+        """Keys of an entry: what the shape says goes before the layer's, that before the usual."""
+        said = {}
+        for key, value in ({} if shape is None else shape.properties).items():
+            key = _PROPERTIES.get(key, key)
+            if key in keys and value is not None:
+                said[key] = value if key in TEXTS else number(f"{use.layer}: {key}", value)
+        values = usual | {key: use.values[key] for key in use.values if key in keys} | said
+        if "material" in values and values["material"] not in MATERIALS:
+            other = values.pop("material")
+            if "information" not in values:
+                raise ValueError(
+                    f"{self.drawing.path}: layer {use.layer}: material must be one of "
+                    f"{', '.join(MATERIALS)}, got {other!r}; any other: information=SHARE"
+                )
+        elif "material" in values and "information" in values:
+            values.pop("information" if "material" in said else "material")
+        return {
+            key: rounded(values[key]) if isinstance(values[key], float) else values[key]
+            for key in keys
+            if key in values
+        }
+
+    # --- the whole -------------------------------------------------------------------------------
+
+    def complete(self) -> None:
+        """Mounts and a zone where no layer is one."""
+        top = rounded(self.height - _BELOW_CEILING_M)
+        if not self.found["mounts"]:
+            low = min(_MOUNT_LOW_M, 0.7 * self.height)
+            self.found["mounts"] = [
+                {
+                    "#": "no layer says where anchors may stand: on every wall, from both sides",
+                    "kind": "wall",
+                    **{key: wall[key] for key in ("line", "closed") if key in wall},
+                    "low_m": rounded(max(low, wall["low_m"])),
+                    "high_m": rounded(min(top, wall["high_m"])),
+                    "side": "both",
+                }
+                for wall in self.found["walls"]
+                if wall["high_m"] > low
+            ]
+            if self.found["mounts"]:
+                self.said.append("no layer of mounts: anchors may stand on every wall")
+            else:
+                self.said.append("no layer of mounts or walls: anchors may stand on the ceiling")
+                self.found["mounts"] = [
+                    {
+                        "#": "no layer says where anchors may stand: on the ceiling",
+                        "kind": "ceiling",
+                        "polygon": self._outline(),
+                        "height_m": rounded(self.height),
+                    }
+                ]
+        if not self.found["zones"]:
+            self.said.append("no layer of zones: the body works in the whole rectangle of the plan")
+            self.found["zones"] = [
+                {
+                    "#": "no layer is a zone: the whole rectangle of the plan",
+                    "polygon": self._outline(),
+                    "name": "plan",
+                    "low_m": ZONE_M[0],
+                    "high_m": ZONE_M[1],
+                }
+            ]
+
+    def _outline(self) -> list[list[float]]:
+        """The rectangle around what is used."""
+        low, high = self.drawing._replace(
+            shapes=[s for s in self.drawing.shapes if s.layer in self.used or not self.used]
+        ).bounds()
+        return rectangle(low, high)
+
+    def tables(self, n_anchors: int) -> dict[str, Any]:
+        anchors: dict[str, Any] = {"number": n_anchors}
+        if self.found["fixed"]:
+            anchors["fixed"] = self.found["fixed"]
+            anchors["number"] = max(n_anchors, len(self.found["fixed"]))
+        materials = {
+            row["material"]
+            for kind in ("walls", "obstacles")
+            for row in self.found[kind]
+            if "material" in row
+        }
+        drawing = self.drawing
+        return {
+            "name": Path(drawing.path).stem,
+            "anchors": anchors,
+            "zones": self.found["zones"],
+            "mounts": self.found["mounts"],
+            **{
+                key: self.found[key]
+                for key in ("forbidden", "walls", "obstacles")
+                if self.found[key]
+            },
+            **(
+                {"materials": {key: MATERIALS[key] for key in MATERIALS if key in materials}}
+                if materials
+                else {}
+            ),
+            "plan": {"drawing": drawing.path, "units": drawing.units, "zero": list(drawing.zero)},
+            **DEVICES,
+        }
+
+
+def _commented(rows: list[dict[str, Any]], layer: str) -> list[dict[str, Any]]:
+    """The first entry of a layer names it."""
+    return [{"#": f"layer {layer}", **row} if k == 0 else row for k, row in enumerate(rows)]

@@ -1,0 +1,64 @@
+"""Shapes of a layer as lists of numbers: lines joined, places of marks, holes cut open."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement.plans.drawing import Shape
+from rbl_gym.placement.plans.rings import joined, opened
+from rbl_gym.placement.plans.uses import Use, number
+
+# Ends of lines this close belong together, metres.
+_TOLERANCE_M = 0.01
+
+
+def rectangle(low: FloatArray, high: FloatArray) -> list[list[float]]:
+    """Corners of a rectangle, counter-clockwise."""
+    return points_of(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))
+
+
+def lines_of(shapes: list[Shape]) -> tuple[list[Shape], list[Shape]]:
+    """Lines and rings, loose lines joined where they meet; and marks."""
+    marks = [shape for shape in shapes if len(shape.points) == 1]
+    rings = [shape for shape in shapes if shape.closed]
+    loose = [shape for shape in shapes if not shape.closed and len(shape.points) > 1]
+    plain = [shape for shape in loose if not shape.properties]
+    lines = [shape for shape in loose if shape.properties]
+    for points, closed in joined([shape.points for shape in plain], _TOLERANCE_M):
+        lines.append(Shape(plain[0].layer, "joined", points, closed))
+    return rings + lines, marks
+
+
+def spots_of(marks: list[Shape], lines: list[Shape], use: Use) -> list[list[float]]:
+    """Places (x, y, z) of marks, or, where there are none, of the middles of rings."""
+    rings = [
+        shape._replace(points=shape.points.mean(axis=0)[None]) for shape in lines if shape.closed
+    ]
+    spots = []
+    for mark in marks or rings:
+        height = mark.properties.get("height", mark.properties.get("z", 0.0))
+        height = number(f"{use.layer}: height", use.values.get("height_m", height))
+        spots.append([*points_of(mark.points)[0], rounded(height)])
+    return spots
+
+
+def outline_of(shape: Shape) -> FloatArray:
+    """A ring with its holes cut open, as far as they can be."""
+    ring = opened(shape.points, shape.holes) if shape.holes else shape.points
+    return shape.points if ring is None else ring
+
+
+def count_blocks(marks: list[Shape]) -> int:
+    """How many marks are those of blocks."""
+    return sum(mark.kind == "INSERT" for mark in marks)
+
+
+def points_of(points: FloatArray) -> list[list[float]]:
+    """Points (n, 2) as lists."""
+    return [[rounded(x) for x in point] for point in points.tolist()]
+
+
+def rounded(value: float) -> float:
+    """To a tenth of a millimetre; no minus zero."""
+    return round(float(value), 4) + 0.0

@@ -1,0 +1,100 @@
+"""Tables as TOML that people go on with: comments, one entry a block, long lists in lines."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["plain", "to_toml"]
+
+_WIDTH = 96
+# Remarks on tables, by their name.
+_REMARKS = {
+    "anchors": "how many are to be placed; `fixed` ones, if any, are counted",
+    "zones": "where the body works. What you ask for: position_m = 0.10, heading_deg = 5.0, "
+    "share = 0.95 of the zone",
+    "mounts": "where anchors may stand: wall, ceiling, column, area or points",
+    "forbidden": "no anchors here",
+    "walls": "each crossing leaves the share of a link's information that its material says",
+    "obstacles": "what stands in the way of links, and of the body",
+    "materials": "share of a link's information that one crossing leaves, 10^(-loss / 10 dB): "
+    "rough, put yours",
+    "plan": "what the plan was read from; layouts are exported to its coordinates",
+    "body": "the tags on the body: a shape, or tags = [[x, y, z], ...] in metres",
+    "noise": "standard deviation of a range: put that of your radio",
+}
+
+
+def to_toml(tables: Mapping[str, Any], head: list[str]) -> str:
+    """A building file with comments.
+
+    Parameters
+    ----------
+    tables
+        Of the file: texts and numbers, tables, lists of tables. The key ``#`` of a table is a
+        comment.
+    head
+        Lines of the comment at its top.
+    """
+    lines = [f"# {line}" for text in head for line in _wrapped(text)]
+    tables = dict(tables)
+    for key, value in tables.items():
+        if not isinstance(value, dict) and not _is_tables(value):
+            lines.append(f"{key} = {_value(value)}")
+    for key, value in tables.items():
+        entries = value if _is_tables(value) else [value] if isinstance(value, dict) else []
+        if entries:
+            lines += ["", *(f"# {line}" for line in _wrapped(_REMARKS.get(key, "")))]
+        for number, entry in enumerate(entries):
+            if number:
+                lines.append("")
+            head = f"[[{key}]]" if _is_tables(value) else f"[{key}]"
+            lines.append(f"{head}  # {entry['#']}" if "#" in entry else head)
+            lines += [_assigned(name, item) for name, item in entry.items() if name != "#"]
+    return "\n".join(lines) + "\n"
+
+
+def plain(tables: Any) -> Any:
+    """The same tables without comments."""
+    if isinstance(tables, Mapping):
+        return {key: plain(value) for key, value in tables.items() if key != "#"}
+    return [plain(value) for value in tables] if isinstance(tables, list) else tables
+
+
+def _is_tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], dict)
+
+
+def _assigned(key: str, value: Any) -> str:
+    """``key = value``; a list too long for a line over several."""
+    line = f"{key} = {_value(value)}"
+    if len(line) <= _WIDTH or not isinstance(value, list):
+        return line
+    rows, row = [f"{key} = ["], "   "
+    for item in value:
+        text = f" {_value(item)},"
+        if len(row) + len(text) > _WIDTH and row.strip():
+            rows.append(row)
+            row = "   "
+        row += text
+    return "\n".join([*rows, row, "]"])
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    return repr(value)
+
+
+def _wrapped(text: str) -> list[str]:
+    lines = [""] if text else []
+    for word in text.split():
+        if len(lines[-1]) + len(word) + 1 > _WIDTH - 2 and lines[-1]:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return lines

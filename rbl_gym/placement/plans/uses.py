@@ -1,0 +1,83 @@
+"""What a layer is taken for: the words of the command line, and the keys that entries have."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+__all__ = ["KEYS", "KINDS", "MATERIALS", "Use", "parse_use"]
+
+# What a layer can be, with the keys that its entries may have: those of the file, and
+# `side_by_side_m`: walls drawn as two lines that are no further apart.
+KEYS = {
+    "walls": ("material", "information", "thickness_m", "low_m", "high_m", "side_by_side_m"),
+    "obstacles": ("material", "information", "low_m", "high_m"),
+    "zones": (
+        *("name", "low_m", "high_m", "weight", "attitude"),
+        *("position_m", "height_m", "heading_deg", "share"),
+    ),
+    "mounts": ("kind", "name", "low_m", "high_m", "height_m", "side", "cost"),
+    "forbidden": ("low_m", "high_m"),
+    "fixed": ("height_m",),
+}
+KINDS = tuple(KEYS)
+TEXTS = {"material", "name", "attitude", "kind", "side"}
+# Share of a link's information that one crossing leaves, 10^(-loss / 10 dB): rough at 6 GHz.
+MATERIALS = {
+    "drywall": 0.7,
+    "glass": 0.6,
+    "wood": 0.5,
+    "brick": 0.15,
+    "concrete": 0.05,
+    "metal": 0.0,
+}
+
+
+class Use(NamedTuple):
+    """What the layers of a name are taken for: one of `KINDS`, with the keys of its entries."""
+
+    kind: str
+    layer: str
+    values: dict[str, Any]
+
+
+def parse_use(kind: str, text: str) -> Use:
+    """``LAYER,KEY=VALUE,...`` as a `Use`; `*` in a layer's name stands for any letters.
+
+    Raises
+    ------
+    ValueError
+        On a key that entries of this kind do not have.
+    """
+    layer, *parts = (part.strip() for part in text.split(","))
+    if not layer or "=" in layer:
+        raise ValueError(f"--{kind} must be LAYER,KEY=VALUE,..., got {text!r}")
+    values: dict[str, Any] = {}
+    for part in parts:
+        key, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals or key not in KEYS[kind] or key in values:
+            raise ValueError(
+                f"--{kind} {layer}: {part!r} must be KEY=VALUE, each key once; "
+                f"keys: {', '.join(KEYS[kind])}"
+            )
+        values[key] = value if key in TEXTS else number(f"--{kind} {layer}: {key}", value)
+    if (
+        values.get("material", next(iter(MATERIALS))) not in MATERIALS
+        and "information" not in values
+    ):
+        raise ValueError(
+            f"--{kind} {layer}: material must be one of {', '.join(MATERIALS)}, got "
+            f"{values['material']!r}; any other: information=SHARE, what a crossing leaves"
+        )
+    return Use(kind, layer, values)
+
+
+def number(name: str, value: Any) -> float:
+    """A finite number, or a ValueError."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be a number, got {value!r:.80}")
+    return number
