@@ -170,7 +170,7 @@ def test_honest_logs_are_not_doubted():
     steps = track_epochs(filter, (Q, t, P), readings)
     noise = ranging.RangeNoise(0.1)
     each = [found for _, found in innovations_of(filter, steps, TAGS, noise)]
-    columns = [np.stack(column, axis=1) for column in zip(*each, strict=True)]
+    columns = [np.concatenate(column).swapaxes(0, 1) for column in zip(*each, strict=True)]
     doubted = [
         replay.contradicts(Innovations(*(column[b] for column in columns)), logs[b])
         for b in range(200)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import estimators, metrics, motion
-from rbl_gym.estimators import PoseBelief
+from rbl_gym.estimators import Innovations, PoseBelief
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import monte_carlo
@@ -151,7 +151,9 @@ def test_an_honest_filter_foretells_its_ranges_as_well_as_it_says():
     size = scene.n_anchors * len(scene.tags)
     told = monte_carlo.told_readings(scene, trials.episode, trials.measurements)
     found_of = innovations_of(filter, steps, np.asarray(scene.tags), scene.noise)
-    for (step, found), reading in zip(found_of, told, strict=True):
+    each = [(s, [a[k] for a in i]) for steps, i in found_of for k, s in enumerate(steps)]
+    for (step, values), reading in zip(each, told, strict=True):
+        found = Innovations(*values)
         np.testing.assert_array_equal(step.reading.ranges, reading.ranges)
         assert found.nis.shape == found.dof.shape == (300,)
         # One range in 16,000 is refused.
@@ -164,7 +166,8 @@ def test_innovations_come_with_their_steps(name):
     """Many epochs at once are the same as one after the other, whatever their laws and links."""
     tags, prior, readings = world(6)
     filter = estimators.make(name, tags=tags, noise=NOISE, process=PROCESS)
-    pairs = list(innovations_of(filter, track_epochs(filter, prior, readings), tags, NOISE))
+    groups = innovations_of(filter, track_epochs(filter, prior, readings), tags, NOISE)
+    pairs = [(s, [a[k] for a in i]) for steps, i in groups for k, s in enumerate(steps)]
     assert len(pairs) == len(readings)
     for (step, found), reading in zip(pairs, readings, strict=True):
         assert step.reading is reading

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.calibration import robust
@@ -111,7 +111,7 @@ def _refined(changes: _Changes, start: float) -> Clock | None:
     if not np.isfinite(std):
         return None
     bounds = start - 1.5 * _SEARCH_STEP_S, start + 1.5 * _SEARCH_STEP_S
-    found: Any = minimize_scalar(cost, bounds=bounds, options={"xatol": 1e-4})
+    found: Any = scipy.optimize.minimize_scalar(cost, bounds=bounds, options={"xatol": 1e-4})
     offset = float(found.x)
     e, known = changes.left(offset)
     rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_count, check_one_of
 from rbl_gym.estimators.smoothing.knowledge import Level
@@ -136,7 +136,7 @@ def _fitted(e: FloatArray, F: FloatArray, basis: DirectionBasis, ridge: float) -
     low = np.full(2 * count, -np.inf)
     low[count] = np.log(_LEAST_STD_M)
     bounds = [(a if np.isfinite(a) else None, None) for a in low]
-    x = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds).x
+    x = scipy.optimize.minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds).x
     return DirectionModel(basis, x[:count], x[count:])
 
 

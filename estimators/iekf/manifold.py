@@ -233,12 +233,14 @@ class IteratedEkf:
             return None, None
         if type(noise) is LinkNoise and noise.std_m.shape == ranges.shape and noise.std_m.min() > 0:
             return links / (noise.std_m * noise.std_m), WEIGHTS
-        if type(noise) is WeakenedNoise and noise.share.shape == ranges.shape[:-1]:
-            numbers = numbers_of(noise.law, len(self.tags))
+        weakened = type(noise) is WeakenedNoise and noise.share.shape == ranges.shape[:-1]
+        if not (weakened or noise is None):
+            return None, None
+        numbers = numbers_of(noise.law if weakened else self.noise, len(self.tags))
+        if numbers is None or numbers[3] >= 0:
             # The range of a reference tag may be lost.
-            if numbers is not None and numbers[3] < 0:
-                return links * noise.share[..., None], numbers
-        return None, None
+            return None, None
+        return links * (noise.share[..., None] if weakened else 1.0), numbers
 
     def weighed(
         self,

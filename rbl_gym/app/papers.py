@@ -8,9 +8,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rbl_gym.studies import hard
-from rbl_gym.studies.papers import camsap2013, doa2019, icassp2013, network2009, slides2013
-
 
 class Experiment(NamedTuple):
     """What an experiment shows, its function, and how its result is drawn and printed."""
@@ -23,21 +20,37 @@ class Experiment(NamedTuple):
 
 
 def _late(module: str, name: str) -> Callable[..., Any]:
-    """A function of this package whose module is imported late: matplotlib takes its time."""
+    """A function of a module that is imported when it is called: what it needs takes its time."""
 
-    def call(*arguments: Any) -> Any:
-        return getattr(importlib.import_module(f"rbl_gym.app.{module}"), name)(*arguments)
+    def call(*arguments: Any, **options: Any) -> Any:
+        return getattr(importlib.import_module(f"rbl_gym.{module}"), name)(*arguments, **options)
 
     return call
 
 
 def _drawn(module: str, name: str) -> Callable[[dict[str, Any], int], Any]:
     """A figure that needs the result alone."""
-    return lambda result, _: _late(module, name)(result)
+    return lambda result, _: _shown(module, name)(result)
+
+
+def _shown(module: str, name: str) -> Callable[..., Any]:
+    return _late(f"app.{module}", name)
 
 
 def _camsap2013_figure(result: dict[str, Any], seed: int) -> Any:
-    return _late("figures", "camsap2013_figure")(result, camsap2013.example(seed))
+    example = _late("studies.papers.camsap2013", "example")(seed)
+    return _shown("figures", "camsap2013_figure")(result, example)
+
+
+def _tracking(trials: int, seed: int, advance: Any) -> dict[str, Any]:
+    run = _late("studies.papers.camsap2013", "tracking_experiment")
+    return run(trials, seed, advance, trade=True)
+
+
+def _static(*arguments: Any) -> dict[str, Any]:
+    from rbl_gym.studies.papers import icassp2013
+
+    return icassp2013.static_experiment("icassp2013", icassp2013.static_settings(), *arguments)
 
 
 def experiments() -> dict[str, Experiment]:
@@ -45,43 +58,39 @@ def experiments() -> dict[str, Experiment]:
     return {
         "camsap2013": Experiment(
             "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), ET-KF's trade",
-            lambda trials, seed, advance: camsap2013.tracking_experiment(
-                trials, seed, advance, trade=True
-            ),
+            _tracking,
             _camsap2013_figure,
-            _late("reports", "print_camsap2013"),
+            _shown("reports", "print_camsap2013"),
         ),
         "doa2019": Experiment(
             "one base station: Newton's iteration, ML, PSO, PSA from angles (Fig 2, Table 1)",
-            doa2019.doa_experiment,
+            _late("studies.papers.doa2019", "doa_experiment"),
             _drawn("doa_figures", "doa2019_figure"),
-            _late("doa_figures", "print_doa2019"),
+            _shown("doa_figures", "print_doa2019"),
         ),
         "hard": Experiment(
             "hard conditions: lost and reflected links, wrong starts, outages (docs)",
-            hard.compare_hard_conditions,
+            _late("studies.hard", "compare_hard_conditions"),
             _drawn("hard_figures", "hard_figure"),
-            _late("hard_figures", "print_hard"),
+            _shown("hard_figures", "print_hard"),
         ),
         "icassp2013": Experiment(
             "static: LS, CLS, Procrustes, ML at reference ranges of 40 to 100 dB (Figs 2 and 3)",
-            lambda *arguments: icassp2013.static_experiment(
-                "icassp2013", icassp2013.static_settings(), *arguments
-            ),
+            _static,
             _drawn("figures", "static_figure"),
-            _late("reports", "print_static"),
+            _shown("reports", "print_static"),
         ),
         "slides2013": Experiment(
             "5 tags on a rectangular pyramid, 4 anchors: static, and the tracking experiment",
-            slides2013.slides_experiment,
+            _late("studies.papers.slides2013", "slides_experiment"),
             _drawn("figures", "slides2013_figure"),
-            _late("reports", "print_slides2013"),
+            _shown("reports", "print_slides2013"),
         ),
         "network2009": Experiment(
             "planar networks: cycle consensus (Figs 3 to 6), convergence, kappa against n",
-            network2009.network_experiment,
+            _late("studies.papers.network2009", "network_experiment"),
             _drawn("network2009_figures", "network2009_figure"),
-            _late("network2009_figures", "print_network2009"),
+            _shown("network2009_figures", "print_network2009"),
             ("positions", "footprints", "variance"),
         ),
     }

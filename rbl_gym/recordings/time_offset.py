@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
@@ -244,7 +244,8 @@ def _refined(a: _Signal, b: _Signal, step: float, offset: float) -> tuple[float,
     """The offset of least squares near `offset`, and its standard deviation."""
     grid_a = step * np.arange(len(a.values))
     grid_b = step * np.arange(len(b.values))
-    spline_a, spline_b = CubicSpline(grid_a, a.values), CubicSpline(grid_b, b.values)
+    spline = scipy.interpolate.CubicSpline
+    spline_a, spline_b = spline(grid_a, a.values), spline(grid_b, b.values)
     rate_a = spline_a(grid_a, 1)
     # Stamps since 1970 have few digits left: the shift is taken between the two starts.
     apart = b.start - a.start

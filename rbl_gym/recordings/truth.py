@@ -70,16 +70,13 @@ def truth_at(
     left = np.clip(np.searchsorted(truth.times, times, side="right") - 1, 0, last)
     right = np.minimum(left + 1, last)
     elapsed, gap = times - truth.times[left], truth.times[right] - truth.times[left]
-    turned = truth.rotation
-    still = np.broadcast_to(np.eye(3), (len(truth.times), 3, 3))
-    known = still if turned is None else turned
-    path = motion.interpolate(truth.times, known, truth.translation, times)
     inside = (times >= truth.times[0]) & (times <= truth.times[-1])
-    return (
-        None if turned is None else path.rotation,
-        path.translation,
-        inside & ((gap <= max_gap_s) | (elapsed == 0)),
-    )
+    valid = inside & ((gap <= max_gap_s) | (elapsed == 0))
+    if truth.rotation is None:
+        columns = [np.interp(times, truth.times, column) for column in truth.translation.T]
+        return None, np.stack(columns, axis=-1), valid
+    path = motion.interpolate(truth.times, truth.rotation, truth.translation, times)
+    return path.rotation, path.translation, valid
 
 
 def read_truth(

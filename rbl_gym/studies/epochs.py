@@ -167,8 +167,10 @@ _CHUNK = 256
 
 def innovations_of(
     filter: Filter, steps: Iterable[Step], tags: FloatArray, noise: NoiseLaw
-) -> Iterator[tuple[Step, Innovations]]:
-    """Steps, each with its innovations (`estimators.innovations`), some epochs behind.
+) -> Iterator[tuple[list[Step], Innovations]]:
+    """Steps in groups of K, each group with its innovations, arrays (K, ...).
+
+    What `estimators.innovations` finds, of many epochs at once.
 
     Parameters
     ----------
@@ -185,10 +187,11 @@ def innovations_of(
     for step in steps:
         trials = math.prod(step.belief.translation.shape[:-1])
         if kept and (len(kept) * trials >= _CHUNK or _shapes(step) != _shapes(kept[0])):
-            yield from _innovations(filter, kept, tags, noise)
+            yield kept, _innovations(filter, kept, tags, noise)
             kept = []
         kept.append(step)
-    yield from _innovations(filter, kept, tags, noise)
+    if kept:
+        yield kept, _innovations(filter, kept, tags, noise)
 
 
 def _shapes(step: Step) -> list[tuple[int, ...]]:
@@ -197,21 +200,25 @@ def _shapes(step: Step) -> list[tuple[int, ...]]:
 
 def _innovations(
     filter: Filter, steps: list[Step], tags: FloatArray, noise: NoiseLaw
-) -> Iterator[tuple[Step, Innovations]]:
-    if not steps:
-        return
+) -> Innovations:
     before, after = (
         type(states[0])(*(np.array(field) for field in zip(*states, strict=True)))
         for states in ([step.predicted for step in steps], [step.state for step in steps])
     )
     readings = [step.reading for step in steps]
     ranges = np.array([reading.ranges for reading in readings])
-    trials = ranges.shape[1:-2]
-    anchors = np.array(
-        [np.broadcast_to(r.anchors, (*trials, *r.anchors.shape[-2:])) for r in readings]
-    )
+    shape = ranges.shape[1:]
+    anchors = np.array([reading.anchors for reading in readings])
+    missing = (1,) * (ranges.ndim - anchors.ndim)
+    anchors = anchors.reshape(len(anchors), *missing, *anchors.shape[1:])
+    all_there = np.ones(shape, dtype=np.bool_)
     links = np.array(
-        [np.broadcast_to(True if r.links is None else r.links, r.ranges.shape) for r in readings]
+        [
+            all_there
+            if r.links is None
+            else (r.links if r.links.shape == shape else np.broadcast_to(r.links, shape))
+            for r in readings
+        ]
     )
     own = [reading.noise for reading in readings]
     variance = np.broadcast_to(noise.variance(ranges, links), ranges.shape).copy()
@@ -219,9 +226,7 @@ def _innovations(
         if law is not None:
             variance[k] = law.variance(ranges[k], links[k])
     law = LinkNoise(np.sqrt(np.where(links, variance, 1.0)))
-    found = innovations(filter, before, after, ranges, anchors, tags, law, links)
-    for k, step in enumerate(steps):
-        yield step, Innovations(*(field[k] for field in found))
+    return innovations(filter, before, after, ranges, anchors, tags, law, links)
 
 
 class PoseErrors(NamedTuple):

@@ -14,7 +14,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import IteratedEkf, hold_level
 from rbl_gym.measurements.ranging import LinkNoise, RangeNoise
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
+from rbl_gym.studies.epochs import Reading, innovations_of, stack_beliefs, track_epochs
 from rbl_gym.studies.replay.place import level_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import has_own_std, prior_of, recording_filter, sensed
@@ -112,11 +112,11 @@ def _together(trials: list[Trial]) -> list[tuple[FloatArray, ...]]:
     hold = None if level is None else partial(hold_level, level=level)
     told = _readings(trials)
     steps = track_epochs(filter, prior, told, hold=hold)  # pyright: ignore[reportArgumentType]
-    columns = [
-        (i.log_likelihood, i.nis, i.dof, step.belief.rotation, step.belief.translation, i.residual)
-        for step, i in innovations_of(filter, steps, tags, RangeNoise())
-    ]
-    stacked = [np.stack(column, axis=1) for column in zip(*columns, strict=True)]
+    columns: list[tuple[FloatArray, ...]] = []
+    for group, i in innovations_of(filter, steps, tags, RangeNoise()):
+        rotation, translation, *_ = stack_beliefs(step.belief for step in group)
+        columns.append((i.log_likelihood, i.nis, i.dof, rotation, translation, i.residual))
+    stacked = [np.concatenate(column).swapaxes(0, 1) for column in zip(*columns, strict=True)]
     return list(zip(*stacked, strict=True))
 
 

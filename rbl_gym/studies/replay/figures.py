@@ -201,8 +201,9 @@ def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list
         translation=apply_alignment(reference.alignment, None, truth.translation)[1]
     )
 
-    def at(late_s: float) -> Judged:
-        moved = aligned._replace(times=truth.times - late_s)
+    def at(late_s: float, with_rotation: bool) -> Judged:
+        rotation = truth.rotation if with_rotation else None
+        moved = aligned._replace(times=truth.times - late_s, rotation=rotation)
         there = matched(moved, *track[:3], settings.comparison.truth_gap_s)
         return judged_of(there, track, reference.planar, ~excluded_epochs(track.times, settings))
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.measurements import ranging
@@ -259,7 +259,7 @@ def _moved(trial: Trial, rotation: FloatArray, translation: FloatArray, m: int) 
     k, n = k[some], n[some]
     away, ranges = (start - points)[k, n], recording.ranges[k, m, n]
     std = std_of(*trial)[k, m, n]
-    step = optimize.least_squares(
+    step = scipy.optimize.least_squares(
         lambda step: np.concatenate(
             [(np.linalg.norm(away + step, axis=-1) - ranges) / std, step / _MOVED_M]
         ),

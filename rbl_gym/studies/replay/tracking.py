@@ -72,12 +72,12 @@ def track_recording(
     filter = recording_filter(recording, settings)
     beliefs, found = [], []
     steps = recording_steps(recording, settings, filter)
-    for step, innovation in innovations_of(
+    for group, innovations in innovations_of(
         filter, _counted(steps, advance), recording.tags, _noise(settings)
     ):
-        beliefs.append(step.belief)
-        found.append(innovation)
-    foretold = Innovations(*map(np.array, zip(*found, strict=True)))
+        beliefs += [step.belief for step in group]
+        found.append(innovations)
+    foretold = Innovations(*map(np.concatenate, zip(*found, strict=True)))
     track = Track(recording.times, *stack_beliefs(beliefs)[:3], innovations=foretold)
     known = settings.knowledge
     if known.planar or known.height_std_m is not None or known.tilt_std_deg is not None:
@@ -129,7 +129,7 @@ def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
     own = recording.range_std if has_own_std(recording, settings) else None
     elapsed = np.diff(recording.times, prepend=recording.times[0])
     anchors = recording.anchors_by_epoch
-    for k, dt in enumerate(elapsed):
+    for k, dt in enumerate(elapsed.tolist()):
         yield Reading(
             recording.ranges[k],
             anchors[k],

@@ -148,7 +148,7 @@ class Judged(NamedTuple):
 
 
 def fault_hints(
-    at: Callable[[float], Judged], seen: Callable[[FloatArray], FloatArray], planar: bool
+    at: Callable[[float, bool], Judged], seen: Callable[[FloatArray], FloatArray], planar: bool
 ) -> list[str]:
     """Constant faults of the truth that explain most of the errors, at most two.
 
@@ -159,7 +159,7 @@ def fault_hints(
     ----------
     at
         What is judged, with the truth's rotations as they are in the file, its stamps taken to be
-        late by so many seconds.
+        late by so many seconds; with or without rotations.
     seen
         Rotations (L, 3, 3) of the file as they are judged.
     planar
@@ -171,7 +171,7 @@ def fault_hints(
             return judged
         return judged._replace(true_rotation=seen(judged.true_rotation))
 
-    as_read = at(0.0)
+    as_read = at(0.0, True)
     if len(as_read.times) < _FEWEST:
         return []
     judged = mended(as_read)
@@ -241,22 +241,22 @@ def _faults(judged: Judged) -> Iterator[tuple[str, Judged]]:
         yield f"the truth's places look like {unit}", judged._replace(true_translation=moved)
 
 
-def _late(at: Callable[[float], Judged]) -> Iterator[tuple[str, Judged]]:
+def _late(at: Callable[[float, bool], Judged]) -> Iterator[tuple[str, Judged]]:
     """The shift of time that leaves least, by the places."""
-    best: tuple[float, float, Judged] | None = None
+    best: tuple[float, float] | None = None
     for shift in _SHIFTS:
-        other = at(shift)
+        other = at(shift, False)
         if len(other.times) < _FEWEST:
             continue
         place = ((other.translation - other.true_translation) ** 2).sum(axis=-1)
         left = float((place / other.place_variance).mean())
         if best is None or left < best[0]:
-            best = left, shift, other
+            best = left, shift
     if best is not None and abs(best[1]) > 0.01:
         side = "late" if best[1] > 0 else "early (or the filter lags: see --walk-m)"
         yield (
             f"the truth's stamps look about {abs(best[1]):.2f} s {side}; see --time-offset",
-            best[2],
+            at(best[1], True),
         )
 
 
@@ -312,12 +312,13 @@ def judged_of(
     place = translation[known].copy()
     if planar:
         place[:, 2] = track.translation[known, 2]
-    variance = np.einsum("kii->ki", track.covariance[known])
+    variance = np.einsum("kii->ki", track.covariance)[known]
+    estimated = track.rotation[known]
     return Judged(
         track.times[known],
-        track.rotation[known],
+        estimated,
         track.translation[known],
-        (track.rotation if rotation is None else rotation)[known],
+        estimated if rotation is None else rotation[known],
         place,
         variance[:, 2 if planar else 0 : 3].sum(axis=-1),
         variance[:, 3 : 5 if planar else 6].sum(axis=-1),
