@@ -1,26 +1,133 @@
 """Where anchors may stand: boxes, the walls and ceiling of a room, shells.
 
-A region draws points from uniforms, and projects any point onto itself; arrays (..., 3).
+A region draws points from uniforms, and projects any point onto itself; arrays (..., 3). Its
+faces say where on it a point stands: on which wall, how that is turned, what it is called.
+`geometry.mounts` holds regions of any shape.
 """
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.kernels import compiled
 
-__all__ = ["REGIONS", "Box", "Region", "Shell", "Walls"]
+__all__ = ["REGIONS", "Box", "Faces", "Region", "Shell", "Walls"]
 
 Triple = tuple[float, float, float]
+# A point further than this from every face stands on none, metres.
+_NEAR_M = 0.01
+
+
+class Faces(NamedTuple):
+    """Boxes of one, two or three sides within which a region lies.
+
+    Attributes
+    ----------
+    origin
+        (K, 3), a corner of each, metres.
+    axes
+        (K, 3, 3): the directions of its sides from there, rows of unit length.
+    extents
+        (K, 3): the lengths of its sides, metres; 0 where it is flat.
+    normal
+        (K, 3): direction into which anchors on it look, of unit length; zero: into all.
+    cost
+        (K,): of an anchor on it.
+    names
+        K texts.
+    """
+
+    origin: FloatArray
+    axes: FloatArray
+    extents: FloatArray
+    normal: FloatArray
+    cost: FloatArray
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike, str]]) -> Faces:
+        """Faces at cost 1, a row for each: origin, axes, extents, normal, name."""
+        *arrays, names = zip(*rows, strict=True)
+        origin, axes, extents, normal = (np.array(array, float) for array in arrays)
+        return cls(origin, axes, extents, normal, np.ones(len(names)), names)
+
+    def nearest(self, points: FloatArray) -> tuple[np.ndarray, FloatArray]:
+        """Index (...) of the face nearest to each point (..., 3), and the distance, metres."""
+        away = points[..., None, :] - self.origin
+        along = np.einsum("kij,...kj->...ki", self.axes, away).clip(0.0, self.extents)
+        away = away - np.einsum("kij,...ki->...kj", self.axes, along)
+        distance = np.sqrt((away**2).sum(axis=-1))
+        face = distance.argmin(axis=-1)
+        return face, np.take_along_axis(distance, face[..., None], axis=-1)[..., 0]
+
+
+class Faced:
+    """What a region knows of its points by its `faces`."""
+
+    @property
+    def faces(self) -> Faces:
+        """The faces within which the region lies."""
+        raise NotImplementedError
+
+    def face_of(self, points: FloatArray) -> np.ndarray:
+        """Index (...) of the face on which legal points (..., 3) stand: the nearest."""
+        return self.faces.nearest(points)[0]
+
+    def normal(self, points: FloatArray) -> FloatArray:
+        """Direction (..., 3) into which anchors at points (..., 3) look.
+
+        Zero where that is not said, and further than a centimetre from every face.
+        """
+        face, distance = self.faces.nearest(points)
+        return np.where((distance <= _NEAR_M)[..., None], self.faces.normal[face], 0.0)
+
+    def cost(self, points: FloatArray) -> FloatArray:
+        """Cost (...) of anchors at points (..., 3)."""
+        return self.faces.cost[self.face_of(points)]
+
+    def names(self, points: FloatArray) -> list[str]:
+        """Names of the faces on which points (M, 3) stand."""
+        return [self.faces.names[face] for face in self.face_of(points)]
+
+    def listed(self) -> FloatArray | None:
+        """All legal points (K, 3), where they are a list; None: there is no end of them."""
+        return None
 
 
 class Region(Protocol):
     """What every region offers."""
+
+    @property
+    def faces(self) -> Faces:
+        """The faces within which the region lies."""
+        ...
+
+    def face_of(self, points: FloatArray) -> np.ndarray:
+        """Index (...) of the face on which legal points (..., 3) stand."""
+        ...
+
+    def normal(self, points: FloatArray) -> FloatArray:
+        """Direction (..., 3) into which anchors at points look; zero: into all."""
+        ...
+
+    def cost(self, points: FloatArray) -> FloatArray:
+        """Cost (...) of anchors at points (..., 3)."""
+        ...
+
+    def names(self, points: FloatArray) -> list[str]:
+        """Names of the faces on which points (M, 3) stand."""
+        ...
+
+    def listed(self) -> FloatArray | None:
+        """All legal points (K, 3), where they are a list."""
+        ...
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner (3,) of the smallest box around it."""
@@ -54,7 +161,7 @@ def _check_corners(region: Box | Walls, *, flat: bool) -> None:
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(Faced):
     """A box (flat ones allowed, such as a water surface), corners in metres."""
 
     low: Triple
@@ -66,6 +173,12 @@ class Box:
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner, not to be written to."""
         return self._corners
+
+    @functools.cached_property
+    def faces(self) -> Faces:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """One, the box itself."""
+        low, high = self.bounds()
+        return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "box")])
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
         """Uniform in the box."""
@@ -95,7 +208,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Walls:
+class Walls(Faced):
     """The four walls and the ceiling of a box-shaped room (no floor), corners in metres."""
 
     low: Triple
@@ -111,6 +224,19 @@ class Walls:
     @functools.cached_property
     def _corners(self) -> tuple[FloatArray, FloatArray]:
         return _fixed(self.low), _fixed(self.high)
+
+    @functools.cached_property
+    def faces(self) -> Faces:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The walls to the west, east, south and north, and the ceiling."""
+        low, high = self.bounds()
+        names = ("west wall", "east wall", "south wall", "north wall", "ceiling")
+        rows = []
+        for axis, value, name in zip(*_faces(low, high), names, strict=True):
+            flat = np.arange(3) != axis
+            sign = 1.0 if value == low[axis] else -1.0
+            origin = np.where(flat, low, value)
+            rows.append((origin, np.eye(3), flat * (high - low), sign * ~flat, name))
+        return Faces.of(rows)
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
         """Uniform by area; the first uniform chooses the surface and its first coordinate."""
@@ -174,7 +300,7 @@ def _place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> Fl
 
 
 @dataclass(frozen=True)
-class Shell:
+class Shell(Faced):
     """The space between two spheres about the origin, radii in metres."""
 
     inner_m: float
@@ -187,6 +313,12 @@ class Shell:
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """The cube around the outer sphere."""
         return np.full(3, -self.outer_m), np.full(3, self.outer_m)
+
+    @functools.cached_property
+    def faces(self) -> Faces:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """One, the cube around the outer sphere."""
+        low, high = self.bounds()
+        return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "shell")])
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
         """Uniform by volume."""

@@ -17,6 +17,7 @@ from rbl_gym.checks import (
     check_one_of,
 )
 from rbl_gym.geometry import rotations
+from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.obstacles import Obstacles, check_obstacles
 from rbl_gym.geometry.regions import REGIONS, Box, Region
 from rbl_gym.measurements import inertial
@@ -27,7 +28,7 @@ __all__ = ["Scene"]
 
 _FIELD_KINDS: dict[str, tuple[type, ...]] = {
     "volume": (Box,),
-    "anchor_region": tuple(REGIONS.values()),
+    "anchor_region": (*REGIONS.values(), Mounts),
     "noise": tuple(NOISE_LAWS.values()),
     "process": (ProcessNoise,),
     "links": (LinkModel,),

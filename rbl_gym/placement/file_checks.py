@@ -1,0 +1,131 @@
+"""Whether a placement problem can be solved at all; errors name the table of its file."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.regions import Walls
+from rbl_gym.placement.building import Problem, Zone, cube, free_places
+from rbl_gym.placement.file_walls import show
+
+__all__ = ["check_numbers", "check_problem"]
+
+# Places of a zone that are looked at for free ones, and for the way to the nearest mount.
+_PLACES = 1000
+# Points on a line differ by less than this share of their extent.
+_FLAT = 1e-9
+
+
+def check_problem(problem: Problem) -> Problem:
+    """The problem, or a ValueError."""
+    for zone in problem.zones:
+        _check_room(problem, zone)
+    _check_tags(problem)
+    _check_fixed(problem)
+    for index, zone in enumerate(problem.zones):
+        name = zone.name if zone.name == "region" else f"zones[{index}] ({zone.name!r})"
+        _check_zone(problem, zone, name)
+    if problem.obstacles.contain(problem.mounts.draw(cube(4000))).all():
+        raise ValueError("anchors have no legal place: obstacles cover all of them")
+    check_numbers(problem)
+    return problem
+
+
+def _check_room(problem: Problem, zone: Zone) -> None:
+    """In a room the body works inside of it; below its lowest mounts is well."""
+    if not isinstance(problem.mounts, Walls):
+        return
+    low, high = zone.bounds()
+    floor, ceiling = problem.mounts.bounds()
+    if (low[:2] < floor[:2]).any() or (high > ceiling).any():
+        raise ValueError(
+            f"{zone.name} must lie inside the room, got {show(low)} to {show(high)} in a room "
+            f"{show(floor)} to {show(ceiling)}"
+        )
+
+
+def _check_tags(problem: Problem) -> None:
+    """No zone asks for what the tags cannot tell."""
+    tags = problem.tags
+    spread = np.linalg.svd(tags - tags.mean(axis=0), compute_uv=False)
+    if len(tags) > 2 and spread[1] > _FLAT * max(spread[0], 1e-300):
+        return
+    flat = np.ptp(tags[:, :2], axis=0).max() > _FLAT
+    for zone in problem.zones:
+        if zone.attitude == "heading" and (flat or zone.heading_deg is None):
+            continue
+        if zone.name != "region" and zone.heading_deg is None and zone.position_m is not None:
+            continue
+        if zone.attitude == "heading":
+            raise ValueError(
+                f"tags must not stand above each other in zone {zone.name!r}, which asks for a "
+                "heading"
+            )
+        raise ValueError(
+            f"tags must be at least 3 and not on one line, got {len(tags)}: no ranges tell how "
+            "such a body is turned. Fewer do in [[zones]] with attitude = \"heading\", or with "
+            "position_m alone"
+        )
+
+
+def _check_fixed(problem: Problem) -> None:
+    held = problem.obstacles.contain(problem.fixed)
+    if held.any():
+        index = int(held.argmax())
+        raise ValueError(
+            f"anchors.fixed[{index}] = {show(problem.fixed[index])} lies inside an obstacle: it "
+            "would see nothing past it; put it in front of the face"
+        )
+
+
+def _check_zone(problem: Problem, zone: Zone, name: str) -> None:
+    """A zone has free places, and mounts within reach."""
+    low, high = zone.bounds()
+    for index, (centre, half) in enumerate(problem.obstacles.boxes.reshape(-1, 2, 3)):
+        if (centre - half <= low).all() and (centre + half >= high).all():
+            raise ValueError(f"obstacles[{index}] swallows the whole {name}")
+    places = free_places(zone, problem.obstacles, _PLACES)
+    if not len(places):
+        where = "region" if name == "region" else name
+        raise ValueError(f"obstacles leave no free place in {'the ' * (name == 'region')}{where}")
+    nearest = np.linalg.norm(problem.mounts.project(places) - places, axis=-1).min()
+    for anchor in problem.fixed:
+        nearest = min(nearest, np.linalg.norm(anchor - places, axis=-1).min())
+    if nearest >= problem.gain.max_range_m:
+        raise ValueError(
+            f"{name} is {nearest:.4g} m from the nearest mount, beyond anchors.max_range_m = "
+            f"{problem.gain.max_range_m:g}"
+        )
+    extent = _extent(problem)
+    if name != "region" and nearest > extent:
+        raise ValueError(
+            f"{name} is {nearest:.4g} m from the nearest mount, farther than the mounts are "
+            f"wide ({extent:.4g} m): are its coordinates in metres, and of this building?"
+        )
+
+
+def _extent(problem: Problem) -> float:
+    """Diagonal of the box around mounts, obstacles and fixed anchors."""
+    prisms = problem.obstacles.prisms
+    points: list[FloatArray] = [np.array(problem.mounts.bounds()), problem.fixed]
+    points += [box[None, :3] + sign * box[None, 3:] for box in problem.obstacles.boxes for sign in (-1, 1)]
+    plan = prisms.corners.reshape(-1, 2)
+    points.append(np.column_stack([plan, np.repeat(prisms.low_m, prisms.corners.shape[1])]))
+    return float(np.linalg.norm(np.ptp(np.concatenate(points), axis=0)))
+
+
+def check_numbers(problem: Problem) -> None:
+    """There are as many anchors as stay where they are, and places for the others."""
+    n_fixed = len(problem.fixed)
+    if problem.n_anchors < n_fixed:
+        raise ValueError(
+            f"the number of anchors counts the fixed ones: at least {n_fixed} of anchors.fixed, "
+            f"got {problem.n_anchors}"
+        )
+    listed = problem.mounts.listed()
+    if listed is not None and len(listed) < problem.n_anchors - n_fixed:
+        raise ValueError(
+            f"mounts list {len(listed)} legal points, too few for {problem.n_anchors} anchors of "
+            f"which {n_fixed} are fixed"
+        )

@@ -1,0 +1,138 @@
+"""Values of the tables of a placement file, checked by `file_keys.FORMAT`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_array, check_number
+from rbl_gym.geometry.polygons import check_line, check_polygon
+from rbl_gym.placement.file_keys import FORMAT, MOST_M, Form, Key
+
+# More points than this in a list are refused.
+_MOST_POINTS = 10_000
+
+
+def read_table(name: str, table: Any, kind: str | None = None) -> dict[str, Any]:
+    """The values of one table, checked, with defaults; a ValueError names what is wrong.
+
+    Parameters
+    ----------
+    name
+        Under which errors speak of it, such as ``"walls[3]"``.
+    table
+        What the file has there.
+    kind
+        Which of `FORMAT` it is; None: as it is named.
+    """
+    table = as_table(table, name)
+    keys = _form(name, table, FORMAT[kind or name].forms).keys
+    check_keys(table, name, keys)
+    values = {}
+    for key, what in keys.items():
+        value = table.get(key, what.default)
+        values[key] = value if value is None else _checked(f"{name}.{key}", value, what)
+    _check_heights(name, values)
+    return values
+
+
+def _form(name: str, table: Mapping[str, Any], forms: tuple[Form, ...]) -> Form:
+    """The form that a table has."""
+    marked = [form for form in forms if form.value and form.mark in form.keys]
+    if marked and marked[0].mark in table:
+        mark, given = marked[0].mark, table[marked[0].mark]
+        choices = [form.value for form in marked]
+        if given not in choices:
+            raise ValueError(
+                f"{name}.{mark} must be one of {', '.join(map(repr, choices))}, got {given!r:.80}"
+            )
+        return marked[choices.index(given)]
+    for form in forms:
+        if not form.value and (not form.mark or form.mark in table):
+            return form
+    if not marked[0].keys[marked[0].mark].needed:
+        return marked[0]
+    raise ValueError(f"{name} must have the key {marked[0].mark!r}")
+
+
+def as_table(value: Any, name: str) -> dict[str, Any]:
+    """A table of keys, or a ValueError."""
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} must be a table of keys, got {value!r:.80}")
+    return dict(value)
+
+
+def check_keys(table: Mapping[str, Any], name: str, keys: Mapping[str, Key]) -> None:
+    """No key but these, and all that are needed."""
+    for key in table:
+        if key not in keys:
+            raise ValueError(
+                f"{name} has an unknown key {key!r:.80}; it may have {', '.join(keys)}"
+            )
+    for key, what in keys.items():
+        if what.needed and key not in table:
+            raise ValueError(f"{name} must have the key {key!r}")
+
+
+def _checked(name: str, value: Any, key: Key) -> Any:
+    """The value as it is used."""
+    if key.kind == "number":
+        return check_number(name, value, low=key.low, high=key.high)
+    if key.kind == "flag":
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} must be true or false, got {value!r:.80}")
+        return value
+    if key.kind == "text":
+        return check_text(name, value)
+    if key.kind == "choice" and key.choices and value not in key.choices:
+        choices = ", ".join(map(repr, key.choices))
+        raise ValueError(f"{name} must be one of {choices}, got {value!r:.80}")
+    if isinstance(value, list) and len(value) > _MOST_POINTS:
+        raise ValueError(f"{name} must have at most {_MOST_POINTS} points, got {len(value)}")
+    if key.kind in ("spot", "place"):
+        return _vector(name, value, 2 if key.kind == "spot" else 3)
+    if key.kind == "places":
+        return _places(name, value)
+    if key.kind in ("line", "polygon"):
+        points = check_polygon(name, value) if key.kind == "polygon" else check_line(name, value)
+        return _within(name, points)
+    return value
+
+
+def check_text(name: str, value: Any) -> str:
+    """A text that can be printed, or a ValueError."""
+    if not isinstance(value, str) or not value or not value.isprintable():
+        raise ValueError(f"{name} must be a printable text, got {value!r:.80}")
+    return value
+
+
+def _vector(name: str, value: Any, size: int) -> tuple[float, ...]:
+    array = check_array(name, value, (size,))
+    if array.ndim != 1:
+        numbers = {2: "two", 3: "three"}[size]
+        raise ValueError(f"{name} must be {numbers} numbers, got shape {array.shape}")
+    return tuple(array.tolist())
+
+
+def _places(name: str, value: Any) -> FloatArray:
+    if isinstance(value, list) and not value:
+        return np.empty((0, 3))
+    array = check_array(name, value, ("N", 3))
+    if array.ndim != 2:
+        raise ValueError(f"{name} must be a list of [x, y, z], got shape {array.shape}")
+    return _within(name, array)
+
+
+def _within(name: str, points: FloatArray) -> FloatArray:
+    far = np.abs(points).max()
+    if far > MOST_M:
+        raise ValueError(f"{name} must lie within {MOST_M:g} m of the origin, got {far:g} m")
+    return points
+
+
+def _check_heights(name: str, values: Mapping[str, Any]) -> None:
+    low, high = values.get("low_m"), values.get("high_m")
+    if low is not None and high is not None and high < low:
+        raise ValueError(f"{name}: low_m must lie below high_m, got {low:g} and {high:g}")

@@ -1,0 +1,256 @@
+"""What stands in a building, from the tables of a file: walls, obstacles, slabs, mounts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.obstacles import Obstacles, Prisms
+from rbl_gym.geometry.polygons import check_polygon
+from rbl_gym.placement.mounting import Mount
+
+# A mitre that is longer than so many half thicknesses is cut off.
+_LONGEST_MITRE = 4.0
+# A mount runs along a wall where their directions differ by less than this, radians.
+_PARALLEL = 1e-3
+
+
+class Wall(NamedTuple):
+    """One straight piece of a wall: its ends in the plan, half its thickness, its heights."""
+
+    start: FloatArray
+    end: FloatArray
+    half_m: float
+    low_m: float
+    high_m: float
+
+
+class Solids(NamedTuple):
+    """Polygons with heights and shares, as they are gathered from the tables."""
+
+    rings: list[FloatArray]
+    low: list[float]
+    high: list[float]
+    share: list[float]
+
+    def add(self, ring: FloatArray, low: float, high: float, share: float) -> None:
+        """One more."""
+        for column, value in zip(self, (ring, low, high, share), strict=True):
+            column.append(value)
+
+
+def read_obstacles(
+    tables: Mapping[str, list[dict[str, Any]]], materials: Mapping[str, float], blocked: float
+) -> tuple[Obstacles, list[Wall]]:
+    """All that takes information from links, and the walls piece by piece.
+
+    Parameters
+    ----------
+    tables
+        The read tables ``obstacles``, ``walls`` and ``slabs``.
+    materials
+        Shares by name.
+    blocked
+        What those without a share leave.
+    """
+    boxes, solids, walls = [], Solids([], [], [], []), []
+    for name, table in _each(tables, "obstacles"):
+        share = _share(name, table, materials)
+        if "polygon" in table:
+            _check_rises(name, table)
+            solids.add(table["polygon"], table["low_m"], table["high_m"], share)
+            continue
+        low, high = np.array(table["low"]), np.array(table["high"])
+        if not (high > low).all():
+            raise ValueError(f"{name}: low must lie below high, got {show(low)}, {show(high)}")
+        if math.isnan(share):
+            boxes.append([*0.5 * (low + high), *0.5 * (high - low)])
+        else:
+            solids.add(rectangle(low, high), low[2], high[2], share)
+    for name, table in _each(tables, "walls"):
+        share = _share(name, table, materials)
+        _check_rises(name, table)
+        line, half = table["line"], 0.5 * table["thickness_m"]
+        if table["closed"]:
+            line = check_polygon(f"{name}.line", line)
+        for ring in wall_pieces(line, half, table["closed"]):
+            solids.add(check_polygon(f"{name}.line", ring), table["low_m"], table["high_m"], share)
+        for start, end in segments(line, table["closed"]):
+            walls.append(Wall(start, end, half, table["low_m"], table["high_m"]))
+    for name, table in _each(tables, "slabs"):
+        share = _share(name, table, materials)
+        solids.add(table["polygon"], table["z_m"], table["z_m"] + table["thickness_m"], share)
+    prisms = Prisms.of(*solids)
+    return Obstacles(np.array(boxes).reshape(-1, 6), blocked, prisms), walls
+
+
+def _each(tables: Mapping[str, Any], kind: str) -> list[tuple[str, dict[str, Any]]]:
+    return [(f"{kind}[{i}]", table) for i, table in enumerate(tables.get(kind, []))]
+
+
+def _share(name: str, table: Mapping[str, Any], materials: Mapping[str, float]) -> float:
+    """What is left behind it; NaN: what obstacles have in common."""
+    material, share = table["material"], table["information"]
+    if material is not None and share is not None:
+        raise ValueError(f"{name} must have either material or information, got both")
+    if material is not None:
+        if material not in materials:
+            known = ", ".join(map(repr, materials)) or "none"
+            raise ValueError(
+                f"{name}.material must be one of [materials], which has {known}, got {material!r}"
+            )
+        return materials[material]
+    return math.nan if share is None else share
+
+
+def _check_rises(name: str, table: Mapping[str, Any]) -> None:
+    if table["high_m"] - table["low_m"] < 1e-3:
+        raise ValueError(
+            f"{name}: low_m must lie below high_m, got {table['low_m']:g} and {table['high_m']:g}"
+        )
+
+
+def rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Corners (4, 2) of a box in the plan, counter-clockwise."""
+    return np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+
+
+def segments(line: FloatArray, closed: bool) -> list[tuple[FloatArray, FloatArray]]:
+    """The straight pieces of a line (V, 2)."""
+    ends = np.roll(line, -1, axis=0)
+    return list(zip(line, ends, strict=True))[: None if closed else -1]
+
+
+def wall_pieces(line: FloatArray, half: float, closed: bool) -> list[FloatArray]:
+    """Quadrilaterals (4, 2) about the pieces of a line, mitred where two of them meet."""
+    found = []
+    parts = segments(line, closed)
+    along = np.array([(end - start) / np.hypot(*(end - start)) for start, end in parts])
+    for i, (start, end) in enumerate(parts):
+        left = half * _turned(along[i])
+        joined = [closed or i > 0, closed or i + 1 < len(parts)]
+        before, after = (
+            _mitre(along[k % len(parts)], along[i], half) if join else left
+            for k, join in zip((i - 1, i + 1), joined, strict=True)
+        )
+        found.append(np.array([start - before, end - after, end + after, start + before]))
+    return found
+
+
+def _mitre(one: FloatArray, other: FloatArray, half: float) -> FloatArray:
+    """From a corner of two directions to where their left sides meet."""
+    middle = _turned(one) + _turned(other)
+    square = middle @ middle
+    # cos^2 of half the turn is square / 4.
+    if square * _LONGEST_MITRE**2 < 4:
+        return half * _turned(other)
+    return 2 * half * middle / square
+
+
+def _turned(direction: FloatArray) -> FloatArray:
+    """A quarter turn to the left."""
+    return np.array([-direction[1], direction[0]])
+
+
+def read_mounts(tables: list[dict[str, Any]], walls: list[Wall]) -> list[Mount]:
+    """The faces of all mounts; those along a wall are moved to its face."""
+    found: list[Mount] = []
+    for index, table in enumerate(tables):
+        kind = table["kind"]
+        faces = _SHAPES[kind](f"mounts[{index}]", table, walls)
+        name = table["name"] or f"{kind} {index + 1}"
+        for k, face in enumerate(faces):
+            label = f"{name} {k + 1}" if len(faces) > 1 and kind != "points" else name
+            found.append(face._replace(cost=table["cost"], name=label))
+    return found
+
+
+def _wall(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+    line = table["line"]
+    if table["closed"]:
+        line = check_polygon(f"{name}.line", line)
+    found = []
+    for side in ("left", "right"):
+        if table["side"] not in (side, "both"):
+            continue
+        for start, end in segments(line, table["closed"]):
+            ends = np.array([start, end] if side == "left" else [end, start])
+            normal = _turned((ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0])))
+            shift = table["offset_m"] + _in_wall(ends, normal, table, walls)
+            found.append(_upright(ends + shift * normal, normal, table))
+    return found
+
+
+def _in_wall(
+    ends: FloatArray, normal: FloatArray, table: Mapping[str, Any], walls: list[Wall]
+) -> float:
+    """How far a face inside a wall, or on its other side, lies behind the wall's face."""
+    shift = 0.0
+    direction = ends[1] - ends[0]
+    length = np.hypot(*direction)
+    for wall in walls:
+        along = wall.end - wall.start
+        cross = abs(along[0] * direction[1] - along[1] * direction[0])
+        behind = (ends.mean(axis=0) - 0.5 * (wall.start + wall.end)) @ normal
+        if cross > _PARALLEL * length * np.hypot(*along) or abs(behind) > wall.half_m + 1e-6:
+            continue
+        if wall.low_m >= table["high_m"] or wall.high_m <= table["low_m"]:
+            continue
+        places = (np.array([wall.start, wall.end]) - ends[0]) @ direction / length
+        if places.max() > 1e-6 and places.min() < length - 1e-6:
+            shift = max(shift, wall.half_m - behind)
+    return shift
+
+
+def _ceiling(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+    height = table["height_m"]
+    return [Mount(table["polygon"], height, height, np.array([0.0, 0, -1]), 1.0, "")]
+
+
+def _column(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+    found = []
+    for start, end in segments(table["polygon"], closed=True):
+        normal = -_turned((end - start) / np.hypot(*(end - start)))
+        found.append(_upright(np.array([start, end]), normal, table))
+    return found
+
+
+def _area(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+    normal = _axis(name, table)
+    return [Mount(table["polygon"], table["low_m"], table["high_m"], normal, 1.0, "")]
+
+
+def _points(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+    if not len(table["points"]):
+        raise ValueError(f"{name}.points must not be empty")
+    normal = _axis(name, table)
+    return [Mount(spot[None, :2], spot[2], spot[2], normal, 1.0, "") for spot in table["points"]]
+
+
+_SHAPES = {
+    "wall": _wall, "ceiling": _ceiling, "column": _column, "area": _area, "points": _points,
+}  # fmt: skip
+
+
+def _upright(ends: FloatArray, normal: FloatArray, table: Mapping[str, Any]) -> Mount:
+    return Mount(ends, table["low_m"], table["high_m"], np.array([*normal, 0.0]), 1.0, "")
+
+
+def _axis(name: str, table: Mapping[str, Any]) -> FloatArray:
+    """The direction in which anchors look, of unit length; zero: everywhere."""
+    if table["axis"] is None:
+        return np.zeros(3)
+    axis = np.array(table["axis"])
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        raise ValueError(f"{name}.axis must not be zero")
+    return axis / length
+
+
+def show(corner: FloatArray) -> str:
+    """A point as a text."""
+    return "(" + ", ".join(f"{value:g}" for value in corner) + ")"
