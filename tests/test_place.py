@@ -269,8 +269,8 @@ def test_coplanar_anchors_are_warned_of():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--anchors", "2"], "the number of anchors must be 3 to 64, got 2"),
-        (["--anchors", "2..4"], "the number of anchors must be 3 to 64, got 2"),
+        (["--anchors", "2"], "the number of anchors must be 3 to 256, got 2"),
+        (["--anchors", "2..4"], "the number of anchors must be 3 to 256, got 2"),
         (["--region", "0,0,0,20,1,1"], "region must lie inside the room"),
         (["--racks", "9"], "racks must be an int from 0 to 2"),
         (["--scene", "nowhere"], "scene must be one of"),

@@ -3,13 +3,16 @@
 # pyright: reportArgumentType=false
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from rbl_gym import bounds, estimators, motion, placement
+from rbl_gym import bounds, estimators, motion
 from rbl_gym.app import bench_command
 from rbl_gym.bounds import links as link_bounds
 from rbl_gym.geometry import bodies
+from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.measurements import ranging
 from rbl_gym.networks import rigidity
 from rbl_gym.placement import scene_files
@@ -220,8 +223,7 @@ def test_benchmarks():
 def test_rooms_full_of_obstacles():
     low, high = np.array(scenes.get("uwb_room").anchor_region.bounds())
     full = np.concatenate([0.5 * (low + high), (high - low)])
-    task = placement.task("uwb_room")
-    context = placement.whole_volume(task)._replace(racks=full[None])
-    problem = scene_files.Problem(task, context)
+    problem = scene_files.problem("uwb_room")
+    problem = dataclasses.replace(problem, obstacles=Obstacles(full[None], 0.01))
     with pytest.raises(ValueError, match="anchors have no legal place: obstacles cover all"):
         design.free_candidates(problem, np.random.default_rng(0), 10)

@@ -13,9 +13,10 @@ import pytest
 
 from rbl_gym import bounds, placement
 from rbl_gym.geometry import bodies
+from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import NOISE_LAWS, RangeNoise
-from rbl_gym.placement import layouts, scene_files
+from rbl_gym.placement import building, layouts, scene_files
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import ROOT, share_by_hand
@@ -47,7 +48,7 @@ def changed(path: str, value: object) -> dict:
 
 def test_the_example_is_read():
     problem = scene_files.problem(str(ROOT / "examples" / "warehouse.toml"))
-    task, context = problem
+    task, context = problem.task, problem.context
     assert problem.name == "warehouse"
     assert task.n_anchors == task.scene.n_anchors == 8
     assert task.scene.anchor_region == Walls((-20, -10, 0.5), (20, 10, 6))
@@ -193,10 +194,11 @@ def test_what_is_predicted_of_a_hall_is_what_its_simulation_tells():
 
 def test_free_points_fill_the_box_and_leave_the_obstacles_out():
     low, high = np.array([0.0, 0, 1]), np.array([4.0, 2, 1])
-    box = np.array([[1.0, 1, 1, 1, 1, 1]])
-    points = scene_files.free_points(low, high, box, 200)
+    obstacles = Obstacles(np.array([[1.0, 1, 1, 1, 1, 1]]), 0.0)
+    zone = building.Zone("flat", np.array([[0.0, 0], [4, 0], [4, 2], [0, 2]]), 1.0, 1.0)
+    points = building.free_places(zone, obstacles, 200)
     assert points.shape == (200, 3)
-    assert not scene_files.inside(points, box).any()
+    assert not obstacles.contain(points).any()
     assert ((points >= low) & (points <= high)).all()
     np.testing.assert_allclose(points.mean(axis=0), [3, 1, 1], atol=0.05)
 
@@ -217,8 +219,8 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("anchors.low", [[0, 0, 0]], "anchors.low must be three numbers"),
         ("anchors.low", [0, 0, math.nan], "anchors.low must be finite"),
         ("anchors.number", None, "anchors.number must be given"),
-        ("anchors.number", 2, "the number of anchors must be 3 to 64, got 2"),
-        ("anchors.number", 65, "the number of anchors must be 3 to 64, got 65"),
+        ("anchors.number", 2, "the number of anchors must be 3 to 256, got 2"),
+        ("anchors.number", 257, "the number of anchors must be 3 to 256, got 257"),
         ("anchors.number", 4.5, "the number of anchors must be a whole number"),
         ("region.high", [7, 5, -1], "region: low must lie below high"),
         ("region.high", [1, 1, 0], "region must not be empty"),
@@ -276,7 +278,7 @@ def test_anchors_without_a_legal_place():
     [
         ({"scene": "moon"}, "scene must be one of"),
         ({"scene": "camsap2013"}, "scene must have a volume with an extent"),
-        ({"scene": "uwb_room", "n_anchors": 2}, "the number of anchors must be 3 to 64"),
+        ({"scene": "uwb_room", "n_anchors": 2}, "the number of anchors must be 3 to 256"),
         ({"scene": "uwb_room", "racks": 3}, "racks must be"),
         ({"scene": "satellite", "racks": 1}, "racks must be 0 in a scene without walls"),
         ({"scene": "x.toml", "racks": 1}, "racks must be 0 with a file"),

@@ -66,7 +66,7 @@ def _place(options: argparse.Namespace) -> int:
     problem = scene_files.problem(
         options.scene, numbers[-1] if numbers else None, options.region, options.racks, options.seed
     )
-    numbers = numbers or range(problem.task.n_anchors, problem.task.n_anchors + 1)
+    numbers = numbers or range(problem.n_anchors, problem.n_anchors + 1)
     scene_files.check_n_anchors(numbers[0])
     with progress("placing") as advance:
         placed = place.place_anchors(problem, numbers, options.seed, options.trials, advance)

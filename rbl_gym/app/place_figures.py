@@ -90,11 +90,11 @@ def _limits(placed: Placed, axes: Plane, far: bool) -> FloatArray:
     corners = [low, high]
     if not far:
         corners += [*placed.design.anchors]
-        region = placed.problem.task.scene.anchor_region
+        region = placed.problem.mounts
         if not isinstance(region, Shell):
             corners += [*region.bounds()]
         corners += [
-            box[:3] + sign * box[3:] for box in placed.problem.context.racks for sign in (-1, 1)
+            box[:3] + sign * box[3:] for box in placed.problem.obstacles.boxes for sign in (-1, 1)
         ]
     points = np.array(corners)[:, list(axes)]
     extent = np.ptp(points, axis=0)
@@ -130,12 +130,12 @@ def _draw_world(axes: Any, placed: Placed, plane: Plane, far: bool, heights: boo
     low, high = problem.corners()
     pair = list(plane)
     third = 3 - sum(pair)
-    region = problem.task.scene.anchor_region
+    region = problem.mounts
     limits = _limits(placed, plane, far)
     if not far and not isinstance(region, Shell):
         _draw_box(axes, *(corner[pair] for corner in region.bounds()), fill=False, ec="0.45", lw=2)
     at = 0.5 * (low + high)[third]
-    for box in problem.context.racks:
+    for box in problem.obstacles.boxes:
         # Cut by the map's plane, or only an outline before or behind it.
         cut = abs(box[third] - at) <= box[3 + third]
         style = {"fc": OBSTACLE, "alpha": 0.9} if cut else {"fill": False, "ls": ":"}

@@ -60,11 +60,11 @@ def place_scene(placed: Placed) -> go.Figure:
         )
     style = {"color": "#222222", "width": 3, "dash": "dash"}
     shown.add_trace(solids.box(low, high, name="work region", line=style))
-    region = problem.task.scene.anchor_region
+    region = problem.mounts
     if not isinstance(region, Shell):
         style = {"color": "#8a8f94", "width": 3}
         shown.add_trace(solids.box(*region.bounds(), name="where anchors may stand", line=style))
-    for index, box in enumerate(problem.context.racks):
+    for index, box in enumerate(problem.obstacles.boxes):
         shown.add_trace(
             solids.solid(
                 box[:3] - box[3:],

@@ -145,6 +145,12 @@ class Obstacles:
         prisms, common = self.prisms, self.blocked_information
         return share_behind(anchors, points, self.boxes, prisms.corners, prisms.limits, common)
 
+    def sees(self, anchors: FloatArray, points: FloatArray) -> BoolArray:
+        """Whether nothing takes information from each link, (..., P, M); arguments as `share`."""
+        if not len(self.prisms):
+            return in_sight(anchors, points, self.boxes)
+        return self.share(anchors, points) == 1.0
+
     def contain(self, points: FloatArray) -> BoolArray:
         """Which points (..., 3) lie in or on one of the boxes (K, 6), or inside of a prism."""
         return inside(points, self.boxes) | self.prisms.contain(points)

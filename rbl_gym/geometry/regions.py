@@ -71,10 +71,7 @@ class Faces(NamedTuple):
 class Faced:
     """What a region knows of its points by its `faces`."""
 
-    @property
-    def faces(self) -> Faces:
-        """The faces within which the region lies."""
-        raise NotImplementedError
+    faces: Faces
 
     def face_of(self, points: FloatArray) -> np.ndarray:
         """Index (...) of the face on which legal points (..., 3) stand: the nearest."""

@@ -169,6 +169,22 @@ class Problem:
         low, high = zip(*(zone.bounds() for zone in self.zones), strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
 
+    def free(self, points: FloatArray) -> BoolArray:
+        """Which points (..., 3) lie in a zone and outside of the obstacles."""
+        within = np.any([zone.contains(points) for zone in self.zones], axis=0)
+        return within & ~self.obstacles.contain(points)
+
+    def free_places(self, count: int) -> FloatArray:
+        """Up to `count` points (n, 3) spread evenly over the zones, to each by its weight."""
+        share = np.cumsum([0.0, *(zone.weight for zone in self.zones)])
+        counts = np.diff(np.round(count * share / share[-1]).astype(int)).tolist()
+        found = [
+            free_places(zone, self.obstacles, n)
+            for zone, n in zip(self.zones, counts, strict=True)
+            if n
+        ]
+        return np.concatenate(found)
+
     def share(self, anchors: FloatArray, points: FloatArray) -> FloatArray:
         """Share (..., P, M) of its information that a link from each anchor to each point has.
 

@@ -9,8 +9,6 @@ from rbl_gym.geometry.regions import Walls
 from rbl_gym.placement.building import Problem, Zone, cube, free_places
 from rbl_gym.placement.file_walls import show
 
-__all__ = ["check_numbers", "check_problem"]
-
 # Places of a zone that are looked at for free ones, and for the way to the nearest mount.
 _PLACES = 1000
 # Points on a line differ by less than this share of their extent.
@@ -64,7 +62,7 @@ def _check_tags(problem: Problem) -> None:
             )
         raise ValueError(
             f"tags must be at least 3 and not on one line, got {len(tags)}: no ranges tell how "
-            "such a body is turned. Fewer do in [[zones]] with attitude = \"heading\", or with "
+            'such a body is turned. Fewer do in [[zones]] with attitude = "heading", or with '
             "position_m alone"
         )
 
@@ -109,7 +107,9 @@ def _extent(problem: Problem) -> float:
     """Diagonal of the box around mounts, obstacles and fixed anchors."""
     prisms = problem.obstacles.prisms
     points: list[FloatArray] = [np.array(problem.mounts.bounds()), problem.fixed]
-    points += [box[None, :3] + sign * box[None, 3:] for box in problem.obstacles.boxes for sign in (-1, 1)]
+    points += [
+        box[None, :3] + sign * box[None, 3:] for box in problem.obstacles.boxes for sign in (-1, 1)
+    ]
     plan = prisms.corners.reshape(-1, 2)
     points.append(np.column_stack([plan, np.repeat(prisms.low_m, prisms.corners.shape[1])]))
     return float(np.linalg.norm(np.ptp(np.concatenate(points), axis=0)))

@@ -1,6 +1,7 @@
 """The format of a placement file: every table, its keys, and what they may hold.
 
-One table of keys serves the reader, its messages, and the JSON schema for editors.
+One table of keys serves the reader, its messages, and the JSON schema for editors
+(`file_schema`).
 """
 
 from __future__ import annotations
@@ -12,8 +13,6 @@ from typing import Any, NamedTuple
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements.ranging import NOISE_LAWS
 from rbl_gym.placement.building import ATTITUDES
-
-__all__ = ["FORMAT", "MAX_ANCHORS", "MIN_ANCHORS", "Form", "Key", "Table", "schema"]
 
 # Fewer anchors never tell a pose; three leave its mirror image in their plane.
 MIN_ANCHORS, MAX_ANCHORS = 3, 256
@@ -57,7 +56,7 @@ class Key(NamedTuple):
 
 
 class Form(NamedTuple):
-    """One form of a table: it is meant where the table has the key `mark`, with `value` if given."""
+    """One form of a table, meant where that has the key `mark`, with `value` if given."""
 
     keys: dict[str, Key]
     mark: str = ""
@@ -119,7 +118,10 @@ _REACH = {
 }
 _ANCHORS = {
     "number": Key(
-        "count", "how many, the fixed ones included; or --anchors", low=MIN_ANCHORS, high=MAX_ANCHORS
+        "count",
+        "how many, the fixed ones included; or --anchors",
+        low=MIN_ANCHORS,
+        high=MAX_ANCHORS,
     ),
     "fixed": Key("places", "anchors [[x, y, z], ...] that stay, metres", default=[]),
     **_REACH,
@@ -144,7 +146,9 @@ _MOUNT = {
     "name": _NAME,
     "cost": Key("number", "of an anchor on it", default=1.0, low=0.0, high=1e9),
 }
-_AXIS = {"axis": Key("place", "direction [x, y, z] in which the anchors look; all round without it")}
+_AXIS = {
+    "axis": Key("place", "direction [x, y, z] in which the anchors look; all round without it")
+}
 
 
 def _noise_form(kind: str, law: Any) -> Form:
@@ -199,7 +203,9 @@ FORMAT: dict[str, Table] = {
                         default="left",
                         choices=("left", "right", "both"),
                     ),
-                    "offset_m": _metres("how far in front of the wall's face", default=0.0, low=0.0),
+                    "offset_m": _metres(
+                        "how far in front of the wall's face", default=0.0, low=0.0
+                    ),
                     "low_m": _LOW,
                     "high_m": _HIGH,
                 },
@@ -331,71 +337,3 @@ FORMAT: dict[str, Table] = {
         ),
     ),
 }
-
-
-# --- schema ----------------------------------------------------------------------------------
-
-_SPOT = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
-_PLACE = {"type": "array", "items": {"type": "number"}, "minItems": 3, "maxItems": 3}
-_TYPES: dict[str, dict[str, Any]] = {
-    "number": {"type": "number"},
-    "count": {"type": "integer"},
-    "text": {"type": "string", "minLength": 1},
-    "flag": {"type": "boolean"},
-    "choice": {"type": "string"},
-    "spot": _SPOT,
-    "place": _PLACE,
-    "places": {"type": "array", "items": _PLACE},
-    "line": {"type": "array", "items": _SPOT, "minItems": 2},
-    "polygon": {"type": "array", "items": _SPOT, "minItems": 3},
-    "any": {"type": "number"},
-}
-
-
-def schema() -> dict[str, Any]:
-    """The JSON schema (draft 2020-12) of a file."""
-    tables: dict[str, Any] = {"name": {"description": "of the problem", **_TYPES["text"]}}
-    for name, table in FORMAT.items():
-        forms = [_form_schema(form) for form in table.forms]
-        one = forms[0] if len(forms) == 1 else {"anyOf": forms}
-        one = {"description": table.doc, **one}
-        tables[name] = {"type": "array", "items": one} if table.many else one
-    tables["materials"] = {
-        "description": MATERIALS_DOC,
-        "type": "object",
-        "additionalProperties": {"type": "number", "minimum": 0, "maximum": 1},
-    }
-    return {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Placement problem of rbl-gym place",
-        "type": "object",
-        "additionalProperties": False,
-        "required": ["body", "noise"],
-        "properties": tables,
-    }
-
-
-def _form_schema(form: Form) -> dict[str, Any]:
-    properties = {name: _key_schema(key) for name, key in form.keys.items()}
-    needed = [name for name, key in form.keys.items() if key.needed]
-    if form.value:
-        properties[form.mark] = {"const": form.value, "description": form.keys[form.mark].doc}
-    return {
-        "type": "object",
-        "additionalProperties": False,
-        "required": needed,
-        "properties": properties,
-    }
-
-
-def _key_schema(key: Key) -> dict[str, Any]:
-    found = {"description": key.doc, **_TYPES[key.kind]}
-    if key.choices:
-        found = {"description": key.doc, "enum": list(key.choices)}
-    if key.low > -math.inf:
-        found["minimum"] = key.low
-    if key.high < math.inf:
-        found["maximum"] = key.high
-    if key.default is not None:
-        found["default"] = key.default
-    return found

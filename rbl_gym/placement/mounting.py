@@ -15,8 +15,6 @@ from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.geometry.regions import Faces
 
-__all__ = ["Mount", "cut_mounts"]
-
 # What stands so close in front of a face covers it, metres.
 _BEFORE_M = 1e-3
 # Forbidden prisms hold their own faces, metres.

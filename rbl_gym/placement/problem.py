@@ -28,7 +28,7 @@ from rbl_gym.checks import (
     check_count,
     check_finite,
 )
-from rbl_gym.geometry import obstacles, rotations
+from rbl_gym.geometry import rotations
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Walls
 from rbl_gym.kernels import compiled
@@ -250,9 +250,10 @@ def _share(
     task: PlacementTask, context: Context, anchors: FloatArray, places: FloatArray
 ) -> FloatArray:
     """Share (..., P, M) of its information that each anchor's sight of each place leaves."""
-    if not context.racks.shape[-2]:
+    in_the_way = task.obstacles(context)
+    if not in_the_way:
         return np.ones((task.n_poses, anchors.shape[-2]))
-    return task.obstacles(context).share(anchors, places)
+    return in_the_way.share(anchors, places)
 
 
 def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
@@ -359,11 +360,10 @@ def mounts(task: PlacementTask) -> FloatArray:
 
 def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """Share (..., M) of the task's poses that each anchor sees."""
-    if not context.racks.shape[-2]:
+    in_the_way = task.obstacles(context)
+    if not in_the_way:
         return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
-    places = positions(task, context)
-    sight = obstacles.in_sight(anchors, places, context.racks)
-    return sight.mean(axis=-2)
+    return in_the_way.sees(anchors, positions(task, context)).mean(axis=-2)
 
 
 def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:

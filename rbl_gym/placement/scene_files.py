@@ -127,7 +127,11 @@ def of_mapping(
     """
     _check_tables(tables)
     lists = {key: _rows(tables, key) for key, table in FORMAT.items() if table.many}
-    anchors = read_table("anchors", tables.get("anchors", {}))
+    anchors = as_table(tables.get("anchors", {}), "anchors")
+    if "kind" not in anchors and not lists["mounts"]:
+        kinds = ", ".join(map(repr, _REGIONS))
+        raise ValueError(f"anchors.kind must be given: one of {kinds}; or [[mounts]]")
+    anchors = read_table("anchors", anchors)
     noise, blocked = _noise(tables["noise"])
     prior = read_table("prior", tables.get("prior", {}))
     obstacles, walls = read_obstacles(lists, _materials(tables.get("materials", {})), blocked)
@@ -225,17 +229,18 @@ def _mounts(
     rows, forbidden = lists["mounts"], lists["forbidden"]
     kind = anchors.get("kind")
     if not rows:
-        if kind is None:
-            kinds = ", ".join(map(repr, _REGIONS))
-            raise ValueError(f"anchors.kind must be given: one of {kinds}; or [[mounts]]")
         if forbidden:
-            raise ValueError(f"forbidden means nothing with anchors.kind = {kind!r}: list [[mounts]]")
+            raise ValueError(
+                f"forbidden means nothing with anchors.kind = {kind!r}: list [[mounts]]"
+            )
         sizes = ("inner_m", "outer_m") if kind == "shell" else ("low", "high")
         return _named("anchors", _REGIONS[kind], **{key: anchors[key] for key in sizes})
     if kind is not None:
         raise ValueError("the file must have either anchors.kind or [[mounts]], got both")
     columns = [[row[key] for row in forbidden] for key in ("polygon", "low_m", "high_m")]
-    mounts = cut_mounts(read_mounts(rows, walls), obstacles, _named("forbidden", Prisms.of, columns))
+    mounts = cut_mounts(
+        read_mounts(rows, walls), obstacles, _named("forbidden", Prisms.of, columns)
+    )
     if mounts is None:
         raise ValueError(
             "mounts have no legal place: obstacles and [[forbidden]] cover all of them. A mount "

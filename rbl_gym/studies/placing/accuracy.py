@@ -8,7 +8,6 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
-from rbl_gym.placement import scene_files
 from rbl_gym.placement.scene_files import Problem
 
 __all__ = [
@@ -53,7 +52,7 @@ def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray) -> Accur
     size = max(1, _BLOCK // (len(turns) * len(anchors) * len(tags)))
     for begin in range(0, len(places), size):
         part = places[begin : begin + size]
-        weight = problem.obstacles.share(anchors, part)[:, None, :, None]
+        weight = problem.share(anchors, part)[:, None, :, None]
         information = bounds.information_at(
             anchors, tags, turns, part[:, None], task.scene.noise, weight
         )
@@ -66,16 +65,16 @@ def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray) -> Accur
 
 
 def free_sample(problem: Problem) -> FloatArray:
-    """Places (L, 3) spread evenly over the work region, obstacles left out."""
-    return scene_files.free_points(*problem.corners(), problem.obstacles.boxes, _SAMPLE)
+    """Places (L, 3) spread evenly over the zones, obstacles left out."""
+    return problem.free_places(_SAMPLE)
 
 
 def free_grid(problem: Problem) -> FloatArray:
-    """A grid of places (L, 3) over the work region, its edges included, obstacles left out."""
+    """A grid of places (L, 3) over the zones, their edges included, obstacles left out."""
     low, high = problem.corners()
     axes = [np.linspace(a, b, n if b > a else 1) for a, b, n in zip(low, high, _GRID, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return places[~problem.obstacles.contain(places)]
+    return places[problem.free(places)]
 
 
 class Map(NamedTuple):
@@ -118,7 +117,7 @@ def accuracy_map(problem: Problem, anchors: FloatArray, up: int = 1, share: floa
     places = np.empty((len(centres[1]), len(centres[0]), 3))
     places[..., 0], places[..., up], places[..., third] = centres[0], centres[1][:, None], at
     found = accuracy(problem, anchors, places.reshape(-1, 3))
-    blocked = problem.obstacles.contain(found.places)
+    blocked = ~problem.free(found.places)
     values = [
         np.where(blocked, np.nan, value).reshape(places.shape[:2])
         for value in (found.position, np.rad2deg(found.rotation))

@@ -116,7 +116,7 @@ def draw_bodies(
     translation = _free_places(problem, trials, rng)
     rotation = rotations.random(rng, (trials,))
     tags = np.asarray(scene.tags)
-    weight = problem.obstacles.share(anchors, translation[:, None])[:, 0, :, None]
+    weight = problem.share(anchors, translation[:, None])[:, 0, :, None]
     distance = ranging.distances(anchors, ranging.tag_positions(rotation, translation, tags))
     normals = rng.standard_normal(distance.shape)
     # A link with nothing left of its information gives no reading.
@@ -139,12 +139,12 @@ def draw_bodies(
 
 
 def _free_places(problem: Problem, count: int, rng: np.random.Generator) -> FloatArray:
-    """Places (count, 3) uniform over the region without its obstacles."""
+    """Places (count, 3) uniform over the zones without the obstacles."""
     low, high = problem.corners()
     free = np.empty((0, 3))
     while len(free) < count:
         drawn = low + rng.random((2 * count, 3)) * (high - low)
-        free = np.concatenate([free, drawn[~problem.obstacles.contain(drawn)]])
+        free = np.concatenate([free, drawn[problem.free(drawn)]])
     return free[:count]
 
 

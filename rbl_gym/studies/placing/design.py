@@ -10,6 +10,7 @@ import numpy as np
 
 from rbl_gym import placement
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.placement import criteria, layouts, scene_files, search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.placement.scene_files import Problem
@@ -38,15 +39,20 @@ _RANDOM_DRAWS = 25
 
 
 class FreeTask(PlacementTask):
-    """A task scored over poses outside of the obstacles of its scene."""
+    """A task scored over poses in the zones of a problem, outside of its obstacles."""
+
+    problem: Problem
+
+    def obstacles(self, context: Context) -> Obstacles:
+        """Those of the problem."""
+        return self.problem.obstacles
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
         """Rotations (P, 3, 3) and offsets (P, 3), spread evenly over what is free."""
         low, high = self.scene.volume.bounds()
-        places = scene_files.free_points(low, high, self.scene.obstruction.boxes, self.n_poses)
         # Few places may be free: they are then taken in turns.
-        places = np.resize(places, (self.n_poses, 3))
+        places = np.resize(self.problem.free_places(self.n_poses), (self.n_poses, 3))
         half = 0.5 * (high - low)
         offsets = (places - 0.5 * (low + high)) / np.where(half > 0, half, 1.0)
         return PlacementTask(self.scene, self.n_anchors, n_poses=self.n_poses).poses[0], offsets
@@ -54,7 +60,9 @@ class FreeTask(PlacementTask):
 
 def free_task(problem: Problem, n_poses: int) -> FreeTask:
     """The problem's task over so many free poses."""
-    return FreeTask(problem.task.scene, problem.task.n_anchors, n_poses=n_poses)
+    task = FreeTask(problem.scene, problem.n_anchors, n_poses=n_poses)
+    object.__setattr__(task, "problem", problem)
+    return task
 
 
 class Design(NamedTuple):
@@ -140,9 +148,9 @@ def free_candidates(problem: Problem, rng: np.random.Generator, count: int) -> F
     ValueError
         If hardly any place is free.
     """
-    drawn = problem.task.scene.anchor_region.draw(rng.random((20 * count, 3)))
+    drawn = problem.mounts.draw(rng.random((20 * count, 3)))
     free = drawn[~problem.obstacles.contain(drawn)]
-    if len(free) < problem.task.n_anchors:
+    if len(free) < problem.n_anchors:
         raise ValueError("anchors have no legal place: obstacles cover all of them")
     return free[:count]
 
@@ -197,13 +205,13 @@ def place_anchors(
         rows.append({"n_anchors": number, **_summary(problem, best)})
     assert found is not None
     low, high = problem.corners()
-    scene, task = problem.task.scene, free_task(problem, _MANY_POSES)
+    scene, task = problem.scene, free_task(problem, _MANY_POSES)
     seen = placement.sight_fractions(task, problem.context, found.anchors)
     boxes = problem.obstacles.boxes
     result = {
         "scene": problem.name,
         "seed": seed,
-        "n_anchors": problem.task.n_anchors,
+        "n_anchors": problem.n_anchors,
         "region": {"low_m": low.tolist(), "high_m": high.tolist()},
         "obstacles": [
             {"low_m": (box[:3] - box[3:]).tolist(), "high_m": (box[:3] + box[3:]).tolist()}
