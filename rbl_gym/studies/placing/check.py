@@ -69,7 +69,7 @@ def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) 
         Bodies at random poses, and of which random numbers.
     """
     drawn = draw_bodies(problem, anchors, trials, np.random.default_rng([seed, 1]))
-    scene = problem.task.scene
+    scene = problem.scene
     prior = scene.prior_covariance
     with_prior = np.linalg.inv(drawn.information + np.linalg.inv(prior))
     laws: dict[str, tuple[ranging.NoiseLaw, bool]] = {"iterated EKF": (drawn.told, False)}
