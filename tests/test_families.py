@@ -12,12 +12,15 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily, family
-from rbl_gym.wrappers import EstimatePose, SelectAnchors
+from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose
 from tests.helpers import assert_same
+from tests.side_by_side import actions_of
 from tests.test_tracking_env import ID
 
 ROOM: dict[str, Any] = {
@@ -159,7 +162,7 @@ def test_an_episode_equals_that_of_its_scene_alone():
             np.testing.assert_array_equal(told["tags"][:n], scene.body)
             if len(got) == 5:
                 assert got[1] == plain[1]
-        assert results[0][1]["scene"]["name"] == scene.name
+        assert json.loads(results[0][1]["scene"])["name"] == scene.name
     assert len(seen) > 2
 
 
@@ -230,3 +233,86 @@ def test_frames_are_those_of_the_drawn_scene():
 def test_scene_beside_scenes_is_refused():
     with pytest.raises(ValueError, match="scene must not be given beside scenes, got 'hall'"):
         gym.make(ID, scene="hall", scenes=MIXED)
+
+
+# --- many worlds ------------------------------------------------------------------------------
+
+VARIED = [
+    {"name": "hall", "steps": 5, "blocked_information": {"choice": [0.0, 0.1]}},
+    {**ROOM, "links": {"drop_probability": 0.2, "nlos_probability": {"uniform": [0.0, 0.2]}}},
+    {"name": "icassp2013", "steps": 3},
+    {"name": "camsap2013", "steps": 4},
+    {"name": "auv_craft", "steps": 6, "n_anchors": {"integers": [2, 5]}},
+    {"name": "satellite", "steps": 4, "links": {"reach_m": 120.0}},
+]
+
+
+def side_by_side(mode, wrap, n=5, reward="bound"):
+    native = wrap[1](TrackingVectorEnv(n, scenes=VARIED, reward=reward, autoreset_mode=mode))
+    peer = SyncVectorEnv(
+        [lambda: wrap[0](TrackingEnv(scenes=VARIED, reward=reward))] * n, autoreset_mode=mode
+    )
+    return native, peer
+
+
+def assert_alike(got, want):
+    """As Gymnasium's own vector environment has it; `scene` it keeps as objects too."""
+    assert_same(got, want, rtol=2e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        (lambda env: env, lambda env: env),
+        (EstimatePose, VectorEstimatePose),
+        (
+            lambda env: EstimatePose(env, reward="worst-tag", observation="flat"),
+            lambda env: VectorEstimatePose(env, reward="worst-tag", observation="flat"),
+        ),
+    ],
+    ids=["raw", "dict", "flat"],
+)
+def test_world_i_equals_the_scalar_environment(mode, wrap):
+    native, peer = side_by_side(mode, wrap)
+    rng = np.random.default_rng(1)
+    assert_alike(native.reset(seed=3), peer.reset(seed=3))
+    for _ in range(16):
+        actions = actions_of(native, rng)
+        got, want = native.step(actions), peer.step(actions)
+        for a, b in zip(got, want, strict=True):
+            assert_alike(a, b)
+        assert native.observation_space.contains(got[0])
+
+
+def test_masks_restart_only_some_worlds():
+    native, peer = side_by_side(AutoresetMode.DISABLED, (EstimatePose, VectorEstimatePose))
+    assert_alike(native.reset(seed=2), peer.reset(seed=2))
+    zeros = np.zeros(native.action_space.shape, np.float32)
+    mask = np.array([False, True, False, True, False])
+    assert_alike(native.step(zeros)[:4], peer.step(zeros)[:4])
+    got, want = (env.reset(options={"reset_mask": mask}) for env in (native, peer))
+    assert_alike(got[0], want[0])
+    np.testing.assert_array_equal(got[1]["scene"] != None, mask)  # noqa: E711 (elementwise)
+    assert_alike(native.step(zeros)[:4], peer.step(zeros)[:4])
+
+
+def test_every_reset_draws_anew_and_says_so():
+    envs = gym.make_vec(ID, num_envs=6, scenes=[ROOM], reward="none")
+    _, info = envs.reset(seed=1)
+    first = [json.loads(one)["noise"]["floor_m"] for one in info["scene"]]
+    for _ in range(7):
+        *_, info = envs.step(np.zeros(6, int))
+    assert info["_scene"].all()
+    again = [json.loads(one)["noise"]["floor_m"] for one in info["scene"]]
+    assert len({*first, *again}) == 12
+
+
+def test_what_many_worlds_cannot_have_is_said():
+    with pytest.raises(ValueError, match="render_mode must be None with scenes"):
+        TrackingVectorEnv(2, scenes=VARIED, render_mode="rgb_array")
+    with pytest.raises(ValueError, match="vectorization_mode='sync'"):
+        VectorEstimatePose(TrackingVectorEnv(2, scenes=["hall", "drone_yard"]), "uc-kf")
+    # One by one they do.
+    env = EstimatePose(gym.make(ID, scenes=["hall", "drone_yard"], reward="none"), "uc-kf")
+    assert len(episode(env, 1)) == 101

@@ -13,6 +13,7 @@ from scipy.spatial.distance import cdist
 
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
+from rbl_gym.measurements.noise_laws import StackedNoise
 from rbl_gym.measurements.ranging import LinkModel, RangeNoise, SquaredRangeNoise
 
 PROPERTY = settings(deadline=None, derandomize=True, max_examples=40)
@@ -323,3 +324,28 @@ def test_reference_to_a_tag_that_is_not_there_is_refused(tag):
     message = f"reference_tag must be below the number of tags 3, got {tag}"
     with pytest.raises(ValueError, match=message):
         RangeNoise(0.1, reference_tag=tag).variance(RANGES)
+
+
+def test_stacked_laws_equal_each_alone():
+    rng = np.random.default_rng(2)
+    laws = [
+        RangeNoise(0.1),
+        RangeNoise(0.05, 0.02),
+        RangeNoise(0.0, 0.01, reference_tag=0),
+        RangeNoise(0.02, 0.01, reference_tag=2),
+        SquaredRangeNoise(0.3),
+    ]
+    stacked = StackedNoise(np.array([law.numbers for law in laws]))
+    ranges = rng.uniform(1, 30, (len(laws), 4, 3))
+    links = rng.random(ranges.shape) < 0.6
+    normals = rng.standard_normal(ranges.shape)
+    for i, law in enumerate(laws):
+        for mask in (None, links):
+            own = None if mask is None else mask[i]
+            used = np.ones((4, 3), bool) if own is None else own
+            for name in ("variance", "squared_range_variance"):
+                got = getattr(stacked, name)(ranges, mask)[i]
+                want = np.broadcast_to(getattr(law, name)(ranges[i], own), (4, 3))
+                np.testing.assert_allclose(got[used], want[used], rtol=1e-12)
+        got = stacked.sample(ranges, normals)[i]
+        np.testing.assert_allclose(got, law.sample(ranges[i], normals[i]), rtol=1e-12)

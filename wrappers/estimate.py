@@ -12,13 +12,14 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
 from rbl_gym import estimators, metrics, rendering
-from rbl_gym.checks import check_one_of
+from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import check_takes_noise, factory_of, reads
 from rbl_gym.measurements.bearing import AngleNoise
-from rbl_gym.measurements.noise_laws import WeakenedNoise
+from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise
 from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.worlds.stacked import StackedScenes
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
 OBSERVATIONS = ("dict", "flat")
@@ -200,7 +201,7 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
         told = {"measurement": "doa", **told}
     filter = estimators.make(
         name,
-        tags=np.asarray(scene.tags),
+        tags=scene.body,
         noise=law,
         process=scene.process,
         **{**scene.links.options, **inertial_options(name, scene), **told},
@@ -262,12 +263,26 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
     if "angles" in observation:
         return filter.update(state, observation["angles"], observation["station"])
     ranges, anchors, links = observation["ranges"], observation["anchors"], observation["links"]
+    if isinstance(scene, StackedScenes):
+        seen = links.astype(np.bool_, copy=False)
+        law = LinkNoise(np.sqrt(_variance(scene, observation, seen)))
+        return filter.update(state, ranges, anchors, seen, noise=law)
     if "quality" not in observation:
         every = np.count_nonzero(links) == links.size
         return filter.update(state, ranges, anchors, None if every else links)
     seen = links.astype(np.bool_, copy=False)
     law = WeakenedNoise(scene.noise, observation["quality"])
     return filter.update(state, ranges, anchors, seen, noise=law)
+
+
+def _variance(
+    scene: StackedScenes, observation: Mapping[str, np.ndarray], links: BoolArray
+) -> FloatArray:
+    """Variances (B, M, N) of an epoch of many worlds, 1 where nothing was measured."""
+    variance = scene.noise.variance(observation["ranges"], links)
+    if "quality" in observation:
+        variance = variance / np.where(links, observation["quality"][..., None], 1.0)
+    return np.where(links, variance, 1.0)
 
 
 def present(
@@ -320,28 +335,23 @@ def flat_observation(
     of the estimated rotation (6); anchors relative to the estimate over the scene's extent (3
     M); log of their distances over that extent (M). Cut to +-10.
     """
-    corners = np.array([*scene.volume.bounds(), *scene.anchor_region.bounds()])
-    extent = np.linalg.norm(np.ptp(corners, axis=0)) / 2
-    low, high = scene.volume.bounds()
-    half = np.maximum(0.5 * (high - low), 1e-3 * extent)
-    speed = max(scene.speed_m_s, float(np.abs(scene.twist[3:]).max()), 1e-3)
-    scale = np.array([np.pi / 10 / scene.dt] * 3 + [speed] * 3)
+    middle, half, extent, rates = scene.scales
     std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
     station = "station" in observation
     anchors = observation["station"][..., None, :] if station else observation["anchors"]
     relative = anchors - belief.translation[..., None, :]
     distance = metrics.length(relative)
     batch = belief.translation.shape[:-1]
-    far = np.log(np.maximum(distance / extent, 1e-6))
+    far = np.log(np.maximum(distance / extent[..., None], 1e-6))
     masks = [observation["anchor_mask"]] if "anchor_mask" in observation else []
     for mask in masks:
         relative, far = relative * mask[..., None], far * mask
     parts = [
-        (belief.translation - 0.5 * (low + high)) / half,
-        observation["twist"] / scale,
+        (belief.translation - middle) / half,
+        observation["twist"] / rates,
         np.log(np.maximum(std, 1e-12)),
         np.swapaxes(belief.rotation, -1, -2)[..., :2, :].reshape(*batch, 6),
-        (relative / extent).reshape(*batch, -1),
+        (relative / extent[..., None, None]).reshape(*batch, -1),
         far,
         *masks,
     ]

@@ -75,7 +75,8 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
         RecordConstructorArgs.__init__(self)
         VectorWrapper.__init__(self, env)
-        self._shape = env.num_envs, scene_of(env).n_anchors
+        scene_of(env)
+        self._shape = env.num_envs, env.single_observation_space["links"].shape[0]
         self.single_action_space = spaces.MultiBinary(self._shape[1])
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._still = _zeros(env.action_space)

@@ -12,10 +12,11 @@ from gymnasium.vector.utils import batch_space
 
 from rbl_gym import metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
-from rbl_gym.estimators import PoseBelief
+from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import reads
 from rbl_gym.wrappers.estimate import (
     OBSERVATIONS,
+    family_of,
     make_filter,
     measured_of,
     observation_space,
@@ -58,11 +59,14 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             self, filter=filter, options=options, reward=reward, observation=observation
         )
         VectorWrapper.__init__(self, env)
-        self._scene = scene_of(env)
+        self._scene: Any = scene_of(env)
+        self._named = filter, options
+        self._varied = family_of(env) is not None
+        if self._varied:
+            self._scene = env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
         self._reward = reward_of(reward)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
-        self._tags = self._scene.body
-        self._filter = make_filter(env, self._scene, filter, options)
+        self._filter = self._filter_of(self._scene)
         self._state: Any = None
         self._belief: PoseBelief | None = None
         single = observation_space(self._kind, env.single_observation_space, self._scene)
@@ -75,7 +79,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         """Start the filters of the worlds that reset from their priors."""
         observation, info = self.env.reset(seed=seed, options=options)
         info = with_bound(info)
-        self._start(observation, info, info["_prior_rotation"])
+        self._begin(observation, info, info["_prior_rotation"])
         self._report(self._figures(info), info)
         return self._present(observation), info
 
@@ -98,7 +102,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         if last.any():
             self._finish(info, figures, last)
         if fresh.any():
-            self._start(observation, info, fresh)
+            self._begin(observation, info, fresh)
             figures = self._figures(info)
         self._report(figures, info)
         return self._present(observation), reward, terminated, truncated, info
@@ -106,26 +110,48 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def _advance(self, observation: dict[str, np.ndarray], moved: BoolArray) -> None:
         """Predict and update the worlds that stepped."""
         measured = measured_of(observation)
-        everywhere = bool(moved.all())
-        state = self._state if everywhere else _rows(self._state, moved)
-        if not everywhere:
+        if moved.all():
+            state, scene, filter = self._state, self._scene, self._filter
+        else:
+            state, (scene, filter) = _rows(self._state, moved), self._of(moved)
             measured = {key: value[moved] for key, value in measured.items()}
-        state = self._filter.predict(state, measured[reads(self._filter)], self._scene.dt)
-        state = update(self._filter, state, measured, self._scene)
-        self._put(state, moved)
+        state = filter.predict(state, measured[reads(filter)], scene.dt)
+        self._put(update(filter, state, measured, scene), filter, moved)
 
-    def _start(
+    def _begin(
         self, observation: dict[str, np.ndarray], info: dict[str, Any], fresh: BoolArray
     ) -> None:
         """States of new episodes, from the priors in `info`, updated with their first ranges."""
+        if self._varied:
+            self._scene = self.env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
+            self._filter = self._filter_of(self._scene)
+        scene, filter = self._of(fresh)
         prior = [info[f"prior_{name}"][fresh] for name in ("rotation", "translation", "covariance")]
-        state = self._filter.initial(*prior)
         epoch = {key: value[fresh] for key, value in measured_of(observation).items()}
-        self._put(update(self._filter, state, epoch, self._scene), fresh)
+        self._put(update(filter, filter.initial(*prior), epoch, scene), filter, fresh)
 
-    def _put(self, state: Any, where: BoolArray) -> None:
+    def _of(self, where: BoolArray) -> tuple[Any, Filter]:
+        """Scene and filter of the worlds of a mask."""
+        if not self._varied or where.all():
+            return self._scene, self._filter
+        scene = self._scene.rows(where)
+        return scene, self._filter_of(scene)
+
+    def _filter_of(self, scene: Any) -> Filter:
+        try:
+            return make_filter(self.env, scene, *self._named)
+        except ValueError as error:
+            if not self._varied:
+                raise
+            raise ValueError(
+                f"{error} (worlds with scenes of their own need a filter that takes tags and "
+                "process noise of each, as 'iekf'; for others: gym.make_vec(..., "
+                "vectorization_mode='sync') of EstimatePose)"
+            ) from error
+
+    def _put(self, state: Any, filter: Filter, where: BoolArray) -> None:
         """Take over the states of some worlds, and their beliefs."""
-        belief = self._filter.belief(state)
+        belief = filter.belief(state)
         if where.all():
             self._state, self._belief = state, belief
         else:
@@ -135,8 +161,14 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def _figures(self, info: Mapping[str, Any]) -> metrics.Figures:
         """Errors of the beliefs against the true poses of the infos."""
         assert self._belief is not None
-        truth = info["rotation"], info["translation"]
-        return metrics.judge(*self._belief[:3], *truth, self._tags)
+        told = *self._belief[:3], info["rotation"], info["translation"]
+        if not self._varied:
+            return metrics.judge(*told, self._scene.body)
+        figures = np.empty((len(metrics.Figures._fields), self.num_envs))
+        for count, alike in self._scene.bodies():
+            tags = self._scene.body[alike, :count]
+            figures[:, alike] = metrics.judge(*(field[alike] for field in told), tags)
+        return metrics.Figures(*figures)
 
     def _finish(self, info: dict[str, Any], figures: metrics.Figures, last: BoolArray) -> None:
         """The last beliefs of ended episodes into copies of `final_obs` and `final_info`."""
@@ -145,7 +177,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         info["final_info"] = with_bound(info["final_info"])
         for i in np.flatnonzero(last):
             belief = PoseBelief(*(field[i].copy() for field in self._belief))
-            info["final_obs"][i] = present(self._kind, info["final_obs"][i], belief, self._scene)
+            scene = self._scene.scenes[i] if self._varied else self._scene
+            info["final_obs"][i] = present(self._kind, info["final_obs"][i], belief, scene)
         for name, value in figures._asdict().items():
             info["final_info"][name] = np.where(last, value, 0.0)
             info["final_info"][f"_{name}"] = last.copy()

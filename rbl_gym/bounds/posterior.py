@@ -160,7 +160,7 @@ def step_of_angles(
 
 
 def _predicted(prior: FloatArray, twist: FloatArray, dt: ArrayLike, std: FloatArray) -> FloatArray:
-    process = ProcessNoise(tuple(std[:3].tolist()), tuple(std[3:].tolist()))
+    process = ProcessNoise(std[..., :3], std[..., 3:])  # pyright: ignore[reportArgumentType]
     return predict_information(prior, twist, dt, process)
 
 

@@ -219,7 +219,8 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         info: dict[str, np.ndarray] = {}
         told = self._restart(chosen, [self._generators[i] for i in chosen])
         for name, value in (told or {}).items():
-            info[name] = np.zeros((self.num_envs, *value.shape[1:]), value.dtype)
+            nothing = None if value.dtype == np.object_ else 0
+            info[name] = np.full((self.num_envs, *value.shape[1:]), nothing, value.dtype)
             info[name][chosen] = value
             info[f"_{name}"] = mask.copy()
         return info

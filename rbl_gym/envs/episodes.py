@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,7 +10,9 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.worlds import simulation
+from rbl_gym.worlds.families import SceneFamily, padded
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.worlds.stacked import StackedScenes
 
 # Worlds that are drawn and built together: what they need on the way fits the cache.
 _BLOCK = 256
@@ -83,6 +86,61 @@ class EpisodeStore:
         if self._num_envs == 1 or (epochs == epochs[0]).all():
             return epochs[0]
         return epochs, np.arange(self._num_envs)
+
+
+class FamilyStore:
+    """The running episodes of B worlds, each with a scene of its own: an `EpisodeStore` of those.
+
+    World i draws its scene, then its episode, as the scalar environment does.
+
+    Attributes
+    ----------
+    stack
+        The scenes of the worlds.
+    """
+
+    def __init__(self, family: SceneFamily, num_envs: int) -> None:
+        self._family = family
+        first = family.corners[0]
+        self.stack = StackedScenes.of(family, [first] * num_envs)
+        m, n, epochs = family.n_anchors, family.n_tags, family.steps + 1
+        shapes = (3, 3), (3,), (6,), (m, n), (2, m, n)
+        self._timed = [np.zeros((epochs, num_envs, *shape)) for shape in shapes]
+
+    def begin(
+        self, worlds: np.ndarray, generators: Sequence[np.random.Generator]
+    ) -> dict[str, np.ndarray]:
+        """New episodes of some worlds; as `EpisodeStore.begin`, and the drawn overrides."""
+        drawn, starts, scenes = [], [], []
+        for world, generator in zip(worlds.tolist(), generators, strict=True):
+            scene, overrides = self._family.draw(generator)
+            episode = simulation.draw_episode(scene, generator)
+            self._write(world, simulation.whole(episode))
+            anchors = padded(episode.anchors, (self._family.n_anchors, 3))
+            starts.append((*episode[-4:-1], anchors))
+            scenes.append(scene)
+            drawn.append(json.dumps(overrides))
+        self.stack = self.stack.replaced(worlds, scenes)
+        names = simulation.Episode._fields[-4:]
+        told = {
+            name: np.stack(parts)
+            for name, parts in zip(names, zip(*starts, strict=True), strict=True)
+        }
+        overrides = np.empty(len(drawn), dtype=object)
+        overrides[:] = drawn
+        return {**told, "scene": overrides}
+
+    def _write(self, world: int, fields: simulation.Epoch) -> None:
+        for stored, field in zip(self._timed, fields, strict=False):
+            row = stored[:, world]
+            row[...] = 0.0
+            if field is not None:
+                row[tuple(slice(size) for size in field.shape)] = field
+
+    def at(self, epochs: np.ndarray) -> simulation.Epoch:
+        """All worlds, each at its epoch (B,); random numbers not to be written to."""
+        where = epochs, np.arange(len(epochs))
+        return simulation.Epoch(*(field[where] for field in self._timed))
 
 
 def rows_of(worlds: np.ndarray) -> slice | np.ndarray:

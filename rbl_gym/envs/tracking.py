@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -112,8 +113,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     M and N are then the most anchors and tags of the family. Rows beyond those of the drawn scene
     are zeros, and their links 0. The observation has three more keys: `anchor_mask` (M,) and
     `tag_mask` (N,), int8, 1 for those that there are; `tags` (N, 3), metres, body frame. `quality`
-    is there if any scene has obstacles. `info["scene"]` of the reset holds the overrides that were
-    drawn. `env.unwrapped.scene` is the scene of the episode. Actions move the anchors that there
+    is there if any scene has obstacles. `info["scene"]` of the reset is JSON: the overrides that
+    were drawn. `env.unwrapped.scene` is the scene of the episode. Actions move the anchors that there
     are; if no scene of the family moves its anchors, the action is ``Discrete(1)``.
 
     ## Version history
@@ -170,7 +171,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         info["prior_translation"] = episode.prior_translation.copy()
         info["prior_covariance"] = episode.prior_covariance.copy()
         if drawn is not None:
-            info["scene"] = drawn
+            info["scene"] = json.dumps(drawn)
         return observation, info
 
     def step(

@@ -11,17 +11,20 @@ from gymnasium.vector import AutoresetMode
 from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.batch import BatchEnv
-from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.envs.episodes import EpisodeStore, FamilyStore
 from rbl_gym.envs.tracking import (
     REWARDS,
     action_space,
     measure,
     observation_space,
+    worlds_of,
 )
-from rbl_gym.worlds import scene_bounds, scenes, simulation
+from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.worlds.stacked import StackedScenes
 
-_PRIOR = ("prior_rotation", "prior_translation", "prior_covariance")
+# What only the start of an episode tells.
+_TOLD = ("prior_rotation", "prior_translation", "prior_covariance", "scene")
 
 
 class TrackingVectorEnv(BatchEnv):
@@ -38,6 +41,8 @@ class TrackingVectorEnv(BatchEnv):
         How many.
     scene, reward, render_mode
         As `TrackingEnv`.
+    scenes
+        As `TrackingEnv`: each world draws a scene of its own at every reset. Not rendered.
     max_episode_steps
         Truncate after so many steps, if fewer than the scene's.
     autoreset_mode
@@ -52,20 +57,42 @@ class TrackingVectorEnv(BatchEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        scenes: Any = None,
     ) -> None:
-        self.scene = scenes.get(scene)
+        self.family, self.scene = worlds_of(scene, scenes)
         self.reward_mode = check_one_of("reward", reward, REWARDS)
-        self.single_observation_space = observation_space(self.scene)
-        self.single_action_space = action_space(self.scene)
+        worlds = self.family or self.scene
+        self.single_observation_space = observation_space(worlds)
+        self.single_action_space = action_space(worlds)
+        if self.family is not None and render_mode is not None:
+            raise ValueError(
+                "render_mode must be None with scenes in a vector environment, got "
+                f"{render_mode!r}: render a scalar one"
+            )
         self.film = rendering.film_of(render_mode, self.scene)
-        self._configure(num_envs, render_mode, self.scene.steps, max_episode_steps, autoreset_mode)
-        self._episodes = EpisodeStore(self.scene, num_envs)
-        self._anchors = np.empty((num_envs, self.scene.n_anchors, 3))
+        self._configure(num_envs, render_mode, worlds.steps, max_episode_steps, autoreset_mode)
+        self._episodes = (
+            EpisodeStore(self.scene, num_envs)
+            if self.family is None
+            else FamilyStore(self.family, num_envs)
+        )
+        self._longest = self.steps_limit
+        self._anchors = np.zeros((num_envs, worlds.n_anchors, 3))
         self._prior_covariance = np.empty((num_envs, 6, 6))
-        size = scene_bounds.information_size(self.scene)
+        size = 6 if self.family is not None else scene_bounds.information_size(self.scene)
         self._information = np.empty((num_envs, size, size))
         self._score_m = np.empty(num_envs)
         self._seen: tuple[simulation.Epoch, dict[str, np.ndarray]] | None = None
+
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode, of a family those of the longest."""
+        return self._longest
+
+    @property
+    def world(self) -> Scene | StackedScenes:
+        """The scene; of a family those of the worlds now, side by side."""
+        return self._episodes.stack if isinstance(self._episodes, FamilyStore) else self.scene
 
     def _restart(
         self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
@@ -74,16 +101,21 @@ class TrackingVectorEnv(BatchEnv):
         self._anchors[chosen] = start["anchors"]
         self._prior_covariance[chosen] = start["prior_covariance"]
         self._seen = None
+        if isinstance(self._episodes, FamilyStore):
+            self.steps_limit = np.minimum(self._episodes.stack.arrays.steps, self._longest)
         if self.reward_mode == "bound":
             self._carry_bound(chosen, started=True)
-        return {name: start[name] for name in _PRIOR}
+        return {name: value for name, value in start.items() if name in _TOLD}
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
         self._seen = None
-        if self.scene.anchor_speed_m_s > 0:
+        if (self.family or self.scene).anchor_speed_m_s > 0:
             # All at once: those that reset in this step get their anchors from the new episode.
-            moved = simulation.move_anchors(self.scene, self._anchors, actions)
+            if isinstance(self._episodes, FamilyStore):
+                moved = self._episodes.stack.move_anchors(self._anchors, actions)
+            else:
+                moved = simulation.move_anchors(self.scene, self._anchors, actions)
             if moving.all():
                 self._anchors = moved
             else:
@@ -100,7 +132,7 @@ class TrackingVectorEnv(BatchEnv):
         """
         if self._seen is None:
             at = self._episodes.at(self._epochs)
-            self._seen = at, measure(self.scene, at, self._anchors)
+            self._seen = at, measure(self.world, at, self._anchors)  # pyright: ignore[reportArgumentType]
         return self._seen
 
     def _observe(self) -> dict[str, np.ndarray]:
@@ -108,7 +140,14 @@ class TrackingVectorEnv(BatchEnv):
         seen = {key: field for key, field in told.items() if key != "nlos"}
         if at.readings is not None:
             seen["inertial"] = at.readings.copy()
-        return {**seen, "anchors": self._anchors.copy(), "twist": at.twist}
+        seen |= {"anchors": self._anchors.copy(), "twist": at.twist}
+        if not isinstance(self._episodes, FamilyStore):
+            return seen
+        arrays = self._episodes.stack.arrays
+        if "quality" in seen:
+            seen["quality"] = seen["quality"] * arrays.anchor_mask
+        masks = {name: getattr(arrays, name).copy() for name in ("tags", "anchor_mask", "tag_mask")}
+        return {key: (seen | masks)[key] for key in self.single_observation_space}
 
     def _inform(self) -> dict[str, np.ndarray]:
         at, told = self._look()
@@ -140,10 +179,35 @@ class TrackingVectorEnv(BatchEnv):
             at = simulation.Epoch(*(None if field is None else field[rows] for field in at))  # pyright: ignore[reportArgumentType]
             anchors, links = anchors[rows], links[rows]
             information, prior = information[rows], prior[rows]
-        information, score_m = scene_bounds.posterior_step(
-            self.scene, at, anchors, links, None if started else information, prior
+        information, score_m = self._bound_of(
+            rows, at, anchors, links, None if started else information, prior
         )
         if len(rows) < self.num_envs:
             self._information[rows], self._score_m[rows] = information, score_m
         else:
             self._information, self._score_m = information, score_m
+
+    def _bound_of(
+        self,
+        rows: np.ndarray,
+        at: simulation.Epoch,
+        anchors: FloatArray,
+        links: BoolArray,
+        previous: FloatArray | None,
+        prior: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]:
+        """`scene_bounds.posterior_step` of some worlds; of a family, of alike bodies together."""
+        if not isinstance(self._episodes, FamilyStore):
+            return scene_bounds.posterior_step(self.scene, at, anchors, links, previous, prior)
+        stack = self._episodes.stack.rows(rows)
+        information, score = np.empty((len(rows), 6, 6)), np.empty(len(rows))
+        for count, alike in stack.bodies():
+            information[alike], score[alike] = scene_bounds.posterior_step(
+                stack.rows(alike).with_tags(count),  # pyright: ignore[reportArgumentType]
+                simulation.Epoch(*(None if f is None else f[alike] for f in at)),  # pyright: ignore[reportArgumentType]
+                anchors[alike],
+                links[alike, :, :count],
+                None if previous is None else previous[alike],
+                prior[alike],
+            )
+        return information, score

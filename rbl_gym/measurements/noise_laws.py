@@ -18,7 +18,7 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
 __all__ = [
     "NOISE_FORMS", "NOISE_LAWS", "LinkNoise", "NoiseLaw", "RangeNoise", "SquaredRangeNoise",
-    "WeakenedNoise", "reference_range",
+    "StackedNoise", "WeakenedNoise", "reference_range",
 ]  # fmt: skip
 
 
@@ -199,6 +199,58 @@ class SquaredRangeNoise:
 
 
 @dataclass(frozen=True, eq=False)
+class StackedNoise:
+    """Laws of many worlds side by side, each of its own kind.
+
+    Parameters
+    ----------
+    numbers
+        (..., 4), those of `RangeNoise.numbers` or `SquaredRangeNoise.numbers` in each row.
+    """
+
+    numbers: FloatArray
+
+    def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
+        """Variance of the ranges [m^2], (..., M, N); see `NoiseLaw`."""
+        squared, first, second = self._parts
+        scale = self._scale(ranges, links)
+        r = ranges if links is None else np.where(links, ranges, 1.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            of_squares = (first * scale) ** 2 / (4 * r**2)
+        return np.where(squared, of_squares, first**2 + (second * scale) ** 2)
+
+    def squared_range_variance(
+        self, ranges: FloatArray, links: BoolArray | None = None
+    ) -> FloatArray:
+        """Variance of the squared ranges [m^4], (..., M, N); see `NoiseLaw`."""
+        squared, first, second = self._parts
+        scale = self._scale(ranges, links)
+        of_ranges = 4 * scale**2 * (first**2 + (second * scale) ** 2)
+        return np.where(squared, (first * scale) ** 2, of_ranges)
+
+    def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
+        """Ranges with noise of these laws, never below zero."""
+        squared, first, second = self._parts
+        scale = self._scale(distances, None)
+        of_ranges = distances + np.sqrt(first**2 + (second * scale) ** 2) * normals
+        squares = np.maximum(distances**2 + first * scale * normals, 0.0)
+        return np.where(squared, np.sqrt(squares), np.maximum(of_ranges, 0.0))
+
+    @property
+    def _parts(self) -> tuple[BoolArray, FloatArray, FloatArray]:
+        """Whether a law is that of squared ranges, and its two parameters, (..., 1, 1)."""
+        kind, first, second, _ = np.moveaxis(self.numbers, -1, 0)[..., None, None]
+        return kind == 1, first, second
+
+    def _scale(self, ranges: FloatArray, links: BoolArray | None) -> FloatArray:
+        """The range (..., M, N) that tells a link's noise: its own, or that of the reference."""
+        reference, scale = self.numbers[..., 3, None, None], ranges
+        for tag in np.unique(reference[reference >= 0]).astype(int).tolist():
+            scale = np.where(reference == tag, reference_range(ranges, tag, links), scale)
+        return scale
+
+
+@dataclass(frozen=True, eq=False)
 class LinkNoise:
     """A standard deviation for every link, as radios report them.
 
@@ -276,13 +328,15 @@ def numbers_of(noise: NoiseLaw, n_tags: int) -> FloatArray | None:
         If there is no such reference tag.
     """
     numbers = getattr(noise, "numbers", None)
-    if numbers is not None and numbers[3] >= n_tags:
+    if numbers is not None and numbers.ndim == 1 and numbers[3] >= n_tags:
         _check_reference(int(numbers[3]), n_tags)
     return numbers
 
 
 def law_of(numbers: FloatArray) -> NoiseLaw:
-    """The law that has these `numbers`."""
+    """The law that has these `numbers`; the laws of many worlds of (..., 4)."""
+    if numbers.ndim > 1:
+        return StackedNoise(numbers)
     kind, first, second, reference = numbers.tolist()
     if kind == 1:
         return SquaredRangeNoise(first)

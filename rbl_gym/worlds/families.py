@@ -53,6 +53,11 @@ class SceneFamily:
                     "scenes must have no inertial sensor: its readings have a shape of their own "
                     f"in every scene, got one in {scene.name!r}"
                 )
+            if scene.links.offset is not None:
+                raise ValueError(
+                    "scenes must have ranges without an offset, got links.offset "
+                    f"{scene.links.offset!r} in {scene.name!r}"
+                )
 
     @functools.cached_property
     def corners(self) -> tuple[Scene, ...]:
@@ -82,6 +87,11 @@ class SceneFamily:
     def n_tags(self) -> int:
         """The most tags of a body."""
         return max(len(scene.tags) for scene in self.corners)
+
+    @functools.cached_property
+    def n_boxes(self) -> int:
+        """The most obstacles of a scene."""
+        return max(len(scene.obstacles) for scene in self.corners)
 
     @property
     def steps(self) -> int:

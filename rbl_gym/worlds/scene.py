@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,34 @@ _FIELD_KINDS: dict[str, tuple[type, ...]] = {
 }
 TRAJECTORIES = ("waypoints", "constant", "random-twist", "orbit", "lawn-mower")
 Points = tuple[tuple[float, float, float], ...]
+
+
+class FlatScales(NamedTuple):
+    """What is large in a scene, for observations of order one.
+
+    Attributes
+    ----------
+    middle, half
+        Of the volume (..., 3), metres.
+    extent
+        Half the diagonal of the box around volume and anchors (...), metres.
+    rates
+        Of a twist (..., 6): pi/10 in a step, and the body's speed.
+    """
+
+    middle: FloatArray
+    half: FloatArray
+    extent: FloatArray
+    rates: FloatArray
+
+    def joined(self) -> FloatArray:
+        """All of them as one array (..., 13)."""
+        return np.concatenate([self.middle, self.half, self.extent[..., None], self.rates], axis=-1)
+
+    @classmethod
+    def split(cls, joined: FloatArray) -> FlatScales:
+        """The inverse of `joined`."""
+        return cls(joined[..., :3], joined[..., 3:6], joined[..., 6], joined[..., 7:])
 
 
 @dataclass(frozen=True)
@@ -204,6 +233,17 @@ class Scene:
         covariance = np.diag(np.square(std))
         covariance.flags.writeable = False
         return covariance
+
+    @functools.cached_property
+    def scales(self) -> FlatScales:
+        """What is large in it."""
+        low, high = self.volume.bounds()
+        corners = np.array([low, high, *self.anchor_region.bounds()])
+        extent = np.linalg.norm(np.ptp(corners, axis=0)) / 2
+        half = np.maximum(0.5 * (high - low), 1e-3 * extent)
+        speed = max(self.speed_m_s, float(np.abs(self.twist[3:]).max()), 1e-3)
+        rates = np.array([np.pi / 10 / self.dt] * 3 + [speed] * 3)
+        return FlatScales(0.5 * (low + high), half, np.asarray(extent), rates)
 
     @functools.cached_property
     def speed_std_m_s(self) -> float:

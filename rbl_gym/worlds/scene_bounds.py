@@ -44,7 +44,7 @@ def posterior_step(
     ValueError
         If the information is singular or not finite.
     """
-    law = ranging.numbers_of(scene.noise, len(scene.tags))
+    law = ranging.numbers_of(scene.noise, scene.body.shape[-2])
     assert law is not None  # the laws of scenes have numbers
     if scene.inertial is not None:
         return _with_inertial(scene, at, anchors, links, previous, prior_covariance)

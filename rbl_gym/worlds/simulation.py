@@ -303,7 +303,7 @@ def measure(
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     measured = ranges > 0
     links = measured if links is None else links & measured
-    if quality is not None and not scene.blocked_information:
+    if quality is not None and not np.all(scene.blocked_information):
         links &= quality[..., None] > 0
         ranges[~links] = 0.0
     measured = ranging.Measurement(ranges, links, nlos)
