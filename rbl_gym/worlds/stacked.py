@@ -22,8 +22,6 @@ from rbl_gym.worlds import simulation
 from rbl_gym.worlds.families import SceneFamily, padded
 from rbl_gym.worlds.scene import FlatScales, Scene
 
-__all__ = ["StackedScenes"]
-
 # Where boxes stand that a scene does not have: without a size, they block nothing.
 _NOWHERE = np.array([1e12, 1e12, 1e12, 0.0, 0.0, 0.0])
 
