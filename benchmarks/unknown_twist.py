@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from rbl_gym import bounds, metrics
-from rbl_gym.bounds import twist as twist_bounds
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.motion import unknown_twist as ut
@@ -97,8 +96,9 @@ def drawn(sensor: ut.TwistSensor | None, options: argparse.Namespace) -> dict[st
                 std = np.where(np.isfinite(sensor.std()), sensor.std(), 0.0)
                 reading = sensor.read(path.rotation[:, k - 1], twist)
                 reading = reading + std * rng.standard_normal((trials, 6))
-            rest = SCENE.noise, twist, SCENE.dt, SCENE.process, LAW
-            J = twist_bounds.posterior_crb_step(J, anchors, tags, *pose, *rest, sensor=sensor)
+            moved = bounds.UnknownTwist(twist, SCENE.dt, SCENE.process, LAW, sensor)
+            epoch = bounds.RangeEpoch(anchors, tags, *pose, SCENE.noise)
+            J = bounds.posterior_step(J, epoch, moved)
         ranges = ranging.simulate(anchors, tags, *pose, SCENE.noise, rng).ranges
         begin = time.process_time()
         if k:

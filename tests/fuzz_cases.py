@@ -12,6 +12,7 @@ from rbl_gym.bounds import doa, links
 from rbl_gym.estimators.filter import reads
 from rbl_gym.geometry import bodies, obstacles, regions, rotations
 from rbl_gym.measurements import bearing, ranging
+from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.networks import bounds as network_bounds
 from rbl_gym.networks import graphs, rigidity, sensing
 from rbl_gym.worlds import scenes
@@ -154,8 +155,16 @@ case(links.expected_information, **PLACES, link_model=LINK_MODEL, nlos_std_m=1.0
 case(links.realised_crb, **PLACES, link_model=LINK_MODEL, rng=Rng, draws=3,
      prior_information=np.eye(6))  # fmt: skip
 case(links.nlos_efficiency, probability=0.1, bias_m=5.0, std_m=0.1, bias_std_m=1.0)
-case(links.bias_information, **PLACES, links=LINKS)
-case(links.with_biases, pose_information=np.eye(6), bias_std_m=0.1, n_biases=3)
-case(links.marginal_information, joint=np.eye(8))
-case(links.posterior_bias_step, J=np.eye(11), **PLACES, twist=TWIST, dt=0.5,
-     process=PROCESS, groups="anchor", bias_walk_m=0.1)  # fmt: skip
+case(bounds.range_information, "anchor_std_m", **PLACES, anchor_std_m=np.full(5, 0.1))
+case(bounds.Nuisances, anchor_std_m=0.1)
+case(bounds.with_nuisances, information=np.eye(6), count=3)
+case(bounds.marginal_information, joint=np.eye(8))
+
+
+def _step(J, anchors, tags, rotation, translation, noise, links, twist, dt):  # noqa: ANN
+    nuisances = bounds.Nuisances(None, 0.1, LinkBias(0.1, 5.0), "anchor")
+    epoch = bounds.RangeEpoch(anchors, tags, rotation, translation, noise, links)
+    return bounds.posterior_step(J, epoch, bounds.KnownTwist(twist, dt, PROCESS), nuisances)
+
+
+case(_step, "posterior_step", J=np.eye(26), **PLACES, links=LINKS, twist=TWIST, dt=0.5)

@@ -8,7 +8,6 @@ import pytest
 from scipy import optimize, stats
 
 from rbl_gym import bounds, estimators, metrics, motion
-from rbl_gym.bounds import twist as twist_bounds
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.named import iekf_bias, iekf_cv
@@ -149,8 +148,9 @@ def test_unknown_twist_in_the_drone_yard_reaches_the_bound_and_is_consistent(sen
                 reading = sensor.read(path.rotation[:, k - 1], twist)
                 reading = reading + std * rng.standard_normal((trials, 6))
             state = filter.predict(state, reading, scene.dt)
-            rest = scene.noise, twist, scene.dt, scene.process, law
-            J = twist_bounds.posterior_crb_step(J, anchors, tags, *pose, *rest, sensor=sensor)
+            moved = bounds.UnknownTwist(twist, scene.dt, scene.process, law, sensor)
+            epoch = bounds.RangeEpoch(anchors, tags, *pose, scene.noise)
+            J = bounds.posterior_step(J, epoch, moved)
         ranges = simulate(rng, anchors, tags, *pose, scene.noise)
         state = filter.update(state, ranges, anchors)
         error = metrics.pose_error(state.rotation, state.translation, *pose)

@@ -302,26 +302,27 @@ def test_the_bound_by_hand():
     expected = np.linalg.inv(F @ np.linalg.inv(start) @ F.T + Q)
     after = before @ moved.rotation
     expected[:6, :6] += bounds.range_information(ANCHORS, TAGS, after, t, NOISE)
-    found = inertial_bounds.posterior_crb_step(
-        start, ANCHORS, TAGS, after, t, NOISE, readings, 0.02, SENSOR
-    )
+    epoch = bounds.RangeEpoch(ANCHORS, TAGS, after, t, NOISE)
+    sensed = bounds.InertialMotion(readings, 0.02, SENSOR)
+    found = bounds.posterior_step(start, epoch, sensed)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
-    with pytest.raises(ValueError, match=r"J must have shape \(..., 15, 15\)"):
-        inertial_bounds.posterior_crb_step(
-            np.eye(6), ANCHORS, TAGS, after, t, NOISE, readings, 0.02, SENSOR
-        )
+    with pytest.raises(
+        ValueError, match=r"J must have shape \(..., 15, 15\) or \(..., 17, 17\), got"
+    ):
+        bounds.posterior_step(np.eye(6), epoch, sensed)
 
 
 def test_the_tilt_of_gravity_costs_information():
     start = inertial_bounds.prior_information(PRIOR, SENSOR, 2.0, 0.02)
     assert start.shape == (17, 17)
     readings = np.tile([0.1, 0, 0, 0, 0, G], (10, 1))
-    world = ANCHORS, TAGS, np.eye(3), np.zeros(3), NOISE, readings, 0.01, SENSOR
+    epoch = bounds.RangeEpoch(ANCHORS, TAGS, np.eye(3), np.zeros(3), NOISE)
+    sensed = bounds.InertialMotion(readings, 0.01, SENSOR)
     for _ in range(5):
-        start = inertial_bounds.posterior_crb_step(start, *world)
+        start = bounds.posterior_step(start, epoch, sensed)
     plain = inertial_bounds.prior_information(PRIOR, SENSOR, 2.0)
     for _ in range(5):
-        plain = inertial_bounds.posterior_crb_step(plain, *world)
+        plain = bounds.posterior_step(plain, epoch, sensed)
     wide, narrow = (np.diagonal(np.linalg.inv(J))[:6] for J in (start, plain))
     assert (wide >= narrow - 1e-12).all()
     assert wide[3:].sum() > 1.001 * narrow[3:].sum()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import kernels, metrics
-from rbl_gym.bounds import pose, posterior
+from rbl_gym.bounds import information, pose, posterior
 from rbl_gym.estimators.linear import engines, kalman, least_squares, unitary
 from rbl_gym.geometry import obstacles, regions, rotations
 from rbl_gym.measurements import bearing, noise_laws, ranging
@@ -182,14 +182,14 @@ def test_information(law, batch, common, m, n):
         pytest.skip("no such tag")
     world = World(batch, m, n, common)
     for share in (world.share, np.ones((m, n)), np.zeros((m, n), bool)):
-        assert_equal_forms(pose._information, np.eye(6), *world.places, law.numbers, share)
+        assert_equal_forms(information._information, np.eye(6), *world.places, law.numbers, share)
 
 
 def test_a_law_that_no_kernel_knows_takes_the_textbook_form():
     world = World((2,))
     law = noise_laws.LinkNoise(np.full((4, 5), 0.1))
-    got = pose.information_at(*world.places, law, world.share)
-    want = pose.information_at(*world.places, noise_laws.RangeNoise(0.1), world.share)
+    got = information.information_at(*world.places, law, world.share)
+    want = information.information_at(*world.places, noise_laws.RangeNoise(0.1), world.share)
     np.testing.assert_allclose(got, want, rtol=1e-9, atol=1e-9)
 
 

@@ -8,11 +8,12 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from rbl_gym import bounds, estimators, kernels, metrics
-from rbl_gym.bounds import pose, smoothing, twist
+from rbl_gym.bounds import information, smoothing
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import noise_laws, offsets
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.motion import ProcessNoise, propagate
+from rbl_gym.motion.unknown_twist import WanderingTwist
 
 every_offset = pytest.mark.parametrize("offset", offsets.OFFSETS)
 NOISE = RangeNoise(0.05, 0.01)
@@ -112,7 +113,7 @@ def test_information_by_its_kernel(batch, law, offset):
     share = np.where(share < 0.3, 0.0, share)
     prior = np.broadcast_to(np.eye(6), (*batch, 6, 6))
     args = prior, *world(2, batch), noise_laws.numbers_of(law, N), share, offsets.code_of(offset)
-    form = pose._offset_information
+    form = information._offset_information
     got, want = form.kernel(*args), form.textbook(*args)
     np.testing.assert_allclose(got, want, rtol=0, atol=1e-9 * np.abs(want).max())
 
@@ -123,11 +124,15 @@ def test_recursions_take_the_offset():
     seen = bounds.range_information(anchors, tags, rotation, translation, NOISE, offset="tag")
     places = anchors, tags, rotation, translation, NOISE
     zero = np.zeros(6)
-    J = bounds.posterior_crb_step(np.eye(6), *places, zero, 0.0, process, offset="tag")
+    epoch, common = bounds.RangeEpoch(*places), bounds.Nuisances(offset="tag")
+    known = bounds.KnownTwist(zero, 0.0, process)
+    J = bounds.posterior_step(np.eye(6), epoch, known, common)
     np.testing.assert_allclose(J, np.eye(6) + seen, rtol=1e-9)
-    law = twist.WanderingTwist(0.5, 1.0, 0.1, 0.1)
-    J = twist.posterior_crb_step(np.eye(12), *places, zero, 0.1, process, law, offset="tag")
-    plain = twist.posterior_crb_step(np.eye(12), *places, zero, 0.1, process, law, np.zeros((M, N)))
+    law = WanderingTwist(0.5, 1.0, 0.1, 0.1)
+    unknown = bounds.UnknownTwist(zero, 0.1, process, law)
+    J = bounds.posterior_step(np.eye(12), epoch, unknown, common)
+    nothing = epoch._replace(links=np.zeros((M, N)))
+    plain = bounds.posterior_step(np.eye(12), nothing, unknown)
     np.testing.assert_allclose(J[:6, :6] - plain[:6, :6], seen, atol=1e-9 * seen.max())
     Q, t = (np.stack([x] * 3) for x in (rotation, translation))
     P = smoothing.smoothing_crb(
@@ -301,10 +306,9 @@ def track(offset, batch=100, steps=8, seed=0, prior=(0.2, 0.5), size=30.0, name=
             walked = twist + rng.standard_normal((batch, 6)) * process.std() / np.sqrt(dt)
             rotation, translation = propagate(rotation, translation, walked, dt)
             state = filter.predict(state, twist, dt)
-        J = bounds.posterior_crb_step(
-            J, anchors, tags, rotation, translation, NOISE, twist, dt if k else 0.0, process,
-            offset=offset,
-        )  # fmt: skip
+        epoch = bounds.RangeEpoch(anchors, tags, rotation, translation, NOISE)
+        moved = bounds.KnownTwist(twist, dt if k else 0.0, process)
+        J = bounds.posterior_step(J, epoch, moved, bounds.Nuisances(offset=offset))
         places = tags @ np.swapaxes(rotation, -1, -2) + translation[:, None]
         d = np.linalg.norm(places[:, None] - anchors[:, None], axis=-1)
         ranges = d + np.sqrt(NOISE.variance(d)) * rng.standard_normal(d.shape)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rbl_gym import bounds, estimators, kernels, motion
-from rbl_gym.bounds import pose
+from rbl_gym.bounds import information as fisher
 from rbl_gym.estimators.costs import losses
 from rbl_gym.estimators.costs.map_problem import PoseState, minimize_ranges, positive_inverse
 from rbl_gym.estimators.iekf.pose_steps import WEIGHTS, predict_pose, update_pose
@@ -345,7 +345,7 @@ def test_bounds_of_one_pose_equal_those_of_a_batch():
     twist = np.random.default_rng(5).standard_normal((4, 6))
     places = anchors, tags, rotation, translation
     distance, J = bounds.range_jacobian(*places)
-    information = pose.information_at(*places, NOISE)
+    information = fisher.information_at(*places, NOISE)
     predicted = bounds.predict_information(np.linalg.inv(P), twist, 0.2, PROCESS)
     b = bounds.score(P, rotation, tags)
     for k in range(4):
@@ -354,7 +354,7 @@ def test_bounds_of_one_pose_equal_those_of_a_batch():
         np.testing.assert_allclose(single[0], distance[k], rtol=1e-14)
         np.testing.assert_allclose(single[1], J[k], atol=1e-14)
         np.testing.assert_allclose(
-            pose.information_at(*one, NOISE), information[k], rtol=1e-10, atol=1e-8
+            fisher.information_at(*one, NOISE), information[k], rtol=1e-10, atol=1e-8
         )
         alone = bounds.predict_information(np.linalg.inv(P[k]), twist[k], 0.2, PROCESS)
         scale = np.abs(alone).max()

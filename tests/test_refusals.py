@@ -128,16 +128,6 @@ def test_laws_without_a_variance(name):
         BOUNDS[name](ANCHORS, *PLACE, ranging.LinkNoise(np.full((4, 5), 1e-200)))
 
 
-def test_biases_of_an_anchor_on_a_tag():
-    tags = bodies.octahedron(0.5)
-    with pytest.raises(
-        ValueError, match="anchors must not stand on a tag, where a range has no deriv"
-    ):
-        link_bounds.bias_information(
-            np.zeros((1, 3)), tags, np.eye(3), -tags[0], ranging.RangeNoise(0.1)
-        )
-
-
 def test_lost_links_out_of_reach_are_drawn_as_lost():
     noise, rng = ranging.RangeNoise(0.1), np.random.default_rng(0)
     near = link_bounds.realised_crb(

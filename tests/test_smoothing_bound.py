@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import bounds, kernels
-from rbl_gym.bounds import smoothing, tridiagonal, twist
+from rbl_gym.bounds import smoothing, tridiagonal
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.motion.kinematics import ProcessNoise
@@ -87,11 +87,10 @@ def test_last_epoch_is_the_posterior_bound_and_earlier_ones_are_lower(law):
         gained = np.linalg.inv(J) - found[k]
         assert np.linalg.eigvalsh(gained).min() > -1e-9
         assert np.trace(gained[:6, :6]) > 1e-3 * np.trace(found[k, :6, :6])
-        at = anchors, tags, Q[k + 1], t[k + 1], NOISE, twists[k], float(dt[k]), process
-        if law is None:
-            J = bounds.posterior_crb_step(J, *at)
-        else:
-            J = twist.posterior_crb_step(J, *at, law)
+        moved = twists[k], float(dt[k]), process
+        moved = bounds.KnownTwist(*moved) if law is None else bounds.UnknownTwist(*moved, law)
+        epoch = bounds.RangeEpoch(anchors, tags, Q[k + 1], t[k + 1], NOISE)
+        J = bounds.posterior_step(J, epoch, moved)
     np.testing.assert_allclose(found[-1], np.linalg.inv(J), rtol=1e-6, atol=1e-12)
 
 

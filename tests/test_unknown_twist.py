@@ -15,6 +15,7 @@ from tests.helpers import random_world
 LAW = ut.WanderingTwist((0.3, 0.2, 0.1), 2.0, (0.4, 0.5, 0.6), (0.7, 0.8, 0.9))
 PROCESS = motion.ProcessNoise((0.05, 0.1, 0.15), (0.2, 0.3, 0.4))
 NOISE = ranging.RangeNoise(0.05, 0.001)
+EPOCH = bounds.RangeEpoch(np.eye(3), np.eye(3), np.eye(3), np.ones(3), NOISE)
 
 
 def moved(Q, t, twist, dt, pose_noise, twist_noise):
@@ -104,7 +105,8 @@ def test_bound_by_brute_force_is_the_last_block_of_the_whole_trajectorys_informa
             rows = np.hstack([-F, np.eye(12)])
             information = np.linalg.inv(G @ noise_covariance(dt, PROCESS, LAW) @ G.T)
             whole[both, both] += rows.T @ information @ rows
-            J = bound.posterior_crb_step(J, *rest, before[2], dt, PROCESS, LAW, links[k])
+            moved = bounds.UnknownTwist(before[2], dt, PROCESS, LAW)
+            J = bounds.posterior_step(J, bounds.RangeEpoch(*rest, links[k]), moved)
         else:
             J = J.copy()
             J[:6, :6] += bounds.range_information(*rest, links[k])
@@ -123,13 +125,12 @@ def test_the_bound_of_a_batch_is_that_of_each():
     twists = rng.normal(size=(3, 6))
     sensor = ut.TwistSensor(0.1, 0.3, "body")
     J = np.eye(12) * rng.uniform(1, 5, (3, 1, 1))
-    rest = NOISE, twists, 0.2, PROCESS, LAW
-    got = bound.posterior_crb_step(J, anchors, tags, rotation, translation, *rest, sensor=sensor)
+    epoch = bounds.RangeEpoch(anchors, tags, rotation, translation, NOISE)
+    moved = bounds.UnknownTwist(twists, 0.2, PROCESS, LAW, sensor)
+    got = bounds.posterior_step(J, epoch, moved)
     for k in range(3):
-        want = bound.posterior_crb_step(
-            J[k], anchors[k], tags, rotation[k], translation[k], NOISE, twists[k], 0.2, PROCESS,
-            LAW, sensor=sensor,
-        )  # fmt: skip
+        one = bounds.RangeEpoch(anchors[k], tags, rotation[k], translation[k], NOISE)
+        want = bounds.posterior_step(J[k], one, moved._replace(twist=twists[k]))
         np.testing.assert_allclose(got[k], want, rtol=1e-9, atol=1e-9)
 
 
@@ -201,18 +202,16 @@ def test_drawn_trajectories_have_the_laws_moments():
             "rng must be a numpy.random.Generator, got 0",
         ),
         (
-            lambda: bound.posterior_crb_step(
-                np.eye(12), np.eye(3), np.eye(3), np.eye(3), np.ones(3), NOISE,
-                np.zeros(6), 0.1, LAW, LAW,  # pyright: ignore[reportArgumentType]
+            lambda: bounds.posterior_step(
+                np.eye(12), EPOCH, bounds.UnknownTwist(np.zeros(6), 0.1, LAW, LAW)  # pyright: ignore[reportArgumentType]
             ),
             "process must be a motion.ProcessNoise, got WanderingTwist",
         ),
         (
-            lambda: bound.posterior_crb_step(
-                np.zeros((12, 12)), np.eye(3), np.eye(3), np.eye(3), np.ones(3), NOISE,
-                np.zeros(6), 0.1, PROCESS, LAW,
+            lambda: bounds.posterior_step(
+                np.zeros((12, 12)), EPOCH, bounds.UnknownTwist(np.zeros(6), 0.1, PROCESS, LAW)
             ),
-            "J must be information about all 12 states",
+            "J must be information about all states",
         ),
     ],
 )  # fmt: skip

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym.bounds.pose import weighted_spread
+from rbl_gym.bounds.tag_information import weighted_spread
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.inputs import matrix_rank, spanned_dimensions
 

@@ -1,9 +1,7 @@
-"""Cramer-Rao bounds where links are lost, biased, or take a reflected path.
+"""Cramer-Rao bounds where links are lost, or take a reflected path.
 
-Shapes, the pose error (w, v) and the order of the 6 x 6 matrices are those of `bounds`. A bias is
-a nuisance: it joins the pose as further parameters, and `marginal_information` takes them out
-again by the Schur complement. A random path is a mixture of densities, whose information about
-the range is an integral.
+Shapes, the pose error (w, v) and the order of the 6 x 6 matrices are those of `bounds`. A random
+path is a mixture of densities, whose information about the range is an integral.
 """
 
 from __future__ import annotations
@@ -19,21 +17,14 @@ from rbl_gym.checks import (
     check_array,
     check_count,
     check_generator,
-    check_links,
     check_number,
-    check_one_of,
     kernel,
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
-from rbl_gym.motion.kinematics import ProcessNoise, check_process
 
-__all__ = [
-    "GROUPS", "bias_information", "expected_information", "marginal_information",
-    "nlos_efficiency", "posterior_bias_step", "realised_crb", "with_biases",
-]  # fmt: skip
+__all__ = ["expected_information", "nlos_efficiency", "realised_crb"]
 
-GROUPS = ("link", "anchor", "tag", "common")
 # Nodes of the trapezoid rule on +-9 standard deviations; such integrands converge exponentially.
 _NODES = np.linspace(-9.0, 9.0, 721)
 # Draws, or biases, beyond which no memory suffices.
@@ -41,8 +32,6 @@ _MOST = 10**6
 _ALL_MEASURE = ranging.LinkModel()
 # Links whose integrals are taken at once.
 _BLOCK = 512
-
-# --- lost and reflected links --------------------------------------------------------------------
 
 
 def expected_information(
@@ -196,158 +185,6 @@ def _mixture_information(p: float, shift: FloatArray, width: FloatArray) -> Floa
         score = (1 - reflected) * x + reflected * (x - shift) / width**2
         total += weight * (bell * score**2).sum(axis=-1)
     return total
-
-
-# --- biased links --------------------------------------------------------------------------------
-
-
-def bias_information(
-    anchors: ArrayLike,
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: ranging.NoiseLaw,
-    links: ArrayLike | None = None,
-    *,
-    groups: str = "link",
-) -> FloatArray:
-    """Joint Fisher information (..., 6 + G, 6 + G) of one epoch about the pose and its biases.
-
-    Parameters
-    ----------
-    anchors, tags, rotation, translation, noise, links
-        As `bounds.range_information`.
-    groups
-        Which ranges share a bias: ``"link"`` (G = M N, in the order of the ranges), ``"anchor"``
-        (M), ``"tag"`` (N), ``"common"`` (1).
-
-    Raises
-    ------
-    ValueError
-        As `bounds.range_information`, and on an unknown grouping.
-    """
-    check_one_of("groups", groups, GROUPS)
-    places = _checked(anchors, tags, rotation, translation)
-    shape = (places[0].shape[-2], places[1].shape[-2])
-    mask = check_links(links, shape)
-    _check_laws(noise)
-    distance, J = bounds.range_jacobian(*places)
-    if not (distance > 0).all():
-        raise ValueError("anchors must not stand on a tag, where a range has no derivative")
-    weight = 1 / np.broadcast_to(noise.variance(distance), distance.shape)
-    if mask is not None:
-        weight = weight * mask
-    flat = weight.reshape((*weight.shape[:-2], 1, -1))
-    D = _group_rows(groups, *shape)
-    J = np.broadcast_to(J, (*flat.shape[:-2], *J.shape[-2:]))
-    rows = np.concatenate([J, np.broadcast_to(D, (*flat.shape[:-2], *D.shape))], axis=-2)
-    return (rows * flat) @ np.swapaxes(rows, -1, -2)
-
-
-def with_biases(pose_information: ArrayLike, bias_std_m: float, n_biases: int) -> FloatArray:
-    """Joint information (..., 6 + G, 6 + G) of a pose's prior and of G independent biases."""
-    J = check_array("pose_information", pose_information, (6, 6))
-    std = check_number("bias_std_m", bias_std_m, low=1e-12)
-    n_biases = check_count("n_biases", n_biases, most=_MOST)
-    joint = np.zeros((*J.shape[:-2], 6 + n_biases, 6 + n_biases))
-    joint[..., :6, :6] = J
-    joint[..., range(6, 6 + n_biases), range(6, 6 + n_biases)] = std**-2
-    return joint
-
-
-def marginal_information(joint: ArrayLike) -> FloatArray:
-    """Information (..., 6, 6) about the pose alone, of one about pose and biases.
-
-    The Schur complement ``J_pp - J_pb J_bb^-1 J_bp``; where a bias is without any information
-    its row is zero, and it is left out.
-
-    Raises
-    ------
-    ValueError
-        On a matrix smaller than 7 x 7 or not square.
-    """
-    joint = check_array("joint", joint, ("n", "n"))
-    if joint.shape[-1] != joint.shape[-2] or joint.shape[-1] < 7:
-        raise ValueError(f"joint must have shape (..., 6 + G, 6 + G), got {joint.shape}")
-    cross, own = joint[..., :6, 6:], joint[..., 6:, 6:].copy()
-    idle = np.einsum("...ii->...i", own)
-    idle[...] = np.where(idle > 0, idle, 1.0)
-    try:
-        with np.errstate(all="ignore"):
-            told = np.linalg.solve(own, np.swapaxes(cross, -1, -2))
-            marginal = bounds.symmetric(joint[..., :6, :6] - cross @ told)
-    except np.linalg.LinAlgError:
-        marginal = np.full((6, 6), np.nan)
-    if not np.isfinite(marginal).all():
-        raise ValueError(f"joint must be information, positive semidefinite, got {joint!r:.80}")
-    return marginal
-
-
-def posterior_bias_step(
-    J: ArrayLike,
-    anchors: ArrayLike,
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: ranging.NoiseLaw,
-    twist: ArrayLike,
-    dt: float,
-    process: ProcessNoise,
-    links: ArrayLike | None = None,
-    *,
-    groups: str = "link",
-    bias_walk_m: float = 0.0,
-) -> FloatArray:
-    """`bounds.posterior_crb_step` of the pose and its biases together.
-
-    Parameters
-    ----------
-    J
-        Joint information (..., 6 + G, 6 + G) of the epoch before; the first from `with_biases`.
-    anchors, tags, rotation, translation, noise, links, groups
-        At the new epoch, as `bias_information`.
-    twist, dt, process
-        Motion of the interval that ends at the new epoch.
-    bias_walk_m
-        Standard deviation of a bias's random walk after one second, metres.
-
-    Returns
-    -------
-    Joint information after the new epoch; `marginal_information` of it bounds the pose.
-
-    Raises
-    ------
-    ValueError
-        As `bias_information`, and where J has another number of biases.
-    """
-    J = check_array("J", J, ("n", "n"))
-    twist = check_array("twist", twist, (6,))
-    dt = check_number("dt", dt, low=0.0)
-    check_process(process)
-    walk = check_number("bias_walk_m", bias_walk_m, low=0.0)
-    told = bias_information(anchors, tags, rotation, translation, noise, links, groups=groups)
-    n = told.shape[-1]
-    if J.shape[-2:] != (n, n):
-        raise ValueError(f"J must have shape (..., {n}, {n}) for groups {groups!r}, got {J.shape}")
-    F = np.zeros((*twist.shape[:-1], n, n))
-    F[..., range(n), range(n)] = 1.0
-    F[..., :3, :3] = rotations.exp(twist[..., :3] * dt)
-    Q = np.zeros((*twist.shape[:-1], n, n))
-    Q[..., range(6, n), range(6, n)] = dt * walk**2
-    Q[..., :6, :6] = process.covariance(twist, dt)
-    turned = F @ J @ np.swapaxes(F, -1, -2)
-    return bounds.symmetric(np.linalg.solve(np.eye(n) + turned @ Q, turned)) + told
-
-
-def _group_rows(groups: str, n_anchors: int, n_tags: int) -> FloatArray:
-    """Derivative (G, M N) of the ranges by the biases."""
-    if groups == "link":
-        return np.eye(n_anchors * n_tags)
-    if groups == "anchor":
-        return np.repeat(np.eye(n_anchors), n_tags, axis=1)
-    if groups == "tag":
-        return np.tile(np.eye(n_tags), n_anchors)
-    return np.ones((1, n_anchors * n_tags))
 
 
 def _checked(

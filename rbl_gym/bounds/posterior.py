@@ -1,64 +1,21 @@
-"""The posterior Cramer-Rao bound: one step, and the recursion over an episode with its scores."""
+"""Steps of the posterior Cramer-Rao bound of a pose: prediction, and an epoch with its score."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.bounds import pose
-from rbl_gym.checks import BoolArray, FloatArray, check_array, kernel
+from rbl_gym.bounds import information, pose
+from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import bearing, ranging
-from rbl_gym.motion.kinematics import ProcessNoise, check_process
+from rbl_gym.motion.kinematics import ProcessNoise
 
-__all__ = ["posterior_crb_step", "predict_covariance", "predict_information"]
+__all__ = ["predict_covariance", "predict_information"]
 
 # Behind the door: what comes to it was checked, or made here.
 _EXP = kernel(rotations.exp)
-
-
-def posterior_crb_step(
-    J: ArrayLike,
-    anchors: ArrayLike,
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: ranging.NoiseLaw,
-    twist: ArrayLike,
-    dt: float,
-    process: ProcessNoise,
-    links: ArrayLike | None = None,
-    offset: str | None = None,
-) -> FloatArray:
-    """One step of the posterior Cramer-Rao recursion (Tichavsky et al. 1998) at the true pose.
-
-    Parameters
-    ----------
-    J
-        Posterior information (..., 6, 6) of the epoch before.
-    anchors, tags, rotation, translation, links
-        At the new epoch; the pose is the true one.
-    noise
-        Law of the ranges.
-    twist, dt, process
-        Motion of the interval that ends at the new epoch, and its noise.
-    offset
-        Whose ranges have an unknown offset in common, as of `range_information`.
-
-    Returns
-    -------
-    Information (..., 6, 6) after the new epoch; its inverse is the bound.
-    """
-    J = check_array("J", J, (6, 6))
-    twist = check_array("twist", twist, (6,))
-    if (check_array("dt", dt, ()) < 0).any():
-        raise ValueError(f"dt must not be negative, got {dt}")
-    check_process(process)
-    predicted = predict_information(J, twist, dt, process)
-    return predicted + pose.range_information(
-        anchors, tags, rotation, translation, noise, links, offset=offset
-    )
 
 
 def predict_information(
@@ -66,11 +23,15 @@ def predict_information(
 ) -> FloatArray:
     """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J.
 
-    Arguments as `predict_covariance`, with information J (..., 6, 6) for P.
+    Arguments as `predict_covariance`, with information J (..., n, n) for P. States beyond the six
+    of the pose stand still.
     """
+    # F is a rotation: with T = F J F^T this is (I + T Q)^-1 T.
     turned = _turn(J, twist, dt)
-    Q = process.covariance(twist, dt)
-    return pose.symmetric(np.linalg.solve(np.eye(6) + turned @ Q, turned))
+    crossed = turned[..., :6] @ process.covariance(twist, dt)
+    A = np.broadcast_to(np.eye(J.shape[-1]), (*crossed.shape[:-2], *J.shape[-2:])).copy()
+    A[..., :6] += crossed
+    return pose.symmetric(np.linalg.solve(A, turned))
 
 
 def predict_covariance(
@@ -92,7 +53,7 @@ def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
     """``F matrix F^T`` of a symmetric matrix: the error is global, so its rotation part turns."""
     step = _EXP(twist[..., :3] * np.asarray(dt, float)[..., None])
     top = step @ matrix[..., :3, :]
-    turned = np.empty((*top.shape[:-2], 6, 6))
+    turned = np.empty((*top.shape[:-2], *matrix.shape[-2:]))
     turned[..., :3, :3] = top[..., :3] @ np.swapaxes(step, -1, -2)
     turned[..., :3, 3:] = top[..., 3:]
     turned[..., 3:, :3] = np.swapaxes(top[..., 3:], -1, -2)
@@ -136,7 +97,8 @@ def step_of_ranges(
     -------
     NaN is the score of information that is not positive definite.
     """
-    told = pose.information_at(anchors, tags, rotation, translation, ranging.law_of(law), share)
+    noise = ranging.law_of(law)
+    told = information.information_at(anchors, tags, rotation, translation, noise, share)
     return _with_score(_predicted(prior, twist, dt, std) + told, rotation, tags)
 
 
@@ -155,7 +117,8 @@ def step_of_angles(
     """`step_of_ranges`, of angles at a station (..., 3) with this standard deviation in radians."""
     noise = bearing.AngleNoise(angle_std)
     places = ranging.tag_positions(rotation, translation - station, tags)
-    told = pose.lift(pose.tag_jacobian(rotation, tags), bearing.information(places, noise))
+    of_tags = bearing.information(places, noise)
+    told = information.lift(information.tag_jacobian(rotation, tags), of_tags)
     return _with_score(_predicted(prior, twist, dt, std) + told, rotation, tags)
 
 
@@ -165,12 +128,12 @@ def _predicted(prior: FloatArray, twist: FloatArray, dt: ArrayLike, std: FloatAr
 
 
 def _with_score(
-    information: FloatArray, rotation: FloatArray, tags: FloatArray
+    J: FloatArray, rotation: FloatArray, tags: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    good = np.asarray(np.isfinite(information).all(axis=(-2, -1)))
-    safe = np.where(good[..., None, None], information, 0.0)
+    good = np.asarray(np.isfinite(J).all(axis=(-2, -1)))
+    safe = np.where(good[..., None, None], J, 0.0)
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", safe), 1e-300))
     scaled = safe / (scale[..., :, None] * scale[..., None, :])
     good &= np.linalg.eigvalsh(scaled)[..., 0] > 1e-14
-    covariance = np.linalg.inv(np.where(good[..., None, None], information, np.eye(6)))
-    return information, np.where(good, pose.score(covariance, rotation, tags), np.nan)
+    covariance = np.linalg.inv(np.where(good[..., None, None], J, np.eye(6)))
+    return J, np.where(good, pose.score(covariance, rotation, tags), np.nan)

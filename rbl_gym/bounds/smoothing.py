@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.bounds.pose import range_information
+from rbl_gym.bounds.information import range_information
 from rbl_gym.bounds.tridiagonal import inverse_blocks
 from rbl_gym.checks import FloatArray, check_array, kernel
 from rbl_gym.geometry import rotations
@@ -70,7 +70,7 @@ def smoothing_crb(
     Returns
     -------
     Covariances (..., K, 6, 6) of the pose error; (..., K, 12, 12) of pose and twist with a law,
-    as of `bounds.twist.posterior_crb_step`.
+    as of `bounds.UnknownTwist`.
 
     Raises
     ------

@@ -1,18 +1,15 @@
-"""Posterior Cramer-Rao bound of pose and twist (12 states) under `motion.unknown_twist`."""
+"""Prediction of pose and twist (12 states) under `motion.unknown_twist`."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from rbl_gym.bounds.pose import range_information, symmetric
-from rbl_gym.checks import FloatArray, check_array, check_number, kernel
+from rbl_gym.checks import FloatArray, kernel
 from rbl_gym.geometry import rotations
-from rbl_gym.measurements import ranging
 from rbl_gym.motion.kinematics import ProcessNoise
-from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist, check_laws
+from rbl_gym.motion.unknown_twist import WanderingTwist
 
-__all__ = ["posterior_crb_step", "predict_covariance"]
+__all__ = ["predict_covariance"]
 
 # Behind the doors: what comes to these was checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
@@ -58,67 +55,3 @@ def covariance_after(
     G = np.broadcast_to(np.eye(n), F.shape).copy()
     G[..., :3, :3] = jacobian
     return F @ P @ np.swapaxes(F, -1, -2) + G @ Q @ np.swapaxes(G, -1, -2)
-
-
-def posterior_crb_step(
-    J: ArrayLike,
-    anchors: ArrayLike,
-    tags: ArrayLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
-    noise: ranging.NoiseLaw,
-    twist: ArrayLike,
-    dt: float,
-    process: ProcessNoise,
-    law: WanderingTwist,
-    links: ArrayLike | None = None,
-    sensor: TwistSensor | None = None,
-    offset: str | None = None,
-) -> FloatArray:
-    """One step of the posterior Cramer-Rao recursion of pose and twist, at the truth.
-
-    Parameters
-    ----------
-    J
-        Posterior information (..., 12, 12) of the epoch before; that of a start is the inverse of
-        ``blkdiag(pose prior, diag(law.prior_std()^2))``, plus that of its ranges.
-    anchors, tags, rotation, translation, noise, links
-        At the new epoch, as `bounds.posterior_crb_step`.
-    twist
-        True twist (..., 6) of the interval that ends there.
-    dt, process, law
-        Seconds, and the laws of pose and twist.
-    sensor
-        Reads the twist of that interval; None: nobody does.
-    offset
-        Whose ranges have an unknown offset in common, as of `bounds.range_information`.
-
-    Returns
-    -------
-    Information (..., 12, 12); the first six rows of its inverse bound the pose.
-
-    Raises
-    ------
-    ValueError
-        On wrong shapes or values, and where J is singular.
-    """
-    J = check_array("J", J, (12, 12))
-    twist = check_array("twist", twist, (6,))
-    dt = check_number("dt", dt, low=0.0)
-    check_laws(law, process)
-    if not isinstance(sensor, TwistSensor | None):
-        raise ValueError(f"sensor must be a TwistSensor or None, got {sensor!r:.80}")
-    if sensor is not None:
-        J = J + sensor.information(twist)
-    try:
-        P = symmetric(np.linalg.inv(J))
-        predicted = np.linalg.inv(predict_covariance(P, twist, dt, process, law))
-    except np.linalg.LinAlgError as error:
-        raise ValueError(
-            f"J must be information about all 12 states, got a singular one {J!r:.80}"
-        ) from error
-    seen = range_information(anchors, tags, rotation, translation, noise, links, offset=offset)
-    batch = np.broadcast_shapes(predicted.shape[:-2], seen.shape[:-2])
-    result = np.broadcast_to(symmetric(predicted), (*batch, 12, 12)).copy()
-    result[..., :6, :6] += seen
-    return result

@@ -1,6 +1,6 @@
 """Ranges with an unknown offset in common, one body: what they tell, and their cost.
 
-The textbook forms are `rbl_gym.measurements.offsets` in `rbl_gym.bounds.pose` and in
+The textbook forms are `rbl_gym.measurements.offsets` in `rbl_gym.bounds.information` and in
 `estimators/costs/range_cost.py`. Kinds of offset: 1 by tag, 2 by anchor, 3 of the epoch.
 """
 

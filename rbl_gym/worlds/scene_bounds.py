@@ -6,6 +6,7 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.bounds import inertial, posterior
+from rbl_gym.bounds.nuisances import with_epoch
 from rbl_gym.checks import BoolArray, FloatArray, all_finite
 from rbl_gym.measurements import ranging
 from rbl_gym.worlds import simulation
@@ -86,8 +87,9 @@ def _with_inertial(
         # As the true motion has them, but for the white noise, which the bound hardly sees.
         felt = at.readings - at.bias[..., None, :]
         steps = np.full(felt.shape[-2], scene.dt / felt.shape[-2])
-        before = inertial.predict_information(previous, at.rotation, felt, steps, sensor)
-    information = inertial.with_pose(before, _seen(scene, at, anchors, links))
+        motion = bounds.InertialMotion(felt, steps, sensor)
+        before = motion.predict(previous, 15, at.rotation)
+    information = with_epoch(before, _seen(scene, at, anchors, links), 15)
     return _scored(scene, at, information)
 
 
