@@ -17,7 +17,14 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.bounds import information as fisher
 from rbl_gym.bounds.pose import inverted, symmetric
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_links, check_one_of
+from rbl_gym.checks import (
+    BoolArray,
+    FloatArray,
+    check_array,
+    check_count,
+    check_links,
+    check_one_of,
+)
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.link_bias import LinkBias
@@ -191,8 +198,13 @@ def with_nuisances(information: ArrayLike, count: int) -> FloatArray:
     count
         q, as `Nuisances.count` says.
     """
-    J = check_array("information", information, ("n", "n"))
+    J, count = (
+        check_array("information", information, ("n", "n")),
+        check_count("count", count, least=0),
+    )
     n = J.shape[-1]
+    if J.shape[-2] != n:
+        raise ValueError(f"information must have shape (..., n, n), got {J.shape}")
     joint = np.zeros((*J.shape[:-2], n + count, n + count))
     joint[..., :n, :n] = J
     joint[..., range(n, n + count), range(n, n + count)] = 1.0
