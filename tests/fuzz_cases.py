@@ -161,7 +161,7 @@ case(bounds.with_nuisances, information=np.eye(6), count=3)
 case(bounds.marginal_information, joint=np.eye(8))
 
 
-def _step(J, anchors, tags, rotation, translation, noise, links, twist, dt):  # noqa: ANN
+def _step(J, anchors, tags, rotation, translation, noise, links, twist, dt):
     nuisances = bounds.Nuisances(None, 0.1, LinkBias(0.1, 5.0), "anchor")
     epoch = bounds.RangeEpoch(anchors, tags, rotation, translation, noise, links)
     return bounds.posterior_step(J, epoch, bounds.KnownTwist(twist, dt, PROCESS), nuisances)

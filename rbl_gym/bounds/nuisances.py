@@ -39,6 +39,8 @@ GROUPS = ("link", "anchor", "tag", "common")
 # A bias that keeps less than this of itself over an interval counts as one that keeps so much.
 _LEAST_KEPT = 1e-6
 _ONE = np.ones((1, 1))
+# States of nuisances beyond which no memory suffices.
+_MOST = 10**5
 
 
 class RangeEpoch(NamedTuple):
@@ -200,7 +202,7 @@ def with_nuisances(information: ArrayLike, count: int) -> FloatArray:
     """
     J, count = (
         check_array("information", information, ("n", "n")),
-        check_count("count", count, least=0),
+        check_count("count", count, least=0, most=_MOST),
     )
     n = J.shape[-1]
     if J.shape[-2] != n:
