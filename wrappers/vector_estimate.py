@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
@@ -14,6 +14,7 @@ from rbl_gym import metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import reads
+from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import (
     OBSERVATIONS,
     family_of,
@@ -22,6 +23,7 @@ from rbl_gym.wrappers.estimate import (
     observation_space,
     present,
     scene_of,
+    unpadded,
     update,
     with_bound,
 )
@@ -66,7 +68,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             self._scene = env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
         self._reward = reward_of(reward)
         self._kind = check_one_of("observation", observation, OBSERVATIONS)
-        self._filter = self._filter_of(self._scene)
+        self._stacks = self._varied and _takes_stacks(env, self._scene, filter, options)
+        self._parts = self._parted()
         self._state: Any = None
         self._belief: PoseBelief | None = None
         single = observation_space(self._kind, env.single_observation_space, self._scene)
@@ -109,14 +112,14 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
 
     def _advance(self, observation: dict[str, np.ndarray], moved: BoolArray) -> None:
         """Predict and update the worlds that stepped."""
-        measured = measured_of(observation)
-        if moved.all():
-            state, scene, filter = self._state, self._scene, self._filter
-        else:
-            state, (scene, filter) = _rows(self._state, moved), self._of(moved)
-            measured = {key: value[moved] for key, value in measured.items()}
-        state = filter.predict(state, measured[reads(filter)], scene.dt)
-        self._put(update(filter, state, measured, scene), filter, moved)
+        states = []
+        for part in self._parts_of(moved):
+            told = part.measured(observation)
+            state = part.filter.predict(
+                _rows(self._state, part.rows), told[reads(part.filter)], part.scene.dt
+            )
+            states.append(update(part.filter, state, told, part.scene))
+        self._put(states, moved)
 
     def _begin(
         self, observation: dict[str, np.ndarray], info: dict[str, Any], fresh: BoolArray
@@ -124,39 +127,47 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         """States of new episodes, from the priors in `info`, updated with their first ranges."""
         if self._varied:
             self._scene = self.env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
-            self._filter = self._filter_of(self._scene)
-        scene, filter = self._of(fresh)
-        prior = [info[f"prior_{name}"][fresh] for name in ("rotation", "translation", "covariance")]
-        epoch = {key: value[fresh] for key, value in measured_of(observation).items()}
-        self._put(update(filter, filter.initial(*prior), epoch, scene), filter, fresh)
+            self._parts = self._parted()
+        states = []
+        for part in self._parts_of(fresh):
+            prior = (
+                info[f"prior_{key}"][part.rows] for key in ("rotation", "translation", "covariance")
+            )
+            state = part.filter.initial(*prior)
+            states.append(update(part.filter, state, part.measured(observation), part.scene))
+        self._put(states, fresh)
 
-    def _of(self, where: BoolArray) -> tuple[Any, Filter]:
-        """Scene and filter of the worlds of a mask."""
-        if not self._varied or where.all():
-            return self._scene, self._filter
-        scene = self._scene.rows(where)
-        return scene, self._filter_of(scene)
+    def _parted(self) -> list[_Part]:
+        """All worlds, those together that one filter tracks."""
+        every = np.arange(self.num_envs)
+        if not self._varied or self._stacks:
+            return [_Part(every, self._scene, make_filter(self.env, self._scene, *self._named))]
+        alike: dict[Scene, list[int]] = {}
+        for row, scene in enumerate(self._scene.scenes):
+            alike.setdefault(scene, []).append(row)
+        return [
+            _Part(np.array(rows), scene, make_filter(self.env, scene, *self._named))
+            for scene, rows in alike.items()
+        ]
 
-    def _filter_of(self, scene: Any) -> Filter:
-        try:
-            return make_filter(self.env, scene, *self._named)
-        except ValueError as error:
-            if not self._varied:
-                raise
-            raise ValueError(
-                f"{error} (worlds with scenes of their own need a filter that takes tags and "
-                "process noise of each, as 'iekf'; for others: gym.make_vec(..., "
-                "vectorization_mode='sync') of EstimatePose)"
-            ) from error
-
-    def _put(self, state: Any, filter: Filter, where: BoolArray) -> None:
-        """Take over the states of some worlds, and their beliefs."""
-        belief = filter.belief(state)
+    def _parts_of(self, where: BoolArray) -> list[_Part]:
+        """The parts of the worlds of a mask."""
         if where.all():
-            self._state, self._belief = state, belief
-        else:
-            self._state = _merged(self._state, state, where)
-            self._belief = _merged(self._belief, belief, where)
+            return self._parts
+        if self._stacks:
+            scene = self._scene.rows(where)
+            filter = make_filter(self.env, scene, *self._named)
+            return [_Part(np.flatnonzero(where), scene, filter)]
+        chosen = (part._replace(rows=part.rows[where[part.rows]]) for part in self._parts)
+        return [part for part in chosen if len(part.rows)]
+
+    def _put(self, states: list[Any], where: BoolArray) -> None:
+        """Take over the states of the parts of some worlds, and their beliefs."""
+        parts = self._parts_of(where)
+        rows = [part.rows for part in parts]
+        beliefs = [part.filter.belief(one) for part, one in zip(parts, states, strict=True)]
+        self._state = _joined(self._state, rows, states, self.num_envs)
+        self._belief = _joined(self._belief, rows, beliefs, self.num_envs)
 
     def _figures(self, info: Mapping[str, Any]) -> metrics.Figures:
         """Errors of the beliefs against the true poses of the infos."""
@@ -210,17 +221,53 @@ def _reached(
     return reached, truth
 
 
-def _rows(state: Any, where: BoolArray) -> Any:
-    """A state of the worlds of a mask."""
-    return type(state)(*(None if field is None else field[where] for field in state))
+class _Part(NamedTuple):
+    """Worlds that one filter tracks: their indices, their scene or scenes, the filter."""
+
+    rows: np.ndarray
+    scene: Any
+    filter: Filter
+
+    def measured(self, observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What the filter reads of these worlds."""
+        told = measured_of(observation)
+        if len(self.rows) < len(told["twist"]):
+            told = {key: value[self.rows] for key, value in told.items()}
+        padded = "anchor_mask" in observation and isinstance(self.scene, Scene)
+        return unpadded(told, self.scene) if padded else told
 
 
-def _merged(state: Any, part: Any, where: BoolArray) -> Any:
-    """`state` with the worlds of the mask taken from `part`."""
+def _takes_stacks(env: Any, scene: Any, filter: str, options: Mapping[str, Any] | None) -> bool:
+    """Whether a filter takes tags and noise of each world; others track alike worlds together."""
+    try:
+        make_filter(env, scene, filter, options)
+    except ValueError:
+        return False
+    return True
+
+
+def _rows(state: Any, rows: np.ndarray) -> Any:
+    """A state of some worlds."""
+    if len(rows) == len(state[0]):
+        return state
+    return type(state)(*(None if field is None else field[rows] for field in state))
+
+
+def _joined(old: Any, rows: list[np.ndarray], parts: list[Any], count: int) -> Any:
+    """The state of all `count` worlds, with some rows from the `parts`."""
+    if len(parts) == 1 and len(rows[0]) == count:
+        return parts[0]
     fields = []
-    for old, new in zip(state, part, strict=True):
-        field = None if old is None else np.array(old)
-        if field is not None:
-            field[where] = new
+    for index, first in enumerate(parts[0]):
+        if first is None:
+            fields.append(None)
+            continue
+        field = (
+            np.zeros((count, *first.shape[1:]), first.dtype)
+            if old is None
+            else np.array(old[index])
+        )
+        for where, part in zip(rows, parts, strict=True):
+            field[where] = part[index]
         fields.append(field)
-    return type(state)(*fields)
+    return type(parts[0])(*fields)
