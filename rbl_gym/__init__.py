@@ -83,6 +83,10 @@ def _register_environments() -> None:
             "rbl_gym.wrappers.tasks:AnchorSelectionEnv",
             "rbl_gym.wrappers.tasks:AnchorSelectionVectorEnv",
         ),
+        "RBL/SharedAnchors-v0": (
+            "rbl_gym.wrappers.shared_anchors:SharedAnchorsEnv",
+            "rbl_gym.wrappers.shared_anchors:SharedAnchorsVectorEnv",
+        ),
         "RBL/BaseStation-v0": (
             "rbl_gym.envs.base_station:BaseStationEnv",
             "rbl_gym.envs.base_station:BaseStationVectorEnv",

@@ -310,8 +310,16 @@ def test_every_reset_draws_anew_and_says_so():
     assert len({*first, *again}) == 12
 
 
-def test_what_many_worlds_cannot_have_is_said():
-    with pytest.raises(ValueError, match="render_mode must be None with scenes"):
-        TrackingVectorEnv(2, scenes=VARIED, render_mode="rgb_array")
+def test_an_unknown_filter_is_named():
     with pytest.raises(ValueError, match="filter must be one of"):
         VectorEstimatePose(TrackingVectorEnv(2, scenes=VARIED), "gold")
+
+
+def test_frames_of_many_worlds_equal_those_of_each():
+    native = VectorEstimatePose(TrackingVectorEnv(2, scenes=MIXED, render_mode="rgb_array"))
+    native.reset(seed=4)
+    frames = native.render()
+    for world in range(2):
+        alone = EstimatePose(TrackingEnv(scenes=MIXED, render_mode="rgb_array"))
+        alone.reset(seed=4 + world)
+        assert (np.abs(frames[world].astype(int) - alone.render()) > 8).mean() < 1e-3

@@ -122,7 +122,7 @@ def reward_of(reward: RewardLike) -> Reward:
         if not callable(found):
             raise ValueError(f"reward {reward!r:.80} must be callable, got {found!r:.80}")
         return found
-    if reward == "requirement":
+    if isinstance(reward, str) and reward == "requirement":
         raise ValueError(
             "reward 'requirement' needs limits: "
             '{"kind": "requirement", "position_m": ..., "rotation_deg": ...}'

@@ -93,14 +93,22 @@ class FamilyStore:
 
     World i draws its scene, then its episode, as the scalar environment does.
 
+    Parameters
+    ----------
+    family, num_envs
+        The family, and B.
+    in_turn
+        Whether the worlds have the members of the family in turn, and draw none.
+
     Attributes
     ----------
     stack
         The scenes of the worlds.
     """
 
-    def __init__(self, family: SceneFamily, num_envs: int) -> None:
+    def __init__(self, family: SceneFamily, num_envs: int, in_turn: bool = False) -> None:
         self._family = family
+        self._in_turn = in_turn
         first = family.corners[0]
         self.stack = StackedScenes.of(family, [first] * num_envs)
         m, n, epochs = family.n_anchors, family.n_tags, family.steps + 1
@@ -113,7 +121,8 @@ class FamilyStore:
         """New episodes of some worlds; as `EpisodeStore.begin`, and the drawn overrides."""
         drawn, starts, scenes = [], [], []
         for world, generator in zip(worlds.tolist(), generators, strict=True):
-            scene, overrides = self._family.draw(generator)
+            member = world % len(self._family.members) if self._in_turn else None
+            scene, overrides = self._family.draw(generator, member)
             episode = simulation.draw_episode(scene, generator)
             self._write(world, simulation.whole(episode))
             anchors = padded(episode.anchors, (self._family.n_anchors, 3))

@@ -42,12 +42,15 @@ class TrackingVectorEnv(BatchEnv):
     scene, reward, render_mode
         As `TrackingEnv`.
     scenes
-        As `TrackingEnv`: each world draws a scene of its own at every reset. Not rendered.
+        As `TrackingEnv`: each world draws a scene of its own at every reset.
     max_episode_steps
         Truncate after so many steps, if fewer than the scene's.
     autoreset_mode
         ``"NextStep"`` (default), ``"SameStep"`` or ``"Disabled"``, see `BatchEnv`.
     """
+
+    # Whether the worlds have the members of a family in turn, and draw none.
+    _in_turn = False
 
     def __init__(
         self,
@@ -64,17 +67,15 @@ class TrackingVectorEnv(BatchEnv):
         worlds = self.family or self.scene
         self.single_observation_space = observation_space(worlds)
         self.single_action_space = action_space(worlds)
-        if self.family is not None and render_mode is not None:
-            raise ValueError(
-                "render_mode must be None with scenes in a vector environment, got "
-                f"{render_mode!r}: render a scalar one"
-            )
-        self.film = rendering.film_of(render_mode, self.scene)
+        if self.family is None:
+            self.film = rendering.film_of(render_mode, self.scene)
+        else:
+            self.film = rendering.film_of_many(render_mode, self._scene_of, worlds.steps)
         self._configure(num_envs, render_mode, worlds.steps, max_episode_steps, autoreset_mode)
         self._episodes = (
             EpisodeStore(self.scene, num_envs)
             if self.family is None
-            else FamilyStore(self.family, num_envs)
+            else FamilyStore(self.family, num_envs, self._in_turn)
         )
         self._longest = self.steps_limit
         self._anchors = np.zeros((num_envs, worlds.n_anchors, 3))
@@ -93,6 +94,10 @@ class TrackingVectorEnv(BatchEnv):
     def world(self) -> Scene | StackedScenes:
         """The scene; of a family those of the worlds now, side by side."""
         return self._episodes.stack if isinstance(self._episodes, FamilyStore) else self.scene
+
+    def _scene_of(self, world: int) -> Scene:
+        assert isinstance(self._episodes, FamilyStore)
+        return self._episodes.stack.scenes[world]
 
     def _restart(
         self, chosen: np.ndarray, generators: Sequence[np.random.Generator]

@@ -4,7 +4,7 @@ A `Film` collects what there was to see, epoch by epoch; a frame is drawn from i
 the same episode gives the same pixels. Matplotlib is imported by the first frame.
 """
 
-from rbl_gym.rendering.body import film_of, shot
+from rbl_gym.rendering.body import film_of, film_of_many, shot
 from rbl_gym.rendering.film import RENDER_MODES, Film, check_mode, picture, select, tell
 from rbl_gym.rendering.shots import Pose
 
@@ -14,6 +14,7 @@ __all__ = [
     "Pose",
     "check_mode",
     "film_of",
+    "film_of_many",
     "picture",
     "select",
     "shot",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -23,10 +23,39 @@ def film_of(render_mode: str | None, scene: Scene, title: str | None = None) -> 
     """A film of a scene, titled by its name; None where nothing is to be rendered."""
     if check_mode(render_mode) is None:
         return None
+    return Film(functools.partial(frame, _stage(scene, title)), scene.steps)
+
+
+def film_of_many(
+    render_mode: str | None, scene_of: Callable[[int], Scene], steps: int
+) -> Film | None:
+    """A film of worlds with scenes of their own, whose anchors are padded in the shots."""
+    if check_mode(render_mode) is None:
+        return None
+    return Film(functools.partial(_frame_of_many, scene_of), steps)
+
+
+def _frame_of_many(
+    scene_of: Callable[[int], Scene],
+    world: int,
+    epochs: np.ndarray,
+    shots: Sequence[Shot],
+    beliefs: Sequence[Pose | None],
+) -> Image:
+    scene = scene_of(world)
+    m = scene.n_anchors
+    own = [
+        shot._replace(anchors=shot.anchors[:, :m], measuring=shot.measuring[:, :m])
+        for shot in shots
+    ]
+    return frame(_stage(scene), world, epochs, own, beliefs)
+
+
+def _stage(scene: Scene, title: str | None = None) -> Stage:
     corners = [*scene.volume.bounds(), *scene.anchor_region.bounds()]
     if scene.anchors is not None:
         corners += list(np.asarray(scene.anchors))
-    stage = Stage(
+    return Stage(
         title or scene.name,
         tuple(np.min(corners, axis=0)),
         tuple(np.max(corners, axis=0)),
@@ -35,7 +64,6 @@ def film_of(render_mode: str | None, scene: Scene, title: str | None = None) -> 
         scene.steps,
         scene.dt,
     )
-    return Film(functools.partial(frame, stage), scene.steps)
 
 
 def shot(

@@ -132,12 +132,16 @@ class SceneFamily:
             told["quality"] = np.ones(scene.n_anchors)
         return {key: padded(told[key], shape) for key, (shape, _) in self.fields.items()}
 
-    def draw(self, rng: np.random.Generator) -> tuple[Scene, dict[str, Any]]:
+    def draw(
+        self, rng: np.random.Generator, index: int | None = None
+    ) -> tuple[Scene, dict[str, Any]]:
         """A scene, and the overrides that make it (`rbl_gym.worlds.scenes.get` takes them).
 
-        A member that is a `Scene` is told by its name alone.
+        Of the member with this index; None: of any. A member that is a `Scene` is told by its name
+        alone.
         """
-        index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
+        if index is None:
+            index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
         member = self.members[index]
         if isinstance(member, Mapping):
             laws = _laws_in(member, f"scenes[{index}]")
