@@ -21,7 +21,7 @@ from rbl_gym.measurements import ranging
 from rbl_gym.recordings import read_recording
 from rbl_gym.studies import extras, monte_carlo, replay
 from rbl_gym.studies.bench import figures as bench_figures
-from rbl_gym.studies.bench import leaderboard, records
+from rbl_gym.studies.bench import leaderboard, records, spec_files
 from rbl_gym.studies.bench import worlds as bench_worlds
 from rbl_gym.worlds import scenes
 
@@ -136,13 +136,13 @@ def test_the_scene_hash_sees_every_field():
     assert len(hashes) == len(scenes.SCENES)
     room = scenes.get("uwb_room")
     facts = bench_worlds.scene_facts(room)
-    # A scene without a sensor keeps the hash that it had before there were any.
-    assert set(facts) == {field.name for field in dataclasses.fields(room)} - {"inertial"} | {
-        "kind"
-    }
-    sensed = scenes.get({"name": "uwb_room", "inertial": "consumer"})
-    assert "inertial" in bench_worlds.scene_facts(sensed)
-    assert bench_worlds.scene_hash(sensed) not in hashes
+    # A scene without a sensor or a survey keeps the hash that it had before there were any.
+    younger = {"inertial", "survey_std_m"}
+    assert set(facts) == {field.name for field in dataclasses.fields(room)} - younger | {"kind"}
+    for change in ({"inertial": "consumer"}, {"survey_std_m": 0.1}):
+        changed = scenes.get({"name": "uwb_room", **change})
+        assert set(bench_worlds.scene_facts(changed)) == {*facts, *change}
+        assert bench_worlds.scene_hash(changed) not in hashes
     assert bench_worlds.scene_hash(dataclasses.replace(room, steps=99)) not in hashes
     for change in ({"dt": 0.2}, {"noise": {"floor_m": 0.2}}, {"links": {"nlos_bias_m": 4.0}},
                    {"noise": {"kind": "squared-range", "sigma_m": 0.1}}):  # fmt: skip
@@ -589,6 +589,33 @@ def test_filters_made_for_other_worlds_run_when_they_are_named():
     assert set(leaderboard.ELSEWHERE) < set(estimators.names())
     assert set(leaderboard.default_filters()) & set(leaderboard.ELSEWHERE) == set()
     assert {"iekf", "kf", *leaderboard.VARIANTS} <= set(leaderboard.default_filters())
+
+
+def test_scenes_with_other_sensors_bring_the_filters_made_for_them():
+    specs = spec_files.scene_specs(["uwb_room", *spec_files.SENSED])
+    hashes = {leaderboard.digest_of(spec) for spec in specs.values()}
+    assert len(hashes) == len(specs)
+    usual = tuple(leaderboard.default_filters())
+    for task in leaderboard.tasks(specs, ["nominal"], None, 5, 0):
+        further = leaderboard.further_filters(task.scene)
+        assert task.filters == (*usual, *further)
+        for text in task.filters:
+            leaderboard.parse_filter(text)
+    assert leaderboard.further_filters("uwb_room") == []
+    assert leaderboard.further_filters(specs["uwb_room-imu"]) == ["iekf-imu"]
+    assert "iekf/anchor_std_m=0.05" in leaderboard.further_filters(specs["uwb_room-survey"])
+
+
+def test_who_knows_the_survey_is_honest_and_who_does_not_is_optimistic():
+    """40 trials of 21 epochs: NEES/6 of the first within 25 %, of the second above 1.5."""
+    spec = {**spec_files.SENSED["uwb_room-survey"], "steps": 20}
+    filters = ("iekf", "iekf/anchor_std_m=0.05")
+    task = leaderboard.Task("x", spec, "nominal", filters, 40, 0)
+    plain, knows = (record for record, _ in leaderboard.run_task(task))
+    assert knows["anees"] == pytest.approx(1, abs=0.25)
+    assert knows["tags_m"]["to_bound"] < 1.1
+    assert plain["anees"] > 1.5
+    assert plain["tags_m"]["rmse"] > knows["tags_m"]["rmse"]
 
 
 def test_scenes_keep_their_hash_when_fields_are_added():

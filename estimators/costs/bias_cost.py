@@ -70,7 +70,7 @@ class BiasProblem:
     extra, gain, spread
         x0 (..., K), G (..., K, 6), C (..., K, K).
     sums
-        S (L, K): of which extra states every link is biased.
+        S (..., L, K): of which extra states every link is biased, and by how much.
     ranges, variance, links
         (..., L), metres, and which of the L = M N links were measured.
     anchors, tags
@@ -115,7 +115,7 @@ class BiasProblem:
     @functools.cached_property
     def _unbiased(self) -> FloatArray:
         """The ranges less the biases expected at the prior's pose."""
-        return self.ranges - self.extra @ self.sums.T
+        return self.ranges - _times(self.sums, self.extra)
 
     @functools.cached_property
     def _slope(self) -> FloatArray:
@@ -125,7 +125,7 @@ class BiasProblem:
     @functools.cached_property
     def _own(self) -> FloatArray:
         """Covariance (..., L, L) of the biases given the pose."""
-        return self.sums @ self.spread @ self.sums.T
+        return self.sums @ self.spread @ np.swapaxes(self.sums, -1, -2)
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
         """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
@@ -241,8 +241,8 @@ def update_any(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """`update_augmented` of ranges that may have an `offset` in common.
 
-    `sums` (M N, K): by how much each extra state lengthens every range, where they are no biases
-    of links one by one.
+    `sums` (..., M N, K): by how much each extra state lengthens every range, where they are no
+    biases of links one by one.
     """
     n_links = ranges.shape[-2] * ranges.shape[-1]
     if sums is None:
@@ -323,7 +323,7 @@ def _solved(
     rotation, translation = found.rotation, found.translation
     nu, H, e, D = problem.innovation(rotation, translation)
     # Of the extra states: what the ranges tell given the pose, then what the pose tells.
-    gain = problem.spread @ problem.sums.T @ problem.weight
+    gain = problem.spread @ np.swapaxes(problem.sums, -1, -2) @ problem.weight
     slope = problem.gain @ D - gain @ H
     pose = kept_wide(
         AugmentedState(

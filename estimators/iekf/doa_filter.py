@@ -23,10 +23,12 @@ from rbl_gym.estimators.costs.map_problem import (
 from rbl_gym.estimators.costs.range_cost import RangeCost
 from rbl_gym.estimators.costs.unseen_directions import kept_wide
 from rbl_gym.estimators.filter import register
+from rbl_gym.estimators.iekf.augmented import AugmentedEkf
 from rbl_gym.estimators.iekf.clock import ClockEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state
 from rbl_gym.estimators.iekf.robust_update import HUBER
+from rbl_gym.estimators.iekf.surveyed import SurveyedEkf
 from rbl_gym.estimators.iekf.vague_start import global_start, is_vague, settles, spread
 from rbl_gym.estimators.inputs import check_epoch, check_variance, spanned_dimensions
 from rbl_gym.estimators.locating.doa_global import global_search
@@ -211,7 +213,8 @@ def iterated_ekf(
     range_noise: NoiseLaw | None = None,
     offset: str | None = None,
     clock: Clock | None = None,
-) -> IteratedEkf | ClockEkf:
+    anchor_std_m: ArrayLike | None = None,
+) -> IteratedEkf | AugmentedEkf | ClockEkf:
     """The filter ``"iekf"``: `IteratedEkf` on ranges, `DoaEkf` on directions of arrival.
 
     Parameters
@@ -224,19 +227,23 @@ def iterated_ekf(
         As `IteratedEkf`.
     clock
         Law of offsets that last, in place of `offset`: their clocks are states then (`ClockEkf`).
+    anchor_std_m
+        How well the anchors' places are known: they are states then (`SurveyedEkf`).
     """
     check_one_of("measurement", measurement, MEASUREMENTS)
     if measurement == "doa":
-        if offset is not None or clock is not None:
-            told = offset if clock is None else clock
-            raise ValueError(
-                f"offset and clock must be None where angles are measured, got {told!r:.80}"
-            )
+        for name, told in (("offset", offset), ("clock", clock), ("anchor_std_m", anchor_std_m)):
+            if told is not None:
+                raise ValueError(f"{name} must be None where angles are measured, got {told!r:.80}")
         return DoaEkf(tags, noise, process, iterations, robust, range_noise=range_noise)
     if range_noise is not None:
         raise ValueError("range_noise must be None where noise is the law of the ranges")
     filter = IteratedEkf(tags, noise, process, iterations, robust, offset)
-    return filter if clock is None else ClockEkf(filter, clock)
+    if anchor_std_m is None:
+        return filter if clock is None else ClockEkf(filter, clock)
+    if clock is not None:
+        raise ValueError(f"clock must be None beside anchor_std_m, got {clock!r:.80}")
+    return SurveyedEkf(filter, anchor_std_m=anchor_std_m)
 
 
 register("iekf", iterated_ekf)

@@ -33,14 +33,14 @@ def add_bench(commands: Any) -> None:
         type=_names,
         metavar="A,B",
         help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all but "
-        "iekf-bank, iekf-bias, iekf-cv, iekf-imu and iekf-log",
+        "iekf-bank, iekf-bias, iekf-cv, iekf-imu and iekf-log, and those made for a scene",
     )
     bench.add_argument(
         "--scenes",
         type=_names,
         metavar="A,B",
-        help="names, or files .toml or .json: a scene with changes, or a "
-        "recording; default all named ones",
+        help="names, or files .toml or .json: a scene with changes, or a recording; default all "
+        "named ones, and those with an inertial sensor, time differences or a survey",
     )
     bench.add_argument("--conditions", type=_names, metavar="A,B", help="default all")
     add_trials(bench, 200)
@@ -84,9 +84,9 @@ def _bench(options: argparse.Namespace) -> int:
     check_html(options)
     workers = _workers(options)
     tasks = leaderboard.tasks(
-        spec_files.scene_specs(options.scenes or list(scenes.SCENES)),
+        spec_files.scene_specs(options.scenes or [*scenes.SCENES, *spec_files.SENSED]),
         options.conditions or list(leaderboard.CONDITIONS),
-        options.filters or leaderboard.default_filters(),
+        options.filters,
         options.trials,
         options.seed,
     )

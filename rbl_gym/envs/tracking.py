@@ -91,7 +91,9 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     )
     ```
     ``scene={"links": {"offset": "tag"}}``: the ranges of a tag have an unknown offset in common
-    (time differences); see `rbl_gym.measurements.offsets`.
+    (time differences); see `rbl_gym.measurements.offsets`. ``scene={"survey_std_m": 0.05}``:
+    anchors are told where they were surveyed, off by 5 cm on every axis; `info["anchors"]` are
+    the true ones, and the bound is that of who knows how good the survey is.
     `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
     `rbl_gym.worlds.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
 
@@ -211,7 +213,9 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
             reward = -math.log(info["score_m"])
         if self.film is not None:
             self._shoot(at, observation["links"])
-        observation["anchors"] = self._anchors.copy()
+        observation["anchors"] = simulation.surveyed(at, self._anchors)
+        if at.survey is not None:
+            info["anchors"] = self._anchors.copy()
         observation["twist"] = at.twist.copy()
         if at.readings is not None and at.velocity is not None and at.bias is not None:
             observation["inertial"] = at.readings.copy()
@@ -302,6 +306,7 @@ def observation_space(scene: Scene | SceneFamily) -> spaces.Dict:
         high = np.maximum(high, np.max(scene.anchors, axis=0))
     # check_env wants room between the bounds; a water surface has none.
     low, high = np.where(high > low, low, low - 1), np.where(high > low, high, high + 1)
+    low, high = low - 6 * scene.survey_std_m, high + 6 * scene.survey_std_m
     twist = np.abs(scene.twist)
     # Ten standard deviations of the drawn turn rate; an orbit of 1 m is the tightest.
     twist[:3] = np.maximum(twist[:3], max(10 * scene.spin_rad_s, np.pi / scene.dt, scene.speed_m_s))

@@ -145,7 +145,7 @@ class TrackingVectorEnv(BatchEnv):
         seen = {key: field for key, field in told.items() if key != "nlos"}
         if at.readings is not None:
             seen["inertial"] = at.readings.copy()
-        seen |= {"anchors": self._anchors.copy(), "twist": at.twist}
+        seen |= {"anchors": simulation.surveyed(at, self._anchors), "twist": at.twist}
         if not isinstance(self._episodes, FamilyStore):
             return seen
         arrays = self._episodes.stack.arrays
@@ -164,6 +164,8 @@ class TrackingVectorEnv(BatchEnv):
         }
         if at.velocity is not None and at.bias is not None:
             info["velocity"], info["inertial_bias"] = at.velocity.copy(), at.bias.copy()
+        if at.survey is not None:
+            info["anchors"] = self._anchors.copy()
         if self.reward_mode == "bound":
             info["score_m"] = self._score_m.copy()
         return info

@@ -122,10 +122,12 @@ def told_readings(
     told
         The scene as filters know it; None: as it is.
     anchors
-        Places (B, M, 3) that filters are told; None: the true ones.
+        Places (B, M, 3) that filters are told; None: the true ones, or the surveyed ones where
+        the scene has a survey.
     """
     told = scene if told is None else told
-    anchors = episode.anchors if anchors is None else anchors
+    if anchors is None:
+        anchors = simulation.surveyed(simulation.epoch_of(episode, 0), episode.anchors)
     readings = []
     for epoch, measured in enumerate(measurements):
         at, law = simulation.epoch_of(episode, epoch), None

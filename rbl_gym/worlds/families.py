@@ -53,6 +53,11 @@ class SceneFamily:
                     "scenes must have no inertial sensor: its readings have a shape of their own "
                     f"in every scene, got one in {scene.name!r}"
                 )
+            if scene.survey_std_m > 0:
+                raise ValueError(
+                    "scenes must have survey_std_m = 0, got "
+                    f"{scene.survey_std_m:g} in {scene.name!r}"
+                )
             if scene.links.offset is not None:
                 raise ValueError(
                     "scenes must have ranges without an offset, got links.offset "

@@ -84,6 +84,9 @@ class Scene:
         in their region.
     anchor_speed_m_s
         Limit on the anchors' speed; 0: they are fixed.
+    survey_std_m
+        Standard deviation per axis of the anchors' surveyed places about the true ones: constant
+        over an episode. Observations and filters are told the surveyed ones.
     tags
         Places (N, 3) on the body, in the body frame.
     noise, links
@@ -144,6 +147,7 @@ class Scene:
     start_volume: Box | None = None
     prior: str = "drawn"
     inertial: inertial.InertialSensor | None = None
+    survey_std_m: float = 0.0
 
     def __post_init__(self) -> None:
         for name, kinds in _FIELD_KINDS.items():
@@ -155,7 +159,7 @@ class Scene:
             raise ValueError(f"process must be that of all worlds, got leading axes {shape}")
         for name in ("initial_rotation_rad", "initial_translation_m"):
             check_number(name, getattr(self, name), low=1e-9)
-        for name in ("anchor_speed_m_s", "speed_m_s", "spin_rad_s"):
+        for name in ("anchor_speed_m_s", "speed_m_s", "spin_rad_s", "survey_std_m"):
             check_number(name, getattr(self, name), low=0.0)
         check_number("blocked_information", self.blocked_information, low=0.0, high=1.0)
         if self.anchor_start_m is not None:

@@ -6,7 +6,8 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.bounds import inertial, posterior
-from rbl_gym.bounds.nuisances import with_epoch
+from rbl_gym.bounds.motions import Motion
+from rbl_gym.bounds.nuisances import information_of, with_epoch
 from rbl_gym.checks import BoolArray, FloatArray, all_finite
 from rbl_gym.measurements import ranging
 from rbl_gym.worlds import simulation
@@ -26,8 +27,9 @@ def posterior_step(
     """Posterior Cramer-Rao information (..., n, n) at the true pose of an epoch, and its score.
 
     n is 6; in a scene with an inertial sensor 15, of what ranges and its readings tell: pose,
-    velocity, biases (`bounds.inertial`). From that of the epoch before, or from the prior at epoch
-    0 (`previous` None). Links that gave nothing tell nothing.
+    velocity, biases (`bounds.inertial`); 3 M more where anchors are off by their survey. From that
+    of the epoch before, or from the prior at epoch 0 (`previous` None). Links that gave nothing
+    tell nothing.
 
     Parameters
     ----------
@@ -47,10 +49,8 @@ def posterior_step(
     """
     law = ranging.numbers_of(scene.noise, scene.body.shape[-2])
     assert law is not None  # the laws of scenes have numbers
-    if scene.inertial is not None:
-        return _with_inertial(scene, at, anchors, links, previous, prior_covariance)
-    if scene.links.offset is not None:
-        return _with_offsets(scene, at, anchors, links, previous, prior_covariance)
+    if scene.inertial is not None or scene.links.offset is not None or scene.survey_std_m > 0:
+        return _joint_step(scene, at, anchors, links, previous, prior_covariance)
     information, score = posterior.step_of_ranges(
         np.linalg.inv(prior_covariance) if previous is None else previous,
         at.twist,
@@ -68,7 +68,7 @@ def posterior_step(
     return information, score
 
 
-def _with_inertial(
+def _joint_step(
     scene: Scene,
     at: simulation.Epoch,
     anchors: FloatArray,
@@ -76,58 +76,42 @@ def _with_inertial(
     previous: FloatArray | None,
     prior_covariance: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """`posterior_step` of all 15 states."""
-    sensor = scene.inertial
-    assert sensor is not None
-    assert at.readings is not None
-    assert at.bias is not None
-    if previous is None:
-        before = inertial.prior_information(prior_covariance, sensor, scene.speed_std_m_s)
-    else:
-        # As the true motion has them, but for the white noise, which the bound hardly sees.
-        felt = at.readings - at.bias[..., None, :]
-        steps = np.full(felt.shape[-2], scene.dt / felt.shape[-2])
-        motion = bounds.InertialMotion(felt, steps, sensor)
-        before = motion.predict(previous, 15, at.rotation)
-    information = with_epoch(before, _seen(scene, at, anchors, links), 15)
-    return _scored(scene, at, information)
-
-
-def _with_offsets(
-    scene: Scene,
-    at: simulation.Epoch,
-    anchors: FloatArray,
-    links: BoolArray,
-    previous: FloatArray | None,
-    prior_covariance: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """`posterior_step` of ranges with offsets."""
+    """`posterior_step` with further states, or with offsets of the ranges."""
+    unknown = bounds.Nuisances(scene.links.offset, scene.survey_std_m)
+    count = unknown.count(scene.n_anchors, len(scene.tags))
+    states = 6 if scene.inertial is None else 15
     if previous is None:
         before = np.linalg.inv(prior_covariance)
+        if scene.inertial is not None:
+            speed = scene.speed_std_m_s
+            before = inertial.prior_information(prior_covariance, scene.inertial, speed)
+        before = bounds.with_nuisances(before, count)
     else:
-        before = bounds.predict_information(previous, at.twist, scene.dt, scene.process)
-    return _scored(scene, at, before + _seen(scene, at, anchors, links))
-
-
-def _seen(scene: Scene, at: simulation.Epoch, anchors: FloatArray, links: BoolArray) -> FloatArray:
-    """What the ranges tell about the pose (..., 6, 6)."""
+        before = _motion_of(scene, at).predict(previous, states, at.rotation)
+    epoch = bounds.RangeEpoch(anchors, scene.body, at.rotation, at.translation, scene.noise)
     share = simulation.shares(scene, at, anchors, links)
-    places = anchors, scene.body, at.rotation, at.translation
-    return bounds.information_at(*places, scene.noise, share, scene.links.offset)
-
-
-def _scored(
-    scene: Scene, at: simulation.Epoch, information: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+    information = with_epoch(before, information_of(epoch, unknown, share), states)
     if not all_finite(information):
         raise ValueError("the information about the pose is singular or not finite")
-    covariance = np.linalg.inv(information)[..., :6, :6]
-    return information, bounds.score(covariance, at.rotation, scene.body)
+    return information, bounds.score(pose_covariance(information), at.rotation, scene.body)
+
+
+def _motion_of(scene: Scene, at: simulation.Epoch) -> Motion:
+    """The motion that led to an epoch."""
+    if scene.inertial is None:
+        return bounds.KnownTwist(at.twist, scene.dt, scene.process)
+    assert at.readings is not None
+    assert at.bias is not None
+    # As the true motion has them, but for the white noise, which the bound hardly sees.
+    felt = at.readings - at.bias[..., None, :]
+    steps = np.full(felt.shape[-2], scene.dt / felt.shape[-2])
+    return bounds.InertialMotion(felt, steps, scene.inertial)
 
 
 def information_size(scene: Scene) -> int:
     """Rows of the information that `posterior_step` carries along."""
-    return 6 if scene.inertial is None else 15
+    states = 6 if scene.inertial is None else 15
+    return states + 3 * scene.n_anchors * (scene.survey_std_m > 0)
 
 
 def pose_covariance(information: FloatArray) -> FloatArray:

@@ -52,6 +52,9 @@ class Episode(NamedTuple):
         biases (..., T + 1, 6) at the epochs.
     offsets
         Where ranges have offsets, else None: their standard normals (..., T + 1, 1 or M, 1 or N).
+    survey
+        Where anchors are off by their survey, else None: by how much the surveyed place of each is
+        off (..., T + 1, M, 3), the same at all epochs.
     prior_rotation, prior_translation, prior_covariance
         Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
     anchors
@@ -67,6 +70,7 @@ class Episode(NamedTuple):
     readings: FloatArray | None
     bias: FloatArray | None
     offsets: FloatArray | None
+    survey: FloatArray | None
     prior_rotation: FloatArray
     prior_translation: FloatArray
     prior_covariance: FloatArray
@@ -74,7 +78,7 @@ class Episode(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An episode at one epoch: the first nine fields of `Episode` without their time axis."""
+    """An episode at one epoch: the first ten fields of `Episode` without their time axis."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -85,6 +89,7 @@ class Epoch(NamedTuple):
     readings: FloatArray | None = None
     bias: FloatArray | None = None
     offsets: FloatArray | None = None
+    survey: FloatArray | None = None
 
 
 class Motion(NamedTuple):
@@ -152,12 +157,13 @@ def _links(scene: Scene) -> int:
     return scene.n_anchors * len(scene.tags)
 
 
-def _normal_sizes(scene: Scene) -> tuple[int, int, int, int, int, int]:
-    """Normals of start, process, ranges, random twists, inertial sensor, offsets of the ranges."""
+def _normal_sizes(scene: Scene) -> tuple[int, int, int, int, int, int, int]:
+    """Normals of start, process, ranges, random twists, inertial sensor, offsets, the survey."""
     held = -(-scene.steps_of_motion // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
     ranges, felt = (scene.steps + 1) * _links(scene), inertial_motion.normals_of(scene)
     offsets = (scene.steps + 1) * scene.links.n_offsets(scene.n_anchors, len(scene.tags))
-    return _START_NORMALS, 6 * scene.steps_of_motion, ranges, held, felt, offsets
+    survey = 3 * scene.n_anchors * (scene.survey_std_m > 0)
+    return _START_NORMALS, 6 * scene.steps_of_motion, ranges, held, felt, offsets, survey
 
 
 def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
@@ -170,7 +176,7 @@ def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
 def build_episode(scene: Scene, draws: Draws) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, _, held, felt, common = _split(draws.normals, _normal_sizes(scene))
+    start, process, _, held, felt, common, surveyed = _split(draws.normals, _normal_sizes(scene))
     places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = scene.steps_of_motion
@@ -213,7 +219,13 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     if scene.links.offset is not None:
         shape = scene.links.offset_shape(scene.n_anchors, len(scene.tags))
         offsets = common.reshape((*batch, scene.steps + 1, *shape))
-    return Episode(*path, twists, *random, *inertial, offsets, *prior, covariance, anchors)
+    survey = None
+    if scene.survey_std_m > 0:
+        # Cut at six standard deviations, so that the space of the observations stays finite.
+        survey = scene.survey_std_m * np.clip(surveyed, -6.0, 6.0)
+        survey = survey.reshape((*batch, 1, scene.n_anchors, 3))
+        survey = np.broadcast_to(survey, (*batch, scene.steps + 1, scene.n_anchors, 3))
+    return Episode(*path, twists, *random, *inertial, offsets, survey, *prior, covariance, anchors)
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
@@ -273,6 +285,7 @@ def epoch_of(episode: Episode, epoch: int) -> Epoch:
         None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
         *inertial,
         None if episode.offsets is None else episode.offsets[..., epoch, :, :],
+        None if episode.survey is None else episode.survey[..., epoch, :, :],
     )
 
 
@@ -312,6 +325,11 @@ def measure(
     if at.offsets is None:
         raise ValueError("links.offset is for episodes of a scene, and these are none")
     return ranging.with_offsets(measured, scene.links, at.offsets)
+
+
+def surveyed(at: Epoch, anchors: FloatArray) -> FloatArray:
+    """Places (..., M, 3) of the anchors as observers are told them; a copy."""
+    return anchors.copy() if at.survey is None else anchors + at.survey
 
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:

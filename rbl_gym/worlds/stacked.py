@@ -82,6 +82,7 @@ class StackedScenes:
     scenes: tuple[Scene, ...]
     arrays: _Arrays
     inertial: None = None
+    survey_std_m: float = 0.0
     name: str = "a family of scenes"
 
     @classmethod

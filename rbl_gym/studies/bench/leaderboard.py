@@ -34,6 +34,7 @@ __all__ = [
     "CONDITIONS",
     "Task",
     "default_filters",
+    "further_filters",
     "parse_filter",
     "run_task",
     "summary",
@@ -42,7 +43,8 @@ __all__ = [
 
 # Options with which a filter of ours stands in the table besides its plain self.
 VARIANTS = ("iekf/robust=true",)
-# Made for what no scene has: a start that nobody knows, biased links, no odometry. They take long.
+# Made for what few scenes have: a start that nobody knows, biased links, no odometry, an inertial
+# sensor. They take long.
 ELSEWHERE = ("iekf-bank", "iekf-bias", "iekf-cv", "iekf-imu", "iekf-log")
 # What makes a record another record; a finished one with the same is not run again.
 KEY = ("scene_hash", "condition", "filter", "filter_source", "trials", "seed", "versions")
@@ -67,6 +69,21 @@ def default_filters() -> list[str]:
     return [*(name for name in estimators.names() if name not in ELSEWHERE), *VARIANTS]
 
 
+def further_filters(spec: str | Mapping[str, Any]) -> list[str]:
+    """Filters made for what a scene has and others have not; none for a recording."""
+    if is_recording(spec):
+        return []
+    scene = scenes.get(spec)
+    further = ["iekf-imu"] if scene.inertial is not None else []
+    if scene.survey_std_m > 0:
+        std = f"{scene.survey_std_m:g}"
+        further += [
+            f"iekf/anchor_std_m={std}",
+            f"iekf-bias/bias_std_m={std}/common_std_m=0",
+        ]
+    return further
+
+
 def parse_filter(text: str) -> tuple[str, dict[str, Any]]:
     """``name/option=value/...`` as a name and options; values are JSON, or else text."""
     name, *parts = text.split("/")
@@ -85,7 +102,7 @@ def parse_filter(text: str) -> tuple[str, dict[str, Any]]:
 def tasks(
     specs: Mapping[str, str | dict[str, Any]],
     conditions: Sequence[str],
-    filters: Sequence[str],
+    filters: Sequence[str] | None,
     trials: int,
     seed: int,
 ) -> list[Task]:
@@ -98,7 +115,8 @@ def tasks(
     conditions
         Of `CONDITIONS`.
     filters
-        Names, with options as `parse_filter` reads them.
+        Names, with options as `parse_filter` reads them; None: `default_filters`, and of every
+        scene its `further_filters`.
     trials, seed
         Of the simulated scenes, and of all randomness.
 
@@ -109,14 +127,18 @@ def tasks(
     """
     for condition in conditions:
         check_one_of("condition", condition, list(CONDITIONS))
-    for text in filters:
+    for text in filters or ():
         name, options = parse_filter(text)
         scene = scenes.get("uwb_room")
         estimators.make(name, tags=scene.tags, noise=scene.noise, process=scene.process, **options)
     for spec in specs.values():
         digest_of(spec)
+    usual = default_filters() if filters is None else filters
+    further = {
+        label: further_filters(spec) if filters is None else [] for label, spec in specs.items()
+    }
     return [
-        Task(label, spec, condition, tuple(filters), trials, seed)
+        Task(label, spec, condition, (*usual, *further[label]), trials, seed)
         for label, spec in specs.items()
         for condition in conditions
     ]

@@ -1,4 +1,7 @@
-"""Scenes of the benchmark from names and files: a named one, one with changes, a recording."""
+"""Scenes of the benchmark from names and files: a named one, one with changes, a recording.
+
+Besides the named scenes the benchmark has `SENSED`: the same with other sensors, or a survey.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,16 @@ from typing import Any
 from rbl_gym.studies.bench import leaderboard
 from rbl_gym.studies.bench.recordings import FILES
 
-__all__ = ["read_spec", "scene_specs"]
+__all__ = ["SENSED", "read_spec", "scene_specs"]
+
+# Named scenes with an inertial sensor, with an unknown offset of every tag's ranges (time
+# differences), and with anchors whose surveyed places are 5 cm off on every axis.
+SENSED: dict[str, dict[str, Any]] = {
+    "uwb_room-imu": {"name": "uwb_room", "inertial": "consumer"},
+    "drone_yard-imu": {"name": "drone_yard", "inertial": "consumer"},
+    "uwb_room-tdoa": {"name": "uwb_room", "links": {"offset": "tag"}},
+    "uwb_room-survey": {"name": "uwb_room", "survey_std_m": 0.05},
+}
 
 
 def scene_specs(names: Sequence[str]) -> dict[str, str | dict[str, Any]]:
@@ -20,8 +32,8 @@ def scene_specs(names: Sequence[str]) -> dict[str, str | dict[str, Any]]:
     Parameters
     ----------
     names
-        Names of scenes, or of files ``.toml`` and ``.json`` (`read_spec`), which have the name
-        of the file without its ending as label.
+        Names of scenes or of `SENSED`, or of files ``.toml`` and ``.json`` (`read_spec`), which
+        have the name of the file without its ending as label.
 
     Raises
     ------
@@ -35,7 +47,7 @@ def scene_specs(names: Sequence[str]) -> dict[str, str | dict[str, Any]]:
         if label in specs:
             raise ValueError(f"--scenes: two are named {label!r}: rename a file")
         if label == name:
-            specs[label] = name
+            specs[label] = dict(SENSED[name]) if name in SENSED else name
             continue
         specs[label] = read_spec(path)
         try:
