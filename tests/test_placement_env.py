@@ -445,3 +445,25 @@ def test_frames_of_a_hall_show_its_obstacles():
         env.step(np.zeros(3))
         shown.append(env.render())
     assert (shown[0] != shown[1]).any()
+
+
+def test_action_masks_are_the_mounts_that_are_free():
+    arguments = {"scene": "uwb_room", "mode": "mounts", "racks": 1}
+    env = gym.make(ID, **arguments)
+    env.reset(seed=3)
+    masks: Any = env.get_wrapper_attr("action_masks")
+    assert masks().shape == (57,)
+    assert masks().all()
+    for count in range(1, 4):
+        chosen = int(np.flatnonzero(masks())[5])
+        *_, info = env.step(chosen)
+        assert not masks()[chosen]
+        assert masks().sum() == 57 - count
+        np.testing.assert_array_equal(masks(), info["action_mask"])
+    envs = gym.make_vec(ID, num_envs=2, **arguments)
+    envs.reset(seed=3)
+    envs.step(np.array([4, 9]))
+    both = envs.unwrapped.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
+    assert [list(np.flatnonzero(~row)) for row in both] == [[4], [9]]
+    with pytest.raises(ValueError, match="mode must be 'mounts' for action masks"):
+        gym.make(ID).get_wrapper_attr("action_masks")()

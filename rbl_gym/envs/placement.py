@@ -204,9 +204,17 @@ class AnchorPlacementVectorEnv(BatchEnv):
             "racks": contexts.racks.copy(),
         }
         if self.mode == "mounts":
-            free = ~np.take_along_axis(self._taken, self._shown(), axis=-1)
-            info["action_mask"] = free.astype(np.int8)
+            info["action_mask"] = self.action_masks().astype(np.int8)
         return info
+
+    def action_masks(self) -> BoolArray:
+        """Mounts (B, 57) that are free, in the order of the actions; only with ``mode="mounts"``.
+
+        As sb3-contrib's ``MaskablePPO`` asks for.
+        """
+        if self.mode != "mounts":
+            raise ValueError(f"mode must be 'mounts' for action masks, got {self.mode!r}")
+        return ~np.take_along_axis(self._taken, self._shown(), axis=-1)
 
 
 class AnchorPlacementEnv(ScalarEnv):
@@ -247,7 +255,7 @@ class AnchorPlacementEnv(ScalarEnv):
     ## Info
     `anchors` (M, 3), zeros where not yet placed; `region` (centre and half size, metres),
     `racks` (K, 6), the scene's own obstacles first; `score_m` of the complete layout, 0 before;
-    mounts: `action_mask` (57).
+    mounts: `action_mask` (57), which `action_masks()` gives as booleans.
 
     ## Rendering
     ``render_mode="rgb_array"``: the problem and its anchors in space and in plan, the expected
@@ -287,6 +295,13 @@ class AnchorPlacementEnv(ScalarEnv):
     def task(self) -> placement.PlacementTask:
         """The family of problems."""
         return self._batch.task
+
+    def action_masks(self) -> BoolArray:
+        """Mounts (57,) that are free, in the order of the actions; only with ``mode="mounts"``.
+
+        As sb3-contrib's ``MaskablePPO`` asks for.
+        """
+        return self._batch.action_masks()[0]
 
 
 def check_sight(sight: bool, task: placement.PlacementTask) -> bool:
