@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,6 +91,34 @@ SHELL = SCENE | {
     "anchors": {"kind": "shell", "inner_m": 50, "outer_m": 300, "number": 5},
     "body": {"tags": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]},
 }
+BUILDING = {
+    "anchors": {"number": 4, "fixed": [[0.5, 0.5, 2]], "max_range_m": 30, "range_edge_m": 4,
+                "half_angle_deg": 80, "angle_edge_deg": 9},
+    "materials": {"glass": 0.8},
+    "mounts": [
+        {"kind": "wall", "line": [[0, 0], [9, 0], [9, 7], [0, 7]], "closed": True, "low_m": 1,
+         "high_m": 3, "side": "both", "offset_m": 0.1, "name": "w", "cost": 2},
+        {"kind": "ceiling", "polygon": [[1, 1], [8, 1], [8, 6]], "height_m": 3},
+        {"kind": "column", "polygon": [[4, 3], [5, 3], [5, 4]], "low_m": 1, "high_m": 3},
+        {"kind": "area", "polygon": [[1, 1], [2, 1], [2, 2]], "high_m": 2, "axis": [0, 0, 1]},
+        {"kind": "points", "points": [[1, 6, 2], [2, 6, 2]]},
+    ],
+    "forbidden": [{"polygon": [[3, -1], [4, -1], [4, 1]], "low_m": 2, "high_m": 3}],
+    "walls": [{"line": [[0, 0], [9, 0], [9, 7], [0, 7]], "closed": True, "thickness_m": 0.2,
+               "high_m": 3, "material": "glass"}, {"line": [[3, 1], [3, 5]], "high_m": 3}],
+    "obstacles": [{"polygon": [[4, 3], [5, 3], [5, 4]], "high_m": 3, "information": 0.1},
+                  {"low": [6, 3, 0], "high": [7, 5, 2]},
+                  {"low": [6, 1, 0], "high": [7, 2, 2], "material": "glass"}],
+    "slabs": [{"polygon": [[0, 0], [9, 0], [9, 7], [0, 7]], "z_m": 3, "thickness_m": 0.3}],
+    "zones": [
+        {"name": "a", "polygon": [[1, 1], [8, 1], [8, 6], [1, 6]], "low_m": 0.5, "high_m": 1.5,
+         "weight": 2, "attitude": "level", "position_m": 0.2, "heading_deg": 5, "share": 0.9},
+        {"low": [1, 1, 0], "high": [2, 2, 1], "attitude": "heading", "height_m": 0.3},
+    ],
+    "plan": {"image": "p.png", "metres_per_pixel": 0.1, "origin": [0, 1]},
+    "body": {"tags": [[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]]},
+    "noise": {"floor_m": 0.1, "blocked_information": 0.01},
+}  # fmt: skip
 TOML = b"""name = "hall"
 [anchors]
 kind = "box"
@@ -153,6 +182,28 @@ def _carrier(relative: bool, path: Path) -> Any:
     return read_recording(**files, relative=relative, format=arms)
 
 
+def _problem(path: Path) -> Any:
+    """All numbers of a placement problem, and places that can be drawn in it."""
+    found = problem(str(path))
+    prisms, zones = found.obstacles.prisms, [zone.bounds() for zone in found.zones]
+    drawn = found.mounts.draw(np.random.default_rng(0).random((50, 3)))
+    places = found.free_places(20)
+    share = found.share(drawn, places)
+    assert ((share >= 0) & (share <= 1)).all()
+    np.testing.assert_allclose(found.mounts.project(drawn), drawn, rtol=1e-9, atol=1e-6)
+    arrays = found.tags, found.fixed, found.obstacles.boxes, prisms.corners, prisms.low_m
+    return (
+        *arrays,
+        prisms.high_m,
+        *zones,
+        *found.prior,
+        found.gain.numbers[1:],
+        drawn,
+        places,
+        share,
+    )
+
+
 def _policy() -> bytes:
     stream = io.BytesIO()
     meta = np.array(json.dumps({"kind": "box", "task": "mobile", "seed": 0}))
@@ -205,10 +256,8 @@ READERS = {
         "graph.csv", read_graph, (b"i,j,dtheta\n0,1,0.5\n1,2,0.1\n", b"i,j,a,b\n0,1,0.5,-2\n"),
         NUMBERS + MARKS,
     ),
-    "scene-json": Reader("scene.json", lambda path: problem(str(path)), _json, NUMBERS + JSON),
-    "scene-toml": Reader(
-        "scene.toml", lambda path: problem(str(path)), (TOML,), NUMBERS + MARKS + JSON
-    ),
+    "scene-json": Reader("scene.json", _problem, _json, NUMBERS + JSON),
+    "scene-toml": Reader("scene.toml", _problem, (TOML,), NUMBERS + MARKS + JSON),
     "policy": Reader("policy.npz", policies.load, (_policy(), _policy_packed()), NUMBERS),
     "bench-spec": Reader(
         "spec.json", spec_files.read_spec,
@@ -222,6 +271,9 @@ READERS = {
         NUMBERS + JSON,
     ),
 }  # fmt: skip
+if find_spec("shapely"):
+    _building = (json.dumps(BUILDING).encode(),)
+    READERS["building"] = Reader("building.json", _problem, _building, NUMBERS + JSON)
 
 
 def check(name: str, data: bytes, folder: Path) -> str:

@@ -1,14 +1,60 @@
-"""Buildings from files: walls, mounts, zones, and what is refused."""
+"""Buildings from files: walls, mounts, zones, the schema, and what is refused."""
 
 from __future__ import annotations
 
-import numpy as np
+import copy
+import json
+import math
+import re
+import tomllib
+from typing import Any
 
+import numpy as np
+import pytest
+
+from rbl_gym.app.cli import main
+from rbl_gym.geometry import polygons
+from rbl_gym.geometry.regions import Box
+from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement import building, scene_files
+from rbl_gym.placement.file_keys import FORMAT
 from rbl_gym.placement.file_schema import schema
+from rbl_gym.placement.file_walls import wall_pieces
 from tests.helpers import ROOT, needs
 
-SQUARE = np.array([[0.0, 0], [4, 0], [4, 4], [0, 4]])
+OFFICE = tomllib.loads((ROOT / "examples" / "office.toml").read_text(encoding="utf-8"))
+SQUARE = [[0, 0], [4, 0], [4, 4], [0, 4]]
+# A hall without walls, whose anchors stand in a box: needs no shapely.
+HALL = {
+    "anchors": {"kind": "box", "low": [0, 0, 2], "high": [10, 8, 3], "number": 4},
+    "zones": [{"low": [1, 1, 0], "high": [9, 7, 2], "position_m": 0.2}],
+    "body": {"shape": "pyramid", "size_m": 0.5},
+    "noise": {"floor_m": 0.1},
+}
+
+
+def changed(path: str, value: object, tables: Any = OFFICE) -> dict:
+    """The tables with one entry changed, added at the end of a list, or taken out for None."""
+    tables = copy.deepcopy(tables)
+    *parents, key = path.split(".")
+    node: Any = tables
+    for parent in parents:
+        node = node[int(parent)] if isinstance(node, list) else node.setdefault(parent, {})
+    index: Any = int(key) if isinstance(node, list) else key
+    if value is None:
+        del node[index]
+    elif isinstance(node, list) and index == len(node):
+        node.append(value)
+    else:
+        node[index] = value
+    return tables
+
+
+def anywhere(problem, count=800) -> np.ndarray:
+    return problem.mounts.draw(np.random.default_rng(0).random((count, 3)))
+
+
+# --- what is read ------------------------------------------------------------------------------
 
 
 @needs("shapely")
@@ -16,24 +62,436 @@ def test_the_office_is_read():
     problem = scene_files.problem(str(ROOT / "examples" / "office.toml"))
     assert isinstance(problem, building.Problem)
     assert problem.name == "office"
-    assert [zone.name for zone in problem.zones] == ["open plan", "meeting room"]
-    assert all(zone.attitude in building.ATTITUDES for zone in problem.zones)
+    assert problem.noise == RangeNoise(0.08, 0.004)
     assert problem.n_anchors == 8
-    assert isinstance(problem.prior, building.Prior)
+    assert problem.prior == building.Prior(math.radians(15), 0.5)
     assert problem.plan is None
-    assert building.Plan().units == "m"
-    points = problem.mounts.draw(np.random.default_rng(0).random((500, 3)))
-    assert not problem.obstacles.contain(points).any()
+    np.testing.assert_array_equal(problem.fixed, [[23.8, 0.2, 2.6]])
+    assert problem.gain.max_range_m == 30
+    assert problem.gain.angle_edge_rad == pytest.approx(math.radians(10))
+    first, second = problem.zones
+    assert (first.name, first.weight, first.attitude) == ("open plan", 2, "level")
+    assert (first.position_m, first.heading_deg, first.height_m) == (0.15, 8, None)
+    assert (second.share, second.heading_deg) == (0.9, None)
+    assert first.has_requirement
+    assert {zone.attitude for zone in problem.zones} <= set(building.ATTITUDES)
+    # Six pieces of outer wall, two of drywall, the core; the cupboard is a box.
+    assert len(problem.obstacles.prisms) == 9
+    assert len(problem.obstacles) == 10
+    share = problem.obstacles.prisms.share
+    np.testing.assert_array_equal(share[~np.isnan(share)], [0.05, 0.6, 0.6])
 
 
-def test_free_places_lie_in_the_zone():
+@needs("shapely")
+def test_mounts_stand_free_and_off_what_is_forbidden():
+    problem = scene_files.of_mapping(OFFICE)
+    points = anywhere(problem)
+    np.testing.assert_allclose(problem.mounts.project(points), points, atol=1e-9)
+    ahead = points + 2e-3 * problem.mounts.normal(points)
+    assert not problem.obstacles.contain(ahead).any()
+    assert not ((points[:, 0] > 23) & (points[:, 1] > 4) & (points[:, 1] < 6)).any()
+    names = problem.mounts.names(points)
+    assert {name.rstrip(" 123456") for name in names} == {
+        "outer wall", "partition", "ceiling", "core",
+    }  # fmt: skip
+    cost = problem.mounts.cost(points)
+    assert all((name == "ceiling") == (c == 1.5) for name, c in zip(names, cost, strict=True))
+    # Outer mounts were drawn on the wall's line: they were moved 0.15 m, to its inner face.
+    west = [point for point, name in zip(points, names, strict=True) if name == "outer wall 6"]
+    np.testing.assert_allclose(np.array(west)[:, 0], 0.15)
+    south = [point for point, name in zip(points, names, strict=True) if name == "outer wall 1"]
+    np.testing.assert_allclose(np.array(south)[:, 1], 0.15)
+    # The two sides of the partition see their own room alone.
+    for side, inside, outside in (("partition 2", 5.0, 13.0), ("partition 1", 13.0, 5.0)):
+        stand = np.array([p for p, name in zip(points, names, strict=True) if name == side])
+        for y, free in ((inside, True), (outside, False)):
+            share = problem.obstacles.share(stand, np.array([[8.0, y, 1.0]]))
+            assert (share == 1).all() == free
+        np.testing.assert_allclose(problem.mounts.normal(stand)[:, 1], np.sign(inside - 10))
+
+
+@needs("shapely")
+def test_only_the_range_and_the_field_of_view_take_from_a_clear_link():
+    problem = scene_files.of_mapping(OFFICE)
+    anchor = np.array([[0.15, 1.0, 2.5]])  # on the west wall, looks along x
+    for point, wanted in (
+        ((10.0, 1.0, 1.0), 1.0),
+        ((0.3, 8.0, 2.0), 0.0),  # 89 degrees off its axis
+        ((10.15, 1.0, 2.5), 1.0),
+    ):
+        assert problem.share(anchor, np.array([point]))[0, 0] == pytest.approx(wanted)
+    assert 0 < problem.share(anchor, np.array([[23.0, 1.0, 2.5]]))[0, 0] <= 1
+    far = scene_files.of_mapping(changed("anchors.max_range_m", 20.0))
+    assert far.share(anchor, np.array([[21.0, 1.0, 2.5]]))[0, 0] == 0
+    half = far.share(anchor, np.array([[0.15 + 17.5, 1.0, 2.5]]))[0, 0]
+    assert half == pytest.approx(0.5)
+
+
+def test_walls_are_mitred_where_they_meet():
+    ring = polygons.check_polygon("ring", SQUARE)
+    pieces = wall_pieces(ring, 0.5, closed=True)
+    # Together they are the frame: no gap, no overlap.
+    assert sum(polygons.area(piece) for piece in pieces) == pytest.approx(5**2 - 3**2)
+    for corner in ([-0.4, -0.3], [4.4, 4.3], [-0.4, 2.0]):
+        held = [polygons.contains(piece, np.array(corner)) for piece in pieces]
+        assert sum(held) == 1
+    bent = wall_pieces(np.array([[0.0, 0], [4, 0], [4, 4]]), 0.1, closed=False)
+    assert sum(polygons.area(piece) for piece in bent) == pytest.approx(2 * 4 * 0.2)
+    # A hairpin is not drawn out to a needle.
+    needle = wall_pieces(np.array([[0.0, 0], [4, 0], [0, 0.1]]), 0.1, closed=False)
+    assert np.abs(np.concatenate(needle)).max() < 4.5
+
+
+def test_losses_by_material_multiply_and_opaque_ones_count_once():
+    tables = HALL | {
+        "materials": {"glass": 0.8},
+        "walls": [
+            {"line": [[2, 0], [2, 8]], "thickness_m": 0.1, "high_m": 3, "material": "glass"},
+            {"line": [[4, 0], [4, 8]], "thickness_m": 0.1, "high_m": 3, "information": 0.5},
+            {"line": [[6, 0], [6, 8]], "high_m": 3},
+            {"line": [[7, 0], [7, 8]], "high_m": 1.5},
+        ],
+        "obstacles": [
+            {"low": [8, 0, 0], "high": [8.2, 8, 3]},
+            {"low": [8.5, 0, 0], "high": [8.6, 8, 3], "material": "glass"},
+        ],
+    }
+    problem = scene_files.of_mapping(tables)
+    places = np.array([[x, 4.0, 1.0] for x in (1, 3, 5, 6.5, 7.5, 8.3, 9)])
+    share = problem.obstacles.share(np.array([[0.0, 4, 1]]), places)[:, 0]
+    np.testing.assert_allclose(share, [1, 0.8, 0.4, 0.004, 0.004, 0.004, 0.0032])
+
+
+@needs("shapely")
+def test_floors_are_parted_by_slabs():
+    tables = HALL | {
+        "anchors": {"number": 4},
+        "materials": {"slab": 0.1},
+        "slabs": [{"polygon": SQUARE, "z_m": 3.0, "material": "slab"}],
+        "mounts": [
+            {"kind": "ceiling", "polygon": SQUARE, "height_m": 3.0},
+            {"kind": "ceiling", "polygon": SQUARE, "height_m": 6.0},
+        ],
+        "zones": [
+            {"name": "ground", "polygon": SQUARE, "low_m": 0.5, "high_m": 2},
+            {"name": "first", "polygon": SQUARE[::-1], "low_m": 3.5, "high_m": 5},
+        ],
+    }
+    problem = scene_files.of_mapping(tables)
+    points = anywhere(problem)
+    assert set(points[:, 2]) == {3.0, 6.0}
+    up, down = (np.array([[2.0, 2, z]]) for z in (4.0, 1.0))
+    share = problem.obstacles.share(points, np.concatenate([up, down]))
+    lower = points[:, 2] == 3.0
+    np.testing.assert_array_equal(share[0], np.where(lower, 0.1, 1.0))
+    np.testing.assert_array_equal(share[1], np.where(lower, 1.0, 0.1))
+    places = problem.free_places(400)
+    assert abs((places[:, 2] > 3).mean() - 0.5) < 0.01
+    assert problem.free(places).all()
+    assert not problem.free(np.array([[2.0, 2, 3.1]])).any()
+    low, high = problem.corners()
+    np.testing.assert_array_equal([low, high], [[0, 0, 0.5], [4, 4, 5]])
+
+
+@needs("shapely")
+def test_every_kind_of_mount():
+    mounts = [
+        {"kind": "column", "polygon": [[1, 1], [2, 1], [2, 2]], "high_m": 3, "name": "pillar"},
+        {"kind": "area", "polygon": SQUARE, "low_m": 1, "high_m": 2, "axis": [0, 0, 2]},
+        {"kind": "points", "points": [[9, 7, 3], [9, 1, 3]], "cost": 7},
+        {"kind": "wall", "line": [[0, 8], [10, 8]], "side": "right", "low_m": 2, "high_m": 2.5,
+         "offset_m": 0.25},
+    ]  # fmt: skip
+    tables = HALL | {"anchors": {"number": 4}, "mounts": mounts}
+    tables["obstacles"] = [
+        {"polygon": [[1, 1], [2, 1], [2, 2]], "high_m": 3, "information": 0.5},
+        {"low": [3, 3, 0], "high": [5, 5, 1.5]},
+    ]
+    problem = scene_files.of_mapping(tables)
+    points = anywhere(problem, 3000)
+    names = np.array(problem.mounts.names(points))
+    normal = problem.mounts.normal(points)
+    assert set(names) == {"pillar 1", "pillar 2", "pillar 3", "area 2", "points 3", "wall 4"}
+    for name, wanted in (
+        ("pillar 1", [0, -1, 0]), ("pillar 2", [1, 0, 0]), ("area 2", [0, 0, 1]),
+        ("points 3", [0, 0, 0]), ("wall 4", [0, -1, 0]),
+    ):  # fmt: skip
+        assert (names == name).any()
+        assert np.abs(normal[names == name] - wanted).max() < 1e-12
+    wall = points[names == "wall 4"]
+    np.testing.assert_allclose(wall[:, 1], 7.75)
+    # The area without the pillar, and below the top of the box without that.
+    area = points[names == "area 2"]
+    assert not problem.obstacles.contain(area).any()
+    corner = (area[:, :2] > 3.01).all(axis=1)
+    assert (area[corner, 2] > 1.5 - 1e-9).all()
+    assert problem.mounts.listed() is None
+    assert (problem.mounts.cost(points)[names == "points 3"] == 7).all()
+    # What stands on the face of the pillar sees past it, not through it.
+    west = points[names == "pillar 1"]
+    share = problem.obstacles.share(west, np.array([[1.5, -3.0, 1.0], [1.2, 5.0, 1.0]]))
+    np.testing.assert_array_equal(share[0], 1)
+    assert (share[1] == 0.5).mean() > 0.9
+    listed = scene_files.of_mapping(tables | {"mounts": [mounts[2]], "anchors": {
+        "number": 3, "fixed": [[0, 0, 3]]}})  # fmt: skip
+    np.testing.assert_array_equal(listed.mounts.listed(), [[9, 7, 3], [9, 1, 3]])
+
+
+@needs("shapely")
+def test_a_cupboard_along_a_wall_covers_it_up_to_its_height():
+    tables = HALL | {
+        "anchors": {"number": 4},
+        "obstacles": [{"low": [2, 0, 0], "high": [4, 0.6, 2.0]}],
+        "mounts": [{"kind": "wall", "line": [[0, 0], [10, 0]], "low_m": 1, "high_m": 3}],
+        "forbidden": [{"polygon": [[8, -1], [9, -1], [9, 1], [8, 1]], "low_m": 2.5}],
+    }
+    problem = scene_files.of_mapping(tables)
+    x, _, z = anywhere(problem, 4000).T
+    assert not ((x > 2.001) & (x < 3.999) & (z < 1.999)).any()
+    assert ((x > 2) & (x < 4) & (z > 2)).any()
+    assert not ((x > 8) & (x < 9) & (z > 2.5)).any()
+    assert ((x > 8) & (x < 9) & (z < 2.5)).any()
+    area = 20 - 2 * 1 - 1 * 0.5
+    assert problem.mounts.measure.sum() == pytest.approx(area, abs=0.02)
+    # From behind the cupboard to above it, or to the side.
+    np.testing.assert_allclose(
+        problem.mounts.project(np.array([[2.5, 0, 1.9], [2.1, 0, 1.1]])),
+        [[2.5, 0, 2.0], [2.0, 0, 1.1]],
+        atol=1e-5,
+    )
+
+
+def test_bodies_of_one_or_two_tags_where_the_question_allows():
+    one, two = [[0, 0, 0.5]], [[-0.5, 0, 0], [0.5, 0, 0]]
+    for tags, zone in (
+        (one, {"position_m": 0.1}),
+        (one, {"attitude": "heading"}),
+        (two, {"position_m": 0.1}),
+        (two, {"attitude": "heading", "position_m": 0.1, "heading_deg": 5}),
+    ):
+        tables = HALL | {"body": {"tags": tags}}
+        tables["zones"] = [{"low": [1, 1, 0], "high": [9, 7, 2], **zone}]
+        assert scene_files.of_mapping(tables).tags.shape == (len(tags), 3)
+    for tags, zone, message in (
+        (two, {}, "tags must be at least 3"),
+        (two, {"position_m": 0.1, "heading_deg": 5}, "tags must be at least 3"),
+        (two, {"attitude": "level"}, "tags must be at least 3"),
+        (one, {"attitude": "heading", "heading_deg": 5}, "tags must not stand above each other"),
+    ):
+        tables = HALL | {"body": {"tags": tags}}
+        tables["zones"] = [{"low": [1, 1, 0], "high": [9, 7, 2], **zone}]
+        with pytest.raises(ValueError, match="^" + message):
+            scene_files.of_mapping(tables)
+
+
+def test_the_plan_has_its_paths_from_the_folder_of_the_file(tmp_path):
+    tables = HALL | {"plan": {"image": "a/plan.png", "metres_per_pixel": 0.05, "origin": [-1, 2]}}
+    path = tmp_path / "hall.json"
+    path.write_text(json.dumps(tables))
+    plan = scene_files.problem(str(path)).plan
+    assert plan == building.Plan(str(tmp_path / "a" / "plan.png"), 0.05, (-1, 2))
+
+
+def test_a_region_on_the_command_line_goes_before_the_zones():
+    problem = scene_files.of_mapping(HALL, region=([1, 1, 0], [2, 2, 1]))
+    (zone,) = problem.zones
+    assert zone.name == "region"
+    assert not zone.has_requirement
+    np.testing.assert_array_equal(zone.bounds(), [[1, 1, 0], [2, 2, 1]])
+    assert problem.scene.volume == Box((1, 1, 0), (2, 2, 1))
+
+
+def test_free_places_lie_in_the_zone_and_begin_with_those_of_fewer():
     zone = building.Zone("z", np.array([[0.0, 0], [4, 0], [0, 4]]), 0.0, 1.0)
     empty = scene_files.problem("uwb_room").obstacles
     places = building.free_places(zone, empty, 300)
-    assert len(places) == 300
+    assert places.shape == (300, 3)
     assert (places[:, 0] + places[:, 1] <= 4).all()
     assert zone.contains(places).all()
+    np.testing.assert_array_equal(building.free_places(zone, empty, 20), places[:20])
+    np.testing.assert_allclose(places.mean(axis=0), [4 / 3, 4 / 3, 0.5], atol=0.05)
 
 
-def test_the_schema_names_every_table():
-    assert {"zones", "mounts", "materials", "name"} <= set(schema()["properties"])
+# --- what is refused ---------------------------------------------------------------------------
+
+NAN = math.nan
+BAD = [
+    ("colour", 1, "the file has an unknown key 'colour'; it may have name, anchors, mounts"),
+    ("zones", None, "the file must have the key 'region' or [[zones]]"),
+    ("region", {"low": [0] * 3, "high": [1] * 3}, "the file must have either [region] or"),
+    ("walls", {"a": 1}, "walls must be a list of tables"),
+    ("walls.0", 7, "walls[0] must be a table of keys, got 7"),
+    ("walls.0.thicknes", 1, "walls[0] has an unknown key 'thicknes'; it may have line, closed"),
+    ("walls.0.thickness_m", 0, "walls[0].thickness_m must be a finite number in [0.001"),
+    ("walls.0.thickness_m", NAN, "walls[0].thickness_m must be a finite number"),
+    ("walls.0.closed", 1, "walls[0].closed must be true or false, got 1"),
+    ("walls.1.material", "wood", "walls[1].material must be one of [materials], which has 'dry"),
+    ("walls.1.information", 0.5, "walls[1] must have either material or information"),
+    ("walls.0.line", [[0, 0], [4, 4], [4, 0], [0, 2]], "walls[0].line must not cross or touch"),
+    ("walls.1.line", [[0, 0], [0, 0]], "walls[1].line must have at least 2 different points"),
+    ("walls.1.line", [[0, 0], [1, NAN]], "walls[1].line must be finite, got nan at index (1, 1)"),
+    ("walls.1.line", [[0, 0], [1, 1e9]], "walls[1].line must lie within 1e+06 m of the origin"),
+    ("walls.1.high_m", -1, "walls[1]: low_m must lie below high_m, got 0 and -1"),
+    ("walls.1.high_m", None, "walls[1] must have the key 'high_m'"),
+    ("materials.drywall", 2, "materials.drywall must be a finite number in [0, 1], got 2"),
+    ("materials", "x", "materials must be a table of keys"),
+    (
+        "obstacles.0.polygon",
+        [[15, 4], [18, 7], [18, 4], [15, 8]],
+        "obstacles[0].polygon must not cross or touch itself: edge 1, from (15, 4) to (18, 7)",
+    ),
+    ("obstacles.0.low", [1, 1, 1], "obstacles[0] has an unknown key 'low'; it may have polygon"),
+    ("obstacles.0.high_m", 0, "obstacles[0]: low_m must lie below high_m, got 0 and 0"),
+    ("obstacles.1.low", None, "obstacles[1] must have the key 'low'"),
+    ("slabs", [{"polygon": SQUARE, "z_m": 3, "material": "x"}], "slabs[0].material must be one"),
+    ("mounts.0.kind", "roof", "mounts[0].kind must be one of 'wall', 'ceiling', 'column'"),
+    ("mounts.0.kind", None, "mounts[0] must have the key 'kind'"),
+    ("mounts.0.side", "up", "mounts[0].side must be one of 'left', 'right', 'both'"),
+    ("mounts.2.low_m", 1, "mounts[2] has an unknown key 'low_m'"),
+    ("mounts", [], "anchors.kind must be given: one of 'room', 'box', 'shell'; or [[mounts]]"),
+    ("mounts", [{"kind": "points", "points": []}], "mounts[0].points must not be empty"),
+    ("mounts.0.name", 3, "mounts[0].name must be a printable text"),
+    ("forbidden.0.low_m", 2e6, "forbidden[0].low_m must be a finite number"),
+    ("anchors.kind", "room", "anchors must have the key 'low'"),
+    ("anchors.fixed", [[16, 5, 2]], "anchors.fixed[0] = (16, 5, 2) lies inside an obstacle"),
+    ("anchors.fixed", [[1, 1, 2]] * 9, "the number of anchors counts the fixed ones: at least 9"),
+    ("anchors.fixed", [[1, 2]], "anchors.fixed must have shape"),
+    ("anchors.half_angle_deg", 200, "anchors.half_angle_deg must be a finite number in [0.1"),
+    ("anchors.range_edge_m", 50, "anchors.range_edge_m must be at most anchors.max_range_m = 30"),
+    ("anchors.max_range_m", None, "anchors.range_edge_m means nothing without anchors.max_ran"),
+    ("zones.0.polygon", [[60, 60], [61, 60], [61, 61]], "zones[0] ('open plan') is 61.9 m from"),
+    ("zones.0.polygon", [[15.5, 5], [17, 5], [17, 6]], "obstacles leave no free place in zones[0]"),
+    ("zones.0.low_m", 2, "zones[0]: low_m must lie below high_m, got 2 and 1.2"),
+    ("zones.0.position_m", 0, "zones[0].position_m must be a finite number"),
+    ("zones.0.share", 1, "zones[0].share must be a finite number in [0.01, 0.9999]"),
+    ("zones.1.position_m", None, "zones[1].share means nothing without position_m, height_m"),
+    ("zones.0.attitude", "up", "zones[0].attitude must be one of 'free', 'level', 'heading'"),
+    ("zones.1.name", "open plan", "zones[1].name must differ from the others"),
+    ("plan", {"images": "x"}, "plan has an unknown key 'images'"),
+    ("plan", {"metres_per_pixel": 0}, "plan.metres_per_pixel must be a finite number"),
+    ("plan", {"image": "a.png"}, "plan.metres_per_pixel must be given with plan.image"),
+    ("plan", {"origin": [0]}, "plan.origin must have shape"),
+]
+
+
+@pytest.mark.parametrize(("path", "value", "message"), BAD)
+def test_what_is_wrong_is_named_with_its_table(path, value, message):
+    pytest.importorskip("shapely", reason="needs the extra placement")
+    with pytest.raises(ValueError, match="^" + re.escape(message)) as error:
+        scene_files.of_mapping(changed(path, value))
+    assert "\n" not in str(error.value)
+
+
+@needs("shapely")
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("mounts", [{"kind": "points", "points": [[16, 5, 2.5]]}], "mounts have no legal place"),
+        ("mounts", [{"kind": "points", "points": [[1, 1, 2.5]]}], "mounts list 1 legal points"),
+        ("forbidden.0.polygon", [[-9, -9], [99, -9], [99, 99], [-9, 99]], "mounts have no legal"),
+        ("mounts.0", {"kind": "points", "points": [[1, 1, 1]], "axis": [0, 0, 0]},
+         "mounts[0].axis must not be zero"),
+    ],
+)  # fmt: skip
+def test_mounts_without_a_legal_place(path, value, message):
+    with pytest.raises(ValueError, match="^" + re.escape(message)):
+        scene_files.of_mapping(changed(path, value))
+
+
+def test_a_zone_of_another_place_is_refused():
+    tables = changed("zones.0", {"low": [500, 1, 0], "high": [505, 7, 2]}, HALL)
+    with pytest.raises(ValueError, match=r"^zones\[0\] \('zone 1'\) is 490 m from the nearest"):
+        scene_files.of_mapping(tables)
+    with pytest.raises(ValueError, match=r"^forbidden means nothing with anchors\.kind = 'box'"):
+        scene_files.of_mapping(HALL | {"forbidden": [{"polygon": SQUARE}]})
+
+
+# --- the schema --------------------------------------------------------------------------------
+
+
+def faults(value: Any, rule: dict, where: str = "") -> list[str]:
+    """What a JSON schema says against a value: the words that ours uses."""
+    found: list[str] = []
+    kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "integer": int,
+             "number": (int, float)}  # fmt: skip
+    kind = rule.get("type")
+    if kind and (not isinstance(value, kinds[kind]) or (kind != "boolean" and value is True)):
+        return [f"{where}: no {kind}"]
+    if isinstance(value, dict):
+        found += [f"{where}: no {key}" for key in rule.get("required", ()) if key not in value]
+        others = rule.get("additionalProperties", {})
+        for key, part in value.items():
+            of_key = rule.get("properties", {}).get(key, others)
+            if of_key is False:
+                found.append(f"{where}: unknown {key}")
+            else:
+                found += faults(part, of_key, f"{where}.{key}")
+    if isinstance(value, list):
+        if not rule.get("minItems", 0) <= len(value) <= rule.get("maxItems", math.inf):
+            found.append(f"{where}: {len(value)} items")
+        for index, part in enumerate(value):
+            found += faults(part, rule.get("items", {}), f"{where}[{index}]")
+    if isinstance(value, str) and len(value) < rule.get("minLength", 0):
+        found.append(f"{where}: short")
+    if "enum" in rule and value not in rule["enum"]:
+        found.append(f"{where}: not of {rule['enum']}")
+    if "const" in rule and value != rule["const"]:
+        found.append(f"{where}: not {rule['const']}")
+    if isinstance(value, int | float) and not (
+        rule.get("minimum", -math.inf) <= value <= rule.get("maximum", math.inf)
+    ):
+        found.append(f"{where}: out of limits")
+    for part in rule.get("allOf", ()):
+        found += faults(value, part, where)
+    for word, right in (("anyOf", lambda n: n > 0), ("oneOf", lambda n: n == 1)):
+        if word in rule:
+            of_each = [faults(value, part, where) for part in rule[word]]
+            if not right(sum(not one for one in of_each)):
+                found += min(of_each, key=len) or [f"{where}: several forms"]
+    return found
+
+
+@pytest.mark.parametrize("name", ["warehouse.toml", "office.toml"])
+def test_the_examples_follow_the_schema(name):
+    tables = tomllib.loads((ROOT / "examples" / name).read_text(encoding="utf-8"))
+    assert faults(tables, schema()) == []
+
+
+def test_the_schema_refuses_what_the_reader_refuses_by_form():
+    rule = schema()
+    # What only geometry or other tables can tell.
+    deeper = re.compile("cross or touch|different points|one of .materials|either material|lie "
+                        "below|inside an obst|counts the|from|free place|must differ|means "
+                        "nothing|at most|finite, got|1e\\+06 m|no legal|legal points|not be empty|"
+                        "axis|either .region|slabs|must be given")  # fmt: skip
+    checked = 0
+    for path, value, message in BAD:
+        if deeper.search(message) or value is NAN:
+            continue
+        assert faults(changed(path, value), rule), path
+        checked += 1
+    assert checked > 20
+    for good in (HALL, HALL | {"$schema": "building.schema.json"}):
+        assert faults(good, rule) == []
+        scene_files.of_mapping(good)
+    for noise in ({"kind": "squared-range", "sigma_m": 0.1}, {"floor_m": 0.1, "kind": "range"}):
+        assert faults(HALL | {"noise": noise}, rule) == []
+    assert faults(HALL | {"noise": {"sigma_m": 0.1}}, rule)
+    assert faults(HALL | {"region": {"low": [0, 0, 0], "high": [1, 1, 1]}}, rule)
+
+
+def test_the_shipped_schema_is_that_of_the_reader(capsys):
+    path = ROOT / "rbl_gym" / "placement" / "building.schema.json"
+    assert json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(schema()))
+    with pytest.raises(SystemExit, match="0"):
+        main(["place", "--schema"])
+    assert capsys.readouterr().out == path.read_text(encoding="utf-8")
+
+
+def test_the_reference_has_every_key_of_the_format():
+    page = (ROOT / "docs" / "building_files.md").read_text(encoding="utf-8")
+    sections = dict(re.findall(r"^### `\[+(\w+)\]+`[^\n]*\n(.*?)(?=^##|\Z)", page, re.M | re.S))
+    for name, table in FORMAT.items():
+        rows = re.findall(r"^\| (`[^|]+) \|", sections[name], re.M)
+        named = set(re.findall(r"`(\w+)`", " ".join(rows)))
+        assert named == {key for form in table.forms for key in form.keys}, name

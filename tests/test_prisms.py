@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rbl_gym.geometry import polygons
-from rbl_gym.geometry.obstacles import Obstacles, Prisms, in_sight, share_behind
+from rbl_gym.geometry.obstacles import Obstacles, Prisms, held_by, in_sight, share_behind
 from tests.helpers import needs
 
 SQUARE = [[0, 0], [2, 0], [2, 2], [0, 2]]
@@ -185,9 +185,13 @@ def test_what_a_prism_contains():
     for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
         inside = winds(ring, points[:, :2])
         held |= inside & (points[:, 2] > low) & (points[:, 2] < high)
-    np.testing.assert_array_equal(prisms.contain(points), held)
+    obstacles = Obstacles(NO_BOXES, 0.0, prisms)
+    np.testing.assert_array_equal(obstacles.contain(points), held)
+    with np.errstate(all="ignore"):
+        textbook = held_by.textbook(points, NO_BOXES, prisms.corners, prisms.limits)
+    np.testing.assert_array_equal(textbook, held)
     assert 0.02 < held.mean() < 0.9
-    square = Prisms.of([SQUARE], 0, 2)
+    square = Obstacles(NO_BOXES, 0.0, Prisms.of([SQUARE], 0, 2))
     edge = np.array([[0, 1, 1], [2, 2, 1], [1, 1, 0], [1, 1, 2], [1, 0, 1]], float)
     assert not square.contain(edge).any()
     assert square.contain(edge + 1e-3 * (np.array([1, 1, 1]) - edge)).all()

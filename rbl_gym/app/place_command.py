@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from typing import Any
 
 from rbl_gym.app.terminal import (
@@ -53,6 +54,9 @@ def add_place(commands: Any) -> None:
     place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
     add_html(place, "3-D page with the tables")
     add_json(place)
+    place.add_argument(
+        "--schema", action=_Schema, nargs=0, help="print the JSON schema of the file, and stop"
+    )
     place.set_defaults(run=_place)
 
 
@@ -84,6 +88,16 @@ def _place(options: argparse.Namespace) -> int:
         place_report.print_place(placed.result)
         print_files(picture=options.plot, page=options.html)
     return 0
+
+
+class _Schema(argparse.Action):
+    """Prints the JSON schema of a building file, for editors, and ends the program."""
+
+    def __call__(self, parser: Any, *_: Any) -> None:
+        from rbl_gym.placement.file_schema import schema
+
+        print(json.dumps(schema(), indent=1))
+        parser.exit()
 
 
 def _numbers(text: str) -> range:

@@ -17,7 +17,7 @@ from rbl_gym.checks import BoolArray, FloatArray, as_float, check_array, check_n
 from rbl_gym.geometry.polygons import TOUCH_M, check_polygon, contains
 from rbl_gym.kernels import compiled
 
-__all__ = ["Obstacles", "Prisms", "in_sight", "inside", "share_behind"]
+__all__ = ["Obstacles", "Prisms", "held_by", "in_sight", "inside", "share_behind"]
 
 # A way inside a prism that is no longer than this is a touch, metres: links begin at its faces.
 _LEAST_WAY_M = 1e-6
@@ -62,20 +62,29 @@ class Prisms:
             outside of 0 to 1.
         """
         rings = [check_polygon(f"polygons[{i}]", ring) for i, ring in enumerate(polygons)]
+        found = cls.packed(rings, low_m, high_m, share)
+        for index in range(len(rings)):
+            bottom = check_number(f"low_m[{index}]", found.low_m[index])
+            check_number(f"high_m[{index}]", found.high_m[index], low=bottom + 1e-6)
+            if not np.isnan(found.share[index]):
+                check_number(f"share[{index}]", found.share[index], low=0.0, high=1.0)
+        return found
+
+    @classmethod
+    def packed(
+        cls,
+        rings: Sequence[FloatArray],
+        low_m: ArrayLike,
+        high_m: ArrayLike,
+        share: ArrayLike = np.nan,
+    ) -> Prisms:
+        """As `of`, of what has been checked."""
         if not rings:
             return cls()
         most = max(map(len, rings))
         corners = np.array([[*ring, *[ring[-1]] * (most - len(ring))] for ring in rings])
-        low, high, part = (
-            np.broadcast_to(np.asarray(value, float), len(rings)).copy()
-            for value in (low_m, high_m, share)
-        )
-        for index in range(len(rings)):
-            bottom = check_number(f"low_m[{index}]", low[index])
-            check_number(f"high_m[{index}]", high[index], low=bottom + 1e-6)
-            if not np.isnan(part[index]):
-                check_number(f"share[{index}]", part[index], low=0.0, high=1.0)
-        return cls(corners, low, high, part)
+        columns = (np.asarray(value, float) for value in (low_m, high_m, share))
+        return cls(corners, *(np.broadcast_to(column, len(rings)).copy() for column in columns))
 
     def __len__(self) -> int:
         """How many there are."""
@@ -91,15 +100,6 @@ class Prisms:
         heights = self.low_m + TOUCH_M, self.high_m - TOUCH_M
         pairs = (low[:, 0], high[:, 0], low[:, 1], high[:, 1], *heights)
         return np.stack([*pairs, self.share], axis=-1)
-
-    def contain(self, points: FloatArray) -> BoolArray:
-        """Which points (..., 3) lie inside of a prism, further than a micrometre from its faces."""
-        found = np.zeros(points.shape[:-1], dtype=bool)
-        heights = points[..., 2]
-        for corners, low, high in zip(self.corners, self.low_m, self.high_m, strict=True):
-            level = (heights > low + _LEAST_WAY_M) & (heights < high - _LEAST_WAY_M) & ~found
-            found[level] = contains(corners, points[level][:, :2], _LEAST_WAY_M)
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +153,9 @@ class Obstacles:
 
     def contain(self, points: FloatArray) -> BoolArray:
         """Which points (..., 3) lie in or on one of the boxes (K, 6), or inside of a prism."""
-        return inside(points, self.boxes) | self.prisms.contain(points)
+        if not len(self.prisms):
+            return inside(points, self.boxes)
+        return held_by(points, self.boxes, self.prisms.corners, self.prisms.limits)
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
@@ -197,6 +199,22 @@ def inside(points: FloatArray, obstacles: FloatArray) -> BoolArray:
     """Which points (..., 3) lie in or on a box of (K, 6)."""
     away = np.abs(points[..., None, :] - obstacles[:, :3]) - obstacles[:, 3:]
     return np.asarray((away.max(axis=-1) <= 1e-9).any(axis=-1))
+
+
+@compiled("sight:held_by")
+def held_by(
+    points: FloatArray, boxes: FloatArray, corners: FloatArray, limits: FloatArray
+) -> BoolArray:
+    """Which points (..., 3) a box (K, 6) holds, or a prism further than a micrometre inside.
+
+    Arguments as `share_behind`.
+    """
+    found = np.asarray(inside(points, boxes))
+    heights = points[..., 2]
+    for polygon, limit in zip(corners, limits, strict=True):
+        level = (heights > limit[4] + _LEAST_WAY_M) & (heights < limit[5] - _LEAST_WAY_M) & ~found
+        found[level] = contains(polygon, points[level][..., :2], _LEAST_WAY_M)
+    return found
 
 
 @compiled("sight:share_behind")

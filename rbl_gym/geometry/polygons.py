@@ -111,7 +111,7 @@ def contains(polygon: FloatArray, points: FloatArray, margin_m: float = 1e-6) ->
     """
     reach = max(0.0, -margin_m)
     low, high = polygon.min(axis=0) - reach, polygon.max(axis=0) + reach
-    found = ((points >= low) & (points <= high)).all(axis=-1)
+    found = np.asarray(((points >= low) & (points <= high)).all(axis=-1))
     near = points[found]
     start, end = polygon, np.roll(polygon, -1, axis=0)
     x, y = near[:, None, 0], near[:, None, 1]

@@ -7,7 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.kernels.jit import gufunc, helper
+from rbl_gym.kernels.jit import gufunc, helper, inlined
+
+# As in the textbook form, metres.
+_TOUCH_M, _LEAST_WAY_M, _VERTICAL_M = 1e-9, 1e-6, 1e-12
 
 
 @gufunc("(m,d),(p,d),(k,b)->(p,m)", "fffb")
@@ -16,10 +19,25 @@ def in_sight(anchors: Any, points: Any, boxes: Any, free: Any) -> None:
     for p in range(points.shape[0]):
         for m in range(anchors.shape[0]):
             free[p, m] = True
+            start, end = anchors[m], points[p]
+            west, east = min(start[0], end[0]), max(start[0], end[0])
+            south, north = min(start[1], end[1]), max(start[1], end[1])
             for k in range(boxes.shape[0]):
-                if _blocks(boxes[k], anchors[m], points[p]):
+                if _is_beside(boxes, k, west, east, south, north):
+                    continue
+                if _blocks(boxes[k], start, end):
                     free[p, m] = False
                     break
+
+
+@inlined
+def _is_beside(boxes: Any, k: int, west: float, east: float, south: float, north: float) -> bool:
+    """Whether a segment between these limits passes beside a box for certain, as most do."""
+    reach = boxes[k, 3] + _TOUCH_M
+    if west > boxes[k, 0] + reach or east < boxes[k, 0] - reach:
+        return True
+    reach = boxes[k, 4] + _TOUCH_M
+    return south > boxes[k, 1] + reach or north < boxes[k, 1] - reach
 
 
 @helper
@@ -36,8 +54,27 @@ def _blocks(box: Any, start: Any, end: Any) -> bool:
     return enter < leave
 
 
-# As in the textbook form, metres.
-_TOUCH_M, _LEAST_WAY_M, _VERTICAL_M = 1e-9, 1e-6, 1e-12
+@gufunc("(d),(k,b),(q,v,e),(q,l)->()", "ffffb")
+def held_by(point: Any, boxes: Any, corners: Any, limits: Any, held: Any) -> None:
+    """Whether a box or a prism holds a point."""
+    x, y, z = point[0], point[1], point[2]
+    held[0] = False
+    for k in range(boxes.shape[0]):
+        if (
+            abs(x - boxes[k, 0]) - boxes[k, 3] <= _TOUCH_M
+            and abs(y - boxes[k, 1]) - boxes[k, 4] <= _TOUCH_M
+            and abs(z - boxes[k, 2]) - boxes[k, 5] <= _TOUCH_M
+        ):
+            held[0] = True
+            return
+    for q in range(corners.shape[0]):
+        if x < limits[q, 0] or x > limits[q, 1] or y < limits[q, 2] or y > limits[q, 3]:
+            continue
+        if z <= limits[q, 4] + _LEAST_WAY_M or z >= limits[q, 5] - _LEAST_WAY_M:
+            continue
+        if _holds(corners[q], x, y, _LEAST_WAY_M):
+            held[0] = True
+            return
 
 
 @gufunc("(m,d),(p,d),(k,b),(q,v,e),(q,l),()->(p,m)")
@@ -52,15 +89,17 @@ def share_behind(
         for m in range(anchors.shape[0]):
             start, end = anchors[m], points[p]
             free, own = True, 1.0
-            for k in range(boxes.shape[0]):
-                if _blocks(boxes[k], start, end):
-                    free = False
-                    break
             ax, ay, az = start[0], start[1], start[2]
             dx, dy = end[0] - ax, end[1] - ay
             west, east = min(ax, end[0]), max(ax, end[0])
             south, north = min(ay, end[1]), max(ay, end[1])
             bottom, top = min(az, end[2]), max(az, end[2])
+            for k in range(boxes.shape[0]):
+                if _is_beside(boxes, k, west, east, south, north):
+                    continue
+                if _blocks(boxes[k], start, end):
+                    free = False
+                    break
             for q in range(corners.shape[0]):
                 # Most links pass beside the bounding box.
                 if west >= limits[q, 1] or east <= limits[q, 0]:
@@ -98,7 +137,7 @@ def _meets(start: Any, end: Any, polygon: Any, limit: Any, crossings: Any, stops
     if not (leave - enter) * length > _LEAST_WAY_M:
         return False
     if dx * dx + dy * dy < _VERTICAL_M * _VERTICAL_M:
-        return _holds(polygon, start[0], start[1])
+        return _holds(polygon, start[0], start[1], _TOUCH_M)
     left, right = crossings[0], crossings[1]
     count = _crossings(start, dx, dy, polygon, left, right)
     n_stops = 2
@@ -165,8 +204,8 @@ def _is_odd(crossings: Any, place: float, count: int) -> bool:
 
 
 @helper
-def _holds(polygon: Any, px: float, py: float) -> bool:
-    """Whether a point in the plan lies inside of a polygon, and not on its edge."""
+def _holds(polygon: Any, px: float, py: float, margin: float) -> bool:
+    """Whether a point in the plan lies inside of a polygon, and not within a margin of its edge."""
     odd = False
     last = polygon.shape[0] - 1
     ax, ay = polygon[last, 0] - px, polygon[last, 1] - py
@@ -175,7 +214,7 @@ def _holds(polygon: Any, px: float, py: float) -> bool:
         dx, dy = bx - ax, by - ay
         square = dx * dx + dy * dy
         share = 0.0 if square == 0.0 else min(max(-(ax * dx + ay * dy) / square, 0.0), 1.0)
-        if math.hypot(ax + share * dx, ay + share * dy) <= _TOUCH_M:
+        if math.hypot(ax + share * dx, ay + share * dy) <= margin:
             return False
         if (ay > 0.0) != (by > 0.0) and ax - ay / dy * dx > 0.0:
             odd = not odd

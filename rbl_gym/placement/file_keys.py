@@ -92,25 +92,28 @@ _BOX = {
 }
 _SHARE = {"low": 0.0, "high": 1.0}
 _LOSS = {
-    "material": Key("text", "name of one of [materials]"),
-    "information": Key(
-        "number", "share of a link's information that a crossing leaves, instead", **_SHARE
-    ),
+    "material": Key("text", "one of [materials]; without it and information: opaque"),
+    "information": Key("number", "the share itself, in place of material", **_SHARE),
 }
-_NAME = Key("text", "what it is called in answers")
+_NAME = Key("text", "name in the results")
 _REACH = {
-    "max_range_m": _size("beyond it a link tells nothing; no limit without it"),
+    "max_range_m": _size(
+        "a longer link carries no information, metres; without it there is no limit"
+    ),
     "range_edge_m": _metres(
-        "width over which the information falls to zero before max_range_m; 0: at once",
+        "width over which the information falls to zero before max_range_m, metres; 0: at once",
         default=0.0,
         low=0.0,
     ),
     "half_angle_deg": Key(
-        "number", "field of view about the mount's normal; all round without it", low=0.1, high=180
+        "number",
+        "half angle of the field of view about the mount's normal, degrees; without it all round",
+        low=0.1,
+        high=180,
     ),
     "angle_edge_deg": Key(
         "number",
-        "width over which the information falls to zero before half_angle_deg; 0: at once",
+        "width over which the information falls to zero before half_angle_deg, degrees",
         default=0.0,
         low=0.0,
         high=180,
@@ -119,47 +122,63 @@ _REACH = {
 _ANCHORS = {
     "number": Key(
         "count",
-        "how many, the fixed ones included; or --anchors",
+        "how many, the fixed ones included; --anchors overrides it",
         low=MIN_ANCHORS,
         high=MAX_ANCHORS,
     ),
     "fixed": Key("places", "anchors [[x, y, z], ...] that stay, metres", default=[]),
     **_REACH,
 }
-_KIND = Key("choice", "where they may stand", needed=True)
+_KIND = Key("choice", "shape of the space in which they may stand", needed=True)
 _ZONE = {
     "name": _NAME,
-    "weight": Key("number", "how much it counts in the score", default=1.0, low=1e-6, high=1e6),
+    "weight": Key("number", "weight in the score", default=1.0, low=1e-6, high=1e6),
     "attitude": Key(
         "choice",
-        "free: turned anyhow; level: upright, all of the pose estimated; heading: tilt known",
+        "what the body's attitude can be",
         default="free",
         choices=ATTITUDES,
     ),
-    "position_m": _size("required: one sigma of the horizontal position"),
-    "height_m": _size("required: one sigma of the height"),
-    "heading_deg": Key("number", "required: one sigma of the heading", low=1e-3, high=180.0),
-    "share": Key("number", "in so much of the zone (0.95 without it)", low=0.01, high=0.9999),
+    "position_m": _size("requirement: one sigma of the horizontal position, metres"),
+    "height_m": _size("requirement: one sigma of the height, metres"),
+    "heading_deg": Key(
+        "number", "requirement: one sigma of the heading, degrees", low=1e-3, high=180.0
+    ),
+    "share": Key(
+        "number",
+        "share of the zone in which the requirements must hold; 0.95 without it",
+        low=0.01,
+        high=0.9999,
+    ),
 }
 _MOUNT = {
-    "kind": Key("choice", "what it is", needed=True),
+    "kind": Key("choice", "wall, ceiling, column, area or points", needed=True),
     "name": _NAME,
-    "cost": Key("number", "of an anchor on it", default=1.0, low=0.0, high=1e9),
+    "cost": Key("number", "cost of an anchor on it", default=1.0, low=0.0, high=1e9),
 }
-_AXIS = {
-    "axis": Key("place", "direction [x, y, z] in which the anchors look; all round without it")
+_AXIS = {"axis": Key("place", "direction [x, y, z] in which anchors look; without it all round")}
+
+
+_OF_LAWS = {
+    "floor_m": "standard deviation of a short range, metres",
+    "proportional": "growth of the standard deviation with the range, metres per metre",
+    "reference_tag": "index of the tag whose range counts for all tags of an anchor",
+    "sigma_m": "deviation of a squared range, as a multiple of the range to the first tag, metres",
 }
 
 
 def _noise_form(kind: str, law: Any) -> Form:
-    fields = {field.name: Key("any", f"{kind}: see ranging") for field in dataclasses.fields(law)}
+    fields = {
+        field.name: Key("any", _OF_LAWS.get(field.name, "see ranging"), default=field.default)
+        for field in dataclasses.fields(law)
+    }
     return Form(
         {
             **fields,
             "kind": Key("choice", "law of the ranges", default="range"),
             "blocked_information": Key(
                 "number",
-                "share that obstacles without a share of their own leave, once",
+                "share of a link's information that opaque obstacles leave, however many",
                 default=0.01,
                 **_SHARE,
             ),
@@ -172,7 +191,7 @@ def _noise_form(kind: str, law: Any) -> Form:
 MATERIALS_DOC = "share of a link's information that one crossing leaves, by name"
 FORMAT: dict[str, Table] = {
     "anchors": Table(
-        "what is placed, and where without [[mounts]]",
+        "the anchors: how many, how far they reach, and where they may stand without [[mounts]]",
         (
             Form({"kind": _KIND, **_BOX, **_ANCHORS}, "kind", "room"),
             Form({"kind": _KIND, **_BOX, **_ANCHORS}, "kind", "box"),
@@ -190,7 +209,7 @@ FORMAT: dict[str, Table] = {
         ),
     ),
     "mounts": Table(
-        "where anchors may stand",
+        "surfaces, spaces and points where anchors may stand",
         (
             Form(
                 {
@@ -199,12 +218,14 @@ FORMAT: dict[str, Table] = {
                     "closed": _CLOSED,
                     "side": Key(
                         "choice",
-                        "on which side of the line; left of a closed one is inside",
+                        "side of the line; left of a closed one is inside",
                         default="left",
                         choices=("left", "right", "both"),
                     ),
                     "offset_m": _metres(
-                        "how far in front of the wall's face", default=0.0, low=0.0
+                        "distance in front of the line or of the wall's face, metres",
+                        default=0.0,
+                        low=0.0,
                     ),
                     "low_m": _LOW,
                     "high_m": _HIGH,
@@ -213,7 +234,7 @@ FORMAT: dict[str, Table] = {
                 "wall",
             ),
             Form(
-                {**_MOUNT, "polygon": _POLYGON, "height_m": _metres("its height", **_NEEDED)},
+                {**_MOUNT, "polygon": _POLYGON, "height_m": _metres("height, metres", **_NEEDED)},
                 "kind",
                 "ceiling",
             ),
@@ -236,26 +257,32 @@ FORMAT: dict[str, Table] = {
         many=True,
     ),
     "forbidden": Table(
-        "no anchors here",
+        "prisms in which no anchor may stand",
         (
             Form(
                 {
                     "polygon": _POLYGON,
-                    "low_m": _metres("from this height; any without it", default=-MOST_M),
-                    "high_m": _metres("up to this height; any without it", default=MOST_M),
+                    "low_m": _metres(
+                        "lower height, metres; without it there is none", default=-MOST_M
+                    ),
+                    "high_m": _metres(
+                        "upper height, metres; without it there is none", default=MOST_M
+                    ),
                 }
             ),
         ),
         many=True,
     ),
     "walls": Table(
-        "walls that links go through",
+        "walls: each straight piece of the line is a prism",
         (
             Form(
                 {
                     "line": _LINE,
                     "closed": _CLOSED,
-                    "thickness_m": _size("about the line", default=0.1),
+                    "thickness_m": _size(
+                        "thickness, half on either side of the line, metres", default=0.1
+                    ),
                     "low_m": _LOW,
                     "high_m": _HIGH,
                     **_LOSS,
@@ -265,7 +292,7 @@ FORMAT: dict[str, Table] = {
         many=True,
     ),
     "obstacles": Table(
-        "what stands in the way of links, the body and anchors",
+        "obstacles: boxes or prisms that take from links, and hold neither the body nor anchors",
         (
             Form({"polygon": _POLYGON, "low_m": _LOW, "high_m": _HIGH, **_LOSS}, "polygon"),
             Form({**_BOX, **_LOSS}),
@@ -273,22 +300,22 @@ FORMAT: dict[str, Table] = {
         many=True,
     ),
     "slabs": Table(
-        "between floors",
+        "slabs between floors",
         (
             Form(
                 {
                     "polygon": _POLYGON,
-                    "z_m": _metres("height of its lower side", **_NEEDED),
-                    "thickness_m": _size("from there up", default=0.3),
+                    "z_m": _metres("height of its lower side, metres", **_NEEDED),
+                    "thickness_m": _size("thickness upwards from there, metres", default=0.3),
                     **_LOSS,
                 }
             ),
         ),
         many=True,
     ),
-    "region": Table("a box in which the body works: one zone of that name", (Form(_BOX),)),
+    "region": Table("a box in which the body works, in place of [[zones]]", (Form(_BOX),)),
     "zones": Table(
-        "where the body works",
+        "zones in which the body works, and the accuracy that each requires",
         (
             Form({"polygon": _POLYGON, "low_m": _FROM, "high_m": _HIGH, **_ZONE}, "polygon"),
             Form({**_BOX, **_ZONE}),
@@ -296,42 +323,57 @@ FORMAT: dict[str, Table] = {
         many=True,
     ),
     "body": Table(
-        "places of the tags on the body",
+        "the tags on the body: their places, or a shape",
         (
             Form({"tags": Key("places", "tags [[x, y, z], ...], metres", **_NEEDED)}, "tags"),
             Form(
                 {
-                    "shape": Key("choice", "of tags", needed=True, choices=tuple(BODIES)),
-                    "size_m": Key("any", "its size", default=1.0),
+                    "shape": Key(
+                        "choice", "arrangement of the tags", needed=True, choices=tuple(BODIES)
+                    ),
+                    "size_m": Key("any", "its size, metres", default=1.0),
                 }
             ),
         ),
     ),
     "noise": Table(
-        "of the ranges", tuple(_noise_form(kind, law) for kind, law in NOISE_LAWS.items())
+        "noise of the ranges, and what opaque obstacles leave",
+        tuple(_noise_form(kind, law) for kind, law in NOISE_LAWS.items()),
     ),
     "prior": Table(
-        "what is known of the pose before the first range, one sigma per axis",
+        "what is known of the pose before the first range: one sigma of each axis",
         (
             Form(
                 {
-                    "rotation_deg": Key("number", "of turn", default=10.0, low=1e-6, high=180.0),
-                    "position_m": Key("number", "of place", default=0.5, low=1e-6),
+                    "rotation_deg": Key(
+                        "number", "rotation, degrees", default=10.0, low=1e-6, high=180.0
+                    ),
+                    "position_m": Key("number", "position, metres", default=0.5, low=1e-6),
                 }
             ),
         ),
     ),
     "plan": Table(
-        "a drawing behind the answers",
+        "a drawing behind the results",
         (
             Form(
                 {
-                    "image": Key("text", "path of a picture, from the file's folder"),
-                    "metres_per_pixel": Key("number", "its scale", default=1.0, low=1e-6, high=1e6),
-                    "origin": Key("spot", "place [x, y] of its lower left corner", default=[0, 0]),
-                    "drawing": Key("text", "path of the drawing that was imported"),
-                    "units": Key("text", "of the drawing", default="m"),
-                    "zero": Key("spot", "its point that is the origin here", default=[0, 0]),
+                    "image": Key("text", "path of a picture, relative to the file"),
+                    "metres_per_pixel": Key(
+                        "number", "scale of the picture; needed with image", low=1e-6, high=1e6
+                    ),
+                    "origin": Key(
+                        "spot",
+                        "place [x, y] of the lower left corner of the picture, metres",
+                        default=[0, 0],
+                    ),
+                    "drawing": Key("text", "path of the imported drawing, relative to the file"),
+                    "units": Key("text", "units of the drawing", default="m"),
+                    "zero": Key(
+                        "spot",
+                        "point [x, y] of the drawing that is the origin here, in its units",
+                        default=[0, 0],
+                    ),
                 }
             ),
         ),

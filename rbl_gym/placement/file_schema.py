@@ -28,7 +28,10 @@ _TYPES: dict[str, dict[str, Any]] = {
 
 def schema() -> dict[str, Any]:
     """The JSON schema (draft 2020-12) of a file."""
-    tables: dict[str, Any] = {"name": {"description": "of the problem", **_TYPES["text"]}}
+    tables: dict[str, Any] = {
+        "name": {"description": "of the problem", **_TYPES["text"]},
+        "$schema": {"description": "where this schema is, for editors", **_TYPES["text"]},
+    }
     for name, table in FORMAT.items():
         forms = [_form_schema(form) for form in table.forms]
         one = forms[0] if len(forms) == 1 else {"anyOf": forms}
@@ -45,6 +48,10 @@ def schema() -> dict[str, Any]:
         "type": "object",
         "additionalProperties": False,
         "required": ["body", "noise"],
+        "allOf": [
+            {"anyOf": [{"required": ["anchors"]}, {"required": ["mounts"]}]},
+            {"oneOf": [{"required": ["region"]}, {"required": ["zones"]}]},
+        ],
         "properties": tables,
     }
 
@@ -53,6 +60,8 @@ def _form_schema(form: Form) -> dict[str, Any]:
     properties = {name: _key_schema(key) for name, key in form.keys.items()}
     needed = [name for name, key in form.keys.items() if key.needed]
     if form.value:
+        if form.keys[form.mark].default != form.value and form.mark not in needed:
+            needed.append(form.mark)
         properties[form.mark] = {"const": form.value, "description": form.keys[form.mark].doc}
     return {
         "type": "object",

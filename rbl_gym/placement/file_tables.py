@@ -11,6 +11,8 @@ from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.geometry.polygons import check_line, check_polygon
 from rbl_gym.placement.file_keys import FORMAT, MOST_M, Form, Key
 
+# Boxes may be of the size of orbits; polygons may not.
+_FARTHEST_M = 1e9
 # More points than this in a list are refused.
 _MOST_POINTS = 10_000
 
@@ -33,7 +35,8 @@ def read_table(name: str, table: Any, kind: str | None = None) -> dict[str, Any]
     values = {}
     for key, what in keys.items():
         value = table.get(key, what.default)
-        values[key] = value if value is None else _checked(f"{name}.{key}", value, what)
+        absent = value is None and key not in table
+        values[key] = None if absent else _checked(f"{name}.{key}", value, what)
     _check_heights(name, values)
     return values
 
@@ -110,6 +113,9 @@ def check_text(name: str, value: Any) -> str:
 
 def _vector(name: str, value: Any, size: int) -> tuple[float, ...]:
     array = check_array(name, value, (size,))
+    far = np.abs(array).max()
+    if far > _FARTHEST_M:
+        raise ValueError(f"{name} must lie within {_FARTHEST_M:g} m of the origin, got {far:g} m")
     if array.ndim != 1:
         numbers = {2: "two", 3: "three"}[size]
         raise ValueError(f"{name} must be {numbers} numbers, got shape {array.shape}")

@@ -19,14 +19,14 @@ _LONGEST_MITRE = 4.0
 _PARALLEL = 1e-3
 
 
-class Wall(NamedTuple):
-    """One straight piece of a wall: its ends in the plan, half its thickness, its heights."""
+class Walls(NamedTuple):
+    """Straight pieces of walls: ends (W, 2) in the plan, half thickness and heights (W,)."""
 
     start: FloatArray
     end: FloatArray
-    half_m: float
-    low_m: float
-    high_m: float
+    half_m: FloatArray
+    low_m: FloatArray
+    high_m: FloatArray
 
 
 class Solids(NamedTuple):
@@ -45,7 +45,7 @@ class Solids(NamedTuple):
 
 def read_obstacles(
     tables: Mapping[str, list[dict[str, Any]]], materials: Mapping[str, float], blocked: float
-) -> tuple[Obstacles, list[Wall]]:
+) -> tuple[Obstacles, Walls]:
     """All that takes information from links, and the walls piece by piece.
 
     Parameters
@@ -67,6 +67,8 @@ def read_obstacles(
         low, high = np.array(table["low"]), np.array(table["high"])
         if not (high > low).all():
             raise ValueError(f"{name}: low must lie below high, got {show(low)}, {show(high)}")
+        if not math.isnan(share) and (high - low).min() < 1e-3:
+            raise ValueError(f"{name} must be at least a millimetre wide, got {show(high - low)}")
         if math.isnan(share):
             boxes.append([*0.5 * (low + high), *0.5 * (high - low)])
         else:
@@ -78,14 +80,16 @@ def read_obstacles(
         if table["closed"]:
             line = check_polygon(f"{name}.line", line)
         for ring in wall_pieces(line, half, table["closed"]):
-            solids.add(check_polygon(f"{name}.line", ring), table["low_m"], table["high_m"], share)
+            solids.add(ring, table["low_m"], table["high_m"], share)
         for start, end in segments(line, table["closed"]):
-            walls.append(Wall(start, end, half, table["low_m"], table["high_m"]))
+            walls.append((start, end, half, table["low_m"], table["high_m"]))
     for name, table in _each(tables, "slabs"):
         share = _share(name, table, materials)
         solids.add(table["polygon"], table["z_m"], table["z_m"] + table["thickness_m"], share)
-    prisms = Prisms.of(*solids)
-    return Obstacles(np.array(boxes).reshape(-1, 6), blocked, prisms), walls
+    prisms = Prisms.packed(*solids)
+    columns = (np.array(column) for column in zip(*walls, strict=True))
+    pieces = Walls(*columns) if walls else Walls(*np.empty((2, 0, 2)), *np.empty((3, 0)))
+    return Obstacles(np.array(boxes).reshape(-1, 6), blocked, prisms), pieces
 
 
 def _each(tables: Mapping[str, Any], kind: str) -> list[tuple[str, dict[str, Any]]]:
@@ -156,7 +160,7 @@ def _turned(direction: FloatArray) -> FloatArray:
     return np.array([-direction[1], direction[0]])
 
 
-def read_mounts(tables: list[dict[str, Any]], walls: list[Wall]) -> list[Mount]:
+def read_mounts(tables: list[dict[str, Any]], walls: Walls) -> list[Mount]:
     """The faces of all mounts; those along a wall are moved to its face."""
     found: list[Mount] = []
     for index, table in enumerate(tables):
@@ -169,7 +173,7 @@ def read_mounts(tables: list[dict[str, Any]], walls: list[Wall]) -> list[Mount]:
     return found
 
 
-def _wall(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+def _wall(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
     line = table["line"]
     if table["closed"]:
         line = check_polygon(f"{name}.line", line)
@@ -185,33 +189,26 @@ def _wall(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]
     return found
 
 
-def _in_wall(
-    ends: FloatArray, normal: FloatArray, table: Mapping[str, Any], walls: list[Wall]
-) -> float:
+def _in_wall(ends: FloatArray, normal: FloatArray, table: Mapping[str, Any], walls: Walls) -> float:
     """How far a face inside a wall, or on its other side, lies behind the wall's face."""
-    shift = 0.0
-    direction = ends[1] - ends[0]
-    length = np.hypot(*direction)
-    for wall in walls:
-        along = wall.end - wall.start
-        cross = abs(along[0] * direction[1] - along[1] * direction[0])
-        behind = (ends.mean(axis=0) - 0.5 * (wall.start + wall.end)) @ normal
-        if cross > _PARALLEL * length * np.hypot(*along) or abs(behind) > wall.half_m + 1e-6:
-            continue
-        if wall.low_m >= table["high_m"] or wall.high_m <= table["low_m"]:
-            continue
-        places = (np.array([wall.start, wall.end]) - ends[0]) @ direction / length
-        if places.max() > 1e-6 and places.min() < length - 1e-6:
-            shift = max(shift, wall.half_m - behind)
-    return shift
+    direction = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+    along = walls.end - walls.start
+    turn = np.abs(along @ normal) / np.hypot(*along.T)
+    behind = (ends.mean(axis=0) - 0.5 * (walls.start + walls.end)) @ normal
+    places = np.stack([walls.start - ends[0], walls.end - ends[0]]) @ direction
+    length = np.hypot(*(ends[1] - ends[0]))
+    inside = (turn <= _PARALLEL) & (np.abs(behind) <= walls.half_m + 1e-6)
+    inside &= (walls.low_m < table["high_m"]) & (walls.high_m > table["low_m"])
+    inside &= (places.max(axis=0) > 1e-6) & (places.min(axis=0) < length - 1e-6)
+    return float((walls.half_m - behind)[inside].max(initial=0.0))
 
 
-def _ceiling(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+def _ceiling(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
     height = table["height_m"]
-    return [Mount(table["polygon"], height, height, np.array([0.0, 0, -1]), 1.0, "")]
+    return [Mount(table["polygon"], height, height, np.array([0.0, 0, -1]))]
 
 
-def _column(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+def _column(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
     found = []
     for start, end in segments(table["polygon"], closed=True):
         normal = -_turned((end - start) / np.hypot(*(end - start)))
@@ -219,16 +216,20 @@ def _column(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Moun
     return found
 
 
-def _area(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+def _area(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
     normal = _axis(name, table)
-    return [Mount(table["polygon"], table["low_m"], table["high_m"], normal, 1.0, "")]
+    low, high = table["low_m"], table["high_m"]
+    return [Mount(table["polygon"], low, high, normal, on_surface=False)]
 
 
-def _points(name: str, table: Mapping[str, Any], walls: list[Wall]) -> list[Mount]:
+def _points(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
     if not len(table["points"]):
         raise ValueError(f"{name}.points must not be empty")
     normal = _axis(name, table)
-    return [Mount(spot[None, :2], spot[2], spot[2], normal, 1.0, "") for spot in table["points"]]
+    return [
+        Mount(spot[None, :2], spot[2], spot[2], normal, on_surface=False)
+        for spot in table["points"]
+    ]
 
 
 _SHAPES = {
@@ -237,7 +238,7 @@ _SHAPES = {
 
 
 def _upright(ends: FloatArray, normal: FloatArray, table: Mapping[str, Any]) -> Mount:
-    return Mount(ends, table["low_m"], table["high_m"], np.array([*normal, 0.0]), 1.0, "")
+    return Mount(ends, table["low_m"], table["high_m"], np.array([*normal, 0.0]))
 
 
 def _axis(name: str, table: Mapping[str, Any]) -> FloatArray:

@@ -21,7 +21,6 @@ _BEFORE_M = 1e-3
 _GROWN_M = 1e-6
 # Smaller pieces than this are left out, metres and square metres.
 _LEAST_M, _LEAST_M2 = 1e-3, 1e-4
-_DOWN = (0.0, 0.0, -1.0)
 
 
 class Mount(NamedTuple):
@@ -37,21 +36,24 @@ class Mount(NamedTuple):
         Where anchors on it look, of unit length; zero: everywhere.
     cost, name
         Of an anchor on it.
+    on_surface
+        Whether it is a surface with a front, not a space.
     """
 
     shape: FloatArray
     low_m: float
     high_m: float
     normal: FloatArray
-    cost: float
-    name: str
+    cost: float = 1.0
+    name: str = ""
+    on_surface: bool = True
 
 
 def cut_mounts(mounts: list[Mount], obstacles: Obstacles, forbidden: Prisms) -> Mounts | None:
     """The region of all mounts, without what is forbidden or covered; None: nothing is left.
 
-    A place is covered where a point a millimetre in front of it, into which its normal points,
-    lies inside of an obstacle.
+    A place on a surface is covered where the point a millimetre in front of it lies inside of an
+    obstacle, other places where they do.
     """
     shapely = _shapely()
     covers = _solids(shapely, _prisms_of(obstacles), 0.0)
@@ -106,7 +108,7 @@ def _prisms_of(obstacles: Obstacles) -> Prisms:
     turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     rings = [*(centre[:, None, :2] + turns * half[:, None, :2]), *obstacles.prisms.corners]
     low = [*(centre - half)[:, 2], *obstacles.prisms.low_m]
-    return Prisms.of(rings, low, [*(centre + half)[:, 2], *obstacles.prisms.high_m])
+    return Prisms.packed(rings, low, [*(centre + half)[:, 2], *obstacles.prisms.high_m])
 
 
 def _solids(shapely: Any, prisms: Prisms, grown: float) -> _Solids:
@@ -120,7 +122,7 @@ def _pieces(shapely: Any, mount: Mount, covers: _Solids, bans: _Solids) -> list[
     """What is left of a mount, rows as `Mounts` takes them."""
     make = {1: shapely.Point, 2: shapely.LineString}.get(len(mount.shape), shapely.Polygon)
     shape = make(mount.shape)
-    ahead = _BEFORE_M * mount.normal
+    ahead = _BEFORE_M * mount.normal * mount.on_surface
     # Moved by so much, what covers the place in front of the face covers the face.
     low, high = mount.low_m + ahead[2], mount.high_m + ahead[2]
     near = covers.at(shapely, make(mount.shape + ahead[:2]), low, high)
@@ -161,7 +163,7 @@ def _layers(
 def _simplices(shapely: Any, shape: Any) -> list[FloatArray]:
     """A shape as triangles, segments and points, each (3, 2), the last corner repeated."""
     found = []
-    for part in shapely.get_parts(shape):
+    for part in () if shape.is_empty else shapely.get_parts(shape):
         if part.geom_type == "Point":
             found.append(np.repeat(shapely.get_coordinates(part), 3, axis=0))
         elif part.geom_type == "LineString":

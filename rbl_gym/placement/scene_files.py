@@ -186,7 +186,7 @@ def check_n_anchors(number: Any) -> int:
 
 def _check_tables(tables: Mapping[str, Any]) -> None:
     """No table but those of the format, and those that every problem needs."""
-    allowed = ("name", *FORMAT, "materials")
+    allowed = ("name", *FORMAT, "materials", "$schema")
     for key in tables:
         if key not in allowed:
             raise ValueError(
@@ -307,9 +307,11 @@ def _gain(anchors: dict[str, Any]) -> Gain:
         "half_angle_rad": anchors["half_angle_deg"] and math.radians(anchors["half_angle_deg"]),
     }
     for edge, limit in (("range_edge_m", "max_range_m"), ("angle_edge_deg", "half_angle_deg")):
-        if anchors[edge] > (anchors[limit] or 0.0):
+        if anchors[edge] and anchors[limit] is None:
+            raise ValueError(f"anchors.{edge} means nothing without anchors.{limit}")
+        if anchors[limit] is not None and anchors[edge] > anchors[limit]:
             raise ValueError(
-                f"anchors.{edge} must be at most anchors.{limit} = {anchors[limit]}, "
+                f"anchors.{edge} must be at most anchors.{limit} = {anchors[limit]:g}, "
                 f"got {anchors[edge]:g}"
             )
     edges = {
@@ -323,10 +325,12 @@ def _plan(tables: Mapping[str, Any], folder: Path) -> Plan | None:
     if "plan" not in tables:
         return None
     values = read_table("plan", tables["plan"])
+    if values["image"] is not None and values["metres_per_pixel"] is None:
+        raise ValueError("plan.metres_per_pixel must be given with plan.image")
     for key in ("image", "drawing"):
         if values[key] is not None:
             values[key] = str((folder / values[key]).absolute())
-    return Plan(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+    return Plan(**{key: value for key, value in values.items() if value is not None})
 
 
 def _named(name: str, make: Any, *rows: Any, **arguments: Any) -> Any:
