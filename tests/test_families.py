@@ -123,7 +123,7 @@ def test_check_env(reward):
 
 def episode(env, seed):
     env.action_space.seed(seed)
-    results = [env.reset(seed=seed)]
+    results: list[Any] = [env.reset(seed=seed)]
     while True:
         results.append(env.step(env.action_space.sample()))
         assert env.observation_space.contains(results[-1][0])
@@ -224,7 +224,7 @@ def test_pickling_and_specifications():
 
 
 def test_frames_are_those_of_the_drawn_scene():
-    env = gym.make(ID, scenes=MIXED, reward="none", render_mode="rgb_array")
+    env: Any = gym.make(ID, scenes=MIXED, reward="none", render_mode="rgb_array")
     for seed in range(2):
         env.reset(seed=seed)
         assert np.shape(env.render()) == (540, 960, 3)
@@ -247,7 +247,7 @@ VARIED = [
 ]
 
 
-def side_by_side(mode, wrap, n=5, reward="bound"):
+def side_by_side(mode, wrap, n=5, reward="bound") -> tuple[Any, Any]:
     native = wrap[1](TrackingVectorEnv(n, scenes=VARIED, reward=reward, autoreset_mode=mode))
     peer = SyncVectorEnv(
         [lambda: wrap[0](TrackingEnv(scenes=VARIED, reward=reward))] * n, autoreset_mode=mode
@@ -318,7 +318,7 @@ def test_an_unknown_filter_is_named():
 def test_frames_of_many_worlds_equal_those_of_each():
     native = VectorEstimatePose(TrackingVectorEnv(2, scenes=MIXED, render_mode="rgb_array"))
     native.reset(seed=4)
-    frames = native.render()
+    frames: Any = native.render()
     for world in range(2):
         alone = EstimatePose(TrackingEnv(scenes=MIXED, render_mode="rgb_array"))
         alone.reset(seed=4 + world)

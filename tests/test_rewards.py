@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,7 +26,7 @@ def far_anchors(outcome: Outcome):
     return -np.linalg.norm(away, axis=-1).max(axis=-1) - speed
 
 
-def step_of(scene, reward, action=0, world="bound"):
+def step_of(scene, reward, action: Any = 0, world="bound"):
     env = EstimatePose(TrackingEnv(scene, world), reward=reward)
     env.reset(seed=4)
     observation, got, *_, info = env.step(action)
@@ -93,7 +94,7 @@ def test_vector_equals_scalar(mode, reward):
         [lambda: EstimatePose(TrackingEnv(scene, "none"), reward=reward)] * n, autoreset_mode=mode
     )
     rng = np.random.default_rng(1)
-    native.reset(seed=3), peer.reset(seed=3)
+    _ = native.reset(seed=3), peer.reset(seed=3)
     for _ in range(10):
         actions = actions_of(native, rng)
         assert_same(native.step(actions)[1], peer.step(actions)[1], rtol=2e-5, atol=2e-6)
@@ -101,11 +102,11 @@ def test_vector_equals_scalar(mode, reward):
 
 @pytest.mark.parametrize("name", ["RBL/MobileAnchors-v0", "RBL/AnchorSelection-v0"])
 def test_tasks_take_a_reward(name):
-    env = gym.make(f"rbl_gym:{name}", reward=far_anchors)
+    env: Any = gym.make(f"rbl_gym:{name}", reward=far_anchors)
     env.reset(seed=1)
     # The scalar form hands over what the function makes of the same step.
     assert env.step(np.zeros(env.action_space.shape, env.action_space.dtype))[1] < 0
-    envs = gym.make_vec(f"rbl_gym:{name}", num_envs=2, reward="error")
+    envs: Any = gym.make_vec(f"rbl_gym:{name}", num_envs=2, reward="error")
     envs.reset(seed=1)
     _, reward, *_, infos = envs.step(np.zeros(envs.action_space.shape, envs.action_space.dtype))
     np.testing.assert_array_equal(reward, -infos["tag_error_m"])
@@ -122,7 +123,7 @@ def test_a_named_reward_survives_the_spec_as_json():
     assert env.spec is not None
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert json.loads(env.spec.to_json()) == json.loads(again.spec.to_json())  # pyright: ignore[reportOptionalMemberAccess]
-    env.reset(seed=1), again.reset(seed=1)
+    _ = env.reset(seed=1), again.reset(seed=1)
     assert env.step(0)[1] == again.step(0)[1]
 
 

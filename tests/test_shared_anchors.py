@@ -33,7 +33,9 @@ def test_check_env(observation):
 
 @needs("stable_baselines3")
 def test_sb3_checker():
-    from stable_baselines3.common.env_checker import check_env as check_sb3
+    from stable_baselines3.common.env_checker import (  # pyright: ignore[reportMissingImports]
+        check_env as check_sb3,
+    )
 
     check_sb3(SharedAnchorsEnv(observation="flat", **TWO))
 

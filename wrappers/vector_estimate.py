@@ -172,13 +172,14 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def _figures(self, info: Mapping[str, Any]) -> metrics.Figures:
         """Errors of the beliefs against the true poses of the infos."""
         assert self._belief is not None
-        told = *self._belief[:3], info["rotation"], info["translation"]
+        told: tuple[Any, ...] = *self._belief[:3], info["rotation"], info["translation"]
         if not self._varied:
             return metrics.judge(*told, self._scene.body)
         figures = np.empty((len(metrics.Figures._fields), self.num_envs))
         for count, alike in self._scene.bodies():
             tags = self._scene.body[alike, :count]
-            figures[:, alike] = metrics.judge(*(field[alike] for field in told), tags)
+            own = [field[alike] for field in told]
+            figures[:, alike] = metrics.judge(*own, tags)
         return metrics.Figures(*figures)
 
     def _finish(self, info: dict[str, Any], figures: metrics.Figures, last: BoolArray) -> None:

@@ -152,7 +152,7 @@ class TrackingVectorEnv(BatchEnv):
         if "quality" in seen:
             seen["quality"] = seen["quality"] * arrays.anchor_mask
         masks = {name: getattr(arrays, name).copy() for name in ("tags", "anchor_mask", "tag_mask")}
-        return {key: (seen | masks)[key] for key in self.single_observation_space}
+        return {key: (seen | masks)[key] for key in self._episodes.stack.family.fields}
 
     def _inform(self) -> dict[str, np.ndarray]:
         at, told = self._look()
