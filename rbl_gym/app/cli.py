@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from rbl_gym import __version__
 from rbl_gym.app import (
     bench_command,
+    bounds_command,
     calibrate_command,
     convert_command,
     learning_commands,
@@ -54,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     learning_commands.add_transfer(commands)
     bench_command.add_bench(commands)
     bench_command.add_rerun(commands)
+    bounds_command.add_bounds(commands)
     convert_command.add_convert(commands)
     replay_command.add_replay(commands)
     calibrate_command.add_calibrate(commands)

@@ -1,0 +1,75 @@
+"""The command bounds."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from rbl_gym.app.page import digits
+from rbl_gym.app.tables import new_console, new_table
+from rbl_gym.app.terminal import add_json, add_trials, progress, write_json
+
+
+def add_bounds(commands: Any) -> None:
+    """The parser of ``rbl-gym bounds``."""
+    bounds = commands.add_parser(
+        "bounds",
+        help="what an inertial sensor, a better survey, calibrated links would buy",
+        description="Posterior Cramer-Rao bounds along a track of a scene: by what tells the "
+        "motion (ranges alone, a told twist, inertial sensors), and by what is not known (places "
+        "of the anchors to 1, 3, 10 cm, biases of the links, offsets of the tags). No filter is "
+        "run. See docs/hard_conditions.md.",
+    )
+    bounds.add_argument(
+        "--scene",
+        default="uwb_room",
+        help="a name, or a file .toml or .json with changes, as of bench; default uwb_room",
+    )
+    add_trials(bounds, 20)
+    add_json(bounds)
+    bounds.set_defaults(run=_bounds)
+
+
+def _bounds(options: argparse.Namespace) -> int:
+    from rbl_gym.studies import what_if
+    from rbl_gym.studies.bench import spec_files
+
+    spec = next(iter(spec_files.scene_specs([options.scene]).values()))
+    if isinstance(spec, dict) and "ranges" in spec:
+        raise ValueError(f"{Path(options.scene)}: a recording has no bound; name a scene")
+    with progress("bounds") as advance:
+        result = what_if.what_if(spec, options.trials, options.seed, advance)
+    if write_json(result, options.json):
+        _print(result)
+    return 0
+
+
+def _print(result: dict[str, Any]) -> None:
+    """One table for position, one for rotation: what is not known by what tells the motion."""
+    console = new_console()
+    rows = {(row["motion"], row["unknown"]): row for row in result["rows"]}
+    motions = list(dict.fromkeys(motion for motion, _ in rows))
+    unknowns = list(dict.fromkeys(unknown for _, unknown in rows))
+    for key, label, n in (("position_m", "position (m)", 3), ("rotation_deg", "rotation (deg)", 3)):
+        table = new_table(
+            f"{result['scene']}: bound of {label}, {result['epochs']} epochs, "
+            f"{result['trials']} trials; in brackets: of their second half"
+        )
+        table.add_column("not known")
+        for motion in motions:
+            table.add_column(motion, justify="right")
+        for unknown in unknowns:
+            cells = [
+                f"{digits(rows[m, unknown][key], n)} ({digits(rows[m, unknown]['late_' + key], n)})"
+                for m in motions
+            ]
+            table.add_row(unknown, *cells)
+        console.print(table)
+    law = result["uncalibrated"]
+    console.print(
+        "One sigma of all three axes together, root mean square over trials and epochs. Ranges "
+        "alone: nothing but a law of the accelerations is known of the motion. Biases of links: "
+        f"{100 * law['std_m']:g} cm each and {100 * law['common_std_m']:g} cm common to all, "
+        "constant; they and the anchors' places are learned on the way."
+    )
