@@ -17,9 +17,9 @@ from rbl_gym.app import place_figures, place_html, place_report
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import obstacles
 from rbl_gym.placement import criteria, layouts, scene_files
-from rbl_gym.studies.placing import accuracy
+from rbl_gym.studies.placing import accuracy, design, requirements
 from rbl_gym.studies.placing import check as place_check
-from rbl_gym.studies.placing import design as place
+from rbl_gym.studies.placing.answer import Question, place_anchors
 from tests.test_scene_files import GOOD
 
 N_TRIALS = 60
@@ -27,7 +27,7 @@ N_TRIALS = 60
 
 @pytest.fixture(autouse=True)
 def short_searches(monkeypatch):
-    monkeypatch.setattr(place, "_GENERATIONS", 8)
+    monkeypatch.setattr(design, "_GENERATIONS", 8)
     monkeypatch.setattr(accuracy, "_MAP", 12)
 
 
@@ -38,10 +38,10 @@ def with_rack():
 
 @pytest.fixture(scope="module")
 def placed(with_rack):
-    before = place._GENERATIONS
-    place._GENERATIONS = 8
-    found = place.place_anchors(with_rack, range(4, 6), 1, N_TRIALS)
-    place._GENERATIONS = before
+    before = design._GENERATIONS
+    design._GENERATIONS = 8
+    found = place_anchors(with_rack, Question(range(4, 6), seed=1, trials=N_TRIALS))
+    design._GENERATIONS = before
     return found
 
 
@@ -49,14 +49,16 @@ def placed(with_rack):
 
 
 def test_the_design_is_legal_and_no_usual_layout_is_better(placed):
-    problem, design, result = placed
-    task = problem.task
-    assert design.anchors.shape == (5, 3)
-    assert placement.is_legal(task, design.anchors).all()
-    assert not scene_files.inside(design.anchors, problem.context.racks).any()
+    problem, layout, result = placed
+    assert layout.anchors.shape == (5, 3)
+    assert placement.is_legal(problem.task, layout.anchors).all()
+    assert not scene_files.inside(layout.anchors, problem.context.racks).any()
     assert list(result["layouts"]) == sorted(
         result["layouts"], key=lambda name: result["layouts"][name]["score_m"]
     )
+    usual = design.usual_layouts(problem, 1)
+    assert set(usual) == set(layouts.LAYOUTS)
+    assert all(anchors.shape == (5, 3) for anchors in usual.values())
     assert set(result["layouts"]) == {"designed", "greedy with swaps", *layouts.LAYOUTS}
     assert min(row["ratio"] for row in result["layouts"].values()) == 1
     assert result["layouts"]["random"]["ratio"] > 1.1
@@ -65,15 +67,16 @@ def test_the_design_is_legal_and_no_usual_layout_is_better(placed):
 @pytest.mark.parametrize("scene", ["auv_buoys", "satellite", "icassp2013"])
 def test_every_kind_of_legal_space(scene):
     problem = scene_files.problem(scene, 4)
-    found = place.design_layout(problem, 0)
+    found = design.design_layout(problem, 0)
     assert placement.is_legal(problem.task, found.anchors, 1e-3).all()
-    assert place_figures.place_figure(place.place_anchors(problem, range(4, 5), 0, 20)) is not None
+    placed = place_anchors(problem, Question(range(4, 5), trials=20))
+    assert place_figures.place_figure(placed) is not None
 
 
 def test_a_plane_and_a_line_are_regions_too():
     for high in ([7, 5, 1], [7, 1, 1]):
         problem = scene_files.problem("uwb_room", 4, ([1, 1, 1], high))
-        found = place.place_anchors(problem, range(4, 5), 0, 20)
+        found = place_anchors(problem, Question(range(4, 5), trials=20))
         assert place_figures.place_figure(found) is not None
         assert found.result["predicted"]["position_m"]["worst"] < 1
 
@@ -86,28 +89,30 @@ def test_more_anchors_are_better(placed):
 
 
 def test_predictions_are_the_bound_at_each_place(placed):
-    problem, design, _ = placed
-    task, scene = problem.task, problem.task.scene
-    places = np.array([[2.0, 2.0, 1.0], [6.5, 4.5, 0.5], [3.5, 4.0, 1.0]])
-    found = accuracy.accuracy(problem, design.anchors, places)
+    """With the sight of every tag by itself, by plain loops."""
+    problem, layout, _ = placed
+    places = np.array([[2.0, 2.0, 1.0], [6.5, 4.5, 0.5], [3.5, 4.3, 1.0]])
+    found = accuracy.accuracy(problem, layout.anchors, places, problem.zones[0])
     for index, spot in enumerate(places):
         squares = []
-        for turn in task.poses[0][: accuracy._TURNS]:
-            sight = obstacles.in_sight(design.anchors, spot[None], problem.context.racks)
-            information = task.prior_information
-            for seen, share in ((sight[0], 1.0), (~sight[0], task.blocked_information)):
-                mask = np.repeat(seen[:, None], len(scene.tags), axis=1)
+        for turn in requirements.turns("free", accuracy.TURNS):
+            tags = spot + problem.tags @ turn.T
+            sight = obstacles.in_sight(layout.anchors, tags, problem.obstacles.boxes).T
+            information = accuracy.prior_of(problem, problem.zones[0])
+            for seen, share in ((sight, 1.0), (~sight, 0.01)):
                 information = information + share * bounds.range_information(
-                    design.anchors, np.array(scene.tags), turn, spot, scene.noise, mask
+                    layout.anchors, problem.tags, turn, spot, problem.noise, seen
                 )
             P = np.linalg.inv(information)
-            squares.append([np.trace(P[3:, 3:]), np.trace(P[:3, :3])])
+            d = np.diag(P)
+            squares.append([d[3:].sum(), d[:3].sum(), d[3] + d[4], d[5], d[2]])
         expected = np.sqrt(np.mean(squares, axis=0))
-        np.testing.assert_allclose([found.position[index], found.rotation[index]], expected)
+        errors = [found.position, found.rotation, found.horizontal, found.height, found.heading]
+        np.testing.assert_allclose([values[index] for values in errors], expected)
 
 
 def test_the_search_scores_over_free_poses(with_rack):
-    task = place.free_task(with_rack, 50)
+    task = design.free_task(with_rack, 50)
     places = placement.positions(task, with_rack.context)
     assert places.shape == (50, 3)
     assert not scene_files.inside(places, with_rack.context.racks).any()
@@ -116,11 +121,11 @@ def test_the_search_scores_over_free_poses(with_rack):
 
 
 def test_maps_leave_obstacles_out_and_agree_with_predictions(placed):
-    problem, design, _ = placed
-    plan = accuracy.accuracy_map(problem, design.anchors)
+    problem, layout, _ = placed
+    plan = accuracy.accuracy_map(problem, layout.anchors)
     assert plan.at == 1.0
     spot = [plan.columns[0], plan.rows[-1], plan.at]
-    found = accuracy.accuracy(problem, design.anchors, np.array([spot]))
+    found = accuracy.accuracy(problem, layout.anchors, np.array([spot]), problem.zones[0])
     assert plan.position[-1, 0] == pytest.approx(found.position[0])
     assert plan.rotation[-1, 0] == pytest.approx(np.rad2deg(found.rotation[0]))
     column, row = (np.abs(axis - x).argmin() for axis, x in ((plan.columns, 3.5), (plan.rows, 2.5)))
@@ -137,13 +142,18 @@ def test_filters_reach_what_is_predicted():
     filters = place_check.check_layout(problem, anchors, 3000, 0)["filters"]
     assert list(filters) == ["iterated EKF", "locate, from nothing"]
     for figures in filters.values():
-        assert figures["lost"] < 0.001
+        assert figures["found"] > 0.999
+        assert figures["holds"]
         assert figures["position_ratio"] == pytest.approx(1, abs=0.04)
         assert figures["rotation_ratio"] == pytest.approx(1, abs=0.04)
         assert figures["nees"] == pytest.approx(6, abs=0.3)
+        (zone,) = figures["zones"]
+        assert zone["position_rmse_m"] == pytest.approx(zone["position_predicted_m"], rel=0.05)
+        assert zone["heading_rmse_deg"] == pytest.approx(zone["heading_predicted_deg"], rel=0.05)
+        assert "within" not in zone
 
 
-def test_lost_bodies_count_in_the_figures_of_all():
+def test_lost_bodies_count_in_the_figures():
     """Without a prior, half of the bodies below a ceiling are put above it: both are said."""
     flat = [[0.2, 0.15, 0], [-0.2, 0.15, 0], [-0.2, -0.15, 0], [0.2, -0.15, 0]]
     tables = {
@@ -158,10 +168,12 @@ def test_lost_bodies_count_in_the_figures_of_all():
     check = place_check.check_layout(problem, anchors, 400, 0)
     found = check["filters"]["locate, from nothing"]
     # The side is a toss of a coin: within four standard deviations of a half.
-    assert found["lost"] == pytest.approx(0.5, abs=0.1)
-    assert found["position_rmse_m"] < 0.2
+    assert found["found"] == pytest.approx(0.5, abs=0.1)
+    assert found["position_rmse_found_m"] < 0.2
     # A mirror pose is about 2 x 1.35 m off.
-    assert 1.0 < found["position_rmse_all_m"] < 3.0
+    assert 1.0 < found["position_rmse_m"] < 3.0
+    assert found["position_p95_m"] > 2.0
+    assert not found["holds"]
 
 
 def test_blocked_links_are_noisier_by_what_is_left_of_their_information(with_rack):
@@ -191,7 +203,7 @@ def test_links_without_information_are_not_measured(with_rack):
     drawn = place_check.draw_bodies(problem, anchors, 200, np.random.default_rng(0))
     assert not drawn.links.all()
     figures = place_check.check_layout(problem, anchors, 300, 0)["filters"]["iterated EKF"]
-    assert figures["position_ratio"] == pytest.approx(1, abs=0.15)
+    assert figures["position_ratio_found"] == pytest.approx(1, abs=0.15)
 
 
 # --- the command -------------------------------------------------------------------------------
@@ -219,21 +231,27 @@ def test_the_command_writes_a_table_a_picture_a_page_and_figures(tmp_path, capsy
 def test_the_figures_have_these_names(placed):
     result = json.loads(json.dumps(placed.result, allow_nan=False))
     assert set(result) == {
-        "scene", "seed", "n_anchors", "region", "obstacles", "tags_m", "method", "anchors",
-        "coplanar", "predicted", "criteria", "layouts", "check", "against_number",
+        "scene", "seed", "n_anchors", "verdict", "survive", "zones", "region", "obstacles",
+        "tags_m", "method", "anchors", "cost", "coplanar", "next_anchor", "predicted", "criteria",
+        "layouts", "check", "against_number",
     }  # fmt: skip
-    assert set(result["anchors"][0]) == {"x_m", "y_m", "z_m", "sees"}
+    assert set(result["anchors"][0]) == {
+        "name", "x_m", "y_m", "z_m", "mount", "cost", "fixed", "sees", "without",
+    }  # fmt: skip
     for name in ("position_m", "rotation_deg", "score_m"):
         figures = result["predicted"][name]
         assert set(figures) == {"rms", "median", "p95", "worst", "worst_at_m"}
         assert figures["median"] <= figures["p95"] <= figures["worst"]
     assert set(result["criteria"]) == set(criteria.Criteria._fields)
     assert set(result["check"]) == {"trials", "prior_rotation_deg", "prior_position_m", "filters"}
+    both = [
+        f"{name}_{of}{unit}"
+        for name, unit in (("position", "m"), ("rotation", "deg"))
+        for of in ("rmse_", "predicted_", "rmse_found_", "predicted_found_", "p95_")
+    ]
+    ratios = [f"{name}_ratio{of}" for name in ("position", "rotation") for of in ("", "_found")]
     assert set(result["check"]["filters"]["iterated EKF"]) == {
-        "lost", "nees", "position_rmse_m", "position_predicted_m", "position_ratio",
-        "rotation_rmse_deg", "rotation_predicted_deg", "rotation_ratio",
-        "nees_all", "position_rmse_all_m", "position_predicted_all_m", "position_ratio_all",
-        "rotation_rmse_all_deg", "rotation_predicted_all_deg", "rotation_ratio_all",
+        "found", "without_pose", "nees", "nees_found", "holds", "zones", *both, *ratios,
     }  # fmt: skip
     assert result["obstacles"] == [{"low_m": [3, 2, 0], "high_m": [4, 3, 2.5]}]
 
@@ -260,7 +278,7 @@ def test_the_picture_is_the_same_for_the_same_result(placed, tmp_path):
 
 def test_coplanar_anchors_are_warned_of():
     problem = scene_files.problem("auv_buoys", 3)
-    result = place.place_anchors(problem, range(3, 4), 0, 20).result
+    result = place_anchors(problem, Question(range(3, 4), trials=20)).result
     assert result["coplanar"]
     assert result["criteria"]["conditioning"] is None
     assert any("mirror image" in note for note in place_report.notes(result))

@@ -100,10 +100,11 @@ def test_errors_are_those_of_the_inverse():
         np.testing.assert_allclose([values[place] for values in found], want, rtol=1e-10)
     # Of one more anchor, or less of one.
     part = informations(mounts(rng, 1), zone.places, zone.rotation)[0]
-    np.testing.assert_allclose(
-        asked.errors_of(F, zone.rotation, TAGS, part),
-        asked.errors_of(F + part, zone.rotation, TAGS),
-    )
+    added = asked.errors_of(F, zone.rotation, TAGS, part)
+    np.testing.assert_allclose(added, asked.errors_of(F + part, zone.rotation, TAGS))
+    np.testing.assert_allclose(asked.asked_of(F, part), added[3:])
+    np.testing.assert_allclose(asked.asked_of(F), found[3:])
+    assert isinstance(asked.asked_of(F), asked.Asked)
 
 
 @pytest.mark.skipif(not kernels.enabled(), reason="kernels are off")
@@ -113,10 +114,10 @@ def test_both_forms_of_the_errors_agree():
     part = rng.standard_normal((2, 5, 2, 6, 6))
     base, part = (x @ np.swapaxes(x, -1, -2) + np.eye(6) for x in (root, part))
     args = base, part, rotations.random(rng, (2,)), TAGS
-    form = asked._mean_squares
-    for mine, plain in zip(form.kernel(*args), form.textbook(*args), strict=True):
-        assert mine.shape == plain.shape == (3, 2, 5)
-        np.testing.assert_allclose(mine, plain, rtol=1e-9)
+    for form, used in ((asked._mean_squares, args), (asked._asked_squares, args[:2])):
+        for mine, plain in zip(form.kernel(*used), form.textbook(*used), strict=True):
+            assert mine.shape == plain.shape == (3, 2, 5)
+            np.testing.assert_allclose(mine, plain, rtol=1e-9)
 
 
 def test_no_information_is_refused():

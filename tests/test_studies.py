@@ -14,7 +14,7 @@ from rbl_gym.studies.bench import leaderboard, records, spec_files
 from rbl_gym.studies.learning import evaluation, transfer
 from rbl_gym.studies.learning.rl_tasks import rl_task
 from rbl_gym.studies.papers import camsap2013, doa2019, icassp2013, network_growth, slides2013
-from rbl_gym.studies.placing import accuracy, check, design
+from rbl_gym.studies.placing import accuracy, answer, check, design, judging
 from rbl_gym.worlds import scenes
 from tests.helpers import Told, needs
 from tests.test_epoch_noise import log
@@ -134,10 +134,10 @@ def test_replay_in_one_call_is_the_four():
 def test_place(capsys, monkeypatch):
     monkeypatch.setattr(design, "_GENERATIONS", 2)
     problem = scene_files.problem("uwb_room", 4, None, 0, 0)
-    placed = design.place_anchors(problem, range(4, 5), 0, 20)
+    placed = answer.place_anchors(problem, answer.Question(range(4, 5), trials=20))
     arguments = "--scene", "uwb_room", "--anchors", "4", "--trials", "20"
     assert placed.result == printed(capsys, "place", *arguments)
-    assert isinstance(placed, design.Placed)
+    assert isinstance(placed, answer.Placed)
     assert isinstance(placed.design, design.Design)
     maps = accuracy.level_maps(problem, placed.design.anchors)
     assert all(isinstance(level, accuracy.Map) for level in maps)
@@ -145,12 +145,13 @@ def test_place(capsys, monkeypatch):
     assert again == placed.result["check"]
     drawn = check.draw_bodies(problem, placed.design.anchors, 5, np.random.default_rng(0))
     assert isinstance(drawn, check.DrawnBodies)
-    places = accuracy.free_sample(problem)
-    found = accuracy.accuracy(problem, placed.design.anchors, places)
-    assert isinstance(found, accuracy.Accuracy)
-    rms = float(monte_carlo.rms(found.score))
-    assert rms == placed.result["predicted"]["score_m"]["rms"]
-    assert design.prediction(problem, placed.design.anchors) == placed.result["predicted"]
+    (judged,) = judging.judge(problem, placed.design.anchors, 0)
+    assert isinstance(judged, judging.Judged)
+    found = accuracy.accuracy(problem, placed.design.anchors, judged.places, problem.zones[0])
+    assert float(monte_carlo.rms(found.score)) == placed.result["predicted"]["score_m"]["rms"]
+    edges = judging.at_edges(problem, placed.design.anchors, judged)
+    assert judging.zone_row(judged, edges) == placed.result["zones"][0]
+    assert judging.overview([judged], [edges]) == placed.result["predicted"]
 
 
 @needs("cmaes")

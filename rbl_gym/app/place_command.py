@@ -35,7 +35,30 @@ def add_place(commands: Any) -> None:
         "--anchors",
         type=_numbers,
         metavar="N|A..B",
-        help="how many; A..B: accuracy against the number",
+        help="how many; A..B: accuracy against the number, or with --fewest what is allowed",
+    )
+    place.add_argument(
+        "--fewest",
+        action="store_true",
+        help="the least number that meets the requirements of all zones",
+    )
+    place.add_argument(
+        "--survive",
+        type=int,
+        choices=(0, 1),
+        default=0,
+        help="1: any one anchor may fail, in judging and in the search",
+    )
+    place.add_argument(
+        "--layout", metavar="F", help="judge these anchors: a CSV file with x_m, y_m, z_m, name"
+    )
+    place.add_argument(
+        "--optimise", action="store_true", help="start from --layout; --anchors may ask for more"
+    )
+    place.add_argument(
+        "--keep",
+        metavar="NAMES",
+        help="anchors of --layout that stay, by their names or numbers, with commas; or all",
     )
     place.add_argument(
         "--racks",
@@ -64,16 +87,33 @@ def _place(options: argparse.Namespace) -> int:
     require("cmaes", "placement")
     check_html(options)
     from rbl_gym.placement import scene_files
-    from rbl_gym.studies.placing import design as place
+    from rbl_gym.studies.placing import answer
 
+    layout = _layout(options)
     numbers = options.anchors
+    if numbers is None and layout is not None:
+        numbers = range(len(layout.positions), len(layout.positions) + 1)
     problem = scene_files.problem(
         options.scene, numbers[-1] if numbers else None, options.region, options.racks, options.seed
     )
-    numbers = numbers or range(problem.n_anchors, problem.n_anchors + 1)
+    if numbers is None:
+        least = max(scene_files.MIN_ANCHORS, len(problem.fixed))
+        most = scene_files.MAX_ANCHORS if options.fewest else problem.n_anchors
+        numbers = range(least if options.fewest else most, most + 1)
     scene_files.check_n_anchors(numbers[0])
+    question = answer.Question(
+        numbers,
+        options.fewest,
+        None if layout is None else layout.positions,
+        () if layout is None else layout.names,
+        options.optimise,
+        _kept(options.keep, layout),
+        options.survive,
+        options.seed,
+        options.trials,
+    )
     with progress("placing") as advance:
-        placed = place.place_anchors(problem, numbers, options.seed, options.trials, advance)
+        placed = answer.place_anchors(problem, question, advance)
     if options.plot:
         from rbl_gym.app import figures, place_figures
 
@@ -98,6 +138,41 @@ class _Schema(argparse.Action):
 
         print(json.dumps(schema(), indent=1))
         parser.exit()
+
+
+def _layout(options: argparse.Namespace) -> Any:
+    """The anchors of --layout, or None; options that need it, or exclude it, are looked at."""
+    if options.layout is None:
+        for name in ("optimise", "keep"):
+            if getattr(options, name):
+                raise ValueError(f"--{name} needs --layout")
+        return None
+    if options.fewest:
+        raise ValueError("--fewest looks for a layout: leave --layout out")
+    if options.keep and not options.optimise:
+        raise ValueError("--keep needs --optimise: else all of the layout stays")
+    if options.anchors is not None and not options.optimise:
+        raise ValueError("--anchors means nothing with --layout alone: its anchors are judged")
+    from rbl_gym.studies.placing.layout_files import read_layout
+
+    return read_layout(options.layout)
+
+
+def _kept(names: str | None, layout: Any) -> tuple[int, ...]:
+    """Indices of the anchors of a layout that stay."""
+    if names is None:
+        return ()
+    if names.strip() == "all":
+        return tuple(range(len(layout.names)))
+    known = {str(k + 1): k for k in range(len(layout.names))}
+    known |= {name: k for k, name in enumerate(layout.names)}
+    asked = [name.strip() for name in names.split(",")]
+    for name in asked:
+        if name not in known:
+            raise ValueError(
+                f"--keep must name anchors of the layout, {', '.join(layout.names)}; got {name!r}"
+            )
+    return tuple(sorted({known[name] for name in asked}))
 
 
 def _numbers(text: str) -> range:

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.regions import Shell
 from rbl_gym.studies.placing.accuracy import Map, accuracy_map
-from rbl_gym.studies.placing.design import Placed
+from rbl_gym.studies.placing.answer import Placed
 
 ANCHOR, REGION, OBSTACLE, DESIGNED, USUAL = "#d1495b", "#222222", "#6c757d", "#1b7f5c", "#9db4c0"
 # Anchors further out than so many half sizes of the region leave its map too small to read.

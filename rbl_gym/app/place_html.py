@@ -14,7 +14,7 @@ from rbl_gym.app import page, solids
 from rbl_gym.app.place_report import notes, tables
 from rbl_gym.geometry.regions import Shell
 from rbl_gym.studies.placing.accuracy import Map, level_maps
-from rbl_gym.studies.placing.design import Placed
+from rbl_gym.studies.placing.answer import Placed
 
 
 def write_place(placed: Placed, path: str) -> None:

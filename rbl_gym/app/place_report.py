@@ -22,13 +22,46 @@ class Rows(NamedTuple):
 
 
 def tables(result: dict[str, Any]) -> Iterator[Rows]:
-    """All tables of a result, in the order in which they answer."""
+    """All tables of a result, in the order in which they answer: first what was asked."""
+    yield _zones(result)
+    if "fewest" in result:
+        yield from _fewest(result["fewest"])
     yield _anchors(result)
+    yield _without(result)
+    if result["next_anchor"] is not None:
+        yield _next(result)
+    if any(anchor["cost"] != 1 for anchor in result["anchors"]):
+        yield _mounts(result)
+    yield _worst(result)
     yield _prediction(result)
     yield _layouts(result["layouts"])
     yield _check(result["check"])
+    if any("within" in row for row in _check_zones(result["check"])):
+        yield _check_within(result["check"])
     if "against_number" in result:
         yield _numbers(result["against_number"])
+
+
+def verdict(result: dict[str, Any]) -> str:
+    """The answer in one sentence."""
+    survives = ", with any one anchor missing" if result["survive"] else ""
+    count = f"{result['n_anchors']} anchors{survives}"
+    if result["verdict"] == "no requirement":
+        return f"{count}: no zone has a requirement."
+    words = {"pass": "PASS", "fail": "FAIL", "undecided": "UNDECIDED"}
+    zones = [row for row in result["zones"] if row["verdict"] != "no requirement"]
+    passed = sum(row["verdict"] == "pass" for row in zones)
+    text = f"{words[result['verdict']]}: {count}, {passed} of {len(zones)} zones pass."
+    fewest = result.get("fewest")
+    if fewest is None:
+        return text
+    if not fewest["met"]:
+        return f"{text} No layout with so many was found that meets the requirements."
+    less = fewest["one_less"]
+    if less is None:
+        return f"{text} That is the least number that was allowed."
+    why = "no choice of" if fewest["proved"] else "no layout was found of"
+    return f"{text} The least number: {why} {less['n_anchors']} that passes."
 
 
 def notes(result: dict[str, Any]) -> list[str]:
@@ -36,22 +69,30 @@ def notes(result: dict[str, Any]) -> list[str]:
     criteria, check = result["criteria"], result["check"]
     conditioning = criteria["conditioning"]
     found = [
-        "Predicted: Cramer-Rao bound of one epoch of ranges, one sigma of all three axes together, "
-        "averaged over turns of the body; b is the root mean square tag error.",
+        "A place is within where one sigma of one epoch of ranges, root mean square over turns of "
+        "the body, is at most each limit: horizontal position, height, heading. The interval "
+        "(95 %) is of the drawn places; a zone passes where it lies above what is required. "
+        "Margin: limit over what is reached at the required share.",
+        "Predicted: Cramer-Rao bound of all three axes together; b is the root mean square tag "
+        "error.",
         f"Criteria: position {criteria['position_m']:.4g} m, rotation "
         f"{math.degrees(criteria['rotation_rad']):.3g} deg, D-optimal "
         f"{criteria['d_optimal_m']:.4g} m, E-optimal {criteria['e_optimal_m']:.4g} m, conditioning "
         + ("infinite (coplanar)." if conditioning is None else f"{conditioning:.3g}."),
-        f"Check: {check['trials']} bodies at random poses in the region; the EKF starts from a "
-        f"prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m around "
-        "the truth. NEES of an honest filter: 6. Lost: further off than once in a million. RMSE is "
-        "of all bodies; of found, predicted, ratio and NEES are of those not lost.",
+        f"Check: {check['trials']} bodies at random poses, as many in each zone; the EKF starts "
+        f"from a prior of {check['prior_rotation_deg']:g} deg and {check['prior_position_m']:g} m "
+        "around the truth. RMSE, ratio and NEES (6 where honest) are of all bodies that have a "
+        "pose; found: no further off than once in a million.",
     ]
     for name, figures in check["filters"].items():
-        if figures["lost"] > _MANY_LOST:
+        if 1 - figures["found"] > _MANY_LOST:
             found.append(
-                f"{name}: {100 * figures['lost']:.3g} % of the bodies are lost; the prediction "
-                "and its ratio hold for the others only."
+                f"{name}: {100 * (1 - figures['found']):.3g} % of the bodies are not found. Of the "
+                "others the position is off by "
+                + _figure(figures.get("position_rmse_found_m"), 4)
+                + " m, as predicted times "
+                + _figure(figures.get("position_ratio_found"), 3)
+                + "."
             )
     if result["coplanar"]:
         found.append(
@@ -66,12 +107,13 @@ def notes(result: dict[str, Any]) -> list[str]:
 
 
 def print_place(result: dict[str, Any]) -> None:
-    """Every table, and the notes."""
+    """The answer, every table, and the notes."""
     console = new_console()
+    console.print(verdict(result))
     for rows in tables(result):
         table = new_table(rows.title)
         for index, heading in enumerate(rows.headings):
-            table.add_column(heading, justify="right" if index else "left")
+            table.add_column(heading, justify="right" if index else "left", no_wrap=not index)
         for row in rows.rows:
             table.add_row(*row)
         console.print(table)
@@ -79,17 +121,165 @@ def print_place(result: dict[str, Any]) -> None:
         console.print(note)
 
 
+def _zones(result: dict[str, Any]) -> Rows:
+    rows = []
+    for row in result["zones"]:
+        figures = [
+            f"{digits(row[key][what], n)}"
+            for key, n in (("position_m", 3), ("heading_deg", 3))
+            for what in ("median", "p95")
+        ]
+        rows.append(
+            [row["name"], row["verdict"], *_share(row), *figures, row.get("without_anchor")]
+        )
+    headings = [
+        "zone", "verdict", "within", "95 % interval", "required", "margin",
+        "position median (m)", "p95", "heading median (deg)", "p95",
+    ]  # fmt: skip
+    if any(row[-1] is not None for row in rows):
+        return Rows(_title(result), [*headings, "worst without"], [_texts(row) for row in rows])
+    return Rows(_title(result), headings, [_texts(row[:-1]) for row in rows])
+
+
+def _title(result: dict[str, Any]) -> str:
+    return f"{result['scene']}: {result['n_anchors']} anchors ({result['method']})"
+
+
+def _texts(row: list[Any]) -> list[str]:
+    return ["-" if cell is None else str(cell) for cell in row]
+
+
+def _figure(value: float | None, n: int) -> str:
+    return "-" if value is None else digits(value, n)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
+
+
+def _share(row: dict[str, Any]) -> list[str]:
+    """Share within, its interval, what is required, margin; dashes without a requirement."""
+    if "share" not in row:
+        return ["-"] * 4
+    interval = f"{100 * row['share_low']:.1f} to {100 * row['share_high']:.1f} %"
+    return [_percent(row["share"]), interval, required(row["required"]), f"{row['margin']:.3f}"]
+
+
+def required(asked: dict[str, Any]) -> str:
+    """A requirement in words: ``0.1 m, 5 deg in 95 %``."""
+    parts = []
+    if asked["position_m"] is not None:
+        parts.append(f"{asked['position_m']:g} m")
+    if asked["height_m"] is not None:
+        parts.append(f"height {asked['height_m']:g} m")
+    if asked["heading_deg"] is not None:
+        parts.append(f"{asked['heading_deg']:g} deg")
+    return f"{', '.join(parts)} in {100 * asked['share']:g} %"
+
+
+def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
+    """What would have to give with one anchor less."""
+    less = fewest["one_less"]
+    if less is None:
+        return
+    rows = []
+    for row in less["zones"]:
+        if "share" not in row:
+            continue
+        needs = row["would_pass"]
+        limits = [_figure(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
+        rows.append([row["name"], row["verdict"], *_share(row), *limits])
+    headings = [
+        "zone", "verdict", "within", "95 % interval", "required", "margin",
+        "would pass: position (m)", "height (m)", "heading (deg)",
+    ]  # fmt: skip
+    yield Rows(f"with one anchor less, {less['n_anchors']}", headings, rows)
+
+
 def _anchors(result: dict[str, Any]) -> Rows:
     rows = [
         [
-            str(index + 1),
+            anchor["name"],
             *(f"{anchor[key]:.3f}" for key in ("x_m", "y_m", "z_m")),
+            anchor["mount"] + (", fixed" if anchor["fixed"] else ""),
             f"{100 * anchor['sees']:.0f} %",
         ]
-        for index, anchor in enumerate(result["anchors"])
+        for anchor in result["anchors"]
     ]
-    title = f"{result['scene']}: {result['n_anchors']} anchors ({result['method']})"
-    return Rows(title, ["anchor", "x (m)", "y (m)", "z (m)", "sees of region"], rows)
+    headings = ["anchor", "x (m)", "y (m)", "z (m)", "mount", "sees of zones"]
+    return Rows("anchors", headings, rows)
+
+
+def _without(result: dict[str, Any]) -> Rows:
+    """What each anchor is for: what is left without it."""
+    asking = [row["name"] for row in result["zones"] if "share" in row]
+    rows = []
+    for anchor in result["anchors"]:
+        left = anchor["without"]
+        shares = [_percent(row["share"]) for row in left["zones"] if "share" in row]
+        worst = [max(row[key] for row in left["zones"]) for key in ("position_m", "heading_deg")]
+        rows.append(
+            [
+                anchor["name"],
+                digits(left["score_m"], 4),
+                f"{left['ratio']:.3f}",
+                *(digits(value, 3) for value in worst),
+                *shares,
+            ]
+        )
+    headings = ["without", "b (m)", "b / with all", "position RMS (m)", "heading RMS (deg)"]
+    return Rows("what each anchor is for", [*headings, *(f"within {n}" for n in asking)], rows)
+
+
+def _next(result: dict[str, Any]) -> Rows:
+    """Where one more anchor would help most."""
+    more = result["next_anchor"]
+    rows = []
+    for now, row in zip(more["zones_now"], more["zones"], strict=True):
+        rows.append(
+            [
+                row["name"],
+                row["verdict"],
+                *(_percent(one["share"]) if "share" in one else "-" for one in (now, row)),
+                *(digits(one["rms_position_m"], 3) for one in (now, row)),
+                *(digits(one["rms_heading_deg"], 3) for one in (now, row)),
+            ]
+        )
+    where = ", ".join(f"{more[key]:.3f}" for key in ("x_m", "y_m", "z_m"))
+    title = f"one more would help most at ({where}), {more['mount']}: b times {more['ratio']:.3f}"
+    headings = [
+        "zone", "verdict", "within now", "then", "position RMS (m) now", "then",
+        "heading RMS (deg) now", "then",
+    ]  # fmt: skip
+    return Rows(title, headings, rows)
+
+
+def _mounts(result: dict[str, Any]) -> Rows:
+    """How many anchors hang where, and what they cost."""
+    kinds: dict[tuple[str, float], int] = {}
+    for anchor in result["anchors"]:
+        key = anchor["mount"], anchor["cost"]
+        kinds[key] = kinds.get(key, 0) + 1
+    rows = [
+        [mount, str(count), f"{cost:g}", f"{count * cost:g}"]
+        for (mount, cost), count in sorted(kinds.items())
+    ]
+    rows.append(["all", str(result["n_anchors"]), "", f"{result['cost']:g}"])
+    return Rows("cost of the mounts", ["mount", "anchors", "each", "cost"], rows)
+
+
+def _worst(result: dict[str, Any]) -> Rows:
+    rows = [
+        [
+            zone["name"],
+            *(f"{place[key]:.2f}" for key in ("x_m", "y_m", "z_m")),
+            *(digits(place[key], 3) for key in ("position_m", "height_m", "heading_deg")),
+        ]
+        for zone in result["zones"]
+        for place in zone["worst_places"]
+    ]
+    headings = ["zone", "x (m)", "y (m)", "z (m)", "position (m)", "height (m)", "heading (deg)"]
+    return Rows("worst places", headings, rows)
 
 
 def _prediction(result: dict[str, Any]) -> Rows:
@@ -135,33 +325,70 @@ def _layouts(layouts: dict[str, dict[str, float]]) -> Rows:
 def _check(check: dict[str, Any]) -> Rows:
     rows = []
     for name, figures in check["filters"].items():
-        row = [name, f"{100 * figures['lost']:.1f} %"]
+        row = [name, _percent(figures["found"]), "yes" if figures["holds"] else "no"]
         for quantity, unit, n in (("position", "m", 4), ("rotation", "deg", 3)):
-            for key in ("rmse_all_{}", "rmse_{}", "predicted_{}"):
-                value = figures.get(f"{quantity}_{key.format(unit)}")
-                row.append("-" if value is None else digits(value, n))
-            ratio = f"{quantity}_ratio"
-            row.append(f"{figures[ratio]:.3f}" if ratio in figures else "-")
+            for key in ("rmse_{}", "p95_{}", "predicted_{}"):
+                row.append(_figure(figures.get(f"{quantity}_{key.format(unit)}"), n))
+            ratio = figures.get(f"{quantity}_ratio")
+            row.append("-" if ratio is None else f"{ratio:.3f}")
         rows.append([*row, f"{figures['nees']:.2f}" if "nees" in figures else "-"])
     headings = [
         "filter",
-        "lost",
+        "found",
+        "as predicted",
         "position RMSE (m)",
-        "of found",
-        "predicted",
+        "p95",
+        "predicted RMS",
         "ratio",
         "rotation RMSE (deg)",
-        "of found",
-        "predicted",
+        "p95",
+        "predicted RMS",
         "ratio",
         "NEES (6)",
     ]
-    return Rows(f"checked by Monte Carlo, {check['trials']} trials", headings, rows)
+    return Rows(f"checked by Monte Carlo, all of {check['trials']} bodies", headings, rows)
+
+
+def _check_zones(check: dict[str, Any]) -> list[dict[str, Any]]:
+    return [row for figures in check["filters"].values() for row in figures["zones"]]
+
+
+def _check_within(check: dict[str, Any]) -> Rows:
+    """Bodies within the limits of their zone, by each filter."""
+    rows = [
+        [
+            name,
+            row["name"],
+            str(row["bodies"]),
+            _percent(row["found"]),
+            _percent(row["within"]),
+            _percent(row["within_predicted"]),
+            _figure(row.get("position_rmse_m"), 3),
+            _figure(row.get("position_predicted_m"), 3),
+            _figure(row.get("heading_rmse_deg"), 3),
+            _figure(row.get("heading_predicted_deg"), 3),
+        ]
+        for name, figures in check["filters"].items()
+        for row in figures["zones"]
+        if "within" in row
+    ]
+    headings = [
+        "filter", "zone", "bodies", "found", "errors within the limits", "predicted",
+        "position RMSE (m)", "predicted", "heading RMSE (deg)", "predicted",
+    ]  # fmt: skip
+    return Rows("checked in each zone: horizontal position, heading", headings, rows)
 
 
 def _numbers(numbers: list[dict[str, float]]) -> Rows:
     rows = [
-        [str(row["n_anchors"]), *(digits(row[key], n) for _, key, n in _FIGURES)] for row in numbers
+        [
+            str(row["n_anchors"]),
+            row["verdict"],
+            *(digits(row[key], n) for _, key, n in _FIGURES),
+            *(_percent(zone["share"]) for zone in row["zones"] if "share" in zone),
+        ]
+        for row in numbers
     ]
-    headings = ["anchors", *(heading for heading, _, _ in _FIGURES)]
+    zones = [f"within {zone['name']}" for zone in numbers[0]["zones"] if "share" in zone]
+    headings = ["anchors", "verdict", *(heading for heading, _, _ in _FIGURES), *zones]
     return Rows("against the number of anchors", headings, rows)

@@ -40,3 +40,31 @@ def mean_squares(
         horizontal[0] += across / n_turns
         height[0] += P[5, 5] / n_turns
         heading[0] += P[2, 2] / n_turns
+
+
+@gufunc("(t,s,s),(t,s,s)->(),(),()")
+def asked_squares(base: Any, part: Any, horizontal: Any, height: Any, heading: Any) -> None:
+    """`mean_squares` of what zones ask for, from the last columns of the factor's inverse alone."""
+    F, L = np.empty((6, 6)), np.empty((6, 6))
+    across = up = turn = 0.0
+    n_turns = base.shape[0]
+    for t in range(n_turns):
+        for i in range(6):
+            for j in range(i + 1):
+                F[i, j] = base[t, i, j] + part[t, i, j]
+        if not cholesky6(F, L):
+            horizontal[0] = height[0] = heading[0] = math.nan
+            return
+        # Of the lower factor's inverse, whose diagonal is that of L; variances are the squares
+        # of its columns.
+        c55, c44, c33, c22 = L[5, 5], L[4, 4], L[3, 3], L[2, 2]
+        c54 = -c55 * L[5, 4] * c44
+        c43 = -c44 * L[4, 3] * c33
+        c53 = -c55 * (L[5, 3] * c33 + L[5, 4] * c43)
+        c32 = -c33 * L[3, 2] * c22
+        c42 = -c44 * (L[4, 2] * c22 + L[4, 3] * c32)
+        c52 = -c55 * (L[5, 2] * c22 + L[5, 3] * c32 + L[5, 4] * c42)
+        across += c33 * c33 + c43 * c43 + c53 * c53 + c44 * c44 + c54 * c54
+        up += c55 * c55
+        turn += c22 * c22 + c32 * c32 + c42 * c42 + c52 * c52
+    horizontal[0], height[0], heading[0] = across / n_turns, up / n_turns, turn / n_turns

@@ -70,7 +70,17 @@ class Gain:
         normals
             (..., 3) of the anchor's mount, of unit length; zero: the anchor sees everywhere.
         """
-        return share_and_slope(self.numbers, offsets, normals)[0]
+        limit, edge, least, full = self.numbers.tolist()
+        distance = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
+        share = np.ones_like(distance)
+        if limit < math.inf:
+            share = _step(limit - distance, edge)[0]
+        if least > -2:
+            cosine = np.einsum("...i,...i->...", offsets, normals) / distance
+            share = share * np.where(
+                normals.any(axis=-1), _step(cosine - least, full - least)[0], 1.0
+            )
+        return share
 
 
 # Neither limit.

@@ -1,99 +1,156 @@
-"""What the Cramer-Rao bound promises at places of a work region: points, grids, maps."""
+"""What the Cramer-Rao bound promises at places of a zone: points, grids, maps."""
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym import bounds
-from rbl_gym.checks import FloatArray
-from rbl_gym.placement.scene_files import Problem
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.placement.building import Problem, Zone
+from rbl_gym.studies.placing.links import anchor_information, layout_information
+from rbl_gym.studies.placing.requirements import Errors, errors_of, turns
 
 __all__ = [
-    "Accuracy",
     "Map",
     "accuracy",
     "accuracy_map",
-    "free_sample",
+    "accuracy_without_each",
     "level_maps",
 ]
 
 # Turns of the body over which the accuracy at a place is averaged.
-_TURNS = 8
-# Places over which the accuracy is averaged; those along the axes where the worst is sought,
-# edges included; those along the longer side of a map, and at least along the other.
-_SAMPLE, _GRID, _MAP, _LEAST_MAP = 600, (13, 13, 5), 56, 20
+TURNS = 9
+# Places along the axes where the worst is sought, edges included.
+_GRID = (9, 9, 3)
+# Places along the longer side of a map, and at least along the other.
+_MAP, _LEAST_MAP = 56, 20
 # Heights at which a map is drawn in 3-D.
 _LEVELS = 5
 # Links that are worked on at a time, so that the temporaries stay in cache.
 _BLOCK = 40_000
+# Rotation of the prior that regularises the bound, and information where the tilt is known.
+_PRIOR_ROTATION_RAD, _KNOWN = math.radians(60), 1e12
+# Drawings of a zone's bounding box after which it has no free place.
+_DRAWS, _DRAWN = 200, 4096
 
 
-class Accuracy(NamedTuple):
-    """Predicted standard deviations at places (L, 3): position (m), rotation (rad), b (m).
+def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zone) -> Errors:
+    """What the Cramer-Rao bound of one epoch of ranges promises (L) at places (L, 3) of a zone.
 
-    Root mean squares over turns of the body, each (L,); position and rotation are of all three
-    axes together.
+    Parameters
+    ----------
+    problem, anchors
+        What is placed, and where (M, 3).
+    places, zone
+        Where, and how the body may be turned there.
     """
-
-    places: FloatArray
-    position: FloatArray
-    rotation: FloatArray
-    score: FloatArray
-
-
-def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray) -> Accuracy:
-    """What the Cramer-Rao bound of one epoch of ranges promises at places (L, 3)."""
-    task = problem.task
-    tags = np.asarray(task.scene.tags)
-    turns = task.poses[0][:_TURNS]
-    rows = []
-    size = max(1, _BLOCK // (len(turns) * len(anchors) * len(tags)))
-    for begin in range(0, len(places), size):
-        part = places[begin : begin + size]
-        weight = problem.share(anchors, part)[:, None, :, None]
-        information = bounds.information_at(
-            anchors, tags, turns, part[:, None], task.scene.noise, weight
-        )
-        covariance = np.linalg.inv(information + task.prior_information)
-        variance = np.einsum("...ii->...i", covariance)
-        b = bounds.score(covariance, turns, tags)
-        squares = variance[..., 3:].sum(-1), variance[..., :3].sum(-1), b**2
-        rows.append([np.sqrt(square.mean(axis=-1)) for square in squares])
-    return Accuracy(places, *(np.concatenate(column) for column in zip(*rows, strict=True)))
+    rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
+    found = []
+    for part in _blocks(problem, anchors, places):
+        told = layout_information(problem, anchors, part, rotation)
+        found.append(errors_of(told + prior, rotation, problem.tags))
+    return Errors(*map(np.concatenate, zip(*found, strict=True)))
 
 
-def free_sample(problem: Problem) -> FloatArray:
-    """Places (L, 3) spread evenly over the zones, obstacles left out."""
-    return problem.free_places(_SAMPLE)
+def accuracy_without_each(
+    problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zone
+) -> Errors:
+    """`accuracy` (M, L) with each one of the anchors missing. Arguments as `accuracy`."""
+    rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
+    found = []
+    for part in _blocks(problem, anchors, places):
+        told = anchor_information(problem, anchors, part, rotation)
+        found.append(errors_of(prior + told.sum(axis=0), rotation, problem.tags, -told))
+    return Errors(*(np.concatenate(column, axis=-1) for column in zip(*found, strict=True)))
 
 
-def free_grid(problem: Problem) -> FloatArray:
-    """A grid of places (L, 3) over the zones, their edges included, obstacles left out."""
-    low, high = problem.corners()
+def _blocks(problem: Problem, anchors: FloatArray, places: FloatArray) -> list[FloatArray]:
+    size = max(1, _BLOCK // (TURNS * len(anchors) * len(problem.tags)))
+    return [places[begin : begin + size] for begin in range(0, len(places), size)]
+
+
+def prior_of(problem: Problem, zone: Zone) -> FloatArray:
+    """Information (6, 6) before any range: 60 degrees, and half of the extent of all zones.
+
+    Where only the heading is estimated, the tilt is known.
+    """
+    extent = float(np.ptp(problem.corners(), axis=0).max())
+    diagonal = np.array([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+    if zone.attitude == "heading":
+        diagonal[:2] = _KNOWN
+    return np.diag(diagonal)
+
+
+def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: int) -> FloatArray:
+    """Places (count, 3) of the body's origin, uniform over what is free of a zone.
+
+    Parameters
+    ----------
+    problem, zone
+        Which obstacles, and which zone.
+    rng, count
+        Random numbers, and how many.
+
+    Raises
+    ------
+    ValueError
+        If hardly any place is free.
+    """
+    low, high = zone.bounds()
+    free = np.empty((0, 3))
+    for _ in range(_DRAWS):
+        if len(free) >= count:
+            return free[:count]
+        drawn = low + rng.random((max(_DRAWN, 2 * count), 3)) * (high - low)
+        free = np.concatenate([free, drawn[is_free(problem, zone, drawn)]])
+    raise ValueError(f"zone {zone.name!r} has hardly any free place: obstacles cover it")
+
+
+def is_free(problem: Problem, zone: Zone, places: FloatArray) -> BoolArray:
+    """Which places (...) lie in a zone, edges included, and in no obstacle."""
+    return zone.contains(places) & ~problem.obstacles.contain(places)
+
+
+def free_grid(problem: Problem, zone: Zone) -> FloatArray:
+    """A grid of places (L, 3) over a zone, its edges and corners included, obstacles left out."""
+    low, high = zone.bounds()
     axes = [np.linspace(a, b, n if b > a else 1) for a, b, n in zip(low, high, _GRID, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return places[problem.free(places)]
+    corners = [np.column_stack([zone.polygon, np.full(len(zone.polygon), z)]) for z in axes[2]]
+    places = np.concatenate([places, *([] if zone.is_box else corners)])
+    return places[is_free(problem, zone, places)]
 
 
 class Map(NamedTuple):
-    """Accuracy on a plane of the region: edges of its axes, values (rows, columns), NaN: blocked.
+    """Accuracy on a plane: edges of its axes, values (rows, columns), NaN: off the zone or blocked.
 
     `across` and `up` are the axes (0, 1, 2) of columns and rows, `at` the third coordinate.
+    Position and rotation are of all three axes together; `horizontal`, `height` (m) and
+    `heading` (degrees) are what zones ask for.
     """
 
     columns: FloatArray
     rows: FloatArray
     position: FloatArray
     rotation: FloatArray
+    horizontal: FloatArray
+    height: FloatArray
+    heading: FloatArray
     across: int
     up: int
     at: float
 
 
-def accuracy_map(problem: Problem, anchors: FloatArray, up: int = 1, share: float = 0.5) -> Map:
-    """Accuracy on a plane of the work region.
+def accuracy_map(
+    problem: Problem,
+    anchors: FloatArray,
+    up: int = 1,
+    share: float = 0.5,
+    zone: Zone | None = None,
+) -> Map:
+    """Accuracy on a plane of a zone.
 
     Parameters
     ----------
@@ -102,9 +159,12 @@ def accuracy_map(problem: Problem, anchors: FloatArray, up: int = 1, share: floa
     up
         1: over x and y; 2: over x and z.
     share
-        Where the plane cuts the third axis: 0 is the region's lower side, 1 its upper one.
+        Where the plane cuts the third axis: 0 is the zone's lower side, 1 its upper one.
+    zone
+        None: the first.
     """
-    low, high = problem.corners()
+    zone = problem.zones[0] if zone is None else zone
+    low, high = zone.bounds()
     third = 3 - up
     at = float(low[third] + share * (high - low)[third])
     extent = max(float((high - low)[[0, up]].max()), 1e-9)
@@ -116,17 +176,26 @@ def accuracy_map(problem: Problem, anchors: FloatArray, up: int = 1, share: floa
         centres.append(low[axis] + share_of * (high - low)[axis])
     places = np.empty((len(centres[1]), len(centres[0]), 3))
     places[..., 0], places[..., up], places[..., third] = centres[0], centres[1][:, None], at
-    found = accuracy(problem, anchors, places.reshape(-1, 3))
-    blocked = ~problem.free(found.places)
-    values = [
-        np.where(blocked, np.nan, value).reshape(places.shape[:2])
-        for value in (found.position, np.rad2deg(found.rotation))
-    ]
-    return Map(*centres, *values, across=0, up=up, at=at)
+    free = is_free(problem, zone, places)
+    found = np.full((len(Errors._fields), *free.shape), np.nan)
+    if free.any():
+        found[:, free] = accuracy(problem, anchors, places[free], zone)
+    errors = Errors(*found)
+    return Map(
+        *centres,
+        errors.position,
+        np.rad2deg(errors.rotation),
+        errors.horizontal,
+        errors.height,
+        np.rad2deg(errors.heading),
+        across=0,
+        up=up,
+        at=at,
+    )
 
 
-def level_maps(problem: Problem, anchors: FloatArray) -> list[Map]:
-    """Maps over x and y at heights from the bottom of the region to its top."""
-    low, high = problem.corners()
-    shares = np.linspace(0, 1, _LEVELS) if high[2] > low[2] else [0.5]
-    return [accuracy_map(problem, anchors, share=float(share)) for share in shares]
+def level_maps(problem: Problem, anchors: FloatArray, zone: Zone | None = None) -> list[Map]:
+    """Maps over x and y at heights from the bottom of a zone to its top. Arguments as there."""
+    zone = problem.zones[0] if zone is None else zone
+    shares = np.linspace(0, 1, _LEVELS) if zone.high_m > zone.low_m else [0.5]
+    return [accuracy_map(problem, anchors, share=float(share), zone=zone) for share in shares]

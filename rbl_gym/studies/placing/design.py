@@ -1,36 +1,29 @@
-"""Where do my anchors go, and how good will the pose be? Design, prediction, comparison."""
+"""The search for a layout that makes b small, and the usual layouts."""
 
 from __future__ import annotations
 
 import functools
-import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rbl_gym import placement
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.obstacles import Obstacles
-from rbl_gym.placement import criteria, layouts, scene_files, search
+from rbl_gym.placement import layouts, search
+from rbl_gym.placement.building import Problem
 from rbl_gym.placement.problem import Context, PlacementTask
-from rbl_gym.placement.scene_files import Problem
-from rbl_gym.studies.monte_carlo import rms
-from rbl_gym.studies.placing import check
-from rbl_gym.studies.placing.accuracy import accuracy, free_grid, free_sample
+from rbl_gym.studies.placing import judging
 from rbl_gym.studies.progress import Advance, silent
 
 __all__ = [
     "Design",
-    "Placed",
     "design_layout",
-    "place_anchors",
-    "prediction",
+    "usual_layouts",
 ]
 
 # Poses over which layouts are scored while searching: racks make the score rough.
 _N_POSES, _N_POSES_OBSTACLES = 64, 160
-# Poses over which the criteria of the result are averaged.
-_MANY_POSES = 1000
 # First standard deviations of CMA-ES, in units of half the legal space: near the start, and far.
 _SIGMAS = (0.1, 0.4)
 _GENERATIONS = 80
@@ -131,8 +124,7 @@ def design_layout(
         if not problem.obstacles.contain(anchors).any()
     }
     # Judged over more places than those that the search has seen.
-    places = free_sample(problem)
-    scores = {name: float(rms(accuracy(problem, x, places).score)) for name, x in legal.items()}
+    scores = {name: judging.score_of(problem, x, seed) for name, x in legal.items()}
     best = min(scores, key=scores.__getitem__)
     return Design(_in_order(legal[best], context.centre), best, searched)
 
@@ -165,108 +157,13 @@ def _repeated(context: Context, count: int) -> Context:
     return Context(*(np.broadcast_to(field, (count, *field.shape)) for field in context))
 
 
-# --- results ---------------------------------------------------------------------------------
+# --- the usual layouts -----------------------------------------------------------------------
 
 
-class Placed(NamedTuple):
-    """What a run found: the problem with its last number of anchors, its design, the figures."""
-
-    problem: Problem
-    design: Design
-    result: dict[str, Any]
-
-
-def place_anchors(
-    problem: Problem,
-    numbers: range,
-    seed: int,
-    trials: int,
-    advance: Advance = silent,
-) -> Placed:
-    """Design, predict, compare and check; figures as plain numbers.
-
-    Parameters
-    ----------
-    problem
-        What is placed.
-    numbers
-        Numbers of anchors; all but the last appear only in the table over the number.
-    seed, trials
-        Of all randomness, and bodies of the Monte-Carlo check.
-    advance
-        Called after every step of the work.
-    """
-    rows, best, found = [], None, None
-    advance(0, more=len(numbers) * SEARCH_STEPS + 1)
-    for number in numbers:
-        problem = scene_files.with_anchors(problem, number)
-        found = design_layout(problem, seed, advance, best)
-        best = found.anchors
-        rows.append({"n_anchors": number, **_summary(problem, best)})
-    assert found is not None
-    low, high = problem.corners()
-    scene, task = problem.scene, free_task(problem, _MANY_POSES)
-    seen = placement.sight_fractions(task, problem.context, found.anchors)
-    boxes = problem.obstacles.boxes
-    result = {
-        "scene": problem.name,
-        "seed": seed,
-        "n_anchors": problem.n_anchors,
-        "region": {"low_m": low.tolist(), "high_m": high.tolist()},
-        "obstacles": [
-            {"low_m": (box[:3] - box[3:]).tolist(), "high_m": (box[:3] + box[3:]).tolist()}
-            for box in boxes
-        ],
-        "tags_m": [list(tag) for tag in scene.tags],
-        "method": found.method,
-        "anchors": [
-            {**dict(zip(("x_m", "y_m", "z_m"), anchor, strict=True)), "sees": float(share)}
-            for anchor, share in zip(found.anchors.tolist(), seen, strict=True)
-        ],
-        "coplanar": _is_flat(found.anchors),
-        "predicted": prediction(problem, found.anchors),
-        "criteria": _criteria(task, problem.context, found.anchors),
-        "layouts": comparison(problem, found, seed),
-        "check": check.check_layout(problem, found.anchors, trials, seed),
-    }
-    if len(numbers) > 1:
-        result["against_number"] = rows
-    advance()
-    return Placed(problem, found, result)
-
-
-def prediction(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
-    """Median, 95th percentile and worst place of position, rotation and b over the region."""
-    sample = free_sample(problem)
-    found = accuracy(problem, anchors, np.concatenate([sample, free_grid(problem)]))
-    result: dict[str, Any] = {"places": len(found.places)}
-    for name, values in (
-        ("position_m", found.position),
-        ("rotation_deg", np.rad2deg(found.rotation)),
-        ("score_m", found.score),
-    ):
-        worst = int(values.argmax())
-        inner = values[: len(sample)]
-        result[name] = {
-            "rms": float(rms(inner)),
-            "median": float(np.median(inner)),
-            "p95": float(np.quantile(inner, 0.95)),
-            "worst": float(values[worst]),
-            "worst_at_m": found.places[worst].tolist(),
-        }
-    return result
-
-
-def _summary(problem: Problem, anchors: FloatArray) -> dict[str, float]:
-    """A prediction's row in a table of layouts."""
-    found = prediction(problem, anchors)
-    row = {"score_m": found["score_m"]["rms"]}
-    for name in ("position_m", "rotation_deg"):
-        row |= {
-            f"{name.replace('_', f'_{what}_')}": found[name][what]
-            for what in ("median", "p95", "worst")
-        }
-    return row
+def usual_layouts(problem: Problem, seed: int) -> dict[str, FloatArray]:
+    """The usual layouts (M, 3) of a problem by their names."""
+    rng = np.random.default_rng([seed, 2])
+    return usual(free_task(problem, _N_POSES), problem.context, rng)
 
 
 def usual(task: PlacementTask, context: Context, rng: np.random.Generator) -> dict[str, FloatArray]:
@@ -279,31 +176,3 @@ def usual(task: PlacementTask, context: Context, rng: np.random.Generator) -> di
     many = layouts.random(task, _repeated(context, _RANDOM_DRAWS), rng)
     order = np.argsort(placement.score(task, _repeated(context, _RANDOM_DRAWS), many))
     return found | {"random": many[order[_RANDOM_DRAWS // 2]]}
-
-
-def comparison(problem: Problem, found: Design, seed: int) -> dict[str, dict[str, Any]]:
-    """The design and the usual layouts, each a row of figures."""
-    task = free_task(problem, _N_POSES)
-    drawn = usual(task, problem.context, np.random.default_rng([seed, 2]))
-    rows = {"designed": found.anchors, "greedy with swaps": found.searched["greedy with swaps"]}
-    table = {name: _summary(problem, anchors) for name, anchors in (rows | drawn).items()}
-    least = table["designed"]["score_m"]
-    return {
-        name: {**row, "ratio": row["score_m"] / least}
-        for name, row in sorted(table.items(), key=lambda item: item[1]["score_m"])
-    }
-
-
-def _criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> dict[str, Any]:
-    """The criteria as numbers; None where there is none (conditioning of coplanar anchors)."""
-    values = criteria.criteria(task, context, anchors)._asdict()
-    numbers = {name: float(value) for name, value in values.items()}
-    if _is_flat(anchors):
-        numbers["conditioning"] = math.inf
-    return {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-
-
-def _is_flat(anchors: FloatArray) -> bool:
-    """Whether the anchors lie in one plane, as three always do."""
-    spread = np.linalg.svd(anchors - anchors.mean(axis=0), compute_uv=False)
-    return bool(len(anchors) < 4 or spread[2] < 1e-6 * spread[0])

@@ -15,13 +15,15 @@ import numpy as np
 from scipy import special
 
 from rbl_gym import bounds
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
+from rbl_gym.checks import BoolArray, FloatArray, check_number
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 
 __all__ = [
+    "Asked",
     "Errors",
     "Limits",
+    "asked_of",
     "errors_of",
     "relative_errors",
     "turns",
@@ -51,6 +53,18 @@ class Errors(NamedTuple):
     position: FloatArray
     rotation: FloatArray
     score: FloatArray
+    horizontal: FloatArray
+    height: FloatArray
+    heading: FloatArray
+
+    def of_places(self, which: slice) -> Errors:
+        """Of some of the places."""
+        return Errors(*(values[..., which] for values in self))
+
+
+class Asked(NamedTuple):
+    """Those of the `Errors` (...) that a zone may ask for."""
+
     horizontal: FloatArray
     height: FloatArray
     heading: FloatArray
@@ -104,12 +118,26 @@ def errors_of(
     ValueError
         Where an information is singular: without a prior, of fewer ranges than a pose needs.
     """
+    squares = _mean_squares(information, _part(part, information), rotation, tags)
+    return Errors(*map(np.sqrt, _regular(squares)))
+
+
+def asked_of(information: FloatArray, part: FloatArray | None = None) -> Asked:
+    """`errors_of` that a zone may ask for, in a third of its time. Arguments as there."""
+    squares = _asked_squares(information, _part(part, information))
+    return Asked(*map(np.sqrt, _regular(squares)))
+
+
+def _part(part: FloatArray | None, information: FloatArray) -> FloatArray:
+    """What is added to the information, nothing for None."""
     part = np.zeros((1, 6, 6)) if part is None else part
-    part = np.broadcast_to(part, (*part.shape[:-3], *information.shape[-3:]))
-    squares = _mean_squares(information, part, rotation, tags)
+    return np.broadcast_to(part, (*part.shape[:-3], *information.shape[-3:]))
+
+
+def _regular(squares: tuple[FloatArray, ...]) -> tuple[FloatArray, ...]:
     if not np.isfinite(squares[0]).all():
         raise ValueError("information must be positive definite at every place")
-    return Errors(*map(np.sqrt, squares))
+    return squares
 
 
 @compiled("place_errors:mean_squares")
@@ -131,7 +159,15 @@ def _mean_squares(
     return tuple(square.mean(axis=-1) for square in squares)
 
 
-def relative_errors(errors: Errors, limits: Limits) -> FloatArray:
+@compiled("place_errors:asked_squares")
+def _asked_squares(base: FloatArray, part: FloatArray) -> tuple[FloatArray, ...]:
+    """Means over the turns of the squares of `Asked`, of the information base + part."""
+    variance = np.einsum("...ii->...i", np.linalg.inv(base + part))
+    squares = variance[..., 3] + variance[..., 4], variance[..., 5], variance[..., 2]
+    return tuple(square.mean(axis=-1) for square in squares)
+
+
+def relative_errors(errors: Errors | Asked, limits: Limits) -> FloatArray:
     """The largest ratio (...) of an error to its limit at each place: within where at most 1.
 
     Parameters
@@ -153,12 +189,11 @@ def value_at_share(values: FloatArray, share: float) -> FloatArray:
     Parameters
     ----------
     values
-        At places.
+        At places; infinite where a place has none.
     share
         Of the places, above 0, at most 1.
     """
     check_number("share", share, low=0.0, high=1.0)
-    values = check_array("values", values, ("L",))
     rank = _rank(share, values.shape[-1])
     return np.partition(values, rank, axis=-1)[..., rank]
 

@@ -17,8 +17,10 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.placing.requirements import (
+    Asked,
     Errors,
     Limits,
+    asked_of,
     errors_of,
     relative_errors,
     value_at_share,
@@ -26,11 +28,14 @@ from rbl_gym.studies.placing.requirements import (
 
 __all__ = ["Stock", "ZonePoses", "all_choices", "cheaper", "grown", "swapped", "value"]
 
-# An exchange must better the value by this share, so that rounding never goes round in circles.
-_GAIN = 1e-6
+# An exchange must better the value by this share, or it is not worth the time.
+_GAIN = 1e-3
 # Weight of the mean beside the place that fills the share: which of two layouts is better where
 # that place does not tell, and a slope where no layout is near the requirement.
 _OF_MEAN = 1e-2
+# Of a long list of candidates, which are compared at every so many places, so many are tried at
+# all; for the loss of one, by the so many that are worst.
+_EVERY, _TRIED, _WORST_LOSSES = 4, 24, 3
 # Layouts that are tried at a time.
 _CHUNK = 64
 
@@ -122,13 +127,11 @@ def grown(
     survive
         As in `value`: of the values that are told, and of the choice where two anchors stand.
     """
-    found = list(chosen)
-    total = _total(stock, found)
+    found, coarse = list(chosen), _coarse(stock)
     while len(found) < min(count, len(stock.cost)):
-        scores = _of_candidates(stock, total, found, survive if len(found) > 2 else 0, math.inf)
-        scores[found] = math.inf
-        found = [*found, int(scores.argmin())]
-        total = [a + part[found[-1]] for a, part in zip(total, stock.parts, strict=True)]
+        spare = survive if len(found) > 2 else 0
+        best, _ = _best_added(stock, coarse, found, spare, math.inf)
+        found = [*found, best]
         yield found, value(stock, found, survive)
 
 
@@ -148,17 +151,15 @@ def swapped(
     sweeps
         At most so many times over all anchors.
     """
-    found, best = list(chosen), value(stock, chosen, survive)
+    found, best, coarse = list(chosen), value(stock, chosen, survive), _coarse(stock)
     for _ in range(sweeps):
         before = best
         for k in range(keep, len(found)):
             others = found[:k] + found[k + 1 :]
             limit = best * (1 - _GAIN)
-            scores = _of_candidates(stock, _total(stock, others), others, survive, limit)
-            scores[found] = math.inf
-            new = int(scores.argmin())
-            if scores[new] < limit:
-                found[k], best = new, float(scores[new])
+            new, reached = _best_added(stock, coarse, others, survive, limit)
+            if reached < limit and new != found[k]:
+                found[k], best = new, reached
         if best == before:
             break
     return found, best
@@ -190,12 +191,13 @@ def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
         saved = False
         for k in sorted(range(keep, len(found)), key=lambda k: -stock.cost[found[k]]):
             others = found[:k] + found[k + 1 :]
-            scores = _of_candidates(stock, _total(stock, others), others, survive, 1 + 1e-12)
-            scores[found] = math.inf
-            good = np.flatnonzero((scores <= 1) & (stock.cost < stock.cost[found[k]] - 1e-12))
+            less = stock.cost < stock.cost[found[k]] - 1e-12
+            which = np.setdiff1d(np.flatnonzero(less), found)
+            scores = _with_candidates(stock, others, which, survive, 1 + 1e-12)
+            good = np.flatnonzero(scores <= 1)
             if len(good):
-                order = np.lexsort((scores[good], stock.cost[good]))
-                found[k], saved = int(good[order[0]]), True
+                order = np.lexsort((scores[good], stock.cost[which[good]]))
+                found[k], saved = int(which[good[order[0]]]), True
     return found
 
 
@@ -244,38 +246,68 @@ def _less(stock: Stock, total: Base, k: int) -> Base:
     return [a - part[k] for a, part in zip(total, stock.parts, strict=True)]
 
 
-def _of_candidates(
-    stock: Stock, base: Base, others: list[int], survive: int, limit: float
-) -> FloatArray:
-    """Value (K,) of `others`, whose information is `base`, with each candidate.
+def _coarse(stock: Stock) -> Stock:
+    """The stock at every fourth place, by which most candidates of a long list are left out."""
+    zones = tuple(zone._replace(places=zone.places[::_EVERY]) for zone in stock.zones)
+    parts = tuple(np.ascontiguousarray(part[:, ::_EVERY]) for part in stock.parts)
+    return Stock(zones, parts, stock.cost)
 
-    Where the loss of one matters, infinite for a candidate that is no better than `limit`.
+
+def _best_added(
+    stock: Stock, coarse: Stock, others: list[int], survive: int, limit: float
+) -> tuple[int, float]:
+    """Which candidate betters the layout `others` most, and the value with it."""
+    which = np.setdiff1d(np.arange(len(stock.cost)), others)
+    if len(which) > _TRIED:
+        rough = _with_candidates(coarse, others, which, survive, math.inf, _WORST_LOSSES)
+        which = which[np.argpartition(rough, _TRIED)[:_TRIED]]
+    scores = _with_candidates(stock, others, which, survive, limit)
+    best = int(scores.argmin())
+    return int(which[best]), float(scores[best])
+
+
+def _with_candidates(
+    stock: Stock,
+    others: list[int],
+    which: np.ndarray,
+    survive: int,
+    limit: float,
+    losses: int | None = None,
+) -> FloatArray:
+    """Value (J,) of the layout `others` with each of the candidates `which`.
+
+    Where the loss of one matters, infinite for a candidate that is no better than `limit`; of so
+    many `losses`, those that are worst without a candidate; None: of all.
     """
+    base = _total(stock, others)
     if not survive:
-        return _values(stock, base, slice(None))
+        return _values(stock, base, which)
     # The candidate itself may fail; then each of the others, the worst first, so that most
     # candidates are left out early.
-    worst = np.full(len(stock.cost), float(_values(stock, base)[0]))
+    worst = np.full(len(which), float(_values(stock, base)[0]))
     left = [(float(_values(stock, _less(stock, base, k))[0]), k) for k in others]
-    for _, k in sorted(left, reverse=True):
+    for _, k in sorted(left, reverse=True)[:losses]:
         open_ = np.flatnonzero(worst < limit)
         if not len(open_):
             break
-        scores = _values(stock, _less(stock, base, k), open_)
+        scores = _values(stock, _less(stock, base, k), which[open_])
         worst[open_] = np.maximum(worst[open_], scores)
     return np.where(worst < limit, worst, math.inf)
 
 
-def _values(stock: Stock, base: Base, added: slice | np.ndarray | None = None) -> FloatArray:
+def _values(stock: Stock, base: Base, added: np.ndarray | None = None) -> FloatArray:
     """Value (J,) of information (..., L, T, 6, 6) with each of the added candidates, or none."""
     found = []
     for zone, total, part in zip(stock.zones, base, stock.parts, strict=True):
         more = None if added is None else part[added]
-        found.append(errors_of(total, zone.rotation, zone.tags, more))
+        asked = stock.asks
+        found.append(
+            asked_of(total, more) if asked else errors_of(total, zone.rotation, zone.tags, more)
+        )
     return np.atleast_1d(_objective(stock, found))
 
 
-def _objective(stock: Stock, errors: list[Errors]) -> FloatArray:
+def _objective(stock: Stock, errors: list[Errors | Asked]) -> FloatArray:
     """Value (...) of errors (..., L) at the places of every zone."""
     if not stock.asks:
         weights = np.array([zone.weight for zone in stock.zones])

@@ -1,0 +1,362 @@
+"""Where do my anchors go, and will that do? A design or a given layout, verdicts, the check."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement import criteria, scene_files
+from rbl_gym.placement.building import Problem
+from rbl_gym.studies.placing import check, choosing, design
+from rbl_gym.studies.placing.accuracy import accuracy_without_each
+from rbl_gym.studies.placing.choosing import Fewest
+from rbl_gym.studies.placing.contributions import without_each
+from rbl_gym.studies.placing.design import Design
+from rbl_gym.studies.placing.judging import (
+    PLACES,
+    Judged,
+    at_edges,
+    judge,
+    limits_of,
+    overall_score,
+    overview,
+    short_row,
+    zone_row,
+)
+from rbl_gym.studies.progress import Advance, silent
+
+__all__ = ["Placed", "Question", "place_anchors"]
+
+# Poses over which the criteria of the result are averaged.
+_MANY_POSES = 1000
+# A link that keeps this share of its information counts as seen.
+_SEEN = 0.5
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked about a problem.
+
+    Parameters
+    ----------
+    numbers
+        Numbers of anchors; all but the last appear only in the table over the number. With
+        `fewest`, those among which the least is sought.
+    fewest
+        The least number that meets the requirements of all zones.
+    layout, names
+        Anchors (M, 3) that are judged, and what they are called; None: they are designed.
+    optimise
+        Start from the layout, which is not judged itself.
+    keep
+        Indices of the layout's anchors that stay where they are.
+    survive
+        1: any one anchor may fail, in judging and in the search.
+    seed, trials
+        Of all randomness, and bodies of the Monte-Carlo check.
+    """
+
+    numbers: range
+    fewest: bool = False
+    layout: FloatArray | None = None
+    names: tuple[str, ...] = ()
+    optimise: bool = False
+    keep: tuple[int, ...] = ()
+    survive: int = 0
+    seed: int = 0
+    trials: int = 500
+
+
+class Placed(NamedTuple):
+    """What a run found: the problem with its last number of anchors, its design, the figures."""
+
+    problem: Problem
+    design: Design
+    result: dict[str, Any]
+
+
+def place_anchors(problem: Problem, question: Question, advance: Advance = silent) -> Placed:
+    """Design or take a layout, judge, compare and check it; figures as plain numbers.
+
+    Parameters
+    ----------
+    problem
+        What is placed.
+    question
+        What is asked.
+    advance
+        Called after every step of the work.
+
+    Raises
+    ------
+    ValueError
+        If the layout does not fit the problem or the numbers, or `fewest` has nothing to meet.
+    """
+    problem, start = _with_kept(problem, question)
+    seed, survive = question.seed, question.survive
+    advance(0, more=2)
+    rows: list[dict[str, Any]] = []
+    least: Fewest | None = None
+    if question.fewest:
+        least = choosing.fewest_anchors(problem, question.numbers, seed, survive, advance)
+        found = Design(least.anchors, "least number", {})
+        problem = scene_files.with_anchors(problem, len(least.anchors))
+    elif question.layout is not None and not question.optimise:
+        found = Design(question.layout, "given", {})
+        problem = scene_files.with_anchors(problem, len(question.layout))
+    else:
+        found = None
+        for number in question.numbers:
+            problem = scene_files.with_anchors(problem, number)
+            found = _designed(problem, question, start, advance)
+            start = found.anchors
+            judged = judge(problem, start, seed, survive)
+            rows.append({"n_anchors": number, **_summary(problem, start, judged)})
+        assert found is not None
+    judged = judge(problem, found.anchors, seed, survive)
+    advance()
+    result = _result(problem, question, found, judged)
+    if least is not None:
+        result["fewest"] = _fewest_row(least)
+    if len(rows) > 1:
+        result["against_number"] = rows
+    advance()
+    return Placed(problem, found, result)
+
+
+def _with_kept(problem: Problem, question: Question) -> tuple[Problem, FloatArray | None]:
+    """The problem with the kept anchors among its fixed ones, and the layout to start from."""
+    layout = question.layout
+    if layout is None:
+        if question.keep or question.optimise:
+            raise ValueError("a layout must be given to keep some of it, or to start from it")
+        return problem, None
+    if not question.optimise:
+        if question.keep:
+            raise ValueError("keep means nothing where the layout is only judged: optimise it")
+        return problem, layout
+    kept = [k for k in range(len(layout)) if k in question.keep or _is_in(layout[k], problem.fixed)]
+    apart = [place for place in problem.fixed if not _is_in(place, layout)]
+    fixed = np.array([*apart, *layout[kept]]).reshape(-1, 3)
+    others = np.delete(layout, kept, axis=0)
+    if len(fixed) + len(others) > question.numbers[0]:
+        raise ValueError(
+            f"the number of anchors must be at least {len(fixed) + len(others)}, those of the "
+            f"layout and the fixed ones, got {question.numbers[0]}"
+        )
+    return dataclasses.replace(problem, fixed=fixed), np.concatenate([fixed, others])
+
+
+def _is_in(place: FloatArray, places: FloatArray) -> bool:
+    return bool(len(places) and np.abs(places - place).max(axis=-1).min() < 1e-9)
+
+
+def _designed(
+    problem: Problem, question: Question, start: FloatArray | None, advance: Advance
+) -> Design:
+    """The best layout for b; where it misses a requirement, or one may fail, exchanges from it."""
+    seed, survive = question.seed, question.survive
+    if question.optimise or len(problem.fixed):
+        advance(0, more=1)
+        anchors = choosing.chosen_layout(problem, seed, survive, start)
+        advance()
+        return Design(anchors, "exchanges", {})
+    advance(0, more=design.SEARCH_STEPS)
+    found = design.design_layout(problem, seed, advance, start)
+    asks = any(limits_of(zone).any() for zone in problem.zones)
+    if not survive and (not asks or choosing.is_met(judge(problem, found.anchors, seed))):
+        return found
+    better, _ = choosing.improved(problem, found.anchors, seed, survive)
+    why = "loss of one" if survive else "requirements"
+    return found._replace(anchors=better, method=f"{found.method}, exchanges for {why}")
+
+
+# --- results ---------------------------------------------------------------------------------
+
+
+def _result(
+    problem: Problem, question: Question, found: Design, judged: list[Judged]
+) -> dict[str, Any]:
+    """All figures of one layout."""
+    seed, survive, anchors = question.seed, question.survive, found.anchors
+    low, high = problem.corners()
+    edges = [at_edges(problem, anchors, one) for one in judged]
+    result: dict[str, Any] = {
+        "scene": problem.name,
+        "seed": seed,
+        "n_anchors": len(anchors),
+        "verdict": verdict(judged),
+        "survive": survive,
+        "zones": [zone_row(*pair) for pair in zip(judged, edges, strict=True)],
+        "region": {"low_m": low.tolist(), "high_m": high.tolist()},
+        "obstacles": _obstacles(problem),
+        "tags_m": problem.tags.tolist(),
+        "method": found.method,
+        "anchors": _anchors(problem, question, anchors, judged),
+        "cost": float(problem.mounts.cost(anchors).sum()),
+        "coplanar": _is_flat(anchors),
+        "next_anchor": _next(problem, anchors, judged, seed, survive),
+        "predicted": overview(judged, edges),
+        "criteria": _criteria(problem, anchors),
+        "layouts": _comparison(problem, found, seed, survive),
+        "check": check.check_layout(problem, anchors, question.trials, seed),
+    }
+    return result
+
+
+def verdict(judged: list[Judged]) -> str:
+    """The worst of the zones' verdicts; those that ask for nothing do not count."""
+    found = {one.verdict for one in judged}
+    for name in ("fail", "undecided", "pass"):
+        if name in found:
+            return name
+    return "no requirement"
+
+
+def _obstacles(problem: Problem) -> list[dict[str, Any]]:
+    boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
+    rows: list[dict[str, Any]] = [
+        {"low_m": (box[:3] - box[3:]).tolist(), "high_m": (box[:3] + box[3:]).tolist()}
+        for box in boxes
+    ]
+    for corners, low, high, share in zip(
+        prisms.corners, prisms.low_m, prisms.high_m, prisms.share, strict=True
+    ):
+        row = {"polygon_m": corners.tolist(), "low_m": float(low), "high_m": float(high)}
+        rows.append(row | {"information": None if math.isnan(share) else float(share)})
+    return rows
+
+
+def _anchors(
+    problem: Problem, question: Question, anchors: FloatArray, judged: list[Judged]
+) -> list[dict[str, Any]]:
+    """A row of each anchor: where it is, what it sees, what is left without it."""
+    first = [one.first()._replace(without=None) for one in judged]
+    lost = [accuracy_without_each(problem, anchors, one.places, one.zone) for one in first]
+    seen = np.concatenate([problem.share(anchors, one.places) >= _SEEN for one in first])
+    known = {
+        tuple(place): name
+        for place, name in zip(
+            [] if question.layout is None else question.layout.tolist(),
+            question.names,
+            strict=False,
+        )
+    }
+    fixed = {tuple(place) for place in problem.fixed.tolist()}
+    rows = []
+    for k, (place, mount, cost, without) in enumerate(
+        zip(
+            anchors.tolist(),
+            problem.mounts.names(anchors),
+            problem.mounts.cost(anchors).tolist(),
+            without_each(first, lost),
+            strict=True,
+        )
+    ):
+        rows.append(
+            {
+                "name": known.get(tuple(place), str(k + 1)),
+                **dict(zip(("x_m", "y_m", "z_m"), place, strict=True)),
+                "mount": mount,
+                "cost": cost,
+                "fixed": tuple(place) in fixed,
+                "sees": float(seen[:, k].mean()),
+                "without": without,
+            }
+        )
+    return rows
+
+
+def _next(
+    problem: Problem, anchors: FloatArray, judged: list[Judged], seed: int, survive: int
+) -> dict[str, Any] | None:
+    """Where one more anchor helps most, and what it buys."""
+    found = choosing.next_anchor(problem, anchors, seed, survive)
+    if found is None:
+        return None
+    place, more = found
+    now = [one.first() for one in judged]
+    return {
+        **dict(zip(("x_m", "y_m", "z_m"), place.tolist(), strict=True)),
+        "mount": problem.mounts.names(place[None])[0],
+        "cost": float(problem.mounts.cost(place[None])[0]),
+        "verdict": verdict(more),
+        "score_m": _overall(more),
+        "ratio": _overall(more) / _overall(now),
+        "zones": [short_row(one) for one in more],
+        "zones_now": [short_row(one) for one in now],
+    }
+
+
+def _overall(judged: list[Judged]) -> float:
+    return float(overall_score([one.zone for one in judged], [one.judged.score for one in judged]))
+
+
+def _fewest_row(least: Fewest) -> dict[str, Any]:
+    """The answer to the least number: whether it is met, the margin, what one less would give."""
+    row: dict[str, Any] = {
+        "met": least.met,
+        "n_anchors": len(least.anchors),
+        "margin": min(short_row(one)["margin"] for one in least.judged if one.asks),
+        "proved": least.proved and least.met,
+        "one_less": None,
+    }
+    if least.one_less is not None:
+        row["one_less"] = {
+            "n_anchors": len(least.one_less),
+            "anchors_m": least.one_less.tolist(),
+            "zones": [short_row(one) for one in least.judged_less],
+        }
+    return row
+
+
+def _summary(problem: Problem, anchors: FloatArray, judged: list[Judged]) -> dict[str, Any]:
+    """A layout's row in a table of layouts."""
+    found = overview(judged, [at_edges(problem, anchors, one) for one in judged])
+    row: dict[str, Any] = {"score_m": found["score_m"]["rms"]}
+    for name in ("position_m", "rotation_deg"):
+        row |= {
+            f"{name.replace('_', f'_{what}_')}": found[name][what]
+            for what in ("median", "p95", "worst")
+        }
+    return row | {"verdict": verdict(judged), "zones": [short_row(one) for one in judged]}
+
+
+def _comparison(
+    problem: Problem, found: Design, seed: int, survive: int
+) -> dict[str, dict[str, Any]]:
+    """The design and the usual layouts, each a row of figures."""
+    rows = {"given" if found.method == "given" else "designed": found.anchors}
+    if "greedy with swaps" in found.searched:
+        rows["greedy with swaps"] = found.searched["greedy with swaps"]
+    rows |= design.usual_layouts(problem, seed)
+    table = {
+        name: _summary(problem, anchors, judge(problem, anchors, seed, survive, PLACES))
+        for name, anchors in rows.items()
+    }
+    least = next(iter(table.values()))["score_m"]
+    return {
+        name: {**row, "ratio": row["score_m"] / least}
+        for name, row in sorted(table.items(), key=lambda item: item[1]["score_m"])
+    }
+
+
+def _criteria(problem: Problem, anchors: FloatArray) -> dict[str, Any]:
+    """The criteria as numbers; None where there is none (conditioning of coplanar anchors)."""
+    task = design.free_task(scene_files.with_anchors(problem, len(anchors)), _MANY_POSES)
+    values = criteria.criteria(task, problem.context, anchors)._asdict()
+    numbers = {name: float(value) for name, value in values.items()}
+    if _is_flat(anchors):
+        numbers["conditioning"] = math.inf
+    return {name: value if math.isfinite(value) else None for name, value in numbers.items()}
+
+
+def _is_flat(anchors: FloatArray) -> bool:
+    """Whether the anchors lie in one plane, as three always do."""
+    spread = np.linalg.svd(anchors - anchors.mean(axis=0), compute_uv=False)
+    return bool(len(anchors) < 4 or spread[2] < 1e-6 * spread[0])

@@ -1,0 +1,364 @@
+"""Anchors for the requirements of the zones: exchanges, the least number that meets them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement.building import Problem
+from rbl_gym.studies.placing.accuracy import draw_places, prior_of
+from rbl_gym.studies.placing.judging import PLACES, Judged, judge, limits_of
+from rbl_gym.studies.placing.links import anchor_information
+from rbl_gym.studies.placing.requirements import Limits, turns
+from rbl_gym.studies.placing.swaps import (
+    Stock,
+    ZonePoses,
+    all_choices,
+    cheaper,
+    dropped,
+    grown,
+    swapped,
+    value,
+)
+from rbl_gym.studies.progress import Advance, silent
+
+__all__ = ["Fewest", "chosen_layout", "fewest_anchors", "next_anchor"]
+
+# Poses over which choices are made: places in all zones together, at least in each; turns.
+_PLACES, _LEAST_PLACES, _TURNS = 400, 128, 3
+# Candidates that are drawn, and how many of a later round stand near the anchors of the last.
+_CANDIDATES, _NEAR = 200, 0.6
+# Later rounds, and how far their near candidates are: shares of the extent of the mounts.
+_REACHES = (0.05, 0.015)
+# A layout whose value is above this is not worth the later rounds.
+_NEAR_ENOUGH = 1.06
+# All choices are tried where they are no more than so many.
+_MOST_CHOICES = 3000
+
+
+class Fewest(NamedTuple):
+    """The least number of anchors that meets the requirements of all zones.
+
+    Attributes
+    ----------
+    anchors
+        (M, 3); of the most that were allowed where they do not do.
+    judged
+        Of every zone; all pass where `met`.
+    met
+        Whether they do.
+    one_less, judged_less
+        The best that was found with one anchor less, which does not do; None where none was
+        allowed.
+    proved
+        Whether all choices of one less were tried: where mounts are a list, and a short one.
+    """
+
+    anchors: FloatArray
+    judged: list[Judged]
+    met: bool
+    one_less: FloatArray | None
+    judged_less: list[Judged]
+    proved: bool
+
+
+# --- candidates ----------------------------------------------------------------------------------
+
+
+def candidates(problem: Problem, rng: np.random.Generator, count: int = _CANDIDATES) -> FloatArray:
+    """Up to `count` different legal mounts (K, 3); all of them where they are a list.
+
+    Parameters
+    ----------
+    problem, rng, count
+        Where anchors may stand, random numbers, and how many are drawn.
+    """
+    listed = problem.mounts.listed()
+    if listed is not None:
+        return listed
+    return _legal(problem, problem.mounts.draw(rng.random((4 * count, 3))))[:count]
+
+
+def _legal(problem: Problem, points: FloatArray) -> FloatArray:
+    """Those of the points (K, 3) that are legal mounts, to the millimetre, each once."""
+    points = problem.mounts.project(np.round(points, 3))
+    off = np.abs(problem.mounts.project(points) - points).max(axis=-1)
+    points = points[(off <= 1e-6) & ~problem.obstacles.contain(points)]
+    _, first = np.unique(points, axis=0, return_index=True)
+    return points[np.sort(first)]
+
+
+def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int = _PLACES) -> Stock:
+    """Candidates (K, 3) with what each tells at random poses of the zones.
+
+    Parameters
+    ----------
+    problem, points
+        What is placed, and the candidates.
+    seed
+        Of the poses; those of `judge_zone` are others.
+    n_places
+        In all zones together; in each a number at least.
+    """
+    rng = np.random.default_rng([seed, 4])
+    zones, parts = [], []
+    for zone in problem.zones:
+        places = draw_places(problem, zone, rng, max(_LEAST_PLACES, n_places // len(problem.zones)))
+        rotation = turns(zone.attitude, _TURNS)
+        zones.append(
+            ZonePoses(
+                places, rotation, prior_of(problem, zone), problem.tags, limits_of(zone),
+                zone.share, zone.weight,
+            )
+        )  # fmt: skip
+        parts.append(anchor_information(problem, points, places, rotation))
+    return Stock(tuple(zones), tuple(parts), problem.mounts.cost(points))
+
+
+def is_met(judged: list[Judged]) -> bool:
+    """Whether every zone that has a requirement passes."""
+    return all(zone.verdict in ("pass", "no requirement") for zone in judged)
+
+
+# --- exchanges -----------------------------------------------------------------------------------
+
+
+def chosen_layout(
+    problem: Problem, seed: int, survive: int = 0, start: FloatArray | None = None
+) -> FloatArray:
+    """A layout (M, 3): greedy from the start, then `improved`.
+
+    Parameters
+    ----------
+    problem
+        What is placed.
+    seed, survive
+        As in `improved`.
+    start
+        Anchors to begin with, the problem's fixed ones first; None: these alone.
+
+    Raises
+    ------
+    ValueError
+        If there are not as many mounts.
+    """
+    start = problem.fixed if start is None else start
+    points = _first(start, candidates(problem, np.random.default_rng([seed, 10])))
+    if len(points) < problem.n_anchors:
+        raise ValueError(
+            f"the number of anchors must be at most {len(points)}, as many as there are mounts, "
+            f"got {problem.n_anchors}"
+        )
+    stock, chosen = stock_of(problem, points, seed), list(range(len(start)))
+    for more, _ in grown(stock, range(len(start)), problem.n_anchors, survive):
+        chosen = more
+    return improved(problem, points[chosen], seed, survive)[0]
+
+
+def improved(
+    problem: Problem, anchors: FloatArray, seed: int, survive: int = 0
+) -> tuple[FloatArray, float]:
+    """A layout (M, 3) after exchanges for the requirements, and its value (`swaps.value`).
+
+    One anchor at a time for candidates everywhere, then near and far. The problem's fixed anchors,
+    the first ones, stay.
+
+    Parameters
+    ----------
+    problem, anchors
+        What is placed, and the layout to begin with.
+    seed
+        Of the candidates and poses.
+    survive
+        1: for the worst over the loss of any one.
+    """
+    rng = np.random.default_rng([seed, len(anchors), 5])
+    reached = math.inf
+    listed = problem.mounts.listed() is not None
+    for reach in (None,) if listed else (None, *_REACHES):
+        points = _first(anchors, _around(problem, rng, anchors, reach))
+        stock = stock_of(problem, points, seed)
+        chosen, reached = swapped(stock, range(len(anchors)), len(problem.fixed), survive)
+        anchors = points[chosen]
+    return anchors, reached
+
+
+def _around(
+    problem: Problem, rng: np.random.Generator, anchors: FloatArray, reach: float | None
+) -> FloatArray:
+    """Candidates everywhere, most of them within a share of the mounts' extent of the anchors."""
+    if reach is None:
+        return candidates(problem, rng)
+    extent = float(np.ptp(problem.mounts.bounds(), axis=0).max())
+    near = np.repeat(anchors, max(1, round(_NEAR * _CANDIDATES / len(anchors))), axis=0)
+    near = near + reach * extent * rng.standard_normal(near.shape)
+    far = candidates(problem, rng, round((1 - _NEAR) * _CANDIDATES))
+    return np.concatenate([_legal(problem, near), far])
+
+
+def _first(anchors: FloatArray, points: FloatArray) -> FloatArray:
+    """The anchors, then those of the points that are none of them."""
+    known = (np.abs(points[:, None] - anchors).max(axis=-1) < 1e-9).any(axis=1)
+    return np.concatenate([anchors, points[~known]])
+
+
+# --- the least number ----------------------------------------------------------------------------
+
+
+def fewest_anchors(
+    problem: Problem,
+    numbers: range,
+    seed: int,
+    survive: int = 0,
+    advance: Advance = silent,
+) -> Fewest:
+    """The least number of anchors that meets the requirements of all zones.
+
+    Greedy up to a number that does, then one less at a time, from several starts with exchanges,
+    until none does. Where the mounts are a short list, all choices of one less are tried.
+
+    Parameters
+    ----------
+    problem
+        What is placed; its fixed anchors count.
+    numbers
+        How many are allowed.
+    seed
+        Of candidates, poses and the places that are judged.
+    survive
+        1: the requirements hold with any one of the anchors missing.
+    advance
+        Called after every number that was tried.
+
+    Raises
+    ------
+    ValueError
+        Where no zone has a requirement.
+    """
+    if not any(limits_of(zone).any() for zone in problem.zones):
+        raise ValueError(
+            "the least number of anchors needs a zone with a requirement: position_m, height_m or "
+            "heading_deg"
+        )
+    keep = len(problem.fixed)
+    rng = np.random.default_rng([seed, 6])
+    points = _first(problem.fixed, candidates(problem, rng))
+    stock = stock_of(problem, points, seed)
+    plain = stock._replace(zones=tuple(z._replace(limits=Limits()) for z in stock.zones))
+    starts = _growth(stock, keep, numbers[-1], survive), _growth(plain, keep, numbers[-1], survive)
+
+    def attempt(count: int, more: list[FloatArray]) -> tuple[FloatArray, list[Judged], bool]:
+        """The best layout of so many anchors, from all starts, and what it promises."""
+        some = rng.permutation(np.arange(keep, len(points)))[: count - keep].tolist()
+        paths = [path[count] for path in starts if count in path]
+        tried = [swapped(stock, path, keep, survive) for path in [*paths, [*range(keep), *some]]]
+        if 0 < math.comb(len(points) - keep, count - keep) <= _MOST_CHOICES:
+            tried.append(all_choices(stock, count, keep, survive))
+        layouts = [(reached, points[chosen]) for chosen, reached in tried]
+        layouts += [(_value(problem, one, seed, survive), one) for one in more]
+        least, best = min(layouts, key=lambda pair: pair[0])
+        judged = judge(problem, best, seed, survive)
+        if not is_met(judged) and least < _NEAR_ENOUGH:
+            other, reached = improved(problem, best, seed, survive)
+            if reached < least:
+                best, judged = other, judge(problem, other, seed, survive)
+        advance()
+        return best, judged, is_met(judged)
+
+    count = _first_count(stock, starts, numbers, survive)
+    advance(0, more=2)
+    best, judged, met = attempt(count, [])
+    while not met and count < min(numbers[-1], len(points)):
+        count += 1
+        advance(0, more=1)
+        best, judged, met = attempt(count, [])
+    less, judged_less = None, []
+    while met and count > max(numbers[0], keep, 1):
+        advance(0, more=1)
+        less, judged_less, still = attempt(count - 1, _one_dropped(problem, best, seed, survive))
+        if not still:
+            break
+        count, best, judged, less, judged_less = count - 1, less, judged_less, None, []
+    choices = math.comb(len(points) - keep, count - 1 - keep) if count - 1 >= keep else 0
+    proved = problem.mounts.listed() is not None and choices <= _MOST_CHOICES
+    if met:
+        best, judged = _cheapened(problem, best, judged, seed, survive)
+    return Fewest(best, judged, met, less, judged_less, proved)
+
+
+def _growth(stock: Stock, keep: int, most: int, survive: int) -> dict[int, list[int]]:
+    """Number -> the greedy choice of so many, the first `keep` among them."""
+    path = {keep: list(range(keep))}
+    for chosen, reached in grown(stock, range(keep), most, survive):
+        path[len(chosen)] = chosen
+        # Far enough on for the first number that is tried.
+        if stock.asks and reached <= 0.8:
+            break
+    return path
+
+
+def _first_count(
+    stock: Stock, starts: tuple[dict[int, list[int]], ...], numbers: range, survive: int
+) -> int:
+    """The number at which the greedy choice is within the requirements, or the largest."""
+    path = starts[0]
+    for count in sorted(path):
+        if count >= max(numbers[0], 1) and value(stock, path[count], survive) <= 1:
+            return count
+    return max(min(numbers[-1], max(path)), numbers[0])
+
+
+def _value(problem: Problem, anchors: FloatArray, seed: int, survive: int) -> float:
+    return value(stock_of(problem, anchors, seed), range(len(anchors)), survive)
+
+
+def _one_dropped(
+    problem: Problem, anchors: FloatArray, seed: int, survive: int
+) -> list[FloatArray]:
+    keep = len(problem.fixed)
+    chosen, _ = dropped(stock_of(problem, anchors, seed), range(len(anchors)), keep, survive)
+    return [anchors[chosen]]
+
+
+def _cheapened(
+    problem: Problem, anchors: FloatArray, judged: list[Judged], seed: int, survive: int
+) -> tuple[FloatArray, list[Judged]]:
+    """The layout after exchanges that save money and still meet the requirements."""
+    rng = np.random.default_rng([seed, 7])
+    points = _first(anchors, candidates(problem, rng))
+    stock = stock_of(problem, points, seed)
+    if np.ptp(stock.cost) == 0:
+        return anchors, judged
+    saved = points[cheaper(stock, range(len(anchors)), len(problem.fixed), survive)]
+    told = judge(problem, saved, seed, survive)
+    return (saved, told) if is_met(told) else (anchors, judged)
+
+
+# --- one more ------------------------------------------------------------------------------------
+
+
+def next_anchor(
+    problem: Problem, anchors: FloatArray, seed: int, survive: int = 0
+) -> tuple[FloatArray, list[Judged]] | None:
+    """Where one more anchor (3,) helps most, and what the zones promise with it.
+
+    None where no mount is left.
+
+    Parameters
+    ----------
+    problem, anchors
+        What is placed, and the layout (M, 3).
+    seed, survive
+        As in `improved`.
+    """
+    rng = np.random.default_rng([seed, 8])
+    points = _first(anchors, candidates(problem, rng))
+    if len(points) == len(anchors):
+        return None
+    stock = stock_of(problem, points, seed, _LEAST_PLACES)
+    chosen, _ = next(grown(stock, range(len(anchors)), len(anchors) + 1, survive))
+    added = points[chosen]
+    return added[-1], judge(problem, added, seed, survive, PLACES)

@@ -1,0 +1,339 @@
+"""Does a layout do what the zones ask? Shares within, intervals, verdicts, worst places."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement.building import Problem, Zone
+from rbl_gym.studies.monte_carlo import rms
+from rbl_gym.studies.placing.accuracy import accuracy, accuracy_without_each, draw_places, free_grid
+from rbl_gym.studies.placing.requirements import (
+    Errors,
+    Limits,
+    relative_errors,
+    share_within,
+    value_at_share,
+    wilson_interval,
+)
+
+__all__ = [
+    "Judged",
+    "at_edges",
+    "judge",
+    "judge_zone",
+    "limits_of",
+    "overview",
+    "short_row",
+    "zone_row",
+]
+
+# Places of a zone that are drawn first, and most of them, where its share is near what it asks.
+PLACES, MOST_PLACES = 600, 9600
+# Limits by the names of a zone's requirement.
+_KEYS = {"horizontal": "position_m", "height": "height_m", "heading": "heading_deg"}
+# Worst places that are told, and how far apart they are: a share of the zone's extent.
+_WORST, _APART = 3, 0.1
+
+
+class Judged(NamedTuple):
+    """What a layout promises in a zone.
+
+    Attributes
+    ----------
+    zone
+        Which one.
+    places
+        (L, 3), uniform over what is free of it.
+    errors
+        At each of them (L).
+    without
+        (M, L), with each one of the anchors missing; None where none has to be spared.
+    """
+
+    zone: Zone
+    places: FloatArray
+    errors: Errors
+    without: Errors | None = None
+
+    @property
+    def asks(self) -> bool:
+        """Whether the zone has a requirement."""
+        return limits_of(self.zone).any()
+
+    @property
+    def failing(self) -> int | None:
+        """Index of the anchor that is missed most: without it the fewest places are within."""
+        if self.without is None:
+            return None
+        if not self.asks:
+            return int(self.without.score.max(axis=-1).argmax())
+        relative = relative_errors(self.without, limits_of(self.zone))
+        reached = value_at_share(relative, self.zone.share)
+        return int(np.lexsort((-reached, share_within(relative)))[0])
+
+    @property
+    def judged(self) -> Errors:
+        """By what the zone is judged (L): all anchors, or without the one that is missed most."""
+        if self.without is None:
+            return self.errors
+        return Errors(*(values[self.failing] for values in self.without))
+
+    @property
+    def relative(self) -> FloatArray:
+        """The judged errors (L) over their limits, the largest at each place."""
+        return relative_errors(self.judged, limits_of(self.zone))
+
+    def first(self) -> Judged:
+        """Of the first places only, which every layout is judged at."""
+        some = slice(PLACES)
+        without = None if self.without is None else self.without.of_places(some)
+        return Judged(self.zone, self.places[some], self.errors.of_places(some), without)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Ends of the 95 % interval (Wilson) of the share within."""
+        return wilson_interval(int((self.relative <= 1).sum()), len(self.places))
+
+    @property
+    def verdict(self) -> str:
+        """``"pass"``, ``"fail"``, ``"undecided"``: by the interval; or ``"no requirement"``."""
+        if not self.asks:
+            return "no requirement"
+        low, high = self.interval
+        if low >= self.zone.share:
+            return "pass"
+        return "fail" if high < self.zone.share else "undecided"
+
+
+def limits_of(zone: Zone) -> Limits:
+    """What a place of the zone may have."""
+    given = (zone.position_m, zone.height_m, zone.heading_deg)
+    horizontal, height, heading = (math.inf if limit is None else limit for limit in given)
+    return Limits(horizontal, height, math.radians(heading))
+
+
+def judge_zone(
+    problem: Problem,
+    zone: Zone,
+    anchors: FloatArray,
+    seed: int,
+    survive: int = 0,
+    most: int | None = None,
+) -> Judged:
+    """What a layout (M, 3) promises in a zone; more places are drawn until the share is decided.
+
+    Parameters
+    ----------
+    problem, zone, anchors
+        What is placed, which zone is judged, and where the anchors are.
+    seed
+        Of the places. The same seed draws the same ones, whatever the layout.
+    survive
+        1: any one of the anchors may be missing.
+    most
+        Places after which an undecided share is left so; None: `MOST_PLACES`.
+    """
+    rng = np.random.default_rng([seed, 3])
+    judged = None
+    while True:
+        drawn = 0 if judged is None else len(judged.places)
+        places = draw_places(problem, zone, rng, max(PLACES, drawn))
+        errors = accuracy(problem, anchors, places, zone)
+        without = accuracy_without_each(problem, anchors, places, zone) if survive else None
+        fresh = Judged(zone, places, errors, without)
+        judged = fresh if judged is None else _joined(judged, fresh)
+        if judged.verdict != "undecided" or len(judged.places) >= (most or MOST_PLACES):
+            return judged
+
+
+def _joined(one: Judged, other: Judged) -> Judged:
+    places = np.concatenate([one.places, other.places])
+    without = None
+    if one.without is not None and other.without is not None:
+        without = _side_by_side(one.without, other.without)
+    return Judged(one.zone, places, _side_by_side(one.errors, other.errors), without)
+
+
+def _side_by_side(one: Errors, other: Errors) -> Errors:
+    pairs = zip(one, other, strict=True)
+    return Errors(*(np.concatenate(pair, axis=-1) for pair in pairs))
+
+
+def short_row(judged: Judged) -> dict[str, Any]:
+    """A zone's verdict: name, verdict, share and its interval, requirement, margin, what it needs.
+
+    Keys: ``name``, ``verdict``, ``pass`` (None: undecided or nothing asked), ``places``; of a
+    layout that must spare any one anchor ``without_anchor``, the one that is missed most, counted
+    from 1; of a zone that asks for something ``share``, ``share_low``, ``share_high``,
+    ``required``, ``margin`` (the requirement over what is reached at the required share: 1.2 is
+    20 % to spare), ``would_pass`` (what each limit would have to be, the others as they are, and
+    the ``factor`` on all of them; None: no value would do); ``rms_position_m`` (horizontal),
+    ``rms_height_m``, ``rms_heading_deg``, ``rms_score_m``.
+    """
+    zone = judged.zone
+    row: dict[str, Any] = {
+        "name": zone.name,
+        "verdict": judged.verdict,
+        "pass": {"pass": True, "fail": False}.get(judged.verdict),
+        "places": len(judged.places),
+    }
+    if judged.failing is not None:
+        row["without_anchor"] = judged.failing + 1
+    if judged.asks:
+        low, high = judged.interval
+        relative = judged.relative
+        row |= {
+            "share": float(share_within(relative)),
+            "share_low": low,
+            "share_high": high,
+            "required": {
+                "share": zone.share,
+                "position_m": zone.position_m,
+                "height_m": zone.height_m,
+                "heading_deg": zone.heading_deg,
+            },
+            "margin": float(1 / value_at_share(relative, zone.share)),
+            "would_pass": would_pass(judged),
+        }
+    return row | {f"rms_{name}": float(rms(v)) for name, v in told(judged.judged).items()}
+
+
+def zone_row(judged: Judged, edges: Judged) -> dict[str, Any]:
+    """`short_row` with the spread of the figures, and the worst places.
+
+    ``position_m`` (horizontal), ``height_m``, ``heading_deg`` and ``score_m`` have ``rms``,
+    ``median``, ``p95`` and ``worst``; the last is sought on the zone's edges too, as are
+    ``worst_places``: some that are apart from each other, with their figures.
+
+    Parameters
+    ----------
+    judged, edges
+        The zone, and `at_edges` of it.
+    """
+    row = short_row(judged)
+    for name, values in told(judged.judged).items():
+        row[name] = {
+            "rms": row.pop(f"rms_{name}"),
+            "median": float(np.median(values)),
+            "p95": float(np.quantile(values, 0.95)),
+            "worst": float(max(values.max(), told(edges.errors)[name].max(initial=0.0))),
+        }
+    inner = Judged(judged.zone, judged.places, judged.judged)
+    return row | {"worst_places": worst_places(_joined(inner, edges))}
+
+
+def overview(judged: list[Judged], edges: list[Judged]) -> dict[str, Any]:
+    """Figures over all zones, as many places of each, of all three axes together.
+
+    ``position_m``, ``rotation_deg`` and ``score_m`` with ``rms``, ``median``, ``p95``, and
+    ``worst`` with ``worst_at_m``, which is sought on the edges too.
+
+    Parameters
+    ----------
+    judged, edges
+        Every zone, and `at_edges` of it.
+    """
+    inner = [one.judged.of_places(slice(PLACES)) for one in judged]
+    places = np.concatenate(
+        [*(one.places[:PLACES] for one in judged), *(one.places for one in edges)]
+    )
+    result: dict[str, Any] = {"places": len(places)}
+    for name, field, unit in (
+        ("position_m", "position", 1.0),
+        ("rotation_deg", "rotation", 180 / math.pi),
+        ("score_m", "score", 1.0),
+    ):
+        values = unit * np.concatenate([getattr(errors, field) for errors in inner])
+        outer = unit * np.concatenate([getattr(one.errors, field) for one in edges])
+        every = np.concatenate([values, outer])
+        worst = int(every.argmax())
+        result[name] = {
+            "rms": float(rms(values)),
+            "median": float(np.median(values)),
+            "p95": float(np.quantile(values, 0.95)),
+            "worst": float(every[worst]),
+            "worst_at_m": places[worst].tolist(),
+        }
+    return result
+
+
+def at_edges(problem: Problem, anchors: FloatArray, judged: Judged) -> Judged:
+    """The same zone at places of a grid with its edges and corners.
+
+    Parameters
+    ----------
+    problem, anchors, judged
+        What was judged; where it was without an anchor, so is this.
+    """
+    places = free_grid(problem, judged.zone)
+    left = anchors if judged.failing is None else np.delete(anchors, judged.failing, axis=0)
+    if not len(places):
+        return Judged(judged.zone, places, Errors(*np.empty((len(Errors._fields), 0))))
+    return Judged(judged.zone, places, accuracy(problem, left, places, judged.zone))
+
+
+def told(errors: Errors) -> dict[str, FloatArray]:
+    """Errors by the names and units in which a zone's requirement is written; and b."""
+    return {
+        "position_m": errors.horizontal,
+        "height_m": errors.height,
+        "heading_deg": np.rad2deg(errors.heading),
+        "score_m": errors.score,
+    }
+
+
+def would_pass(judged: Judged) -> dict[str, float | None]:
+    """What would be met in the required share: each limit alone, and all by one ``factor``."""
+    zone, limits = judged.zone, limits_of(judged.zone)
+    result: dict[str, float | None] = {"factor": float(value_at_share(judged.relative, zone.share))}
+    for name, key in _KEYS.items():
+        if not math.isfinite(getattr(limits, name)):
+            continue
+        others = limits._replace(**{name: math.inf})
+        within = relative_errors(judged.judged, others) <= 1
+        values = told(judged.judged)[key]
+        needed = float(value_at_share(np.where(within, values, np.inf), zone.share))
+        result[key] = needed if math.isfinite(needed) else None
+    return result
+
+
+def worst_places(judged: Judged) -> list[dict[str, float]]:
+    """Places where the zone is worst, apart from each other, with their figures."""
+    order = judged.relative if judged.asks else judged.judged.score
+    apart = _APART * float(np.linalg.norm(np.ptp(judged.places, axis=0)))
+    open_ = np.ones(len(order), dtype=bool)
+    values = told(judged.judged)
+    rows: list[dict[str, float]] = []
+    while open_.any() and len(rows) < _WORST:
+        worst = int(np.where(open_, order, -np.inf).argmax())
+        place = judged.places[worst]
+        rows.append(
+            dict(zip(("x_m", "y_m", "z_m"), place.tolist(), strict=True))
+            | {name: float(value[worst]) for name, value in values.items()}
+        )
+        open_ &= np.linalg.norm(judged.places - place, axis=-1) > apart
+    return rows
+
+
+def judge(
+    problem: Problem, anchors: FloatArray, seed: int, survive: int = 0, most: int | None = None
+) -> list[Judged]:
+    """`judge_zone` of every zone. Arguments as there."""
+    return [judge_zone(problem, zone, anchors, seed, survive, most) for zone in problem.zones]
+
+
+def score_of(problem: Problem, anchors: FloatArray, seed: int) -> float:
+    """b of a layout over all zones, judged on places that no search has seen."""
+    judged = judge(problem, anchors, seed, most=PLACES)
+    return float(overall_score(list(problem.zones), [one.errors.score for one in judged]))
+
+
+def overall_score(zones: list[Zone], scores: list[FloatArray]) -> FloatArray:
+    """b (...) over all zones: root of the mean of b^2 (..., L) by the weights of the zones."""
+    weights = np.array([zone.weight for zone in zones])
+    squares = [(score**2).mean(axis=-1) for score in scores]
+    return np.sqrt(np.tensordot(weights / weights.sum(), squares, axes=1))
