@@ -170,11 +170,47 @@ def test_both_forms_agree(batch):
     anchors, points = (rng.uniform(0, 8, (*batch, n, 3)) for n in (5, 20))
     points[..., 0, :2] = anchors[..., 0, :2]  # upright
     points[..., 1, 2] = anchors[..., 1, 2]  # level
+    obstacles = Obstacles(boxes, 0.05, prisms)
     arguments = anchors, points, boxes, prisms.corners, prisms.limits, np.float64(0.05)
+    arguments = *arguments, *obstacles._grid
     got = share_behind(*arguments)
     with np.errstate(all="ignore"):
         np.testing.assert_allclose(got, share_behind.textbook(*arguments), rtol=1e-12)
     assert got.shape == (*batch, 20, 5)
+    np.testing.assert_array_equal(obstacles.share(anchors, points), got)
+    np.testing.assert_array_equal(obstacles.sees(anchors, points), got == 1)
+
+
+@pytest.mark.parametrize("extent", [(300.0, 40.0), (5.0, 5.0), (2e5, 1.0)])
+def test_many_obstacles_are_found_by_the_grid_as_one_by_one(extent):
+    """Short and long links, level, upright, along rows, and far outside of the grid."""
+    rng = np.random.default_rng(9)
+    walls, boxes = [], []
+    for centre in rng.uniform([0, 0], extent, (70, 2)):
+        along = rng.normal(size=2) * rng.choice([0.02, 0.2]) * min(extent)
+        across = 0.1 * np.array([-along[1], along[0]])
+        walls.append(np.array([-along - across, along - across, along + across, across - along]))
+        walls[-1] += centre
+        boxes.append([*rng.uniform([0, 0], extent), 1, *rng.uniform(0.01, 0.1, 2), 1])
+    prisms = Prisms.of(walls, 0, 3, rng.uniform(0.2, 0.9, 70))
+    low, high = -0.2 * np.array(extent), 1.2 * np.array(extent)
+    anchors = np.column_stack([rng.uniform(low, high, (40, 2)), rng.uniform(0, 4, 40)])
+    points = np.column_stack([rng.uniform(low, high, (60, 2)), rng.uniform(0, 4, 60)])
+    points[:20, 0], points[20:40, 1] = anchors[:20, 0], anchors[20:40, 1]
+    points[40:50, :2] = anchors[:10, :2] + 0.05 * rng.normal(size=(10, 2)) * min(extent)
+    obstacles = Obstacles(np.array(boxes), 0.3, prisms)
+    got = obstacles.share(anchors, points)
+    with np.errstate(all="ignore"):
+        wanted = share_behind.textbook(
+            anchors, points, obstacles.boxes, prisms.corners, prisms.limits, 0.3, *obstacles._grid
+        )
+    np.testing.assert_allclose(got, wanted, rtol=1e-12)
+    assert (wanted < 1).mean() > 0.1
+    assert (wanted == 1).any()
+    alone = Obstacles(np.array(boxes), 0.3)
+    free = in_sight(anchors, points, alone.boxes)
+    np.testing.assert_array_equal(alone.share(anchors, points), np.where(free, 1.0, 0.3))
+    np.testing.assert_array_equal(alone.sees(anchors, points), free)
 
 
 def test_what_a_prism_contains():

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, as_float, check_array, check_number
+from rbl_gym.geometry.plan_grid import PlanGrid, one_cell, plan_grid
 from rbl_gym.geometry.polygons import TOUCH_M, check_polygon, contains
 from rbl_gym.kernels import compiled
 
@@ -21,6 +22,8 @@ __all__ = ["Obstacles", "Prisms", "held_by", "in_sight", "inside", "share_behind
 
 # A way inside a prism that is no longer than this is a touch, metres: links begin at its faces.
 _LEAST_WAY_M = 1e-6
+# From so many on a link asks a grid which of them stand on its way: of boxes alone, of all.
+_MANY_BOXES, _MANY = 64, 12
 # A link that is shorter than this in the plan is vertical, metres.
 _VERTICAL_M = 1e-12
 
@@ -140,22 +143,42 @@ class Obstacles:
         Anchors (..., M, 3) and points (..., P, 3), metres: the link is that of a body with its
         origin there, or of a tag.
         """
-        if not len(self.prisms):
+        if self._are_few_boxes:
             return np.where(in_sight(anchors, points, self.boxes), 1.0, self.blocked_information)
-        prisms, common = self.prisms, self.blocked_information
-        return share_behind(anchors, points, self.boxes, prisms.corners, prisms.limits, common)
+        return self._share(anchors, points, self.blocked_information)
 
     def sees(self, anchors: FloatArray, points: FloatArray) -> BoolArray:
         """Whether nothing takes information from each link, (..., P, M); arguments as `share`."""
-        if not len(self.prisms):
+        if self._are_few_boxes:
             return in_sight(anchors, points, self.boxes)
-        return self.share(anchors, points) == 1.0
+        return self._share(anchors, points, 0.0) == 1.0
 
     def contain(self, points: FloatArray) -> BoolArray:
         """Which points (..., 3) lie in or on one of the boxes (K, 6), or inside of a prism."""
-        if not len(self.prisms):
+        if self._are_few_boxes:
             return inside(points, self.boxes)
         return held_by(points, self.boxes, self.prisms.corners, self.prisms.limits)
+
+    @property
+    def _are_few_boxes(self) -> bool:
+        return not len(self.prisms) and (self.boxes.ndim > 2 or len(self.boxes) < _MANY_BOXES)
+
+    def _share(self, anchors: FloatArray, points: FloatArray, blocked: float) -> FloatArray:
+        prisms = self.prisms
+        return share_behind(
+            anchors, points, self.boxes, prisms.corners, prisms.limits, blocked, *self._grid
+        )
+
+    @functools.cached_property
+    def _grid(self) -> PlanGrid:
+        """Which obstacles stand where, the boxes counted first."""
+        if self.boxes.ndim > 2 or len(self) < _MANY:
+            return one_cell(len(self))
+        low, high = (self.boxes[:, :2] + sign * self.boxes[:, 3:5] for sign in (-1, 1))
+        limits = self.prisms.limits
+        return plan_grid(
+            np.concatenate([low, limits[:, [0, 2]]]), np.concatenate([high, limits[:, [1, 3]]])
+        )
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
@@ -225,6 +248,9 @@ def share_behind(
     corners: FloatArray,
     limits: FloatArray,
     blocked: FloatArray,
+    cells: FloatArray,
+    starts: np.ndarray,
+    members: np.ndarray,
 ) -> FloatArray:
     """Share (..., P, M) of a link's information that boxes and prisms leave.
 
@@ -239,6 +265,8 @@ def share_behind(
         (K, V, 2) and (K, 7), of `Prisms`.
     blocked
         What obstacles without their own share leave, once.
+    cells, starts, members
+        Of a `plan_grid.PlanGrid` of the boxes and the prisms; only the kernel looks at it.
     """
     free = in_sight.textbook(anchors, points, boxes)
     start, end = np.broadcast_arrays(anchors[..., None, :, :], points[..., :, None, :])

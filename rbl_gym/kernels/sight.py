@@ -77,69 +77,115 @@ def held_by(point: Any, boxes: Any, corners: Any, limits: Any, held: Any) -> Non
             return
 
 
-@gufunc("(m,d),(p,d),(k,b),(q,v,e),(q,l),()->(p,m)")
+@gufunc("(m,d),(p,d),(k,b),(q,v,e),(q,l),(),(g),(c),(n)->(p,m)", "fffffffiif")
 def share_behind(
-    anchors: Any, points: Any, boxes: Any, corners: Any, limits: Any, blocked: Any, share: Any
+    anchors: Any,
+    points: Any,
+    boxes: Any,
+    corners: Any,
+    limits: Any,
+    blocked: Any,
+    cells: Any,
+    starts: Any,
+    members: Any,
+    share: Any,
 ) -> None:
-    """What boxes and prisms leave of the information of each link."""
-    n_corners = corners.shape[1]
+    """What boxes and prisms leave of the information of each link, by the cells on its way."""
+    n_boxes, n_corners = boxes.shape[0], corners.shape[1]
     crossings = np.empty((2, n_corners))
     stops = np.empty(2 * n_corners + 2)
+    # The last link that has asked each obstacle.
+    asked = np.full(n_boxes + corners.shape[0], -1)
+    left, bottom, side = cells[0], cells[1], cells[2]
+    n_columns, n_rows = int(cells[3]), int(cells[4])
     for p in range(points.shape[0]):
         for m in range(anchors.shape[0]):
             start, end = anchors[m], points[p]
-            free, own = True, 1.0
-            ax, ay, az = start[0], start[1], start[2]
-            dx, dy = end[0] - ax, end[1] - ay
-            west, east = min(ax, end[0]), max(ax, end[0])
-            south, north = min(ay, end[1]), max(ay, end[1])
-            bottom, top = min(az, end[2]), max(az, end[2])
-            for k in range(boxes.shape[0]):
-                if _is_beside(boxes, k, west, east, south, north):
-                    continue
-                if _blocks(boxes[k], start, end):
-                    free = False
-                    break
-            for q in range(corners.shape[0]):
-                # Most links pass beside the bounding box.
-                if west >= limits[q, 1] or east <= limits[q, 0]:
-                    continue
-                if south >= limits[q, 3] or north <= limits[q, 2]:
-                    continue
-                if bottom >= limits[q, 5] or top <= limits[q, 4]:
-                    continue
-                # Or have all of it on one side of their line in the plan.
-                off = dx * (limits[q, 2] + limits[q, 3] - 2.0 * ay)
-                off -= dy * (limits[q, 0] + limits[q, 1] - 2.0 * ax)
-                half = abs(dx) * (limits[q, 3] - limits[q, 2])
-                if abs(off) > half + abs(dy) * (limits[q, 1] - limits[q, 0]):
-                    continue
-                common = limits[q, 6] != limits[q, 6]
-                if common and not free:
-                    continue
-                if _meets(start, end, corners[q], limits[q], crossings, stops):
-                    if common:
-                        free = False
-                    else:
-                        own *= limits[q, 6]
+            free, own, link = True, 1.0, p * anchors.shape[0] + m
+            ax, ay, dx, dy = start[0], start[1], end[0] - start[0], end[1] - start[1]
+            first = _cell_of(min(ax, end[0]), left, side, n_columns)
+            last = _cell_of(max(ax, end[0]), left, side, n_columns)
+            for column in range(first, last + 1):
+                enter, leave = 0.0, 1.0
+                if first < last:
+                    # Where the link is in this column.
+                    near, far = (
+                        (left + column * side - ax) / dx,
+                        (left + (column + 1) * side - ax) / dx,
+                    )
+                    if column > first:
+                        enter = max(enter, near) if dx > 0.0 else enter
+                        leave = min(leave, near) if dx < 0.0 else leave
+                    if column < last:
+                        leave = min(leave, far) if dx > 0.0 else leave
+                        enter = max(enter, far) if dx < 0.0 else enter
+                low = _cell_of(min(ay + enter * dy, ay + leave * dy), bottom, side, n_rows)
+                high = _cell_of(max(ay + enter * dy, ay + leave * dy), bottom, side, n_rows)
+                for row in range(low, high + 1):
+                    cell = row * n_columns + column
+                    for i in range(starts[cell], starts[cell + 1]):
+                        k = members[i]
+                        if asked[k] == link:
+                            continue
+                        asked[k] = link
+                        q = k - n_boxes
+                        if q < 0:
+                            if free and _blocks(boxes[k], start, end):
+                                free = False
+                            continue
+                        common = limits[q, 6] != limits[q, 6]
+                        if (common and not free) or _is_past(limits, q, start, end, dx, dy):
+                            continue
+                        if _meets(start, end, corners, limits, q, crossings, stops):
+                            if common:
+                                free = False
+                            else:
+                                own *= limits[q, 6]
             share[p, m] = own if free else own * blocked
 
 
+@inlined
+def _cell_of(place: float, origin: float, side: float, count: int) -> int:
+    """Which row or column of cells a coordinate lies in."""
+    cell = int(min(max((place - origin) / side, 0.0), count - 0.5))
+    # What is no number is somewhere.
+    return min(max(cell, 0), count - 1)
+
+
+@inlined
+def _is_past(limits: Any, q: int, start: Any, end: Any, dx: float, dy: float) -> bool:
+    """Whether a segment passes beside the bounding box of a prism for certain."""
+    ax, bx, ay, by = start[0], end[0], start[1], end[1]
+    if min(ax, bx) >= limits[q, 1] or max(ax, bx) <= limits[q, 0]:
+        return True
+    if min(ay, by) >= limits[q, 3] or max(ay, by) <= limits[q, 2]:
+        return True
+    if min(start[2], end[2]) >= limits[q, 5] or max(start[2], end[2]) <= limits[q, 4]:
+        return True
+    # Or has all of it on one side of its line in the plan.
+    off = dx * (limits[q, 2] + limits[q, 3] - 2.0 * ay)
+    off -= dy * (limits[q, 0] + limits[q, 1] - 2.0 * ax)
+    half = abs(dx) * (limits[q, 3] - limits[q, 2]) + abs(dy) * (limits[q, 1] - limits[q, 0])
+    return abs(off) > half
+
+
 @helper
-def _meets(start: Any, end: Any, polygon: Any, limit: Any, crossings: Any, stops: Any) -> bool:
+def _meets(
+    start: Any, end: Any, corners: Any, limits: Any, q: int, crossings: Any, stops: Any
+) -> bool:
     """Whether a segment runs inside a prism; the last two are overwritten."""
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     enter, leave = 0.0, 1.0
     if dz != 0.0:
-        low, high = (limit[4] - start[2]) / dz, (limit[5] - start[2]) / dz
+        low, high = (limits[q, 4] - start[2]) / dz, (limits[q, 5] - start[2]) / dz
         enter, leave = max(enter, min(low, high)), min(leave, max(low, high))
     if not (leave - enter) * length > _LEAST_WAY_M:
         return False
     if dx * dx + dy * dy < _VERTICAL_M * _VERTICAL_M:
-        return _holds(polygon, start[0], start[1], _TOUCH_M)
+        return _holds(corners[q], start[0], start[1], _TOUCH_M)
     left, right = crossings[0], crossings[1]
-    count = _crossings(start, dx, dy, polygon, left, right)
+    count = _crossings(start, dx, dy, corners, q, left, right)
     n_stops = 2
     stops[0], stops[1] = enter, leave
     for i in range(count):
@@ -161,21 +207,23 @@ def _meets(start: Any, end: Any, polygon: Any, limit: Any, crossings: Any, stops
     return False
 
 
-@helper
-def _crossings(start: Any, dx: float, dy: float, polygon: Any, left: Any, right: Any) -> int:
+@inlined
+def _crossings(
+    start: Any, dx: float, dy: float, corners: Any, q: int, left: Any, right: Any
+) -> int:
     """Where a line in the plan crosses the edges, moved by nothing to its left and to its right.
 
     Infinity where one of the two does not; how many there are to look at.
     """
     ax, ay, reach = start[0], start[1], math.sqrt(dx * dx + dy * dy)
-    last = polygon.shape[0] - 1
-    x, y = polygon[last, 0] - ax, polygon[last, 1] - ay
+    last = corners.shape[1] - 1
+    x, y = corners[q, last, 0] - ax, corners[q, last, 1] - ay
     ahead, side = dx * x + dy * y, dx * y - dy * x
     if abs(side) <= _TOUCH_M * reach:
         side = 0.0
     count = 0
-    for i in range(polygon.shape[0]):
-        x, y = polygon[i, 0] - ax, polygon[i, 1] - ay
+    for i in range(corners.shape[1]):
+        x, y = corners[q, i, 0] - ax, corners[q, i, 1] - ay
         next_ahead, next_side = dx * x + dy * y, dx * y - dy * x
         if abs(next_side) <= _TOUCH_M * reach:
             next_side = 0.0
@@ -193,7 +241,7 @@ def _crossings(start: Any, dx: float, dy: float, polygon: Any, left: Any, right:
     return count
 
 
-@helper
+@inlined
 def _is_odd(crossings: Any, place: float, count: int) -> bool:
     """Whether an odd number of the crossings lies before a place."""
     odd = False
