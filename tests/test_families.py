@@ -20,7 +20,7 @@ from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.wrappers import EstimatePose, SelectAnchors, VectorEstimatePose
 from tests.helpers import assert_same
-from tests.side_by_side import actions_of
+from tests.side_by_side import actions_of, assert_steps_alike, of_its_spec
 from tests.test_tracking_env import ID
 
 ROOM: dict[str, Any] = {
@@ -323,3 +323,83 @@ def test_frames_of_many_worlds_equal_those_of_each():
         alone = EstimatePose(TrackingEnv(scenes=MIXED, render_mode="rgb_array"))
         alone.reset(seed=4 + world)
         assert (np.abs(frames[world].astype(int) - alone.render()) > 8).mean() < 1e-3
+
+
+# --- tasks ------------------------------------------------------------------------------------
+
+CRAFT = [{"name": "auv_craft", "n_anchors": {"integers": [2, 5]}, "steps": 5}]
+STILL = {"name": "hall", "anchor_speed_m_s": 0.0}
+HALLS = [
+    {"name": "hall", "steps": 4},
+    {
+        "name": "hall",
+        "n_anchors": 7,
+        "steps": 3,
+        "obstacles": {"choice": [[], [[0, 0, 2, 1, 1, 2]]]},
+    },
+]
+TASKS = [
+    ("RBL/MobileAnchors-v0", {"scenes": CRAFT}),
+    ("RBL/MobileAnchors-v0", {"scenes": CRAFT, "sort_craft": False, "reward": "error"}),
+    ("RBL/AnchorSelection-v0", {"scenes": HALLS}),
+    ("RBL/AnchorSelection-v0", {"scenes": HALLS, "mode": "priced", "reward": "error"}),
+]
+
+
+@pytest.mark.parametrize(("name", "arguments"), TASKS, ids=str)
+def test_tasks_draw_worlds_scalar_and_vector_alike(name, arguments):
+    env = gym.make(f"rbl_gym:{name}", **arguments)
+    check_env(env.unwrapped)
+    assert env.spec is not None
+    assert of_its_spec(env).reset(seed=1)[0].shape == env.observation_space.shape
+    for mode in ("NextStep", "SameStep"):
+        native: Any = gym.make_vec(f"rbl_gym:{name}", num_envs=4, autoreset_mode=mode, **arguments)
+        peer = SyncVectorEnv(
+            [lambda: gym.make(f"rbl_gym:{name}", **arguments).unwrapped] * 4,
+            autoreset_mode=AutoresetMode(mode),
+        )
+        assert_steps_alike(native, peer, 9, 5, {"rtol": 2e-5, "atol": 2e-6})
+
+
+def test_craft_that_are_not_there_are_zeros():
+    env: Any = gym.make("rbl_gym:RBL/MobileAnchors-v0", scenes=CRAFT)
+    seen = set()
+    for seed in range(12):
+        flat, info = env.reset(seed=seed)
+        m = json.loads(info["scene"])["n_anchors"]
+        seen.add(m)
+        np.testing.assert_array_equal(flat[30:], np.arange(5) < m)
+        assert flat[15 : 15 + 2 * m].all()
+        assert not flat[15 + 2 * m : 25].any()
+        assert not flat[25 + m : 30].any()
+        alone: Any = gym.make(
+            "rbl_gym:RBL/MobileAnchors-v0", scene={**CRAFT[0], "n_anchors": m}
+        ).unwrapped
+        # The same view of the same belief and craft.
+        told = {**env.unwrapped.seen, "anchors": env.unwrapped.seen["anchors"][:m]}
+        told.pop("anchor_mask")
+        own = alone._show(told)
+        np.testing.assert_array_equal(flat[15 : 15 + 2 * m], own[15 : 15 + 2 * m])
+        np.testing.assert_array_equal(flat[25 : 25 + m], own[15 + 2 * m :])
+    assert seen == {2, 3, 4, 5}
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "named"),
+    [
+        ("MobileAnchors", {"scenes": [STILL]}, "scene must have anchors that move"),
+        ("MobileAnchors", {"scenes": CRAFT, "scene": "hall"}, "scene must not be given beside"),
+        ("AnchorSelection", {"scenes": HALLS, "k": 8}, "k must be .* 7, got 8"),
+    ],
+)
+def test_what_does_not_do_for_a_task_is_named(name, arguments, named):
+    with pytest.raises(ValueError, match=named):
+        gym.make(f"rbl_gym:RBL/{name}-v0", **arguments)
+
+
+def test_filters_whose_states_differ_in_size_go_one_by_one():
+    envs: Any = gym.make_vec(
+        "rbl_gym:RBL/MobileAnchors-v0", num_envs=4, scenes=CRAFT, filter="iekf-bias"
+    )
+    with pytest.raises(ValueError, match=r"states of one size .* vectorization_mode='sync'"):
+        envs.reset(seed=5)

@@ -19,6 +19,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import StatedLength
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.estimators import PoseBelief
+from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 
 
@@ -32,13 +33,16 @@ class _Task(StatedLength):
     inner
         The stack: its observation is that of `EstimatePose`, a dict with the belief.
     scene
-        The world.
+        The world; of a family the first of its scenes.
+    family
+        What every reset draws a scene of; None: there is one scene.
     seen
         The last observation of `inner`, None before the first reset.
     """
 
     inner: Any = None
     scene: Scene
+    family: SceneFamily | None = None
     seen: dict[str, np.ndarray] | None = None
 
     @property

@@ -18,6 +18,7 @@ from rbl_gym.envs.batch import check_actions
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
+from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers import views
 from rbl_gym.wrappers.compositions import TaskEnv, VectorTaskEnv
@@ -49,17 +50,41 @@ def _options(filter: Any, options: Mapping[str, Any] | None) -> dict[str, Any]:
     return {**usual, **check_options_of(options)}
 
 
-class _Usual:
-    """What is usual in a scene: variances of the prior, speed."""
+def _family(value: Any, scene: Any, usual: Any, **defaults: Any) -> SceneFamily | None:
+    """The family that `scenes` names, None without one; `defaults` stand where a member says none.
 
-    def __init__(self, scene: Scene) -> None:
-        self.variance = np.diagonal(scene.prior_covariance).copy()
-        self.speed = max(scene.speed_m_s, float(np.abs(scene.twist[3:]).max()), 1e-3)
+    A `scene` other than the `usual` one is refused beside it.
+    """
+    if value is None:
+        return None
+    if scene != usual:
+        raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
+    members = [{"name": one} if isinstance(one, str) else one for one in family(value).members]
+    return family([{**defaults, **one} if isinstance(one, Mapping) else one for one in members])
+
+
+def _made_of(task: Any) -> dict[str, Any]:
+    """Arguments of the environment of a task."""
+    worlds = {"scene": task.scene} if task.family is None else {"scenes": task.family}
+    return {**worlds, "reward": "none"}
+
+
+class _Usual:
+    """What is usual in a scene, or the most in those of a family: variances of the prior, speed."""
+
+    def __init__(self, *worlds: Scene) -> None:
+        self.variance = np.max([np.diagonal(one.prior_covariance) for one in worlds], axis=0)
+        speeds = [(one.speed_m_s, float(np.abs(one.twist[3:]).max())) for one in worlds]
+        self.speed = max(np.max(speeds), 1e-3)
 
 
 def _worlds(batch: tuple[int, ...]) -> tuple[np.ndarray, ...]:
     """Indices that stand before those (B, M) of each world's anchors."""
     return tuple(np.arange(n)[:, None] for n in batch)
+
+
+# What the view of the craft is made of, in the order of its arguments.
+_CRAFT_VIEW = ("belief_translation", "belief_rotation", "belief_covariance", "twist", "anchors")
 
 
 # --- surface craft and a diving vehicle -------------------------------------------------------
@@ -73,41 +98,67 @@ class _MobileAnchors:
     # Numbers (..., M) of the craft in the order of the last observation.
     order: np.ndarray
 
-    def _configure(self, difficulty: str, scene: Any, sort_craft: bool) -> None:
+    def _configure(self, difficulty: str, scene: Any, sort_craft: bool, scenes: Any) -> None:
         level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
-        self.scene = _world(scene, **level)
-        if self.scene.anchor_speed_m_s <= 0:
+        found = _family(scenes, scene, "auv_craft", **level)
+        worlds = (_world(scene, **level),) if found is None else found.corners
+        if any(one.anchor_speed_m_s <= 0 for one in worlds):
             raise ValueError("scene must have anchors that move, got anchor_speed_m_s = 0")
         if not isinstance(sort_craft, bool):
             raise ValueError(f"sort_craft must be True or False, got {sort_craft!r}")
         self.sort_craft = sort_craft
-        self._limits = np.full(15 + 3 * self.scene.n_anchors, _LIMIT)
-        self._usual = _Usual(self.scene)
+        self.family, self.scene = found, worlds[0]
+        self._n_craft = (found or self.scene).n_anchors
+        self._limits = np.full(15 + 3 * self._n_craft, _LIMIT)
+        self._usual = _Usual(*worlds)
 
     def _spaces(self) -> tuple[spaces.Box, spaces.Box]:
-        m = self.scene.n_anchors
+        m = self._n_craft
+        size = 15 + (3 if self.family is None else 4) * m
         return (
-            spaces.Box(-_LIMIT, _LIMIT, self._limits.shape, np.float32),
+            spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32),
             spaces.Box(-1.0, 1.0, (2 * m,), np.float32),
         )
 
     def _velocities(self, level: FloatArray) -> FloatArray:
         """Actions of the world (..., 3 M) of level velocities (..., 2 M) in order."""
-        batch, m = level.shape[:-1], self.scene.n_anchors
+        batch, m = level.shape[:-1], self._n_craft
         velocity = np.zeros((*batch, m, 3))
         # Action k is that of the k-th craft in the observation.
         velocity[(*_worlds(batch), self.order, slice(2))] = level.reshape(*batch, m, 2)
         return velocity.reshape(*batch, 3 * m)
 
     def _show(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
-        order, flat = views.mobile_anchors(
-            observation["belief_translation"], observation["belief_rotation"],
-            observation["belief_covariance"], observation["twist"], observation["anchors"],
-            self._usual.variance, self._usual.speed, self.sort_craft, self._limits,
-        )  # fmt: skip
+        told = [observation[key] for key in _CRAFT_VIEW]
+        if self.family is None:
+            order, flat = self._view(*told)
+        else:
+            order, flat = self._padded_view(told, observation["anchor_mask"])
         if observation is self.seen:
             self.order = order
         return flat.astype(np.float32)
+
+    def _view(self, *told: np.ndarray) -> tuple[np.ndarray, FloatArray]:
+        size = 15 + 3 * told[-1].shape[-2]
+        usual = self._usual.variance, self._usual.speed
+        return views.mobile_anchors(*told, *usual, self.sort_craft, self._limits[:size])
+
+    def _padded_view(
+        self, told: list[np.ndarray], mask: np.ndarray
+    ) -> tuple[np.ndarray, FloatArray]:
+        """The view of craft that there are, in arrays for the most; their mask is the end of it."""
+        m, counts = self._n_craft, mask.sum(axis=-1)
+        order = np.broadcast_to(np.arange(m), mask.shape).copy()
+        flat = np.zeros((*counts.shape, 15 + 4 * m))
+        flat[..., 15 + 3 * m :] = mask
+        for count in np.unique(counts).tolist():
+            rows = counts == count
+            *belief, anchors = (field[rows] for field in told)
+            order[rows, :count], seen = self._view(*belief, anchors[:, :count])
+            # Places, then distances: each part is padded by itself.
+            flat[rows, : 15 + 2 * count] = seen[:, : 15 + 2 * count]
+            flat[rows, 15 + 2 * m : 15 + 2 * m + count] = seen[:, 15 + 2 * count :]
+        return order, flat
 
 
 class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
@@ -125,12 +176,14 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        scenes: Any = None,
     ) -> None:
-        self._configure(difficulty, scene, sort_craft)
+        self._configure(difficulty, scene, sort_craft, scenes)
         self.single_observation_space, self.single_action_space = self._spaces()
         envs = TrackingVectorEnv(
-            num_envs, self.scene, "none", render_mode, max_episode_steps, autoreset_mode
-        )
+            num_envs, **_made_of(self), render_mode=render_mode,
+            max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
+        )  # fmt: skip
         self._compose(VectorEstimatePose(envs, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> FloatArray:
@@ -180,6 +233,12 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     env = gym.make("rbl_gym:RBL/MobileAnchors-v0", difficulty="hard")
     ```
     `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`; the anchors must move.
+
+    `scenes`: a family of such in its place, see `RBL/Tracking-v0`, as
+    ``scenes=[{"name": "auv_craft", "n_anchors": {"integers": [2, 5]}}]``. M is then the largest
+    number of craft. Entries of craft that are not there are 0. The observation has M more entries:
+    1 for the craft that are there.
+
     `filter`, `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options`
     say else.
 
@@ -196,10 +255,11 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
         options: Mapping[str, Any] | None = None,
         reward: RewardLike = "belief",
         render_mode: str | None = None,
+        scenes: Any = None,
     ) -> None:
-        self._configure(difficulty, scene, sort_craft)
+        self._configure(difficulty, scene, sort_craft, scenes)
         self.observation_space, self.action_space = self._spaces()
-        env = TrackingEnv(self.scene, "none", render_mode)
+        env = TrackingEnv(**_made_of(self), render_mode=render_mode)
         self._compose(EstimatePose(env, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> FloatArray:
@@ -214,21 +274,27 @@ class _AnchorSelection:
     """Choices and their price: what scalar and vector forms share."""
 
     scene: Scene
+    seen: Any
 
-    def _configure(self, mode: str, k: int, price: float, scene: Any) -> None:
-        self.scene = _world(scene, steps=50)
+    def _configure(self, mode: str, k: int, price: float, scene: Any, scenes: Any) -> None:
+        found = _family(scenes, scene, "hall", steps=50)
+        worlds = (_world(scene, steps=50),) if found is None else found.corners
+        self.family, self.scene = found, worlds[0]
+        self._most = (found or self.scene).n_anchors
         self.mode = check_one_of("mode", mode, SELECTIONS)
-        self.k = check_count("k", k, most=self.scene.n_anchors)
+        self.k = check_count("k", k, most=min(one.n_anchors for one in worlds))
         self.price = check_number("price", price, low=0.0)
         self._limits = np.full(18, _LIMIT)
-        self._usual = _Usual(self.scene)
-        low, high = self.scene.volume.bounds()
+        self._usual = _Usual(*worlds)
+        corners = np.array([one.volume.bounds() for one in worlds])
+        low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
         self._centre = 0.5 * (low + high)
         # In a volume without height, deviations count by what the prior leaves open.
-        self._half = np.maximum(0.5 * (high - low), self.scene.initial_translation_m)
+        prior = max(one.initial_translation_m for one in worlds)
+        self._half = np.maximum(0.5 * (high - low), prior)
 
     def _spaces(self) -> tuple[spaces.Box, spaces.Space[Any]]:
-        m = self.scene.n_anchors
+        m = self._most
         return (
             spaces.Box(-_LIMIT, _LIMIT, (18,), np.float32),
             spaces.Box(-1.0, 1.0, (m,), np.float32)
@@ -238,8 +304,11 @@ class _AnchorSelection:
 
     def _choice(self, action: np.ndarray) -> np.ndarray:
         """Which anchors (..., M) an action chooses, int8; ties go to the lower number."""
+        there = None if self.family is None else self.seen["anchor_mask"]
         if self.mode == "priced":
-            return action
+            return action if there is None else action & there
+        if there is not None:
+            action = np.where(there, action, -np.inf)
         best = (-action).argsort(axis=-1, kind="stable")[..., : self.k]
         chosen = np.zeros(action.shape, dtype=np.int8)
         chosen[(*_worlds(action.shape[:-1]), best)] = 1
@@ -273,12 +342,14 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        scenes: Any = None,
     ) -> None:
-        self._configure(mode, k, price, scene)
+        self._configure(mode, k, price, scene, scenes)
         self.single_observation_space, self.single_action_space = self._spaces()
         envs = TrackingVectorEnv(
-            num_envs, self.scene, "none", render_mode, max_episode_steps, autoreset_mode
-        )
+            num_envs, **_made_of(self), render_mode=render_mode,
+            max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
+        )  # fmt: skip
         selected = VectorSelectAnchors(envs)
         self._compose(VectorEstimatePose(selected, filter, _options(filter, options), reward))
 
@@ -329,8 +400,9 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", mode="priced", price=0.05)
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", filter="uc-kf", k=6)
     ```
-    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. `filter`, `options`, `reward`:
-    as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
+    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. `scenes`: a family in its place,
+    see `RBL/Tracking-v0`; anchors that a drawn scene does not have cannot be chosen. `filter`,
+    `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
 
     ## Version history
     * v0: first version.
@@ -346,10 +418,11 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
         options: Mapping[str, Any] | None = None,
         reward: RewardLike = "belief",
         render_mode: str | None = None,
+        scenes: Any = None,
     ) -> None:
-        self._configure(mode, k, price, scene)
+        self._configure(mode, k, price, scene, scenes)
         self.observation_space, self.action_space = self._spaces()
-        env = SelectAnchors(TrackingEnv(self.scene, "none", render_mode))
+        env = SelectAnchors(TrackingEnv(**_made_of(self), render_mode=render_mode))
         self._compose(EstimatePose(env, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> np.ndarray:

@@ -258,6 +258,12 @@ def _joined(old: Any, rows: list[np.ndarray], parts: list[Any], count: int) -> A
     """The state of all `count` worlds, with some rows from the `parts`."""
     if len(parts) == 1 and len(rows[0]) == count:
         return parts[0]
+    if len({tuple(np.shape(field)[1:] for field in part) for part in parts}) > 1:
+        raise ValueError(
+            "filter must have states of one size in worlds of different sizes, got "
+            f"{' and '.join(str([np.shape(f)[1:] for f in part]) for part in parts[:2])}: use "
+            "gym.make_vec(..., vectorization_mode='sync') of EstimatePose"
+        )
     fields = []
     for index, first in enumerate(parts[0]):
         if first is None:

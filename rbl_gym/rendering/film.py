@@ -50,8 +50,12 @@ class Film:
         self._taken[-1][2] = mapped(np.array, belief)
 
     def select(self, chosen: np.ndarray) -> None:
-        """Of the last shot, which has a field `measuring` (B, M), only these anchors measure."""
+        """Of the last shot, which has a field `measuring` (B, M), only these anchors measure.
+
+        `chosen` may be padded.
+        """
         shot = self._taken[-1][1]
+        chosen = chosen[..., : shot.measuring.shape[-1]]
         self._taken[-1][1] = shot._replace(measuring=shot.measuring & chosen)
 
     def frame(self, world: int) -> Image:
