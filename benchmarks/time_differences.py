@@ -23,7 +23,9 @@ from rbl_gym.studies import monte_carlo
 from rbl_gym.worlds import scenes
 
 OFFSETS = (None, "epoch", "tag", "anchor")
-LABELS = {None: "ranges", "epoch": "one offset", "tag": "one per tag", "anchor": "one per anchor"}
+LABELS = {
+    None: "none: ranges", "epoch": "one for all", "tag": "one per tag", "anchor": "one per anchor",
+}  # fmt: skip
 COUNTS = (4, 5, 6, 8, 10)
 BLOCKS = (slice(0, 3), slice(3, 6))
 
