@@ -233,7 +233,7 @@ def test_the_figures_have_these_names(placed):
     assert set(result) == {
         "scene", "seed", "n_anchors", "verdict", "survive", "zones", "region", "obstacles",
         "tags_m", "method", "anchors", "cost", "coplanar", "next_anchor", "predicted", "criteria",
-        "layouts", "check", "against_number",
+        "layouts", "check", "against_number", "survey",
     }  # fmt: skip
     assert set(result["anchors"][0]) == {
         "name", "x_m", "y_m", "z_m", "mount", "cost", "fixed", "sees", "without",

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from rbl_gym.app.page import digits
+from rbl_gym.app.place_survey import survey_table
 from rbl_gym.app.tables import new_console, new_table
 
 # A share of lost bodies above this is said in words.
@@ -34,6 +35,7 @@ def tables(result: dict[str, Any]) -> Iterator[Rows]:
         yield _mounts(result)
     yield _worst(result)
     yield _prediction(result)
+    yield Rows(*survey_table(result))
     yield _layouts(result["layouts"])
     yield _check(result["check"])
     if any("within" in row for row in _check_zones(result["check"])):

@@ -28,6 +28,7 @@ from rbl_gym.studies.placing.judging import (
     short_row,
     zone_row,
 )
+from rbl_gym.studies.placing.surveys import survey_rows
 from rbl_gym.studies.progress import Advance, silent
 
 __all__ = ["Placed", "Question", "place_anchors"]
@@ -202,6 +203,7 @@ def _result(
         "coplanar": _is_flat(anchors),
         "next_anchor": _next(problem, anchors, judged, seed, survive),
         "predicted": overview(judged, edges),
+        "survey": survey_rows(problem, anchors, judged),
         "criteria": _criteria(problem, anchors),
         "layouts": _comparison(problem, found, seed, survive),
         "check": check.check_layout(problem, anchors, question.trials, seed),

@@ -1,0 +1,19 @@
+"""The table of a placement that says what a better survey, or calibrated links, would buy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rbl_gym.app.page import digits
+
+
+def survey_table(result: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
+    """Title, headings and rows."""
+    rows, asking = [], list(result["survey"][0]["within"])
+    for row in result["survey"]:
+        figures = (("position_m", 4), ("rotation_deg", 3), ("score_m", 4))
+        shares = [f"{100 * row['within'][name]:.1f} %" for name in asking]
+        rows.append([row["known"], *(digits(row[key], n) for key, n in figures), *shares])
+    headings = ["known", "position RMS (m)", "orientation RMS (deg)", "b (m)"]
+    headings += [f"within {name}" for name in asking]
+    return "one epoch, by what is known of anchors and links", headings, rows

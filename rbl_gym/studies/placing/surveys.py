@@ -1,0 +1,117 @@
+"""How good a pose is where anchors were surveyed to centimetres, or links were never calibrated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rbl_gym import bounds
+from rbl_gym.bounds.information import marginal
+from rbl_gym.bounds.nuisances import information_of
+from rbl_gym.checks import FloatArray
+from rbl_gym.measurements import ranging
+from rbl_gym.measurements.link_bias import LinkBias
+from rbl_gym.placement.building import Problem, Zone
+from rbl_gym.studies.monte_carlo import rms
+from rbl_gym.studies.placing.accuracy import TURNS, prior_of
+from rbl_gym.studies.placing.judging import Judged, limits_of, share_within
+from rbl_gym.studies.placing.links import link_shares
+from rbl_gym.studies.placing.requirements import Errors, errors_of, relative_errors, turns
+from rbl_gym.studies.what_if import SURVEYS_M, UNCALIBRATED
+
+__all__ = ["survey_rows", "surveyed_accuracy"]
+
+# Places of each zone; 95 % of a share are good to 3 % with so many.
+_PLACES = 200
+
+
+def survey_rows(
+    problem: Problem, anchors: FloatArray, judged: list[Judged]
+) -> list[dict[str, Any]]:
+    """Figures of one epoch by what is known of anchors and links, over the places of all zones.
+
+    Parameters
+    ----------
+    problem, anchors
+        What is placed, and where (M, 3).
+    judged
+        Its zones, with the places that were judged.
+
+    Returns
+    -------
+    Rows of plain numbers: `known` (a name), `anchor_std_m`, `bias_std_m` and `bias_common_m`, root
+    mean squares `position_m`, `rotation_deg` and `score_m`, and of every zone that asks for
+    something the share of its places `within`, by name.
+    """
+    cases: list[tuple[str, float, LinkBias | None]] = [("anchors and links", 0.0, None)]
+    cases += [(f"anchors to {100 * std:g} cm", std, None) for std in SURVEYS_M]
+    cases += [("anchors, not the links", 0.0, UNCALIBRATED)]
+    rows = []
+    for name, std, bias in cases:
+        found = [
+            surveyed_accuracy(problem, anchors, one.places[:_PLACES], one.zone, std, bias)
+            for one in judged
+        ]
+        position, rotation, score = (
+            float(rms(np.concatenate([errors[k] for errors in found]))) for k in range(3)
+        )
+        within = {
+            one.zone.name: float(share_within(relative_errors(errors, limits_of(one.zone))))
+            for one, errors in zip(judged, found, strict=True)
+            if one.asks
+        }
+        rows.append(
+            {
+                "known": name,
+                "anchor_std_m": std,
+                "bias_std_m": 0.0 if bias is None else bias.std_m,
+                "bias_common_m": 0.0 if bias is None else bias.common_std_m,
+                "position_m": position,
+                "rotation_deg": float(np.rad2deg(rotation)),
+                "score_m": score,
+                "within": within,
+            }
+        )
+    return rows
+
+
+def surveyed_accuracy(
+    problem: Problem,
+    anchors: FloatArray,
+    places: FloatArray,
+    zone: Zone,
+    anchor_std_m: float = 0.0,
+    bias: LinkBias | None = None,
+) -> Errors:
+    """`accuracy` (L) at places (L, 3) of a zone with anchors and links that are not quite known.
+
+    Parameters
+    ----------
+    problem, anchors, places, zone
+        As `accuracy`.
+    anchor_std_m
+        Standard deviation of the anchors' places, per axis.
+    bias
+        Law of the links' biases; None: they have none.
+    """
+    rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
+    share = link_shares(problem, anchors, places, rotation)
+    common = None
+    if bias is not None:
+        # Within one epoch a bias of each link is noise; what all have in common is not.
+        spots = ranging.tag_positions(rotation, places[:, None], problem.tags)
+        variance = problem.noise.variance(ranging.distances(anchors, spots))
+        share = share / (1 + share * bias.std_m**2 / variance)
+        common = LinkBias(bias.common_std_m)
+    epoch = bounds.RangeEpoch(anchors, problem.tags, rotation, places[:, None], problem.noise)
+    if common is None:
+        std = np.full((len(anchors), 3), anchor_std_m) if anchor_std_m > 0 else None
+        told = bounds.information_at(*epoch[:5], share, anchor_std=std)  # pyright: ignore[reportArgumentType]
+    else:
+        unknown = bounds.Nuisances(None, anchor_std_m, common, "common")
+        joint = information_of(epoch, unknown, share)
+        own = np.arange(6, joint.shape[-1])
+        joint[..., own, own] += 1.0
+        told = marginal(joint, 6)
+    return errors_of(told + prior, rotation, problem.tags)
