@@ -2,13 +2,13 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-long coverage benchmarks lint format types docs dist clean
+.PHONY: demo test test-long coverage benchmarks lint format copy types docs dist clean
 
 demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png --html out/demo.html
 
 test: .venv/dev.stamp
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 # What `test` leaves out: whole recordings, more trials.
 test-long: .venv/dev.stamp
@@ -31,17 +31,17 @@ format: .venv/dev.stamp
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# On an installed copy: no checker follows the mapping from folders to import names.
-types: .venv/dev.stamp
-	rm -rf build/types build/lib
-	$(BIN)/python -m pip install --quiet --no-deps --target build/types .
-	cp -r tests pyproject.toml build/types/
-	cd build/types && ../../$(BIN)/pyright --threads 2 --pythonpath ../../$(BIN)/python
+# An installed copy: no checker follows the mapping from folders to import names.
+copy: .venv/dev.stamp
+	rm -rf build/copy build/lib
+	$(BIN)/python -m pip install --quiet --no-deps --target build/copy .
 
-# The site, in build/site; its reference is read from an installed copy, as the types are.
-docs: .venv/dev.stamp
-	rm -rf build/docs build/lib
-	$(BIN)/python -m pip install --quiet --no-deps --target build/docs .
+types: copy
+	cp -r tests pyproject.toml build/copy/
+	cd build/copy && ../../$(BIN)/pyright --threads 2 --pythonpath ../../$(BIN)/python
+
+# The site, in build/site; its reference is read from the copy.
+docs: copy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The wheel, built from the sdist and installed outside the checkout, where the folder mapping has

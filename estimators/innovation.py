@@ -127,24 +127,20 @@ def innovations(
     # A = R^-1/2 H of what was used: cov(v) = R^1/2 (I + A P A^T) R^1/2.
     scale = np.where(links, 1 / np.sqrt(variance), 0.0)
     A = H * scale[..., None]
-    spread = A @ P @ np.swapaxes(A, -1, -2)
-    own = np.diagonal(spread, axis1=-2, axis2=-1)
-    spread = np.where(used[..., None] & used[..., None, :], spread, 0.0)
-    finite = np.isfinite(spread).all(axis=(-2, -1)) & np.isfinite(residual).all(axis=-1)
-    sound: BoolArray = np.asarray(finite)
-    spread = np.where(sound[..., None, None], spread, 0.0) + np.eye(flat[-1])
-    root = np.linalg.cholesky(spread)
-    u = np.where(used & sound[..., None], v * scale, 0.0)
-    white = np.linalg.solve(root, u[..., None])
-    nis = (white[..., 0] ** 2).sum(axis=-1)
-    log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+    own = ((A @ P) * A).sum(axis=-1)
+    sound: BoolArray = np.isfinite(own).all(axis=-1) & np.isfinite(residual).all(axis=-1)
+    A = np.where((used & sound[..., None])[..., None], A, 0.0)
+    P = np.where(sound[..., None, None], P, 0.0)
+    u = np.where(used & sound[..., None], v * scale, 0.0)[..., None]
+    white, sign, log_det = _divided(u, A, P)
+    sound = sound & (sign > 0)
+    nis = (u * white).sum(axis=(-2, -1))
     log_det = log_det + np.where(used, np.log(variance), 0.0).sum(axis=-1)
     dof = used.sum(axis=-1)
     refused = links.sum(axis=-1) - dof
     if offset is not None:
         U = offsets.columns(offset, *shape[-2:]) * np.where(used, scale, 0.0)[..., None]
-        U = np.linalg.solve(root, U)
-        total = np.swapaxes(U, -1, -2) @ U
+        total = np.swapaxes(U, -1, -2) @ _divided(U, A, P)[0]
         empty = np.diagonal(total, axis1=-2, axis2=-1) == 0
         total = total + empty[..., None] * np.eye(U.shape[-1])
         found = np.linalg.solve(total, np.swapaxes(U, -1, -2) @ white)
@@ -165,6 +161,20 @@ def innovations(
         dof,
         np.where(sound, likelihood, -np.inf),
     )
+
+
+def _divided(
+    B: FloatArray, A: FloatArray, P: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """``(I + A P A^T)^-1 B``, sign and logarithm of the determinant, in the smaller size."""
+    rows, states = A.shape[-2:]
+    transposed = np.swapaxes(A, -1, -2)
+    if rows <= states:
+        S = np.eye(rows) + A @ P @ transposed
+        return np.linalg.solve(S, B), *np.linalg.slogdet(S)
+    # By Woodbury's identity.
+    S = np.eye(states) + P @ (transposed @ A)
+    return B - A @ np.linalg.solve(S, P @ (transposed @ B)), *np.linalg.slogdet(S)
 
 
 def _states(

@@ -17,8 +17,8 @@ from rbl_gym.studies import replay
 from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
 from rbl_gym.studies.replay.tracking import start_of
 
-# Many filters run side by side: a minute in kernels, five without.
-pytestmark = pytest.mark.skipif(not kernels.enabled(), reason="slow without kernels")
+# Many filters run side by side.
+with_kernels = pytest.mark.skipif(not kernels.enabled(), reason="slow without kernels")
 
 ANCHORS = np.array(
     [[0, 0, 2.5], [10, 0, 0.5], [10, 8, 3], [0, 8, 0.4], [4, 3, 3], [7, 6, 2.8], [2, 7, 1.2]],
@@ -99,6 +99,7 @@ WORDS = {
 }
 
 
+@with_kernels
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_fault_put_in_is_named(fault):
     kind, log, changed = FAULTS[fault]
@@ -121,6 +122,16 @@ def test_the_fault_put_in_is_named(fault):
     assert cause["text"] in notes[-1]
 
 
+@pytest.mark.parametrize("fault", ["deviation", "two anchors"])
+def test_a_short_log_tells_a_fault_of_settings_and_one_of_files(fault):
+    kind, log, changed = FAULTS[fault]
+    log = log._replace(times=log.times[:25], ranges=log.ranges[:25], links=log.links[:25])
+    figures = replay.replay_recording(log, SETTINGS.changed(**changed)).figures
+    assert [cause["kind"] for cause in figures["consistency"]["causes"]] == [kind]
+    assert figures["consistency"]["causes"][0]["mended"] > 0.9
+
+
+@with_kernels
 def test_two_faults_are_both_named():
     log = recording(RANGES[:, [0, 4, 2, 3, 1, 5, 6]])
     settings = SETTINGS.changed(range_std_m=0.04)
@@ -131,6 +142,7 @@ def test_two_faults_are_both_named():
     assert [cause.kind for cause in causes] == ["anchors-swapped", "range-std"]
 
 
+@with_kernels
 def test_the_height_of_a_planar_body():
     log = recording(walked(3, planar=True)[0])
     # The tags' mean height is 1.49 m, the anchors' 1.91 m.
@@ -150,6 +162,7 @@ def test_the_height_of_a_planar_body():
     assert float(named[1]) == pytest.approx(offset - 0.42, abs=0.05)
 
 
+@with_kernels
 def test_noise_that_nothing_explains_has_no_cause():
     """Each epoch of another place and body: no fault makes sense of that."""
     log = recording(np.random.default_rng(5).uniform(1, 9, RANGES.shape))
@@ -158,6 +171,7 @@ def test_noise_that_nothing_explains_has_no_cause():
     assert all(cause["kind"] == "range-std" for cause in figures["consistency"]["causes"])
 
 
+@with_kernels
 def test_honest_logs_are_not_doubted():
     """None of two hundred logs that are as the filter believes is said to contradict it."""
     ranges = walked(7, logs=200, epochs=40)
@@ -207,6 +221,7 @@ def test_residuals_by_anchor_tag_and_link():
     assert ((low < 1) & (high > 1)).all()
 
 
+@with_kernels
 def test_the_page_and_the_picture_show_what_the_figures_say(capsys):
     pytest.importorskip("plotly")
     from rbl_gym.app import track_pages

@@ -7,18 +7,15 @@ import json
 import numpy as np
 import pytest
 
-from rbl_gym import kernels
 from rbl_gym.app import cli
 from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
-from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording
-
-# Many filters run side by side: a minute in kernels, five without.
-pytestmark = pytest.mark.skipif(not kernels.enabled(), reason="slow without kernels")
+from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording, with_kernels
 
 DEFAULTS = replay.Settings()
 
 
+@with_kernels
 def test_the_settings_that_made_a_log_are_found():
     """From the defaults: 0.12 m, 0.1 m and 7 degrees; the log has 0.1 m, 0.3 m, 17 degrees."""
     tuned = replay.tune(recording(RANGES), DEFAULTS)
@@ -38,6 +35,7 @@ def test_the_settings_that_made_a_log_are_found():
     assert figures["consistency"]["log_likelihood"] == pytest.approx(tuned.log_likelihood, abs=1e-3)
 
 
+@with_kernels
 def test_only_the_first_part_is_looked_at_and_never_the_truth():
     log = recording(RANGES)
     spoiled = RANGES.copy()
@@ -48,6 +46,7 @@ def test_only_the_first_part_is_looked_at_and_never_the_truth():
     assert replay.tune(recording(spoiled)._replace(truth=truth), SETTINGS, seconds=2.0) == plain
 
 
+@with_kernels
 def test_the_likelier_filter_is_taken():
     """Biases where there are some; none where the noise is white."""
     biases = 0.15 * np.random.default_rng(6).standard_normal((7, 5))
@@ -58,12 +57,15 @@ def test_the_likelier_filter_is_taken():
         assert tuned.options.startswith(f"--filter {name} --range-std-m ")
 
 
-def test_every_round_is_told():
+def test_a_short_log_tells_its_deviation_and_every_round_is_told():
     told = []
-    replay.tune(recording(RANGES[:20]), SETTINGS, advance=lambda: told.append(1))
+    tuned = replay.tune(recording(RANGES[:25]), DEFAULTS, advance=lambda: told.append(1))
     assert len(told) == replay.TUNING_ROUNDS
+    # By 875 ranges, less what the poses take, to 3 %: four standard deviations.
+    assert tuned.found["range_std_m"] == pytest.approx(0.1, rel=0.12)
 
 
+@with_kernels
 def test_late_ranges_have_their_price():
     """A twentieth of the ranges is late: neither are they noise, nor is all else refused."""
     late = RANGES + 3.0 * (np.random.default_rng(4).random(RANGES.shape) < 0.05)
@@ -71,6 +73,7 @@ def test_late_ranges_have_their_price():
     assert tuned.found["range_std_m"] == pytest.approx(0.1, rel=0.1)
 
 
+@with_kernels
 def test_filters_of_an_unknown_twist_have_their_acceleration_tuned():
     settings = DEFAULTS.changed(filter="iekf-cv", walk_m=0.0, walk_deg=0.0)
     tuned = replay.tune(recording(RANGES), settings)
@@ -109,6 +112,7 @@ def written(folder):
     return arguments
 
 
+@with_kernels
 def test_the_command_runs_with_what_it_tuned_and_prints_it(tmp_path, capsys):
     arguments = written(tmp_path)
     assert (

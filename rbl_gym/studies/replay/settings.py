@@ -287,7 +287,8 @@ class Settings:
         for name, group in groups.items():
             if dataclasses.is_dataclass(group):
                 new = {key: fields[key] for key in vars(group) if key in fields}
-                groups[name] = dataclasses.replace(group, **new)  # pyright: ignore[reportArgumentType]
+                if new:
+                    groups[name] = dataclasses.replace(group, **new)  # pyright: ignore[reportArgumentType]
             else:
                 groups[name] = fields.get(name, group)
         return Settings(**groups)
@@ -295,8 +296,8 @@ class Settings:
     def flat(self) -> dict[str, Any]:
         """All fields by their names, without the groups."""
         result: dict[str, Any] = {}
-        for name, value in dataclasses.asdict(self).items():
-            result |= value if isinstance(value, dict) else {name: value}
+        for name, value in vars(self).items():
+            result |= vars(value) if dataclasses.is_dataclass(value) else {name: value}
         return result
 
 
