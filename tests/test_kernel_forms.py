@@ -300,6 +300,26 @@ def test_linear_update(batch, weights, m, n, flat):
 
 
 @every_batch
+@pytest.mark.parametrize("law", [(0, 0.05, 0.0, -1), (0, 0.05, 0.01, 2), (1, 0.03, 0, 0)])
+@pytest.mark.parametrize(("m", "n"), [(4, 5), (10, 6)])
+def test_a_plain_linear_epoch_in_one_call(batch, law, m, n):
+    linear = Linear(batch, m, n, "common")
+    P = 0.1 * linear.P / np.abs(linear.P).max()
+    told = [np.array(law, dtype=float), linear.anchors, linear.tags, 1 / 3]
+    found = assert_equal_forms(kalman._update, linear.mean, P, linear.ranges, *told, atol=1e-8)
+    weights = 1 / noise_laws.law_of(told[0]).squared_range_variance(linear.ranges)
+    want = engines.update_covariance.textbook(P, linear.anchors, linear.tags, weights)
+    np.testing.assert_allclose(found[1], want, rtol=1e-9, atol=1e-12)
+    assert np.isfinite(found[0]).all()
+    spoiled = linear.ranges.copy()
+    spoiled[..., 0, 0] = 0.0
+    for prior, ranges in ((P, spoiled), (30 * P, linear.ranges)):
+        for form in (kalman._update.kernel, kalman._update.textbook):
+            with np.errstate(all="ignore"):
+                assert np.isnan(form(linear.mean, prior, ranges, *told)[0]).all()
+
+
+@every_batch
 @every_weight
 def test_compressed_measurements(batch, weights):
     """Two factors of the same information: H^T H and H^T z are equal."""

@@ -12,12 +12,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number, check_one_of
+from rbl_gym.checks import (
+    HUGE,
+    BoolArray,
+    FloatArray,
+    all_finite,
+    check_array,
+    check_number,
+    check_one_of,
+)
 from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
@@ -26,9 +34,18 @@ from rbl_gym.estimators.inputs import (
     check_epoch,
     check_one_process,
     epoch_variance,
+    is_plain_epoch,
     plain,
 )
-from rbl_gym.estimators.linear.engines import ENGINES, LinearEpoch, Motion, engine_for
+from rbl_gym.estimators.linear.engines import (
+    ENGINES,
+    Batched,
+    LinearEpoch,
+    Motion,
+    engine_for,
+    update_covariance,
+    update_mean,
+)
 from rbl_gym.estimators.linear.least_squares import unvec, vec
 from rbl_gym.estimators.linear.squared_range import geometric_rank
 from rbl_gym.estimators.linear.unitary import (
@@ -39,6 +56,7 @@ from rbl_gym.estimators.linear.unitary import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
+from rbl_gym.measurements.noise_laws import law_of, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -173,6 +191,9 @@ class KalmanFamily:
             cannot determine the 12 states and the state is too vague to stand in (the
             message names the rank).
         """
+        found = self._update_plain(state, ranges, anchors, links, noise)
+        if found is not None:
+            return found
         state = plain(state)
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
         self._check_determined(state, anchors)
@@ -201,6 +222,34 @@ class KalmanFamily:
         mean, covariance = engine.update(state.mean, state.covariance, epoch)
         posterior = KalmanState(mean, covariance, np.zeros(mean.shape[:-1], bool))
         return _CONSTRAINTS[self.constraint](self, state, posterior, epoch)
+
+    def _update_plain(
+        self, state: KalmanState, ranges: ArrayLike, anchors: ArrayLike, links: Any, noise: Any
+    ) -> KalmanState | None:
+        """The KF's update by an epoch with nothing special about it, in one call.
+
+        None where there is: then the long way says what, or does it.
+        """
+        batch = state.mean.shape[:-1]
+        if (
+            links is not None
+            or noise is not None
+            or self.weights is not None
+            or self.constraint != "none"
+            or state.covariance.shape[:-2] != batch
+            or not is_plain_epoch(ranges, anchors, self.tags, batch)
+            or engine_for(self.engine, state=batch) is not Batched
+        ):
+            return None
+        numbers = numbers_of(self.noise, len(self.tags))
+        if numbers is None:
+            return None
+        mean, covariance = _update(
+            state.mean, state.covariance, ranges, numbers, anchors, self.tags, VAGUE_ENTRY_VARIANCE
+        )
+        if not all_finite(mean):
+            return None
+        return KalmanState(mean, covariance, np.zeros(batch, bool))
 
     def belief(self, state: KalmanState) -> PoseBelief:
         """Pose, its covariance, and the raw matrix (copies).
@@ -244,6 +293,29 @@ def _is_vague(P: FloatArray, anchors: FloatArray, vague_entry: float) -> BoolArr
     extent = np.ptp(anchors, axis=-2).max(axis=-1)
     vague = variance[..., :9].max(axis=-1) > vague_entry
     return vague | (variance[..., 9:].max(axis=-1) > extent**2)
+
+
+@compiled("linear_filter:update")
+def _update(
+    mean: FloatArray,
+    P: FloatArray,
+    ranges: FloatArray,
+    law: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    vague_entry: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance after an epoch without lost links, by the numbers of its law.
+
+    NaN where a range is not positive or the prior says nothing (`_is_vague`).
+    """
+    weights = 1 / law_of(law).squared_range_variance(ranges)
+    new_P = update_covariance.textbook(P, anchors, tags, weights)
+    new_mean = update_mean.textbook(mean, new_P, ranges, anchors, tags, weights)
+    sound = ((ranges > 0) & (ranges < HUGE)).all(axis=(-2, -1))
+    sound = sound & ~_is_vague.textbook(P, anchors, vague_entry)
+    new_P = np.where(sound[..., None, None], new_P, np.nan)
+    return np.where(sound[..., None], new_mean, np.nan), new_P
 
 
 # --- constraints: what happens to the rotation after the linear update --------------------

@@ -7,15 +7,18 @@ lost. The textbook forms stand in `estimators/linear/`.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from rbl_gym.kernels import rotations
 from rbl_gym.kernels.jit import gufunc, helper
-from rbl_gym.kernels.linear_algebra import factor_semidefinite, of_size
+from rbl_gym.kernels.linear_algebra import factor_semidefinite, fill, of_size
 
 _STATES = 12
+# No length is as large.
+HUGE = 1e50
 _cholesky, _, _invert_factored = of_size(_STATES)
 
 
@@ -175,9 +178,8 @@ def innovation(
             y[k, 2] += c * b2
 
 
-@gufunc("(p,p),(m,d),(n,d),(m,w)->(p,p)")
-def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) -> None:
-    """``(P^-1 + information)^-1``: the covariance after an epoch, which needs no ranges."""
+@helper
+def _take_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) -> None:
     work = np.empty((2, _STATES, _STATES))
     L, information = work[0], work[1]
     _cholesky(P, L)
@@ -185,6 +187,12 @@ def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any)
     _add_information(information, anchors, tags, weights)
     _cholesky(information, L)
     _invert_factored(L, new_P)
+
+
+@gufunc("(p,p),(m,d),(n,d),(m,w)->(p,p)")
+def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) -> None:
+    """``(P^-1 + information)^-1``: the covariance after an epoch, which needs no ranges."""
+    _take_covariance(P, anchors, tags, weights, new_P)
 
 
 @gufunc("(p,p)->(p,p)")
@@ -195,11 +203,10 @@ def inverse(matrix: Any, inverted: Any) -> None:
     _invert_factored(L, inverted)
 
 
-@gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p)")
-def update_mean(
+@helper
+def _take_mean(
     mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any
 ) -> None:
-    """``x + P y``: the mean after an epoch, with the covariance P after it."""
     y = np.empty((4, 3))
     innovation(mean, ranges, anchors, tags, weights, tags, y)
     for i in range(_STATES):
@@ -208,6 +215,68 @@ def update_mean(
             for j in range(3):
                 total += P[i, 3 * k + j] * y[k, j]
         new_mean[i] = total
+
+
+@gufunc("(p),(p,p),(m,n),(m,d),(n,d),(m,w)->(p)")
+def update_mean(
+    mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any
+) -> None:
+    """``x + P y``: the mean after an epoch, with the covariance P after it."""
+    _take_mean(mean, P, ranges, anchors, tags, weights, new_mean)
+
+
+@helper
+def _weigh(ranges: Any, law: Any, weights: Any) -> bool:
+    """Inverse variances of the squared ranges of a law; whether all ranges are such.
+
+    `weights` (M, 1) where a reference tag tells them, else (M, N).
+    """
+    sound, first = True, max(int(law[3]), 0)
+    for m in range(ranges.shape[0]):
+        for n in range(ranges.shape[1]):
+            sound = sound and 0.0 < ranges[m, n] < HUGE
+        for n in range(weights.shape[1]):
+            square = ranges[m, first + n] ** 2
+            if law[0] == 1:
+                weights[m, n] = 1 / (law[1] * law[1] * square)
+            else:
+                variance = law[1] * law[1] + law[2] * law[2] * square
+                weights[m, n] = 1 / (4 * square * variance)
+            sound = sound and 0.0 < weights[m, n] < math.inf
+    return sound
+
+
+@helper
+def _says_nothing(P: Any, anchors: Any, vague_entry: float) -> bool:
+    rotation = place = extent = 0.0
+    for i in range(9):
+        rotation = max(rotation, P[i, i])
+    for i in range(3):
+        place = max(place, P[9 + i, 9 + i])
+        low = high = anchors[0, i]
+        for m in range(anchors.shape[0]):
+            low, high = min(low, anchors[m, i]), max(high, anchors[m, i])
+        extent = max(extent, high - low)
+    return rotation > vague_entry or place > extent * extent
+
+
+@gufunc("(p),(p,p),(m,n),(l),(m,d),(n,d),()->(p),(p,p)")
+def update(
+    mean: Any, P: Any, ranges: Any, law: Any, anchors: Any, tags: Any, vague_entry: float,
+    new_mean: Any, new_P: Any,
+) -> None:  # fmt: skip
+    """Mean and covariance after an epoch without lost links, by the numbers of its law.
+
+    NaN where a range is not positive or the prior says nothing.
+    """
+    weights = np.empty((ranges.shape[0], ranges.shape[1] if law[3] < 0 else 1))
+    if _weigh(ranges, law, weights) and not _says_nothing(P, anchors, vague_entry):
+        _take_covariance(P, anchors, tags, weights, new_P)
+        _take_mean(mean, new_P, ranges, anchors, tags, weights, new_mean)
+        return
+    fill(math.nan, new_P)
+    for i in range(_STATES):
+        new_mean[i] = math.nan
 
 
 @gufunc("(m,n),(m,d),(n,d),(m,w),(p)->(p),(p,p)")
@@ -235,13 +304,4 @@ def compress(ranges: Any, anchors: Any, tags: Any, weights: Any, like: Any, z: A
 @gufunc("(p,p),(m,d),()->()", "fffb")
 def is_vague(P: Any, anchors: Any, vague_entry: float, vague: Any) -> None:
     """Whether a covariance says nothing: of an entry of Q, or beyond the anchors' extent."""
-    rotation = place = extent = 0.0
-    for i in range(9):
-        rotation = max(rotation, P[i, i])
-    for i in range(3):
-        place = max(place, P[9 + i, 9 + i])
-        low = high = anchors[0, i]
-        for m in range(anchors.shape[0]):
-            low, high = min(low, anchors[m, i]), max(high, anchors[m, i])
-        extent = max(extent, high - low)
-    vague[0] = rotation > vague_entry or place > extent * extent
+    vague[0] = _says_nothing(P, anchors, vague_entry)
