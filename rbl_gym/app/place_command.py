@@ -6,6 +6,13 @@ import argparse
 import json
 from typing import Any
 
+from rbl_gym.app.plan_options import (
+    add_plan_options,
+    add_report_options,
+    check_report_options,
+    read_problem,
+    write_report,
+)
 from rbl_gym.app.terminal import (
     add_html,
     add_json,
@@ -29,7 +36,10 @@ def add_place(commands: Any) -> None:
         "layouts, check with real filters. See docs/placement.md for the file format.",
     )
     place.add_argument(
-        "--scene", required=True, metavar="NAME|F", help="a named scene, or a file .toml or .json"
+        "--scene",
+        required=True,
+        metavar="NAME|F",
+        help="a named scene, a building file .toml or .json, or a plan .dxf, .geojson, .png, .jpg",
     )
     place.add_argument(
         "--anchors",
@@ -74,9 +84,11 @@ def add_place(commands: Any) -> None:
         help="work region, metres; write --region=-1,... for a minus",
     )
     add_trials(place, 500, "of the check, ")
-    place.add_argument("--plot", metavar="F", help="picture: maps, side view, layouts")
-    add_html(place, "3-D page with the tables")
+    place.add_argument("--plot", metavar="F", help="picture: maps over the plan, layouts")
+    add_html(place, "page with the plan, its maps, the tables and the scene in 3-D")
+    add_report_options(place)
     add_json(place)
+    add_plan_options(place)
     place.add_argument(
         "--schema", action=_Schema, nargs=0, help="print the JSON schema of the file, and stop"
     )
@@ -86,6 +98,7 @@ def add_place(commands: Any) -> None:
 def _place(options: argparse.Namespace) -> int:
     require("cmaes", "placement")
     check_html(options)
+    check_report_options(options)
     from rbl_gym.placement import scene_files
     from rbl_gym.studies.placing import answer
 
@@ -93,9 +106,7 @@ def _place(options: argparse.Namespace) -> int:
     numbers = options.anchors
     if numbers is None and layout is not None:
         numbers = range(len(layout.positions), len(layout.positions) + 1)
-    problem = scene_files.problem(
-        options.scene, numbers[-1] if numbers else None, options.region, options.racks, options.seed
-    )
+    problem = read_problem(options, numbers[-1] if numbers else None)
     if numbers is None:
         least = max(scene_files.MIN_ANCHORS, len(problem.fixed))
         most = scene_files.MAX_ANCHORS if options.fewest else problem.n_anchors
@@ -122,11 +133,13 @@ def _place(options: argparse.Namespace) -> int:
         from rbl_gym.app import place_html
 
         place_html.write_place(placed, options.html)
+    write_report(placed, options)
     if write_json(placed.result, options.json):
         from rbl_gym.app import place_report
 
         place_report.print_place(placed.result)
-        print_files(picture=options.plot, page=options.html)
+        layout = ", ".join(options.export)
+        print_files(picture=options.plot, page=options.html, report=options.report, layout=layout)
     return 0
 
 

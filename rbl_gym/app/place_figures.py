@@ -1,4 +1,4 @@
-"""Pictures of a placement: plan and side view with maps of accuracy, layouts side by side."""
+"""The picture of a placement: maps of accuracy over the plan, the answer, the usual layouts."""
 
 from __future__ import annotations
 
@@ -7,228 +7,173 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
+from rbl_gym.app import place_answer, place_draw
+from rbl_gym.app import place_shapes as shapes
 from rbl_gym.checks import FloatArray
-from rbl_gym.geometry.regions import Shell
-from rbl_gym.studies.placing.accuracy import Map, accuracy_map
+from rbl_gym.placement.scene_files import Problem
+from rbl_gym.studies.placing.accuracy import Map
 from rbl_gym.studies.placing.answer import Placed
 
-ANCHOR, REGION, OBSTACLE, DESIGNED, USUAL = "#d1495b", "#222222", "#6c757d", "#1b7f5c", "#9db4c0"
-# Anchors further out than so many half sizes of the region leave its map too small to read.
-_FAR = 4.0
-# A map that hardly varies must not look as if it did: its colours span at least this ratio.
-_LEAST_CONTRAST = 1.15
-_NAMES = "xyz"
-Plane = tuple[int, int]
-_PLAN: Plane = (0, 1)
-_SIDE: Plane = (0, 2)
+DESIGNED, USUAL, OTHER = "#0072b2", "#9db4c0", "#d55e00"
+# Width of a map in the picture, its largest height, height of a chart alone: inches.
+_WIDE, _TALL, _CHART = 5.7, 6.0, 2.4
+
+styled = matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10, "axes.labelsize": 8})
 
 
-@matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10})
+@styled
 def place_figure(placed: Placed) -> Figure:
-    """Maps of position and orientation, a side view, the usual layouts or the number's curve."""
+    """One sheet: where requirements are met, maps of what is asked, zones in words, a chart."""
+    problem, anchors, result = placed.problem, placed.design.anchors, placed.result
+    maps = shapes.maps_of(problem, anchors)
+    panels = map_panels(problem)
+    tall = map_height(problem, anchors)
+    heights = [tall] * ((len(panels) + 1) // 2)
+    # A chart of its own row is lower than a map.
+    if len(panels) % 2 == 0:
+        heights.append(_CHART)
+    size = (14, sum(heights) + 0.75 * len(heights) + 0.6)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.add_gridspec(len(heights), 2, height_ratios=heights)
+    groups = []
+    for index, quantity in enumerate(panels):
+        axes = figure.add_subplot(grid[index // 2, index % 2])
+        groups.append((axes, map_panel(axes, placed, maps, quantity, index == 0)))
+    axes = figure.add_subplot(grid[-1, len(panels) % 2 :])
+    draw_chart(axes, result)
+    sign = place_answer.SIGNS[place_answer.verdict(result)].strip("-")
+    title = f"{result['scene']}   {sign}   {place_answer.headline(result)}"
+    figure.suptitle(title, fontsize=13)
+    figure.supxlabel(legend_text(problem), fontsize=8, color="0.35")
+    place_draw.settle_labels(figure, groups)
+    return figure
+
+
+@styled
+def building_figure(problem: Problem) -> Figure:
+    """The building alone, with a grid of metres: to see whether it was read as it is."""
+    nothing = np.empty((0, 3))
+    figure = Figure(figsize=(11, 0.9 * map_height(problem, nothing, 9.0) + 1.2))
+    figure.set_layout_engine("constrained")
+    axes = figure.add_subplot()
+    for zone in problem.zones:
+        axes.fill(*zone.polygon.T, color="#dcecf7", zorder=0)
+    place_draw.draw_building(axes, problem, nothing)
+    edges = shapes.limits(problem, nothing)
+    step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 1e9) if np.ptp(edges, axis=0).max() / s < 25)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(matplotlib.ticker.MultipleLocator(step))
+    axes.grid(color="0.6", lw=0.4, zorder=0.5)
+    axes.plot(*problem.fixed[:, :2].T, "s", ms=7, color=place_draw.KEPT, mec="white", zorder=7)
+    axes.set_title(f"{problem.name}: the building as it was read, a line every {step:g} m")
+    figure.supxlabel(legend_text(problem), fontsize=8, color="0.35")
+    return figure
+
+
+def map_panels(problem: Problem) -> list[shapes.Quantity]:
+    """What is shown: the requirement where there is one, and each quantity."""
+    first = [REQUIREMENT] if shapes.has_requirement(problem) else []
+    return first + shapes.quantities(problem)
+
+
+REQUIREMENT = shapes.Quantity("relative", "requirement", "", None)
+
+
+def map_height(problem: Problem, anchors: FloatArray, wide: float = _WIDE) -> float:
+    """Height of a map so wide, inches."""
+    width, height = np.ptp(shapes.limits(problem, anchors), axis=0)
+    return float(np.clip(wide * height / width, 2.8, _TALL))
+
+
+def map_panel(
+    axes: Any, placed: Placed, maps: list[Map], quantity: shapes.Quantity, heights: bool
+) -> list[Any]:
+    """One map with its title; returns the texts of the anchors."""
     problem, anchors = placed.problem, placed.design.anchors
-    low, high = problem.corners()
-    plan = accuracy_map(problem, anchors)
-    side = accuracy_map(problem, anchors, up=2) if high[2] > low[2] else None
-    far = _is_far(placed)
-    width, height = np.ptp(_limits(placed, _PLAN, far), axis=0)
-    tall = float(np.clip(6.0 * height / width, 2.6, 6.0))
-    shown = Figure(figsize=(14, tall + 4.6), layout="constrained")
-    grid = shown.add_gridspec(2, 2, height_ratios=[tall, 3.4])
-    for column, (values, label) in enumerate(
-        ((plan.position, "position, 1 sigma [m]"), (plan.rotation, "orientation, 1 sigma [deg]"))
-    ):
-        axes = shown.add_subplot(grid[0, column])
-        _draw_map(axes, plan, values, label)
-        _draw_world(axes, placed, _PLAN, far, heights=column == 0)
-        axes.set_aspect("equal", adjustable="box")
-        axes.set_title(f"{label.split(',')[0]} accuracy at z = {plan.at:.3g} m")
-    axes = shown.add_subplot(grid[1, 0])
-    _draw_world(axes, placed, _SIDE, far=False, heights=False)
-    if side is None or far:
-        axes.set_aspect("equal", adjustable="box")
-        axes.set_title("from the side")
-    else:
-        _draw_map(axes, side, side.position, "position, 1 sigma [m]")
-        axes.set_title(f"position accuracy from the side, at y = {side.at:.3g} m (z stretched)")
-    axes = shown.add_subplot(grid[1, 1])
-    if "against_number" in placed.result:
-        _draw_numbers(axes, placed.result["against_number"])
-    else:
-        _draw_layouts(axes, placed.result["layouts"])
-    shown.suptitle(_headline(placed.result), fontsize=12)
-    shown.supxlabel(
-        "triangles: anchors     dashed: work region     grey line: edge of where anchors may "
-        "stand     grey: obstacles (dotted: off the map's plane)",
-        fontsize=8,
-        color="0.35",
-    )
-    return shown
-
-
-def _headline(result: dict[str, Any]) -> str:
-    predicted = result["predicted"]
-    position, rotation = predicted["position_m"], predicted["rotation_deg"]
-    return (
-        f"{result['scene']}, {result['n_anchors']} anchors:  position {position['median']:.3g} m "
-        f"(p95 {position['p95']:.3g}),  orientation {rotation['median']:.2g} deg "
-        f"(p95 {rotation['p95']:.2g}),  from one epoch of ranges"
-    )
-
-
-def _is_far(placed: Placed) -> bool:
-    low, high = placed.problem.corners()
-    reach = np.abs(placed.design.anchors - 0.5 * (low + high))[:, :2].max()
-    return bool(reach > _FAR * 0.5 * (high - low)[:2].max())
-
-
-def _limits(placed: Placed, axes: Plane, far: bool) -> FloatArray:
-    """Lower and upper corner (2, 2) of what is shown: the region alone, or all that there is."""
-    low, high = placed.problem.corners()
-    corners = [low, high]
-    if not far:
-        corners += [*placed.design.anchors]
-        region = placed.problem.mounts
-        if not isinstance(region, Shell):
-            corners += [*region.bounds()]
-        corners += [
-            box[:3] + sign * box[3:] for box in placed.problem.obstacles.boxes for sign in (-1, 1)
-        ]
-    points = np.array(corners)[:, list(axes)]
-    extent = np.ptp(points, axis=0)
-    margin = (0.22 if far else 0.06) * np.maximum(extent, 0.1 * extent.max())
-    return np.array([points.min(axis=0) - margin, points.max(axis=0) + margin])
-
-
-def _draw_map(axes: Any, plane: Map, values: FloatArray, label: str) -> None:
-    low, top = float(np.nanmin(values)), float(np.nanquantile(values, 0.99))
-    mesh = axes.pcolormesh(
-        plane.columns,
-        plane.rows,
-        values,
-        cmap="viridis_r",
-        shading="nearest",
-        zorder=0,
-        vmin=low,
-        vmax=max(top, _LEAST_CONTRAST * low),
-    )
-    # Inside the axes' own box: as high as the map, whatever its aspect.
-    bar = axes.figure.colorbar(
-        mesh,
-        cax=axes.inset_axes((1.02, 0.0, 0.025, 1.0)),
-        label=label,
-        extend="max" if np.nanmax(values) > 1.001 * mesh.norm.vmax else "neither",
-    )
-    bar.outline.set_visible(False)
-
-
-def _draw_world(axes: Any, placed: Placed, plane: Plane, far: bool, heights: bool) -> None:
-    """Legal space, region, obstacles and anchors in two of the three axes."""
-    problem = placed.problem
-    low, high = problem.corners()
-    pair = list(plane)
-    third = 3 - sum(pair)
-    region = problem.mounts
-    limits = _limits(placed, plane, far)
-    if not far and not isinstance(region, Shell):
-        _draw_box(axes, *(corner[pair] for corner in region.bounds()), fill=False, ec="0.45", lw=2)
-    at = 0.5 * (low + high)[third]
-    for box in problem.obstacles.boxes:
-        # Cut by the map's plane, or only an outline before or behind it.
-        cut = abs(box[third] - at) <= box[3 + third]
-        style = {"fc": OBSTACLE, "alpha": 0.9} if cut else {"fill": False, "ls": ":"}
-        _draw_box(
-            axes, (box[:3] - box[3:])[pair], (box[:3] + box[3:])[pair], ec="0.25", lw=0.9, **style
-        )
-    _draw_box(axes, low[pair], high[pair], fill=False, ec=REGION, lw=1.2, ls=(0, (4, 2)))
-    centre = 0.5 * (low + high)
-    shown: list[tuple[FloatArray, list[str]]] = []
-    for index, anchor in enumerate(placed.design.anchors):
-        place, outside = _shown_place(anchor[pair], limits, centre[pair])
-        text = f"{index + 1}"
-        if outside:
-            text += f" ({np.linalg.norm(anchor - centre):.3g} m away)"
-        elif heights:
-            text += f"  z {anchor[2]:.3g}"
-        axes.plot(
-            *place, marker="^", ms=10, color=ANCHOR, mec="white", mew=1.0, zorder=5, clip_on=False
-        )
-        close = (
-            np.abs((place - other) / np.ptp(limits, axis=0)).max() < 0.05 for other, _ in shown
-        )
-        group = next((k for k, is_close in enumerate(close) if is_close), None)
-        if group is None:
-            shown.append((place, [text]))
-        else:
-            shown[group][1].append(text)
-    for place, texts in shown:
-        inward = place[0] > limits[0, 0] + 0.7 * np.ptp(limits[:, 0])
-        axes.annotate(
-            ", ".join(texts),
-            place,
-            xytext=(-9 if inward else 9, 3),
-            textcoords="offset points",
+    shown = shapes.layers(problem, maps, quantity.field)
+    if quantity.field == "relative":
+        place_draw.draw_verdict(axes, shown)
+        title = "where the requirements are met"
+        axes.legend(
+            handles=place_draw.verdict_handles(shown),
+            loc="lower left",
+            bbox_to_anchor=(0.0, 1.0),
+            ncols=3,
+            frameon=False,
             fontsize=8,
-            ha="right" if inward else "left",
-            zorder=6,
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.8},
+            borderaxespad=0.1,
         )
-    axes.set_xlim(*limits[:, 0])
-    axes.set_ylim(*limits[:, 1])
-    axes.set_xlabel(f"{_NAMES[plane[0]]} [m]")
-    axes.set_ylabel(f"{_NAMES[plane[1]]} [m]")
-    axes.spines[["top", "right", "left", "bottom"]].set_visible(False)
+        axes.set_title(title, pad=22)
+    else:
+        place_draw.draw_map(axes, shown, quantity)
+        levels = sorted({f"{one.at:.3g}" for one in maps}, key=float)
+        at = levels[0] if len(levels) == 1 else f"{levels[0]} to {levels[-1]}"
+        limited = any(
+            (layer.values > (getattr(layer.zone, str(quantity.limit), None) or np.inf)).any()
+            for layer in shown
+        )
+        title = f"error of {quantity.name} at z = {at} m"
+        axes.set_title(title + (", hatched: beyond the requirement" if limited else ""))
+    place_draw.draw_building(axes, problem, anchors, names=heights)
+    return place_draw.draw_anchors(axes, problem, anchors, anchor_names(placed), heights)
 
 
-def _shown_place(
-    place: FloatArray, limits: FloatArray, centre: FloatArray
-) -> tuple[FloatArray, bool]:
-    """Where an anchor is drawn: itself, or on the way to it at the edge of what is shown."""
-    if (place >= limits[0]).all() and (place <= limits[1]).all():
-        return place, False
-    away = place - centre
-    edge = 0.93 * np.where(away > 0, limits[1] - centre, centre - limits[0])
-    share = (edge / np.maximum(np.abs(away), 1e-12)).min()
-    return centre + share * away, True
+def anchor_names(placed: Placed) -> list[str]:
+    """What the anchors are called."""
+    return [str(row["name"]) for row in placed.result["anchors"]]
 
 
-def _draw_box(axes: Any, low: FloatArray, high: FloatArray, **style: Any) -> None:
-    axes.add_patch(Rectangle(tuple(low), *(high - low), zorder=3, **style))
+def legend_text(problem: Problem) -> str:
+    """What the signs of a plan are."""
+    parts = ["triangles: anchors, by number"]
+    if len(problem.fixed):
+        parts.append("squares: anchors that stay")
+    parts += ["dashed: zones", "violet: where anchors may stand"]
+    if problem.obstacles:
+        parts.append("grey: obstacles, the darker the less of a link they leave")
+    return "     ".join(parts)
+
+
+def draw_chart(axes: Any, result: dict[str, Any]) -> None:
+    """Accuracy against the number of anchors, or the usual layouts."""
+    if "against_number" in result:
+        _draw_numbers(axes, result["against_number"])
+    else:
+        _draw_layouts(axes, result["layouts"])
 
 
 def _draw_layouts(axes: Any, rows: dict[str, dict[str, Any]]) -> None:
-    """Typical and worst position error of every layout, the best on top."""
+    """b of every layout, the best on top."""
     names = list(rows)[::-1]
+    asked = any(row.get("verdict", "no requirement") != "no requirement" for row in rows.values())
+    scores = [rows[name]["score_m"] for name in names]
     places = np.arange(len(names))
-    for key, alpha, label in (
-        ("worst", 0.35, "worst"),
-        ("p95", 0.65, "p95"),
-        ("median", 1.0, "median"),
-    ):
-        values = [rows[name][f"position_{key}_m"] for name in names]
-        colours = [DESIGNED if name == "designed" else USUAL for name in names]
-        axes.barh(places, values, color=colours, alpha=alpha, height=0.72, label=label)
-    # A layout that is bad somewhere must not hide how the good ones differ.
-    limit = 3.2 * rows["designed"]["position_worst_m"]
-    worst = max(row["position_worst_m"] for row in rows.values())
-    axes.set_xlim(0, min(limit, 1.05 * worst))
-    for place, name in zip(places, names, strict=True):
-        row = rows[name]
-        axes.text(
-            0.985,
-            place,
-            f"b {row['score_m']:.3g} m  x{row['ratio']:.2f}",
+    own = "designed" if "designed" in rows else "given"
+    colours = [DESIGNED if name == own else USUAL for name in names]
+    axes.barh(places, scores, color=colours, height=0.7)
+    # A layout that is bad must not hide how the good ones differ.
+    least = rows[own]["score_m"] if own in rows else min(scores)
+    edge = min(1.12 * max(scores), 4.0 * least)
+    axes.set_xlim(0, edge)
+    for place, name, score in zip(places, names, scores, strict=True):
+        text = f"{score:.3g} m  (x {rows[name]['ratio']:.2f})"
+        if asked:
+            text += f"  {place_answer.SIGNS[rows[name]['verdict']]}"
+        inside = score > 0.75 * edge
+        axes.annotate(
+            text + (" >" if score > edge else ""),
+            (min(score, edge), place),
+            xytext=(-5 if inside else 5, 0),
+            textcoords="offset points",
+            ha="right" if inside else "left",
             va="center",
-            ha="right",
             fontsize=8,
-            transform=axes.get_yaxis_transform(),
-            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85},
         )
     axes.set_yticks(places, names)
-    axes.set_xlabel("position, 1 sigma [m]: median, p95, worst place from dark to light")
-    axes.set_title("the usual layouts (b: root mean square tag error)")
+    axes.set_xlabel("b, root mean square error of the tags over all zones [m]")
+    signs = ", and whether all zones get what they ask for" if asked else ""
+    axes.set_title(f"this layout and the usual ones{signs}")
     axes.spines[["top", "right"]].set_visible(False)
 
 
@@ -238,21 +183,16 @@ def _draw_numbers(axes: Any, rows: list[dict[str, float]]) -> None:
     other = axes.twinx()
     for ax, key, unit, colour in (
         (axes, "position", "m", DESIGNED),
-        (other, "rotation", "deg", ANCHOR),
+        (other, "rotation", "deg", OTHER),
     ):
         for what, style in (("median", "o-"), ("p95", "s--"), ("worst", "^:")):
+            if f"{key}_{what}_{unit}" not in rows[0]:
+                continue
             values = [row[f"{key}_{what}_{unit}"] for row in rows]
-            ax.plot(
-                numbers,
-                values,
-                style,
-                color=colour,
-                ms=4.5,
-                lw=1.4,
-                label=what if ax is axes else None,
-            )
+            label = what if ax is axes else None
+            ax.plot(numbers, values, style, color=colour, ms=4.5, lw=1.4, label=label)
         name = "orientation" if key == "rotation" else key
-        ax.set_ylabel(f"{name}, 1 sigma [{unit}]", color=colour)
+        ax.set_ylabel(f"{name}, one sigma [{unit}]", color=colour)
         ax.set_ylim(bottom=0)
         ax.spines[["top"]].set_visible(False)
     axes.set_xticks(numbers)

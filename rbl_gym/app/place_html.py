@@ -1,154 +1,109 @@
-"""A placement as one HTML file: the scene in 3-D with its map of accuracy, and the tables.
+"""A placement as one HTML file: the answer, the plan with its maps, the tables, the scene in 3-D.
 
 The file carries plotly's script (extra ``viz``) and needs no network.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import plotly.graph_objects as go
 
-from rbl_gym.app import page, solids
+from rbl_gym.app import page, place_answer, solids
+from rbl_gym.app import place_shapes as shapes
+from rbl_gym.app.place_assets import SCRIPT, STYLE
+from rbl_gym.app.place_figures import anchor_names
+from rbl_gym.app.place_pdf import mounting_rows
 from rbl_gym.app.place_report import notes, tables
+from rbl_gym.app.place_svg import answer_part, plan_part
+from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.regions import Shell
-from rbl_gym.studies.placing.accuracy import Map, level_maps
+from rbl_gym.rendering.drawing import box_edges
 from rbl_gym.studies.placing.answer import Placed
 
 
 def write_place(placed: Placed, path: str) -> None:
     """Write the page, making its folder."""
     result = placed.result
-    title = f"{result['scene']}: {result['n_anchors']} anchors"
+    headings, *rows = mounting_rows(placed)
     parts = [
-        page.plot(place_scene(placed), "scene"),
-        *(page.table(*rows) for rows in tables(result)),
+        f"<style>{STYLE}</style>",
+        f"<p>{place_answer.headline(result)}</p>",
+        answer_part(result),
+        plan_part(placed),
+        page.table("mounting list", headings, rows),
+        *(page.table(*table) for table in tables(result)),
+        "<h2>the scene in 3-D</h2>",
+        f'<div class="scene">{page.plot(place_scene(placed), "scene")}</div>',
         *(page.note(text) for text in notes(result)),
+        f"<script>{SCRIPT}</script>",
     ]
-    page.write(page.document(title, parts), path)
+    page.write(page.document(f"Anchors for {result['scene']}", parts), path)
 
 
 def place_scene(placed: Placed) -> go.Figure:
-    """Anchors, obstacles, region and map; a slider for its height, buttons for what it shows."""
+    """Anchors, obstacles, zones, and a map over the middle of each zone."""
     problem, anchors = placed.problem, placed.design.anchors
-    maps = level_maps(problem, anchors)
-    middle = len(maps) // 2
-    low, high = problem.corners()
     shown = go.Figure()
-    for key, label, on in (
-        ("position", "position, 1 sigma (m)", True),
-        ("rotation", "orientation, 1 sigma (deg)", False),
-    ):
-        values = np.concatenate([getattr(level, key).ravel() for level in maps])
+    quantity = shapes.quantities(problem)[0]
+    maps = shapes.maps_of(problem, anchors)
+    layers = shapes.layers(problem, maps, quantity.field)
+    low, high = shapes.colour_range(layers, None)
+    for plane, layer in zip(maps, layers, strict=True):
         shown.add_surface(
-            x=maps[middle].columns,
-            y=maps[middle].rows,
-            z=_height(maps[middle]),
-            surfacecolor=solids.numbers(getattr(maps[middle], key)),
-            name=key,
-            visible=on,
+            x=plane.columns,
+            y=plane.rows,
+            z=np.full(layer.values.shape, plane.at).tolist(),
+            surfacecolor=solids.numbers(np.where(layer.free, layer.values, np.nan)),
             colorscale="Viridis",
             reversescale=True,
             opacity=0.9,
+            cmin=low,
+            cmax=high,
+            showscale=plane is maps[0],
             showlegend=False,
-            cmin=float(np.nanmin(values)),
-            cmax=float(np.nanquantile(values, 0.99)),
-            colorbar={"title": {"text": label, "side": "right"}, "len": 0.7},
+            colorbar={
+                "title": {"text": f"{quantity.name} ({quantity.unit})", "side": "top"},
+                "orientation": "h",
+                "len": 0.7,
+                "thickness": 12,
+                "y": -0.02,
+            },
             hovertemplate="x %{x:.2f}, y %{y:.2f}, z %{z:.2f} m<br>%{surfacecolor:.4g}"
-            f"<extra>{key}</extra>",
+            f"<extra>{layer.zone.name}</extra>",
         )
-    style = {"color": "#222222", "width": 3, "dash": "dash"}
-    shown.add_trace(solids.box(low, high, name="work region", line=style))
-    region = problem.mounts
-    if not isinstance(region, Shell):
-        style = {"color": "#8a8f94", "width": 3}
-        shown.add_trace(solids.box(*region.bounds(), name="where anchors may stand", line=style))
-    for index, box in enumerate(problem.obstacles.boxes):
+    for index, zone in enumerate(problem.zones):
+        style = {"color": "#222222", "width": 3, "dash": "dash"}
+        edges = solids.prism_edges(zone.polygon, zone.low_m, zone.high_m)
         shown.add_trace(
-            solids.solid(
-                box[:3] - box[3:],
-                box[:3] + box[3:],
-                name="obstacles",
-                legendgroup="obstacles",
-                showlegend=index == 0,
-            )
+            solids.lines(edges, name="zones", legendgroup="zones", showlegend=not index, line=style)
+        )
+    if not isinstance(problem.mounts, Mounts | Shell):
+        edges = box_edges(*problem.mounts.bounds())
+        style = {"color": "#8a8f94", "width": 3}
+        shown.add_trace(solids.lines(edges, name="where anchors may stand", line=style))
+    blocks = shapes.solids(problem)
+    if blocks:
+        shown.add_trace(
+            solids.prisms([(s.corners, s.low_m, s.high_m) for s in blocks], name="obstacles")
         )
     shown.add_scatter3d(
-        x=anchors[:, 0],
-        y=anchors[:, 1],
-        z=anchors[:, 2],
+        **solids.xyz(anchors),
         mode="markers+text",
         name="anchors",
-        text=[str(index + 1) for index in range(len(anchors))],
+        text=anchor_names(placed),
         textposition="top center",
-        marker={"size": 6, "color": "#d1495b", "symbol": "diamond"},
-        customdata=[[anchor["sees"]] for anchor in placed.result["anchors"]],
-        hovertemplate="anchor %{text}<br>x %{x:.3f}, y %{y:.3f}, z %{z:.3f} m<br>"
-        "sees %{customdata[0]:.0%} of the region<extra></extra>",
+        marker={"size": 5, "color": "#111111", "symbol": "diamond"},
+        hovertemplate="anchor %{text}<br>x %{x:.3f}, y %{y:.3f}, z %{z:.3f} m<extra></extra>",
     )
-    others = sum(1 for _ in shown.select_traces()) - 2
     shown.update_layout(
-        height=720,
-        margin={"l": 0, "r": 0, "t": 40, "b": 30},
+        margin={"l": 0, "r": 0, "t": 10, "b": 0},
         scene={
-            "domain": {"y": [0.1, 1.0]},
             "aspectmode": "data",
             "xaxis_title": "x (m)",
             "yaxis_title": "y (m)",
             "zaxis_title": "z (m)",
-            "camera": {"eye": {"x": -0.9, "y": -1.8, "z": 1.3}},
+            "camera": {"eye": {"x": -1.0, "y": -1.9, "z": 1.6}},
         },
-        legend={"orientation": "h", "x": 0.25, "y": 1.0},
-        updatemenus=[_buttons(others)],
-        sliders=[_slider(maps, middle)] if len(maps) > 1 else [],
+        legend={"orientation": "h", "x": 0.0, "y": 1.0},
     )
     return shown
-
-
-def _buttons(others: int) -> dict[str, Any]:
-    rest = [True] * others
-    return {
-        "type": "buttons",
-        "direction": "right",
-        "x": 0.0,
-        "y": 1.02,
-        "xanchor": "left",
-        "yanchor": "top",
-        "buttons": [
-            {"label": label, "method": "restyle", "args": [{"visible": [*which, *rest]}]}
-            for label, which in (("position", (True, False)), ("orientation", (False, True)))
-        ],
-    }
-
-
-def _slider(maps: list[Map], active: int) -> dict[str, Any]:
-    steps = [
-        {
-            "label": f"{level.at:.3g}",
-            "method": "restyle",
-            "args": [
-                {
-                    "z": [_height(level)] * 2,
-                    "surfacecolor": [
-                        solids.numbers(level.position),
-                        solids.numbers(level.rotation),
-                    ],
-                },
-                [0, 1],
-            ],
-        }
-        for level in maps
-    ]
-    return {
-        "active": active,
-        "steps": steps,
-        "len": 0.6,
-        "x": 0.2,
-        "y": 0.1,
-        "currentvalue": {"prefix": "height of the map z = ", "suffix": " m"},
-    }
-
-
-def _height(level: Map) -> list[list[float]]:
-    return np.full(level.position.shape, level.at).tolist()

@@ -48,10 +48,10 @@ def _plan(options: argparse.Namespace) -> int:
         plan_report.write_building(tables, path, said, options.out)
     result = {"plan": path, "layers": layers, "said": said, "tables": toml_text.plain(tables)}
     if options.plot:
-        from rbl_gym.app import figures, place_plan
+        from rbl_gym.app import figures, place_figures
 
         problem = scene_files.of_mapping(toml_text.plain(tables), name=Path(path).stem)
-        figures.save_figure(place_plan.building_figure(problem), options.plot)
+        figures.save_figure(place_figures.building_figure(problem), options.plot)
     if write_json(result, options.json):
         plan_report.print_plan(layers, said)
         print_files(building=options.out, picture=options.plot)

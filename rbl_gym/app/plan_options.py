@@ -1,10 +1,14 @@
-"""Options that read a floor plan, of `plan` and of `place`: layers, units, scale, height."""
+"""Options about floor plans: how they are read, of `plan` and `place`; what is written of them."""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rbl_gym.studies.extras import require
 
 if TYPE_CHECKING:
     from rbl_gym.placement.plans.drawing import Drawing
@@ -94,6 +98,77 @@ def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = No
     if options.picture:
         made.tables["plan"] |= picture(options)
     return Plan(made.tables, [*found.said, *made.said], made.used, found)
+
+
+def read_problem(options: argparse.Namespace, n_anchors: int | None) -> Any:
+    """The `Problem` of --scene: a named scene, a building file, or a plan with its layers."""
+    from rbl_gym.placement import building, scene_files
+    from rbl_gym.placement.plans import toml_text
+
+    path = options.scene
+    if not is_plan(path):
+        told = [kind for kind in _HELP if getattr(options, kind)]
+        if told:
+            raise ValueError(f"--{told[0]} is of a drawing, .dxf or .geojson, got {path}")
+        problem = scene_files.problem(path, n_anchors, options.region, options.racks, options.seed)
+        if options.picture:
+            plan = problem.plan or building.Plan()
+            problem = dataclasses.replace(problem, plan=plan._replace(**picture(options)))
+        return problem
+    if options.racks:
+        raise ValueError(f"racks must be 0 with a plan, got {options.racks}")
+    plan = read_plan(path, options, n_anchors)
+    for line in plan.said:
+        print(f"{path}: {line}", file=sys.stderr)
+    tables = toml_text.plain(plan.tables)
+    try:
+        return scene_files.of_mapping(tables, n_anchors, options.region, Path(path).stem)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def add_report_options(parser: argparse.ArgumentParser) -> None:
+    """The options --report and --export."""
+    parser.add_argument(
+        "--report",
+        metavar="F",
+        help="PDF: question and answer, plan, maps, mounting list, tables",
+    )
+    parser.add_argument(
+        "--export",
+        action="append",
+        default=[],
+        metavar="F",
+        help="the layout: .csv (mounting list), .geojson, or .dxf (in a copy of the drawing); "
+        "may be given several times",
+    )
+
+
+def check_report_options(options: argparse.Namespace) -> None:
+    """A ValueError before the work where a file cannot be written in its format."""
+    from rbl_gym.studies.placing.layout_export import SUFFIXES
+
+    for path in options.export:
+        if not path.lower().endswith(SUFFIXES):
+            raise ValueError(f"--export must end in {', '.join(SUFFIXES)}, got {path}")
+        if path.lower().endswith(".dxf"):
+            require("ezdxf", "placement")
+    if options.report and not options.report.lower().endswith(".pdf"):
+        raise ValueError(f"--report must end in .pdf, got {options.report}")
+
+
+def write_report(placed: Any, options: argparse.Namespace) -> None:
+    """Write what --report and --export ask for."""
+    if options.report:
+        from rbl_gym.app import place_pdf
+
+        place_pdf.write_pdf(placed, options.report)
+    if options.export:
+        from rbl_gym.studies.placing import layout_export
+
+        names = [str(row["name"]) for row in placed.result["anchors"]]
+        for path in options.export:
+            layout_export.write_layout(placed.problem, placed.design.anchors, path, names)
 
 
 def picture(options: argparse.Namespace) -> dict[str, Any]:

@@ -1,21 +1,16 @@
-"""Boxes, bodies and ellipsoids in plotly's 3-D scenes."""
+"""Prisms, bodies and ellipsoids in plotly's 3-D scenes."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.rendering.drawing import RADIUS_95, box_corners, box_edges, gapped
+from rbl_gym.rendering.drawing import RADIUS_95, gapped
 
-# The twelve triangles of a box, by corner.
-_TRIANGLES = (
-    (0, 0, 4, 4, 0, 0, 2, 2, 0, 0, 1, 1),
-    (1, 3, 5, 7, 1, 5, 3, 7, 2, 6, 3, 7),
-    (3, 2, 7, 6, 5, 4, 7, 6, 6, 4, 7, 5),
-)
 # Latitudes and longitudes of an ellipsoid's net.
 _LATITUDES, _LONGITUDES = 9, 16
 
@@ -32,18 +27,38 @@ def xyz(points: FloatArray) -> dict[str, list[float | None]]:
     return dict(zip("xyz", numbers(points.T), strict=True))
 
 
-def box(low: Any, high: Any, **style: Any) -> go.Scatter3d:
-    """The edges of a box as one line."""
-    return go.Scatter3d(
-        **xyz(gapped(box_edges(low, high))), mode="lines", hoverinfo="skip", **style
-    )
+def lines(segments: FloatArray, **style: Any) -> go.Scatter3d:
+    """Segments (S, 2, 3) as one line."""
+    return go.Scatter3d(**xyz(gapped(segments)), mode="lines", hoverinfo="skip", **style)
 
 
-def solid(low: Any, high: Any, **style: Any) -> go.Mesh3d:
-    """A box with faces."""
-    i, j, k = _TRIANGLES
+def prism_edges(corners: FloatArray, low: float, high: float) -> FloatArray:
+    """The edges (3 V, 2, 3) of a prism over corners (V, 2)."""
+    bottom, top = (np.insert(corners, 2, z, axis=1) for z in (low, high))
+    rings = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in (bottom, top)]
+    return np.concatenate([*rings, np.stack([bottom, top], axis=1)])
+
+
+def prisms(found: Sequence[tuple[FloatArray, float, float]], **style: Any) -> go.Mesh3d:
+    """Prisms, each of corners (V, 2) and two heights, as one mesh with faces."""
+    points, triangles, count = [], [], 0
+    for corners, low, high in found:
+        size = len(corners)
+        points += [np.insert(corners, 2, z, axis=1) for z in (low, high)]
+        here = np.arange(size)
+        there = (here + 1) % size
+        caps = ears(corners)
+        faces = [
+            caps,
+            caps + size,
+            np.stack([here, there, there + size], axis=1),
+            np.stack([here, there + size, here + size], axis=1),
+        ]
+        triangles.append(np.concatenate(faces) + count)
+        count += 2 * size
+    i, j, k = np.concatenate(triangles).T.tolist()
     return go.Mesh3d(
-        **xyz(box_corners(low, high)),
+        **xyz(np.concatenate(points)),
         i=i,
         j=j,
         k=k,
@@ -51,8 +66,35 @@ def solid(low: Any, high: Any, **style: Any) -> go.Mesh3d:
         opacity=0.55,
         flatshading=True,
         hoverinfo="skip",
+        showlegend=True,
         **style,
     )
+
+
+def ears(corners: FloatArray) -> np.ndarray:
+    """Triangles (V - 2, 3) of a simple polygon (V, 2), indices of its corners: by cutting ears."""
+
+    def turn(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+        u, v = b - a, c - a
+        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+    x, y = corners.T
+    area = x @ np.roll(y, -1) - y @ np.roll(x, -1)
+    left = list(range(len(corners)))[:: 1 if area >= 0 else -1]
+    found = []
+    while len(left) > 3:
+        for k in range(len(left)):
+            a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
+            others = corners[[n for n in left if n not in (a, b, c)]]
+            pairs = ((a, b), (b, c), (c, a))
+            sides = [turn(corners[p], corners[q], others) for p, q in pairs]
+            if turn(*corners[[a, b, c]]) > 0 and not (np.min(sides, axis=0) >= 0).any():
+                break
+        else:  # what is left has no area
+            break
+        found.append([a, b, c])
+        left.remove(b)
+    return np.array([*found, left[:3]])
 
 
 def ellipsoid(centre: FloatArray, covariance: FloatArray) -> dict[str, list[float | None]]:

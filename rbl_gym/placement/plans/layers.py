@@ -320,6 +320,13 @@ class _Maker:
                 }
             ]
 
+        taken: set[str] = set()
+        for zone in self.found["zones"]:
+            name, count = zone["name"], 2
+            while zone["name"] in taken:
+                zone["name"], count = f"{name} {count}", count + 1
+            taken.add(zone["name"])
+
     def _outline(self) -> list[list[float]]:
         """The rectangle around what is used."""
         low, high = self.drawing._replace(

@@ -1,0 +1,116 @@
+"""The question and the answer of a placement in words, for titles, the first page, the page."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+# Said by a sign and a word too: colours alone do not reach everyone.
+SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? UNDECIDED", "no requirement": "-"}
+_NAMES = {
+    "position_m": ("horizontal position", "m"),
+    "height_m": ("height", "m"),
+    "heading_deg": ("heading", "deg"),
+}
+
+
+class ZoneAnswer(NamedTuple):
+    """What a zone asks for and what it gets, in words."""
+
+    name: str
+    verdict: str
+    asks: str
+    reached: str
+    figures: str
+
+
+def verdict(result: dict[str, Any]) -> str:
+    """Of all zones: ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``."""
+    found = [zone["verdict"] for zone in result["zones"]]
+    for one in ("fail", "undecided", "pass"):
+        if one in found:
+            return one
+    return "no requirement"
+
+
+def headline(result: dict[str, Any]) -> str:
+    """One line: how many anchors, and whether they do."""
+    count = f"{result['n_anchors']} anchors"
+    zones = result["zones"]
+    asked = [zone for zone in zones if zone["verdict"] != "no requirement"]
+    overall = verdict(result)
+    if overall == "no requirement":
+        return f"{count}: {typical(zones)}"
+    met = sum(zone["verdict"] == "pass" for zone in asked)
+    if len(asked) == 1:
+        words = {
+            "pass": "the zone gets what it asks for",
+            "fail": "the zone does not get what it asks for",
+            "undecided": "too close to tell",
+        }[overall]
+        return f"{count}: {words}"
+    if met == len(asked):
+        every = "both" if met == 2 else f"all {met}"
+        return f"{count}: {every} zones get what they ask for"
+    return f"{count}: {met} of {len(asked)} zones get what they ask for"
+
+
+def typical(zones: list[dict[str, Any]]) -> str:
+    """Typical errors of the zones, the least and the largest median."""
+    parts = []
+    for key in ("position_m", "heading_deg"):
+        name, unit = _NAMES[key]
+        medians = sorted(zone[key]["median"] for zone in zones)
+        span = digits(medians[0])
+        if digits(medians[-1]) != span:
+            span += f" to {digits(medians[-1])}"
+        parts.append(f"{name} {span} {unit}")
+    return "typical error " + ", ".join(parts)
+
+
+def question(result: dict[str, Any]) -> list[str]:
+    """What was asked, a line each."""
+    count = result["n_anchors"]
+    lines = [f"Where do {count} anchors go in {result['scene']!r}, and what do they promise?"]
+    for zone in zone_answers(result):
+        if zone.asks:
+            lines.append(f"{zone.name}: {zone.asks}")
+    return lines
+
+
+def zone_answers(result: dict[str, Any]) -> list[ZoneAnswer]:
+    """Every zone in words."""
+    found = []
+    for zone in result["zones"]:
+        asks = reached = ""
+        if zone["verdict"] != "no requirement":
+            required = zone["required"]
+            limits = [
+                f"{name} {required[key]:g} {unit}"
+                for key, (name, unit) in _NAMES.items()
+                if required.get(key) is not None
+            ]
+            asks = f"{' and '.join(limits)} in {percent(required['share'])} of the zone"
+            reached = (
+                f"{percent(zone['share'])} within ({percent(zone['share_low'])} to "
+                f"{percent(zone['share_high'])})"
+            )
+        figures = ", ".join(
+            f"{name} {digits(zone[key]['median'])} {unit} (95 %: {digits(zone[key]['p95'])})"
+            for key, (name, unit) in _NAMES.items()
+            if key in zone
+        )
+        found.append(ZoneAnswer(zone["name"], zone["verdict"], asks, reached, figures))
+    return found
+
+
+def percent(share: float) -> str:
+    """A share, 100 % only where it is all."""
+    text = f"{100 * share:.1f}"
+    if text == "100.0" and share < 1:
+        text = "99.9"
+    return f"{text.removesuffix('.0')} %"
+
+
+def digits(value: float) -> str:
+    """Three digits, without exponents where people read."""
+    return f"{value:.3g}" if value < 1000 else f"{value:.0f}"

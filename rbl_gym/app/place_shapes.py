@@ -1,0 +1,301 @@
+"""What pictures and pages of a placement draw: outlines, maps without holes, places of labels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.mounts import Mounts
+from rbl_gym.geometry.polygons import contains
+from rbl_gym.geometry.regions import Shell
+from rbl_gym.placement.scene_files import Problem
+from rbl_gym.studies.placing.accuracy import Map, accuracy_map
+from rbl_gym.studies.placing.judging import limits_of
+
+# Okabe and Ito's blue and vermilion: told apart by everyone, and in grey.
+WITHIN, BEYOND, NOTHING = "#56b4e9", "#d55e00", "#c9ced2"
+# Anchors further out than so many half sizes of the zones leave their maps too small to read.
+_FAR = 4.0
+# A map that hardly varies must not look as if it did: its colours span at least this ratio.
+_LEAST_CONTRAST = 1.15
+# A hole of a zone is joined to its outline by a slit so narrow, metres.
+_SLIT_M = 0.003
+
+
+class Quantity(NamedTuple):
+    """What a map shows: a field of `Map`, its name and unit, the key of its requirement."""
+
+    field: str
+    name: str
+    unit: str
+    limit: str | None
+
+
+_ASKED = (
+    Quantity("horizontal", "horizontal position", "m", "position_m"),
+    Quantity("heading", "heading", "deg", "heading_deg"),
+    Quantity("height", "height", "m", "height_m"),
+)
+_PLAIN = (
+    Quantity("position", "position", "m", None),
+    Quantity("rotation", "orientation", "deg", None),
+)
+
+
+def quantities(problem: Problem) -> list[Quantity]:
+    """What is worth a map: what the zones ask for, else position and orientation in space."""
+    asked = {q.field for q in _ASKED for z in problem.zones if getattr(z, str(q.limit)) is not None}
+    if not asked and all(zone.attitude == "free" for zone in problem.zones):
+        return list(_PLAIN)
+    found = [q for q in _ASKED if q.field in asked]
+    return found or list(_ASKED[:2])
+
+
+def has_requirement(problem: Problem) -> bool:
+    """Whether any zone asks for anything."""
+    return any(limits_of(zone).any() for zone in problem.zones)
+
+
+class Solid(NamedTuple):
+    """An obstacle from above: corners (V, 2), heights, share of information that it leaves."""
+
+    corners: FloatArray
+    low_m: float
+    high_m: float
+    share: float
+
+
+def solids(problem: Problem) -> list[Solid]:
+    """All obstacles, the lowest first."""
+    obstacles = problem.obstacles
+    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    common = obstacles.blocked_information
+    found = [
+        Solid(box[:2] + turns * box[3:5], box[2] - box[5], box[2] + box[5], common)
+        for box in obstacles.boxes
+    ]
+    prisms = obstacles.prisms
+    for corners, low, high, share in zip(
+        prisms.corners, prisms.low_m, prisms.high_m, prisms.share, strict=True
+    ):
+        found.append(Solid(corners, low, high, common if np.isnan(share) else share))
+    return sorted(found, key=lambda solid: solid.high_m)
+
+
+def grey(share: float) -> str:
+    """Darker, the less a solid leaves."""
+    return f"{0.32 + 0.36 * min(max(share, 0.0), 1.0):.2f}"
+
+
+def mount_shapes(problem: Problem) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Lines (2, 2) and areas (V, 2) from above on which anchors may stand; points are lines."""
+    if isinstance(problem.mounts, Shell):
+        return [], []
+    if isinstance(problem.mounts, Mounts):
+        plan = problem.mounts.pieces[:, :6].reshape(-1, 3, 2)
+        flat = (plan[:, 1] == plan[:, 2]).all(axis=-1)
+        return list(plan[flat, :2]), list(plan[~flat])
+    low, high = problem.mounts.bounds()
+    corners = np.array([low[:2], [high[0], low[1]], high[:2], [low[0], high[1]]])
+    return list(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)), []
+
+
+def sides_of(polygon: FloatArray) -> list[FloatArray]:
+    """Sides (2, 2) of a zone, without the slits that join its holes to its outline."""
+    sides = np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1)
+    apart = np.abs(sides[:, None] - sides[None, :, ::-1]).max(axis=(-1, -2))
+    return list(sides[~(apart < _SLIT_M).any(axis=1)])
+
+
+def inner_point(polygon: FloatArray, blocked: list[Solid], anchors: FloatArray) -> FloatArray:
+    """A place for a zone's name: inside, wide, off obstacles and anchors, near the middle."""
+    low, high = polygon.min(axis=0), polygon.max(axis=0)
+    middle = 0.5 * (low + high)
+    if not (high > low).all():
+        return middle
+    grid = np.stack(np.meshgrid(*[np.arange(1, 24) / 24] * 2), axis=-1).reshape(-1, 2)
+    inside = low + grid * (high - low)
+    inside = inside[contains(polygon, inside)]
+    if not len(inside):
+        return middle
+    near = [s.corners for s in blocked if (s.corners.max(0) > low).all()]
+    near = [corners for corners in near if (corners.min(0) < high).all()]
+    clear = np.min([_distance(inside, ring) for ring in (polygon, *near)], axis=0)
+    for ring in near:
+        clear[contains(ring, inside)] = 0.0
+    away = np.linalg.norm((inside - middle) / (high - low), axis=-1)
+    # Labels are wider than high: anchors beside a name are nearer than those above it.
+    for anchor in anchors[:, :2]:
+        off = (inside - anchor) * (0.5, 1.0)
+        clear = np.minimum(clear, np.linalg.norm(off, axis=-1))
+    return inside[(clear / max(clear.max(), 1e-9) - away).argmax()]
+
+
+def _distance(points: FloatArray, ring: FloatArray) -> FloatArray:
+    """From points (P, 2) to the edge of a ring."""
+    away = np.roll(ring, -1, axis=0) - ring
+    off = points[:, None] - ring
+    share = (off * away).sum(-1) / np.maximum((away**2).sum(-1), 1e-12)
+    return np.linalg.norm(off - share.clip(0, 1)[..., None] * away, axis=-1).min(axis=1)
+
+
+def is_far(problem: Problem, anchors: FloatArray) -> bool:
+    """Whether the anchors are so far out that only the zones can be shown."""
+    low, high = problem.corners()
+    reach = np.abs(anchors - 0.5 * (low + high))[:, :2].max(initial=0.0)
+    return bool(reach > _FAR * 0.5 * (high - low)[:2].max())
+
+
+def limits(problem: Problem, anchors: FloatArray, margin: float = 0.03) -> FloatArray:
+    """Lower and upper corner (2, 2) of what is shown from above."""
+    points = [corner[:2] for corner in problem.corners()]
+    far = is_far(problem, anchors)
+    if not far:
+        points += [anchor[:2] for anchor in anchors]
+        points += [corner for solid in solids(problem) for corner in solid.corners]
+        lines, areas = mount_shapes(problem)
+        points += [corner for shape in (*lines, *areas) for corner in shape]
+    array = np.array(points)
+    extent = np.ptp(array, axis=0)
+    around = (0.2 if far else margin) * np.maximum(extent, 0.2 * extent.max())
+    return np.array([array.min(axis=0) - around, array.max(axis=0) + around])
+
+
+def is_kept(problem: Problem, anchor: FloatArray) -> bool:
+    """Whether an anchor (3,) is one of those that stay."""
+    return bool((np.abs(problem.fixed - anchor).max(axis=-1, initial=0.0) < 1e-6).any())
+
+
+def shown_place(place: FloatArray, edges: FloatArray) -> tuple[FloatArray, bool]:
+    """Where an anchor (2,) is drawn: itself, or on the way to it at the edge of what is shown."""
+    if (place >= edges[0]).all() and (place <= edges[1]).all():
+        return place, False
+    centre = edges.mean(axis=0)
+    away = place - centre
+    edge = 0.93 * np.where(away > 0, edges[1] - centre, centre - edges[0])
+    return centre + (edge / np.maximum(np.abs(away), 1e-12)).min() * away, True
+
+
+# --- maps ------------------------------------------------------------------------------------
+
+
+class Layer(NamedTuple):
+    """A zone's map without holes: edges of its columns and rows (2,), values (rows, columns)."""
+
+    zone: Any
+    left: float
+    right: float
+    bottom: float
+    top: float
+    values: FloatArray
+    free: Any
+
+
+def maps_of(problem: Problem, anchors: FloatArray, share: float = 0.5) -> list[Map]:
+    """The map of each zone, at this share of its height."""
+    return [accuracy_map(problem, anchors, share=share, zone=zone) for zone in problem.zones]
+
+
+def layers(problem: Problem, maps: list[Map], field: str) -> list[Layer]:
+    """What is drawn of the maps, of one field or of ``"relative"``: the largest error to limit."""
+    return [
+        layer_of(zone, one, values_of(zone, one, field))
+        for zone, one in zip(problem.zones, maps, strict=True)
+    ]
+
+
+def values_of(zone: Any, one: Map, field: str) -> FloatArray:
+    """Values (rows, columns) of a map; NaN off the zone, in an obstacle, and without limits."""
+    if field != "relative":
+        return getattr(one, field)
+    ratios = [
+        getattr(one, q.field) / getattr(zone, str(q.limit))
+        for q in _ASKED
+        if getattr(zone, str(q.limit)) is not None
+    ]
+    return np.max(ratios, axis=0) if ratios else np.full(one.position.shape, np.nan)
+
+
+def layer_of(zone: Any, one: Map, values: FloatArray) -> Layer:
+    """A map whose holes are filled from their nearest neighbours: what is there is drawn on top."""
+    free = np.isfinite(values)
+    if free.any() and not free.all():
+        nearest = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+    (left, right), (bottom, top) = (_edges(axis) for axis in (one.columns, one.rows))
+    return Layer(zone, left, right, bottom, top, values, free)
+
+
+def _edges(centres: FloatArray) -> tuple[float, float]:
+    half = 0.5 * float(centres[1] - centres[0]) if len(centres) > 1 else 0.05
+    return float(centres[0]) - half, float(centres[-1]) + half
+
+
+def colour_range(shown: list[Layer], limit: float | None) -> tuple[float, float]:
+    """Least and largest value of the colours, over all zones; a limit that is near lies within."""
+    values = np.concatenate([layer.values[layer.free] for layer in shown])
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return 0.0, 1.0
+    low, high = float(values.min()), float(np.quantile(values, 0.99))
+    # A limit that is near is shown; one that is far would make the map one colour.
+    if limit is not None and limit < 1.5 * high:
+        low, high = min(low, limit), max(high, 1.1 * limit)
+    return low, max(high, _LEAST_CONTRAST * low, low + 1e-12)
+
+
+# --- labels ----------------------------------------------------------------------------------
+
+
+def spread_labels(
+    points: FloatArray,
+    sizes: FloatArray,
+    edges: FloatArray,
+    marker: float,
+    taken: Sequence[tuple[FloatArray, FloatArray]] = (),
+) -> FloatArray:
+    """Centres (K, 2) of labels beside points (K, 2) such that none lies on another.
+
+    Parameters
+    ----------
+    points, sizes
+        Places of the markers, widths and heights of the labels (K, 2); pixels.
+    edges
+        Lower and upper corner (2, 2) of what is shown.
+    marker
+        Half size of a marker.
+    taken
+        Centres and half sizes (2,) of what stands there already.
+    """
+    placed: list[FloatArray] = []
+    angles = np.deg2rad([25, 155, -25, -155, 90, -90, 0, 180, 60, 120, -60, -120])
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    for k, point in enumerate(points):
+        half = 0.5 * sizes[k]
+        best, least = point, math.inf
+        for step, reach in enumerate((1.0, 2.2, 3.6, 5.5, 8.0)):
+            for turn, direction in enumerate(directions):
+                centre = point + direction * (half + marker * (0.6 + reach))
+                cost = 3.0 * step + 0.1 * turn
+                cost += 40.0 * sum(
+                    _overlap(centre, half, other, 0.5 * sizes[j]) for j, other in enumerate(placed)
+                )
+                cost += 12.0 * sum(_overlap(centre, half, other, marker) for other in points)
+                cost += 30.0 * sum(_overlap(centre, half, *other) for other in taken)
+                outside = np.maximum(edges[0] - (centre - half), centre + half - edges[1])
+                cost += 30.0 * float((outside > 0).any())
+                if cost < least:
+                    best, least = centre, cost
+            if least < 3.0 * (step + 1):
+                break
+        placed.append(best)
+    return np.array(placed).reshape(-1, 2)
+
+
+def _overlap(a: FloatArray, half_a: FloatArray, b: FloatArray, half_b: Any) -> bool:
+    return bool((np.abs(a - b) < half_a + half_b - 0.5).all())

@@ -1,0 +1,253 @@
+"""A layout for those who mount it: a list, and files for a table, a map or a drawing program."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_array
+from rbl_gym.geometry.mounts import Mounts
+from rbl_gym.geometry.polygons import area, contains
+from rbl_gym.placement.plans.drawing import UNITS
+from rbl_gym.placement.scene_files import Problem
+
+__all__ = ["LAYER", "SUFFIXES", "mounting_list", "write_layout"]
+
+SUFFIXES = (".csv", ".geojson", ".dxf")
+# Layer of a DXF that is written; what stood on it before is replaced.
+LAYER = "RBL-ANCHORS"
+# A slab is at most so thick and at least so large: floors above z = 0 begin on one.
+_SLAB_M, _SLAB_M2 = 0.6, 20.0
+# Radius of the circle that marks an anchor in a drawing, metres.
+_MARK_M = 0.15
+
+
+def mounting_list(
+    problem: Problem, anchors: FloatArray, names: list[str] | None = None
+) -> list[dict[str, Any]]:
+    """For each anchor what who mounts it needs, as plain values.
+
+    Keys: ``name``, ``x_m``, ``y_m``, ``z_m``, ``mount`` (name), ``above_floor_m`` (z = 0, or the
+    top of the slab below), ``faces`` (``down``, ``+x``, an angle from +x in degrees, or ``any``),
+    and ``corners``: up to two dicts with ``x_m``, ``y_m`` of a corner of the mount and
+    ``distance_m`` along the wall or ceiling to it.
+
+    Parameters
+    ----------
+    problem, anchors
+        Of which problem, and where (M, 3), metres.
+    names
+        Of the anchors; None: those of the file's order, from 1.
+    """
+    anchors = check_array("anchors", anchors, ("M", 3))
+    names = [str(k + 1) for k in range(len(anchors))] if names is None else names
+    mounts, normals = problem.mounts.names(anchors), problem.mounts.normal(anchors)
+    rows = []
+    for name, anchor, mount, normal in zip(names, anchors, mounts, normals, strict=True):
+        x, y, z = (round(value, 3) + 0.0 for value in anchor.tolist())
+        rows.append(
+            {
+                "name": name,
+                "x_m": x,
+                "y_m": y,
+                "z_m": z,
+                "mount": mount,
+                "above_floor_m": round(z - floor_below(problem, anchor), 3),
+                "faces": direction(normal),
+                "corners": _corners(problem, anchor, normal),
+            }
+        )
+    return rows
+
+
+def floor_below(problem: Problem, point: FloatArray) -> float:
+    """Height of the floor below a point (3,): the top of the highest slab below it, or 0."""
+    prisms = problem.obstacles.prisms
+    tops = [0.0]
+    for ring, low, high in zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True):
+        slab = high - low <= _SLAB_M and abs(area(ring)) >= _SLAB_M2
+        if slab and high <= point[2] and contains(ring, point[None, :2], -1e-3)[0]:
+            tops.append(float(high))
+    return max(tops) if point[2] >= 0 else 0.0
+
+
+def direction(normal: FloatArray) -> str:
+    """Where an anchor looks, in words."""
+    if not normal.any():
+        return "any"
+    if abs(normal[2]) > 0.99:
+        return "down" if normal[2] < 0 else "up"
+    angle = math.degrees(math.atan2(normal[1], normal[0])) % 360
+    nearest = round(angle / 90)
+    if abs(angle - 90 * nearest) < 0.5:
+        return ("+x", "+y", "-x", "-y")[nearest % 4]
+    return f"{angle:.0f} deg"
+
+
+def _corners(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[dict[str, float]]:
+    """The two ends of the wall, or the two nearest corners of what is flat; none of points."""
+    faces, plan = problem.mounts.faces, anchor[:2]
+    if not len(faces.origin) or not normal.any():
+        return []
+    face = int(problem.mounts.face_of(anchor[None])[0])
+    axes, extents = faces.axes[face], faces.extents[face]
+    flat = [k for k in range(3) if extents[k] > 0 and abs(axes[k, 2]) < 0.5]
+    if isinstance(problem.mounts, Mounts):
+        # What is left of the face where the anchor is: up to the walls that meet it.
+        pieces = problem.mounts.pieces[problem.mounts.piece_face == face]
+        pieces = pieces[(pieces[:, 6] - 1e-6 <= anchor[2]) & (anchor[2] <= pieces[:, 7] + 1e-6)]
+        corners = _joined(pieces[:, :6].reshape(-1, 3, 2), plan)
+    else:
+        corners = faces.origin[face, None, :2]
+        for k in flat:
+            corners = np.concatenate([corners, corners + extents[k] * axes[k, :2]])
+    distance = np.linalg.norm(corners - plan, axis=-1)
+    nearest = np.argsort(distance, kind="stable")[:2] if len(corners) > 1 else []
+    return [
+        {
+            "x_m": round(float(corners[k, 0]), 3),
+            "y_m": round(float(corners[k, 1]), 3),
+            "distance_m": round(float(distance[k]), 3),
+        }
+        for k in nearest
+    ]
+
+
+def _joined(pieces: FloatArray, place: FloatArray) -> FloatArray:
+    """Corners (K, 2) of those pieces (N, 3, 2) of a face that hang together with a place (2,)."""
+    corners = np.round(pieces, 6)
+    if not (corners[:, 1] == corners[:, 2]).all():
+        return np.unique(corners.reshape(-1, 2), axis=0)
+    ends = corners[:, :2]
+    away = ends[:, 1] - ends[:, 0]
+    share = ((place - ends[:, 0]) * away).sum(-1) / np.maximum((away**2).sum(-1), 1e-12)
+    off = np.linalg.norm(place - ends[:, 0] - share.clip(0, 1)[:, None] * away, axis=-1)
+    together = off <= off.min() + 1e-6
+    while True:
+        near = np.abs(ends[:, None, :, None] - ends[None, together][:, :, None]).max(-1)
+        grown = (near < 1e-5).any(axis=(1, 2, 3))
+        if (grown == together).all():
+            break
+        together = grown
+    found = ends[together].reshape(-1, 2)
+    along = (found - place) @ away[off.argmin()]
+    return found[[along.argmin(), along.argmax()]]
+
+
+def write_layout(
+    problem: Problem, anchors: FloatArray, path: str, names: list[str] | None = None
+) -> None:
+    """Write a layout, making its folder.
+
+    Parameters
+    ----------
+    problem, anchors, names
+        As `mounting_list`.
+    path
+        `.csv`: the mounting list, which ``place --layout`` reads again. `.geojson`: points, in the
+        coordinates of the drawing where the problem was read from GeoJSON, else in metres.
+        `.dxf`: the layer `LAYER`, in a copy of the drawing where the problem was read from a DXF,
+        else with the building's outlines in metres.
+
+    Raises
+    ------
+    ValueError
+        On another suffix.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"{path}: a layout is written to {', '.join(SUFFIXES)}")
+    rows = mounting_list(problem, anchors, names)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    {".csv": _write_csv, ".geojson": _write_geojson, ".dxf": _write_dxf}[suffix](
+        problem, rows, path
+    )
+
+
+def _write_csv(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
+    columns = [key for key in rows[0] if key != "corners"]
+    ends = [f"{key}_{n}" for n in (1, 2) for key in ("corner_x_m", "corner_y_m", "distance_m")]
+    with Path(path).open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*columns, *ends])
+        for row in rows:
+            values = [value for corner in row["corners"] for value in corner.values()]
+            values += [""] * (len(ends) - len(values))
+            writer.writerow([*(row[key] for key in columns), *values])
+
+
+def _write_geojson(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
+    places = np.array([[row["x_m"], row["y_m"]] for row in rows])
+    plan, digits = problem.plan, 4
+    if plan is not None and plan.drawing and not plan.drawing.lower().endswith(".dxf"):
+        if plan.units == "degrees":
+            from rbl_gym.placement.plans.geojson import to_degrees
+
+            places, digits = to_degrees(places, plan.zero), 9
+        else:
+            places = places / UNITS[plan.units] + np.array(plan.zero)
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {
+                "type": "Point",
+                "coordinates": [*(round(x, digits) for x in place), row["z_m"]],
+            },
+            "properties": {
+                "kind": "fixed",
+                **{key: value for key, value in row.items() if key != "corners"},
+            },
+        }
+        for place, row in zip(places.tolist(), rows, strict=True)
+    ]
+    text = json.dumps({"type": "FeatureCollection", "features": features}, indent=1)
+    Path(path).write_text(text + "\n", encoding="utf-8")
+
+
+def _write_dxf(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
+    import ezdxf
+
+    plan = problem.plan
+    if plan is not None and plan.drawing and plan.drawing.lower().endswith(".dxf"):
+        document = ezdxf.readfile(plan.drawing)
+        scale, zero = 1 / UNITS[plan.units], np.array(plan.zero)
+    else:
+        document, scale, zero = ezdxf.new(), 1.0, np.zeros(2)
+        document.header["$INSUNITS"] = 6
+        _draw_building(document, problem)
+    model = document.modelspace()
+    if LAYER in document.layers:
+        for entity in model.query(f'*[layer=="{LAYER}"]'):
+            model.delete_entity(entity)
+    else:
+        document.layers.add(LAYER, color=1)
+    at = {"layer": LAYER}
+    for row in rows:
+        x, y = np.array([row["x_m"], row["y_m"]]) * scale + zero
+        model.add_point((x, y, row["z_m"] * scale), dxfattribs=at)
+        model.add_circle((x, y), _MARK_M * scale, dxfattribs=at)
+        text = model.add_text(
+            f"{row['name']}  z {row['z_m']:g} m", height=_MARK_M * scale, dxfattribs=at
+        )
+        text.set_placement((x + 1.4 * _MARK_M * scale, y + 0.4 * _MARK_M * scale))
+    document.saveas(path)
+
+
+def _draw_building(document: Any, problem: Problem) -> None:
+    """Outlines of obstacles and zones, on layers as `rbl-gym plan` knows them."""
+    model = document.modelspace()
+    turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    boxes = problem.obstacles.boxes
+    rings = [*(box[:2] + turns * box[3:5] for box in boxes), *problem.obstacles.prisms.corners]
+    for layer, outlines in (
+        ("OBSTACLES", rings),
+        ("ZONES", [zone.polygon for zone in problem.zones]),
+    ):
+        document.layers.add(layer)
+        for ring in outlines:
+            model.add_lwpolyline(ring.tolist(), close=True, dxfattribs={"layer": layer})

@@ -1,0 +1,122 @@
+"""Layouts for those who mount them: the list, CSV, GeoJSON, DXF."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rbl_gym.placement import scene_files
+from rbl_gym.placement.plans import geojson
+from rbl_gym.studies.placing.layout_export import LAYER, SUFFIXES, mounting_list, write_layout
+from tests.helpers import needs
+from tests.plan_files import write_dxf
+
+TABLES = {
+    "anchors": {"number": 4, "max_range_m": 30.0},
+    "mounts": [
+        {"kind": "wall", "name": "hall", "line": [[0, 0], [8, 0], [8, 6], [0, 6]], "closed": True,
+         "side": "left", "low_m": 2.0, "high_m": 3.0},
+        {"kind": "ceiling", "name": "roof", "polygon": [[0, 0], [8, 0], [8, 6], [0, 6]],
+         "height_m": 3.5},
+    ],
+    "slabs": [{"polygon": [[-1, -1], [9, -1], [9, 7], [-1, 7]], "z_m": 1.0, "thickness_m": 0.2}],
+    "zones": [{"name": "hall", "polygon": [[1, 1], [7, 1], [7, 5], [1, 5]], "low_m": 1.5,
+               "high_m": 2.0}],
+    "body": {"shape": "octahedron", "size_m": 0.8},
+    "noise": {"floor_m": 0.1},
+}  # fmt: skip
+ANCHORS = np.array([[3.0, 0.0, 2.5], [8.0, 4.5, 2.0], [1.0, 6.0, 3.0], [2.0, 2.0, 3.5]])
+
+pytest.importorskip("shapely", reason="needs the extra placement")
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return scene_files.of_mapping(TABLES, name="hall")
+
+
+def test_the_list_says_how_high_which_way_and_how_far_from_corners(problem):
+    rows = mounting_list(problem, ANCHORS)
+    assert [row["faces"] for row in rows] == ["+y", "-x", "-y", "down"]
+    assert [row["name"] for row in rows] == ["1", "2", "3", "4"]
+    # The slab's top is at 1.2 m.
+    assert [row["above_floor_m"] for row in rows] == pytest.approx([1.3, 0.8, 1.8, 2.3])
+    assert rows[0]["mount"].startswith("hall")
+    for row, anchor in zip(rows, ANCHORS, strict=True):
+        assert len(row["corners"]) == 2
+        for corner in row["corners"]:
+            away = np.hypot(corner["x_m"] - anchor[0], corner["y_m"] - anchor[1])
+            assert corner["distance_m"] == pytest.approx(away, abs=1e-3)
+            assert corner["x_m"] in (0, 8)
+            assert corner["y_m"] in (0, 6)
+    ends = [corner["distance_m"] for corner in rows[0]["corners"]]
+    assert sorted(ends) == [3, 5]
+
+
+def test_csv_is_a_layout_that_place_reads(problem, tmp_path):
+    from rbl_gym.studies.placing.layout_files import read_layout
+
+    path = tmp_path / "new" / "l.csv"
+    write_layout(problem, ANCHORS, str(path), ["N", "E", "S", "W"])
+    found = read_layout(str(path))
+    np.testing.assert_allclose(found.positions, ANCHORS)
+    assert list(found.names) == ["N", "E", "S", "W"]
+    with path.open(encoding="utf-8") as file:
+        row = next(csv.DictReader(file))
+    assert row["faces"] == "+y"
+    assert float(row["distance_m_1"]) + float(row["distance_m_2"]) == 8
+
+
+def test_geojson_stands_in_the_coordinates_of_its_plan(problem, tmp_path):
+    path = tmp_path / "l.geojson"
+    write_layout(problem, ANCHORS, str(path))
+    (first, *_) = json.loads(path.read_text())["features"]
+    assert first["geometry"] == {"type": "Point", "coordinates": [3.0, 0.0, 2.5]}
+    zero = (11.5, 48.1)
+    tables = {**TABLES, "plan": {"drawing": "x.geojson", "units": "degrees", "zero": list(zero)}}
+    write_layout(scene_files.of_mapping(tables, name="hall"), ANCHORS, str(path))
+    features = json.loads(path.read_text())["features"]
+    degrees = np.array([feature["geometry"]["coordinates"][:2] for feature in features])
+    np.testing.assert_allclose(geojson.from_degrees(degrees, zero), ANCHORS[:, :2], atol=1e-3)
+
+
+@needs("ezdxf")
+def test_dxf_is_a_layer_in_a_copy_of_the_drawing(problem, tmp_path):
+    import ezdxf
+
+    plan = {"drawing": write_dxf(tmp_path / "x.dxf"), "units": "mm", "zero": [100.0, 200.0]}
+    tables = {**TABLES, "plan": plan}
+    drawn = scene_files.of_mapping(tables, name="hall")
+    path = str(tmp_path / "l.dxf")
+    for _ in range(2):  # the second replaces the first
+        write_layout(drawn, ANCHORS, path)
+        write_layout(drawn, ANCHORS, plan["drawing"])
+    for name in (path, plan["drawing"]):
+        model = ezdxf.readfile(name).modelspace()
+        places = [point.dxf.location for point in model.query(f'POINT[layer=="{LAYER}"]')]
+        expected = ANCHORS * 1000 + (100, 200, 0)
+        np.testing.assert_allclose([tuple(place) for place in places], expected)
+        assert len(model.query('LWPOLYLINE[layer=="A-WALL-EXT"]')) == 1
+
+
+@needs("ezdxf")
+def test_without_a_drawing_the_dxf_has_the_building(problem, tmp_path):
+    from rbl_gym.placement.plans.drawing import read_drawing
+
+    path = str(tmp_path / "l.dxf")
+    write_layout(problem, ANCHORS, path)
+    found = read_drawing(path)
+    assert found.units == "m"
+    assert found.layers() == ["OBSTACLES", LAYER, "ZONES"]
+    marks = [s.points[0] for s in found.shapes if s.layer == LAYER and s.kind == "POINT"]
+    np.testing.assert_allclose(marks, ANCHORS[:, :2])
+
+
+def test_another_format_is_refused(problem):
+    assert all(Path(f"x{suffix}").suffix == suffix for suffix in SUFFIXES)
+    with pytest.raises(ValueError, match=r"x\.xls: a layout is written to \.csv, "):
+        write_layout(problem, ANCHORS, "x.xls")

@@ -1,0 +1,285 @@
+"""The report of a placement: from somebody's plan to PDF, page and picture in one command."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cmaes", reason="needs the extra placement")
+pytest.importorskip("shapely", reason="needs the extra placement")
+pytest.importorskip("plotly", reason="needs the extra viz")
+
+from rbl_gym.app import place_answer, place_figures, place_html, place_pdf, solids
+from rbl_gym.app import place_shapes as shapes
+from rbl_gym.app.cli import main
+from rbl_gym.geometry import polygons
+from rbl_gym.placement import scene_files
+from rbl_gym.placement.plans import layers, toml_text
+from rbl_gym.placement.plans.drawing import read_drawing
+from rbl_gym.studies.placing import accuracy, answer, judging
+from tests.helpers import needs
+from tests.plan_files import write_dxf, write_geojson, write_png
+
+LAYOUT = "x_m,y_m,z_m\n0.05,2,2.5\n0.05,7,2.7\n11.95,1,2.5\n7,7.95,2.3\n3,7.95,2.7\n"
+DXF = [
+    *("--walls", "A-WALL-EXT,material=concrete", "--walls", "A-WALL-*,material=drywall"),
+    *("--zones", "ZONES,position_m=0.3,heading_deg=20", "--obstacles", "FURNITURE,high_m=1"),
+    *("--mounts", "A-WALL-EXT"),
+]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def coarse():
+    """Few places: the tests look at what is written, not at the figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(accuracy, "_MAP", 12)
+        patch.setattr(accuracy, "_LEAST_MAP", 8)
+        patch.setattr(judging, "PLACES", 120)
+        patch.setattr(judging, "MOST_PLACES", 120)
+        yield
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory):
+    """The office of the tests with a zone that passes, one that fails, one that asks nothing."""
+    path = tmp_path_factory.mktemp("plan") / "office.geojson"
+    tables = layers.building(read_drawing(write_geojson(path))).tables
+    tables["zones"][0] |= {"position_m": 5.0, "attitude": "level"}
+    tables["zones"][1] |= {"heading_deg": 0.01}
+    corner = {"name": "store", "polygon": [[7, 6], [9, 6], [9, 7], [7, 7]], "low_m": 1, "high_m": 1}
+    tables["zones"].append(corner)
+    problem = scene_files.of_mapping(toml_text.plain(tables), 5)
+    rows = [line.split(",") for line in LAYOUT.splitlines()[1:]]
+    anchors = problem.mounts.project(np.array(rows, float))
+    question = answer.Question(range(5, 6), layout=anchors, trials=4)
+    return answer.place_anchors(problem, question)
+
+
+# --- one command -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "options"),
+    [
+        pytest.param("office.dxf", write_dxf, DXF, marks=needs("ezdxf")),
+        ("office.geojson", write_geojson, []),
+        ("office.png", write_png, ["--width", "12"]),
+    ],
+)
+def test_a_plan_goes_to_a_report_in_one_command(name, write, options, tmp_path, capsys):
+    plan = write(tmp_path / name)
+    (tmp_path / "layout.csv").write_text(LAYOUT)
+    given = [] if name.endswith("png") else ["--layout", str(tmp_path / "layout.csv")]
+    made = {end: tmp_path / "new" / f"report.{end}" for end in ("pdf", "html", "png", "csv")}
+    files = ["--report", made["pdf"], "--html", made["html"], "--plot", made["png"]]
+    command = ["place", "--scene", plan, *options, *given, *map(str, files)]
+    command += ["--export", str(made["csv"]), "--trials", "4"]
+    if not given:
+        command += ["--anchors", "3"]
+    assert main(command) == 0
+    shown = capsys.readouterr()
+    assert "12 x 8" in shown.err  # what was read
+    assert f"report: {made['pdf']}" in shown.out
+    assert made["pdf"].read_bytes().startswith(b"%PDF")
+    assert made["csv"].read_text().startswith("name,x_m,y_m,z_m,mount,above_floor_m,faces")
+    page = made["html"].read_text(encoding="utf-8")
+    assert "Anchors for office" in page
+    if name.endswith("png"):
+        assert page.count('opacity="0.55"') == 1  # the picture behind the plan
+
+
+def test_plan_writes_a_file_that_place_reads(tmp_path, capsys):
+    plan, out = write_geojson(tmp_path / "office.geojson"), tmp_path / "new" / "office.toml"
+    picture = tmp_path / "plan.png"
+    command = ["plan", plan, "-o", str(out), "--anchors", "6", "--plot", str(picture)]
+    assert main(command) == 0
+    shown = capsys.readouterr().out
+    assert "layers of the drawing" in shown
+    assert f"building: {out}" in shown
+    assert picture.stat().st_size > 20_000
+    problem = scene_files.problem(str(out))
+    assert (problem.name, problem.n_anchors, len(problem.zones)) == ("office", 6, 2)
+    assert problem.plan.drawing.endswith("office.geojson")
+    assert "rbl-gym plan" in out.read_text().splitlines()[0]
+    # The file can be drawn too, over a picture.
+    over = ["--picture", write_png(tmp_path / "x.png"), "--metres-per-pixel", "0.05"]
+    assert main(["plan", str(out), "--plot", str(picture), *over]) == 0
+
+
+def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, capsys):
+    pytest.importorskip("ezdxf")
+    assert main(["plan", write_dxf(tmp_path / "x.dxf"), "--json"]) == 0
+    rows = {row["layer"]: row for row in json.loads(capsys.readouterr().out)["layers"]}
+    assert rows["DIM"] == {
+        "layer": "DIM", "taken_for": [], "entities": {}, "unread": {"DIMENSION": 1},
+    }  # fmt: skip
+    assert rows["ZONES"]["taken_for"] == ["zones"]
+    assert main(["plan", str(tmp_path / "x.dxf"), "--zones", "ZONES"]) == 0
+    shown = capsys.readouterr().out
+    assert "not used: 8 entities on 4 layers (A-WALL-EXT, A-WALL-INT, DIM, FURNITURE)" in shown
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["plan", "x.png"], "x.png: a picture needs --metres-per-pixel or --width"),
+        (["plan", "nowhere.geojson"], "nowhere.geojson: No such file or directory"),
+        (["plan", "x.dwg"], "x.dwg: DWG cannot be read: save the drawing as DXF"),
+        (["plan", "x.png", "--walls", "A"], "a picture has no layers: --walls means nothing"),
+        (["plan", "x.geojson", "--walls", "A,x=1"], "'x=1' must be KEY=VALUE"),
+        (["plan", "office.geojson", "-o", "x.json"], "--out must end in .toml, got x.json"),
+        (["place", "--scene", "uwb_room", "--walls", "A"], "--walls is of a drawing"),
+        (["place", "--scene", "uwb_room", "--report", "x.doc"], "--report must end in .pdf"),
+        (["place", "--scene", "uwb_room", "--export", "x.xls"], "--export must end in .csv"),
+        (["place", "--scene", "bad.geojson"], "bad.geojson: this is no GeoJSON"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_with_status_2(
+    command, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    write_png(tmp_path / "x.png")
+    write_geojson(tmp_path / "office.geojson")
+    write_geojson(tmp_path / "x.geojson")
+    (tmp_path / "bad.geojson").write_text("[]")
+    assert main(command) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len(error) == 1
+    assert message in error[0]
+
+
+# --- words -------------------------------------------------------------------------------------
+
+
+def test_the_answer_is_in_words_and_signs(placed):
+    zones = place_answer.zone_answers(placed.result)
+    assert [zone.verdict for zone in zones] == ["pass", "fail", "no requirement"]
+    assert zones[0].asks == "horizontal position 5 m in 95 % of the zone"
+    assert zones[0].reached.startswith("100 % within (")
+    assert zones[2].asks == zones[2].reached == ""
+    assert place_answer.headline(placed.result) == "5 anchors: 1 of 2 zones get what they ask for"
+    assert place_answer.verdict(placed.result) == "fail"
+    assert len(place_answer.question(placed.result)) == 3
+
+
+def test_all_is_said_only_of_all():
+    assert place_answer.percent(1) == "100 %"
+    assert place_answer.percent(0.9999) == "99.9 %"
+    assert place_answer.percent(0.5) == "50 %"
+
+
+# --- pictures ----------------------------------------------------------------------------------
+
+
+def test_the_report_is_the_same_for_the_same_result(placed, tmp_path):
+    for name in ("a.pdf", "b.pdf"):
+        place_pdf.write_pdf(placed, str(tmp_path / name))
+    assert (tmp_path / "a.pdf").read_bytes() == (tmp_path / "b.pdf").read_bytes()
+
+
+def test_maps_have_no_holes_where_a_wall_crosses(placed):
+    maps = shapes.maps_of(placed.problem, placed.design.anchors)
+    for zone, one in zip(placed.problem.zones, maps, strict=True):
+        layer = shapes.layer_of(zone, one, one.horizontal)
+        assert np.isfinite(layer.values).all()
+        assert (layer.values[layer.free] == one.horizontal[layer.free]).all()
+
+
+def test_the_relative_map_is_the_largest_error_to_its_limit(placed):
+    zone = placed.problem.zones[1]
+    one = shapes.maps_of(placed.problem, placed.design.anchors)[1]
+    found = shapes.values_of(zone, one, "relative")
+    np.testing.assert_allclose(found, one.heading / 0.01)
+    other = shapes.maps_of(placed.problem, placed.design.anchors)[2]
+    assert np.isnan(shapes.values_of(placed.problem.zones[2], other, "relative")).all()
+
+
+def test_labels_lie_on_no_other(placed):
+    """The texts of all maps, as they are drawn; anchors may stand as close as they like."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.random((20, 2)) * (900, 500), [[50, 50], [52, 51], [54, 49]]])
+    sizes = np.tile([[44.0, 16.0]], (23, 1))
+    found = shapes.spread_labels(points, sizes, np.array([[0, 0], [900, 500]]), 6.0)
+    for a, b in itertools.combinations(found, 2):
+        assert (np.abs(a - b) >= (44, 16)).any()
+    assert np.linalg.norm(found - points, axis=-1).max() < 120
+    figure = place_figures.place_figure(placed)
+    renderer = figure.canvas.get_renderer()
+    for axes in figure.axes:
+        boxes = [
+            text.get_window_extent(renderer) for text in axes.texts if text.get_text().isdigit()
+        ]
+        assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
+
+
+def test_colours_of_pass_and_fail_differ_in_lightness():
+    """Told apart without hue: their luminances differ, and the second is hatched."""
+
+    def luminance(colour):
+        parts = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        return parts @ (0.2126, 0.7152, 0.0722)
+
+    assert luminance(shapes.WITHIN) - luminance(shapes.BEYOND) > 0.15
+
+
+def test_the_page_needs_no_network_and_says_it_all(placed, tmp_path):
+    path = tmp_path / "x.html"
+    place_html.write_place(placed, str(path))
+    page = path.read_text(encoding="utf-8")
+    assert not re.search(r"<script[^>]+src\s*=\s*[\"']?https?:", page)
+    assert 'name="viewport" content="width=device-width' in page
+    for text in ("PASS", "FAIL", "mounting list", 'data-map="heading/', "store", "Plotly.newPlot"):
+        assert text in page
+    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page)[1])
+    assert data["first"] == "relative"
+    zone = data["maps"][data["level"]][0]
+    assert zone["zone"] == "open plan"
+    assert np.array(zone["values"]["horizontal"], float).shape[0] >= 8
+
+
+def test_the_report_has_these_pages(placed):
+    pages = list(place_pdf.report_pages(placed))
+    titles = [page.texts[0].get_text() for page in pages]
+    assert titles[:2] == ["Anchors for office", "Plan: anchors, zones, and where anchors may stand"]
+    for title in ("Requirements", "Error of heading", "Mounting list", "How to read it"):
+        assert title in titles
+    words = {text.get_text() for page in pages for text in page.texts}
+    assert {"✗ FAIL", "✓ PASS"} <= words
+
+
+def test_far_anchors_are_shown_at_the_edge():
+    problem = scene_files.problem("satellite", 4)
+    anchors = problem.mounts.draw(np.random.default_rng(1).random((4, 3)))
+    assert shapes.is_far(problem, anchors)
+    edges = shapes.limits(problem, anchors)
+    place, outside = shapes.shown_place(anchors[0, :2], edges)
+    assert outside
+    assert ((place > edges[0]) & (place < edges[1])).all()
+
+
+# --- solids ------------------------------------------------------------------------------------
+
+
+def test_caps_of_prisms_fill_their_outline():
+    ring = np.array([(0, 0), (4, 0), (4, 3), (3, 3), (3, 1), (1, 1), (1, 3), (0, 3)], float)
+    for outline in (ring, ring[::-1]):
+        triangles = outline[solids.ears(outline)]
+        areas = [abs(polygons.area(triangle)) for triangle in triangles]
+        assert len(areas) == len(ring) - 2
+        assert sum(areas) == pytest.approx(abs(polygons.area(ring)))
+        centres = triangles.mean(axis=1)
+        assert polygons.contains(ring, centres).all()
+
+
+def test_slits_of_holes_are_not_drawn():
+    outline = np.array([(0, 0), (9, 0), (9, 9), (0, 9.0)])
+    hole = np.array([(3, 3), (3, 6), (6, 6), (6, 3.0)])
+    from rbl_gym.placement.plans.rings import opened
+
+    sides = shapes.sides_of(opened(outline, (hole,)))
+    lengths = np.linalg.norm(np.diff(sides, axis=1)[:, 0], axis=-1)
+    assert lengths.sum() == pytest.approx(36 + 12, abs=0.01)
