@@ -14,6 +14,7 @@ import pytest
 
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import polygons
+from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.regions import Box
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement import building, scene_files
@@ -137,6 +138,10 @@ def test_walls_are_mitred_where_they_meet():
         assert sum(held) == 1
     bent = wall_pieces(np.array([[0.0, 0], [4, 0], [4, 4]]), 0.1, closed=False)
     assert sum(polygons.area(piece) for piece in bent) == pytest.approx(2 * 4 * 0.2)
+    # Nor do the mitres of a piece cross that is shorter than they are.
+    step = wall_pieces(np.array([[0.0, 0], [4, 0], [4, 0.2], [8, 0.2]]), 0.5, closed=False)
+    for piece in step:
+        polygons.check_polygon("piece", piece)
     # A hairpin is not drawn out to a needle.
     needle = wall_pieces(np.array([[0.0, 0], [4, 0], [0, 0.1]]), 0.1, closed=False)
     assert np.abs(np.concatenate(needle)).max() < 4.5
@@ -252,6 +257,7 @@ def test_a_cupboard_along_a_wall_covers_it_up_to_its_height():
     assert not ((x > 8) & (x < 9) & (z > 2.5)).any()
     assert ((x > 8) & (x < 9) & (z < 2.5)).any()
     area = 20 - 2 * 1 - 1 * 0.5
+    assert isinstance(problem.mounts, Mounts)
     assert problem.mounts.measure.sum() == pytest.approx(area, abs=0.02)
     # From behind the cupboard to above it, or to the side.
     np.testing.assert_allclose(

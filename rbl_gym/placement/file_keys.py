@@ -90,7 +90,7 @@ _BOX = {
     "low": Key("place", "lower corner [x, y, z], metres", **_NEEDED),
     "high": Key("place", "upper corner [x, y, z], metres", **_NEEDED),
 }
-_SHARE = {"low": 0.0, "high": 1.0}
+_SHARE: dict[str, Any] = {"low": 0.0, "high": 1.0}
 _LOSS = {
     "material": Key("text", "one of [materials]; without it and information: opaque"),
     "information": Key("number", "the share itself, in place of material", **_SHARE),

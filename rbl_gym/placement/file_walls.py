@@ -10,7 +10,7 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
-from rbl_gym.geometry.polygons import check_polygon
+from rbl_gym.geometry.polygons import TOUCH_M, check_polygon
 from rbl_gym.placement.mounting import Mount
 
 # A mitre that is longer than so many half thicknesses is cut off.
@@ -19,7 +19,7 @@ _LONGEST_MITRE = 4.0
 _PARALLEL = 1e-3
 
 
-class Walls(NamedTuple):
+class WallPieces(NamedTuple):
     """Straight pieces of walls: ends (W, 2) in the plan, half thickness and heights (W,)."""
 
     start: FloatArray
@@ -39,13 +39,15 @@ class Solids(NamedTuple):
 
     def add(self, ring: FloatArray, low: float, high: float, share: float) -> None:
         """One more."""
-        for column, value in zip(self, (ring, low, high, share), strict=True):
-            column.append(value)
+        self.rings.append(ring)
+        self.low.append(low)
+        self.high.append(high)
+        self.share.append(share)
 
 
 def read_obstacles(
     tables: Mapping[str, list[dict[str, Any]]], materials: Mapping[str, float], blocked: float
-) -> tuple[Obstacles, Walls]:
+) -> tuple[Obstacles, WallPieces]:
     """All that takes information from links, and the walls piece by piece.
 
     Parameters
@@ -88,7 +90,7 @@ def read_obstacles(
         solids.add(table["polygon"], table["z_m"], table["z_m"] + table["thickness_m"], share)
     prisms = Prisms.packed(*solids)
     columns = (np.array(column) for column in zip(*walls, strict=True))
-    pieces = Walls(*columns) if walls else Walls(*np.empty((2, 0, 2)), *np.empty((3, 0)))
+    pieces = WallPieces(*columns) if walls else WallPieces(*np.empty((2, 0, 2)), *np.empty((3, 0)))
     return Obstacles(np.array(boxes).reshape(-1, 6), blocked, prisms), pieces
 
 
@@ -141,7 +143,11 @@ def wall_pieces(line: FloatArray, half: float, closed: bool) -> list[FloatArray]
             _mitre(along[k % len(parts)], along[i], half) if join else left
             for k, join in zip((i - 1, i + 1), joined, strict=True)
         )
-        found.append(np.array([start - before, end - after, end + after, start + before]))
+        ring = np.array([start - before, end - after, end + after, start + before])
+        # Where a piece is shorter than the mitres at its ends they would cross.
+        if min((ring[1] - ring[0]) @ along[i], (ring[2] - ring[3]) @ along[i]) < TOUCH_M:
+            ring = np.array([start - left, end - left, end + left, start + left])
+        found.append(ring)
     return found
 
 
@@ -160,7 +166,7 @@ def _turned(direction: FloatArray) -> FloatArray:
     return np.array([-direction[1], direction[0]])
 
 
-def read_mounts(tables: list[dict[str, Any]], walls: Walls) -> list[Mount]:
+def read_mounts(tables: list[dict[str, Any]], walls: WallPieces) -> list[Mount]:
     """The faces of all mounts; those along a wall are moved to its face."""
     found: list[Mount] = []
     for index, table in enumerate(tables):
@@ -173,7 +179,7 @@ def read_mounts(tables: list[dict[str, Any]], walls: Walls) -> list[Mount]:
     return found
 
 
-def _wall(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
+def _wall(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]:
     line = table["line"]
     if table["closed"]:
         line = check_polygon(f"{name}.line", line)
@@ -189,7 +195,9 @@ def _wall(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
     return found
 
 
-def _in_wall(ends: FloatArray, normal: FloatArray, table: Mapping[str, Any], walls: Walls) -> float:
+def _in_wall(
+    ends: FloatArray, normal: FloatArray, table: Mapping[str, Any], walls: WallPieces
+) -> float:
     """How far a face inside a wall, or on its other side, lies behind the wall's face."""
     direction = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
     along = walls.end - walls.start
@@ -203,12 +211,12 @@ def _in_wall(ends: FloatArray, normal: FloatArray, table: Mapping[str, Any], wal
     return float((walls.half_m - behind)[inside].max(initial=0.0))
 
 
-def _ceiling(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
+def _ceiling(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]:
     height = table["height_m"]
     return [Mount(table["polygon"], height, height, np.array([0.0, 0, -1]))]
 
 
-def _column(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
+def _column(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]:
     found = []
     for start, end in segments(table["polygon"], closed=True):
         normal = -_turned((end - start) / np.hypot(*(end - start)))
@@ -216,13 +224,13 @@ def _column(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
     return found
 
 
-def _area(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
+def _area(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]:
     normal = _axis(name, table)
     low, high = table["low_m"], table["high_m"]
     return [Mount(table["polygon"], low, high, normal, on_surface=False)]
 
 
-def _points(name: str, table: Mapping[str, Any], walls: Walls) -> list[Mount]:
+def _points(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]:
     if not len(table["points"]):
         raise ValueError(f"{name}.points must not be empty")
     normal = _axis(name, table)

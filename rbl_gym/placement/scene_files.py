@@ -25,7 +25,7 @@ from rbl_gym.placement.building import Plan, Prior, Problem, Zone
 from rbl_gym.placement.file_checks import check_numbers, check_problem
 from rbl_gym.placement.file_keys import BODIES, FORMAT, MAX_ANCHORS, MIN_ANCHORS
 from rbl_gym.placement.file_tables import as_table, check_text, read_table
-from rbl_gym.placement.file_walls import read_mounts, read_obstacles, rectangle, show
+from rbl_gym.placement.file_walls import WallPieces, read_mounts, read_obstacles, rectangle, show
 from rbl_gym.placement.gain import Gain
 from rbl_gym.placement.mounting import cut_mounts
 from rbl_gym.worlds import scenes
@@ -223,11 +223,11 @@ def _materials(table: Any) -> dict[str, float]:
 
 
 def _mounts(
-    anchors: dict[str, Any], lists: dict[str, Any], obstacles: Obstacles, walls: list[Any]
+    anchors: dict[str, Any], lists: dict[str, Any], obstacles: Obstacles, walls: WallPieces
 ) -> Region:
     """Where anchors may stand."""
     rows, forbidden = lists["mounts"], lists["forbidden"]
-    kind = anchors.get("kind")
+    kind: Any = anchors.get("kind")
     if not rows:
         if forbidden:
             raise ValueError(
@@ -243,8 +243,7 @@ def _mounts(
     )
     if mounts is None:
         raise ValueError(
-            "mounts have no legal place: obstacles and [[forbidden]] cover all of them. A mount "
-            "in the middle of a wall needs its side and offset_m"
+            "mounts have no legal place: obstacles and [[forbidden]] cover all of them"
         )
     return mounts
 
