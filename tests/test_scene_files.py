@@ -17,9 +17,10 @@ from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import NOISE_LAWS, RangeNoise
 from rbl_gym.placement import building, layouts, scene_files
+from rbl_gym.placement.file_tables import read_table
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scenes import SCENES
-from tests.helpers import ROOT, share_by_hand
+from tests.helpers import ROOT, needs, share_by_hand
 
 GOOD = {
     "anchors": {"kind": "room", "low": [0, 0, 0.3], "high": [8, 6, 3], "number": 5},
@@ -62,12 +63,22 @@ def test_the_example_is_read():
     assert context.racks.shape == (4, 6)
 
 
-def test_the_example_of_the_documentation_is_read():
-    text = (ROOT / "docs" / "placement.md").read_text(encoding="utf-8")
+@needs("shapely")
+@pytest.mark.parametrize("page", ["placement", "building_files"])
+def test_the_examples_of_the_documentation_are_read(page):
+    text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     blocks = [block.split("```")[0] for block in text.split("```toml\n")[1:]]
-    assert len(blocks) >= 2
+    assert blocks
     for block in blocks:
-        scene_files.of_mapping(tomllib.loads(block))
+        tables = tomllib.loads(block)
+        if "body" in tables:
+            scene_files.of_mapping(tables)
+            continue
+        # A part of a file.
+        for name, table in tables.items():
+            for row in table if isinstance(table, list) else [table]:
+                if name != "materials":
+                    read_table(name, row)
 
 
 def test_toml_and_json_say_the_same(tmp_path):
