@@ -602,7 +602,9 @@ def test_scenes_with_other_sensors_bring_the_filters_made_for_them():
         for text in task.filters:
             leaderboard.parse_filter(text)
     assert leaderboard.further_filters("uwb_room") == []
-    assert leaderboard.further_filters(specs["uwb_room-imu"]) == ["iekf-imu"]
+    assert leaderboard.further_filters(specs["uwb_room-imu"]) == [
+        "iekf-imu", "iekf-imu/robust=true",
+    ]  # fmt: skip
     assert "iekf/anchor_std_m=0.05" in leaderboard.further_filters(specs["uwb_room-survey"])
 
 

@@ -74,7 +74,7 @@ def further_filters(spec: str | Mapping[str, Any]) -> list[str]:
     if is_recording(spec):
         return []
     scene = scenes.get(spec)
-    further = ["iekf-imu"] if scene.inertial is not None else []
+    further = ["iekf-imu", "iekf-imu/robust=true"] if scene.inertial is not None else []
     if scene.survey_std_m > 0:
         std = f"{scene.survey_std_m:g}"
         further += [
