@@ -91,7 +91,7 @@ def _legal(problem: Problem, points: FloatArray) -> FloatArray:
     return points[np.sort(first)]
 
 
-def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int = _PLACES) -> Stock:
+def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int | None = None) -> Stock:
     """Candidates (K, 3) with what each tells at random poses of the zones.
 
     Parameters
@@ -101,12 +101,13 @@ def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int = _P
     seed
         Of the poses; those of `judge_zone` are others.
     n_places
-        In all zones together; in each a number at least.
+        In all zones together, in each a number at least; None: the usual.
     """
     rng = np.random.default_rng([seed, 4])
     zones, parts = [], []
     for zone in problem.zones:
-        places = draw_places(problem, zone, rng, max(_LEAST_PLACES, n_places // len(problem.zones)))
+        count = (n_places or _PLACES) // len(problem.zones)
+        places = draw_places(problem, zone, rng, max(_LEAST_PLACES, count))
         rotation = turns(zone.attitude, _TURNS)
         zones.append(
             ZonePoses(
@@ -146,7 +147,8 @@ def chosen_layout(
         If there are not as many mounts.
     """
     start = problem.fixed if start is None else start
-    points = _first(start, candidates(problem, np.random.default_rng([seed, 10])))
+    rng = np.random.default_rng([seed, 10])
+    points = _first(start, candidates(problem, rng, max(_CANDIDATES, 4 * problem.n_anchors)))
     if len(points) < problem.n_anchors:
         raise ValueError(
             f"the number of anchors must be at most {len(points)}, as many as there are mounts, "
@@ -248,7 +250,8 @@ def fewest_anchors(
     points = _first(problem.fixed, candidates(problem, rng))
     stock = stock_of(problem, points, seed)
     plain = stock._replace(zones=tuple(z._replace(limits=Limits()) for z in stock.zones))
-    starts = _growth(stock, keep, numbers[-1], survive), _growth(plain, keep, numbers[-1], survive)
+    path = _growth(stock, keep, numbers[-1], survive)
+    starts = path, _growth(plain, keep, max(path), survive)
 
     def attempt(count: int, more: list[FloatArray]) -> tuple[FloatArray, list[Judged], bool]:
         """The best layout of so many anchors, from all starts, and what it promises."""

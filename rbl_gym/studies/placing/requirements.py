@@ -17,7 +17,7 @@ from scipy import special
 from rbl_gym import bounds
 from rbl_gym.checks import BoolArray, FloatArray, check_number
 from rbl_gym.geometry import rotations
-from rbl_gym.kernels import compiled
+from rbl_gym.kernels import Compiled, compiled
 
 __all__ = [
     "Asked",
@@ -118,14 +118,13 @@ def errors_of(
     ValueError
         Where an information is singular: without a prior, of fewer ranges than a pose needs.
     """
-    squares = _mean_squares(information, _part(part, information), rotation, tags)
-    return Errors(*map(np.sqrt, _regular(squares)))
+    args = information, _part(part, information), rotation, tags
+    return Errors(*_roots(_mean_squares, *args))
 
 
 def asked_of(information: FloatArray, part: FloatArray | None = None) -> Asked:
     """`errors_of` that a zone may ask for, in a third of its time. Arguments as there."""
-    squares = _asked_squares(information, _part(part, information))
-    return Asked(*map(np.sqrt, _regular(squares)))
+    return Asked(*_roots(_asked_squares, information, _part(part, information)))
 
 
 def _part(part: FloatArray | None, information: FloatArray) -> FloatArray:
@@ -134,10 +133,15 @@ def _part(part: FloatArray | None, information: FloatArray) -> FloatArray:
     return np.broadcast_to(part, (*part.shape[:-3], *information.shape[-3:]))
 
 
-def _regular(squares: tuple[FloatArray, ...]) -> tuple[FloatArray, ...]:
-    if not np.isfinite(squares[0]).all():
+def _roots(squares: Compiled, *args: FloatArray) -> list[FloatArray]:
+    """Roots of what `squares` says, or a ValueError where an information is singular."""
+    try:
+        found = squares(*args)
+    except np.linalg.LinAlgError:
+        found = (np.array(np.nan),)
+    if not np.isfinite(found[0]).all():
         raise ValueError("information must be positive definite at every place")
-    return squares
+    return [np.sqrt(square) for square in found]
 
 
 @compiled("place_errors:mean_squares")

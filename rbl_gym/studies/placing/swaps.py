@@ -259,8 +259,9 @@ def _best_added(
     """Which candidate betters the layout `others` most, and the value with it."""
     which = np.setdiff1d(np.arange(len(stock.cost)), others)
     if len(which) > _TRIED:
-        rough = _with_candidates(coarse, others, which, survive, math.inf, _WORST_LOSSES)
-        which = which[np.argpartition(rough, _TRIED)[:_TRIED]]
+        rough = _with_candidates(coarse, others, None, survive, math.inf, _WORST_LOSSES)
+        rough[others] = math.inf
+        which = np.argpartition(rough, _TRIED)[:_TRIED]
     scores = _with_candidates(stock, others, which, survive, limit)
     best = int(scores.argmin())
     return int(which[best]), float(scores[best])
@@ -269,33 +270,39 @@ def _best_added(
 def _with_candidates(
     stock: Stock,
     others: list[int],
-    which: np.ndarray,
+    which: np.ndarray | None,
     survive: int,
     limit: float,
     losses: int | None = None,
 ) -> FloatArray:
-    """Value (J,) of the layout `others` with each of the candidates `which`.
+    """Value (J,) of the layout `others` with each of the candidates `which`; None: of all.
 
     Where the loss of one matters, infinite for a candidate that is no better than `limit`; of so
     many `losses`, those that are worst without a candidate; None: of all.
     """
     base = _total(stock, others)
+    # All of them without a copy.
+    every = slice(None) if which is None else which
     if not survive:
-        return _values(stock, base, which)
+        return _values(stock, base, every)
     # The candidate itself may fail; then each of the others, the worst first, so that most
     # candidates are left out early.
-    worst = np.full(len(which), float(_values(stock, base)[0]))
+    count = len(stock.cost) if which is None else len(which)
+    worst = np.full(count, float(_values(stock, base)[0]))
     left = [(float(_values(stock, _less(stock, base, k))[0]), k) for k in others]
     for _, k in sorted(left, reverse=True)[:losses]:
         open_ = np.flatnonzero(worst < limit)
         if not len(open_):
             break
-        scores = _values(stock, _less(stock, base, k), which[open_])
-        worst[open_] = np.maximum(worst[open_], scores)
+        if len(open_) == count:
+            worst = np.maximum(worst, _values(stock, _less(stock, base, k), every))
+            continue
+        some = open_ if which is None else which[open_]
+        worst[open_] = np.maximum(worst[open_], _values(stock, _less(stock, base, k), some))
     return np.where(worst < limit, worst, math.inf)
 
 
-def _values(stock: Stock, base: Base, added: np.ndarray | None = None) -> FloatArray:
+def _values(stock: Stock, base: Base, added: np.ndarray | slice | None = None) -> FloatArray:
     """Value (J,) of information (..., L, T, 6, 6) with each of the added candidates, or none."""
     found = []
     for zone, total, part in zip(stock.zones, base, stock.parts, strict=True):
