@@ -13,8 +13,8 @@ import rbl_gym
 from rbl_gym.app.cli import _parser
 from rbl_gym.estimators import filter as belief
 from rbl_gym.measurements import ranging
+from rbl_gym.placement import design
 from rbl_gym.studies.learning import policies
-from rbl_gym.studies.placing import design
 from tests.helpers import ROOT, needs
 
 # Its blocks are files of a package: tests/test_your_estimator.py.
@@ -70,7 +70,7 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
             for topic, time, message in test_bags.flight(types)
         ]
         test_bags.write_bag(tmp_path / "flight", "ros1", types, messages)
-    monkeypatch.setattr(design, "_GENERATIONS", 4)  # pages show how, not how well
+    monkeypatch.setattr(design, "STAGES", (64, 64, 64))  # pages show how, not how well
     write_files_that_pages_read(tmp_path)
     names: dict = {}
     for block in blocks(page, "python"):

@@ -414,7 +414,9 @@ def test_scores_of_layouts(law, batch, m):
         anchors, poses.rotation, poses.translation, world.tags, 0.1 * np.eye(6), law.numbers, share
     )  # fmt: skip
     assert_equal_forms(placement._mean_square, *args)
-    assert_equal_forms(placement._mean_square_of, poses.matrix, poses.rotation, world.tags)
+    assert_equal_forms(
+        placement.weighted_square, poses.matrix, poses.rotation, world.tags, world.rng.random(6)
+    )
 
 
 @every_batch

@@ -12,7 +12,7 @@ import pytest
 from rbl_gym import placement
 from rbl_gym.placement import Context, layouts
 from rbl_gym.placement import search as layout_search
-from rbl_gym.placement.search import SEARCHES, cma_es, expand, greedy, shared_layout
+from rbl_gym.placement.search import SEARCHES, along_gradient, cma_es, expand, greedy, shared_layout
 from tests.helpers import needs
 
 QUICK = {"generations": 6, "population": 6}
@@ -140,6 +140,15 @@ def test_searches_are_legal_deterministic_and_better_than_chance(name, scene):
     assert np.log(placement.score(task, context, found)).mean() < np.log(chance).mean()
     single = Context(*(field[0, 0] for field in context))
     assert SEARCHES[name](task, single, rng(), **options).shape == (4, 3)
+
+
+@pytest.mark.parametrize(("scene", "racks"), [("uwb_room", 1), ("drone_yard", 0), ("satellite", 0)])
+def test_along_the_gradient_it_is_better_than_the_ring_and_than_swaps(scene, racks):
+    task, context = problem(scene, 4, (6,), racks=racks, n_poses=16)
+    found = np.log(placement.score(task, context, along_gradient(task, context, rng())))
+    others = layouts.ring(task, context, rng()), layout_search.greedy_swaps(task, context, rng())
+    ring, swapped = (np.log(placement.score(task, context, other)) for other in others)
+    assert found.mean() < min(ring.mean(), swapped.mean())
 
 
 @needs("cmaes")

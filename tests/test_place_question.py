@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("shapely", reason="needs the extra placement")
-pytest.importorskip("cmaes", reason="needs the extra placement")
 
 from scipy import stats
 

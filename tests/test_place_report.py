@@ -9,7 +9,6 @@ import re
 import numpy as np
 import pytest
 
-pytest.importorskip("cmaes", reason="needs the extra placement")
 pytest.importorskip("shapely", reason="needs the extra placement")
 pytest.importorskip("plotly", reason="needs the extra viz")
 

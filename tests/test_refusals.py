@@ -15,11 +15,10 @@ from rbl_gym.geometry import bodies
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.measurements import ranging
 from rbl_gym.networks import rigidity
-from rbl_gym.placement import scene_files
+from rbl_gym.placement import design, scene_files
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.bench import spec_files, worlds
-from rbl_gym.studies.placing import design
 from rbl_gym.worlds import scene_bounds, scenes, simulation
 
 TAGS = bodies.pyramid()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from rbl_gym.app.cli import main
+from rbl_gym.placement import design as search_design
 from rbl_gym.placement import scene_files
 from rbl_gym.studies import backends, monte_carlo, network, replay
 from rbl_gym.studies.bench import leaderboard, records, spec_files
@@ -132,7 +133,7 @@ def test_replay_in_one_call_is_the_four():
 
 @needs("cmaes")
 def test_place(capsys, monkeypatch):
-    monkeypatch.setattr(design, "_GENERATIONS", 2)
+    monkeypatch.setattr(search_design, "STAGES", (64, 64, 64))
     problem = scene_files.problem("uwb_room", 4, None, 0, 0)
     placed = answer.place_anchors(problem, answer.Question(range(4, 5), trials=20))
     arguments = "--scene", "uwb_room", "--anchors", "4", "--trials", "20"

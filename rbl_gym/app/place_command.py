@@ -24,7 +24,6 @@ from rbl_gym.app.terminal import (
     progress,
     write_json,
 )
-from rbl_gym.studies.extras import require
 
 
 def add_place(commands: Any) -> None:
@@ -96,7 +95,6 @@ def add_place(commands: Any) -> None:
 
 
 def _place(options: argparse.Namespace) -> int:
-    require("cmaes", "placement")
     check_html(options)
     check_report_options(options)
     from rbl_gym.placement import scene_files

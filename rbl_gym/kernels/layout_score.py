@@ -16,14 +16,14 @@ from rbl_gym.kernels.pose_bound import (
 )
 
 
-@gufunc("(p,s,s),(p,d,d),(n,d)->()")
-def mean_square_of_information(information: Any, rotation: Any, tags: Any, square: Any) -> None:
-    """Mean of b^2 over the poses, of the information at each."""
+@gufunc("(p,s,s),(p,d,d),(n,d),(p)->()")
+def weighted_square(information: Any, rotation: Any, tags: Any, weight: Any, square: Any) -> None:
+    """Sum of b^2 over the poses by their weights, of the information at each."""
     work = np.empty((2, 6, 6))
     total = 0.0
     for k in range(rotation.shape[0]):
-        total += square_of_information(information[k], rotation[k], tags, work)
-    square[0] = total / rotation.shape[0]
+        total += weight[k] * square_of_information(information[k], rotation[k], tags, work)
+    square[0] = total
 
 
 @gufunc("(m,d),(p,d,d),(p,d),(n,d),(s,s),(l),(p,m)->()")

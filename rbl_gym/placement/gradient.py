@@ -63,9 +63,12 @@ def score_and_gradient(
         normals = np.zeros((1, 3))
     normals = np.broadcast_to(check_array("normals", normals, ("M", 3)), anchors.shape)
     shares = _shares(share, len(sample.places), anchors.shape[-2], len(tags))
-    square, gradient = _square_and_gradient(
-        anchors, normals, *sample[:4], tags, law, gain.numbers, shares
-    )
+    return of_arrays(anchors, normals, *sample[:4], tags, law, gain.numbers, shares)
+
+
+def of_arrays(*arrays: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`score_and_gradient`, of the arguments of `_square_and_gradient`."""
+    square, gradient = _square_and_gradient(*arrays)
     root = root_of(square)
     return root, gradient / (2 * root[..., None, None])
 

@@ -300,15 +300,18 @@ def _mean_square(
         ranging.law_of(law),
         share[..., None],
     )
-    return _mean_square_of(told + prior[..., None, :, :], rotation, tags)
+    weight = np.full(rotation.shape[-3], 1 / rotation.shape[-3])
+    return weighted_square.textbook(told + prior[..., None, :, :], rotation, tags, weight)
 
 
-@compiled("layout_score:mean_square_of_information")
-def _mean_square_of(information: FloatArray, rotation: FloatArray, tags: FloatArray) -> FloatArray:
-    """Mean (...) of b^2 over poses of information (..., P, 6, 6)."""
+@compiled("layout_score:weighted_square")
+def weighted_square(
+    information: FloatArray, rotation: FloatArray, tags: FloatArray, weight: FloatArray
+) -> FloatArray:
+    """Sum (...) of b^2 by weights (..., P) over poses of information (..., P, 6, 6)."""
     J = bounds.tag_jacobian(rotation, tags[..., None, :, :])
     S = np.einsum("...nia,...nib->...ab", J, J) / tags.shape[-2]
-    return np.einsum("...ab,...ba->...", S, np.linalg.inv(information)).mean(axis=-1)
+    return (weight * np.einsum("...ab,...ba->...", S, np.linalg.inv(information))).sum(axis=-1)
 
 
 def checked_context(context: Context) -> Context:
@@ -323,7 +326,8 @@ def checked_context(context: Context) -> Context:
 def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
     """Score (...) of an information (..., P, 6, 6) at the task's poses."""
     told = information + task.prior_information
-    return root_of(_mean_square_of(told, task.poses[0], task.scene.body))
+    weight = np.full(task.n_poses, 1 / task.n_poses)
+    return root_of(weighted_square(told, task.poses[0], task.scene.body, weight))
 
 
 def root_of(square: FloatArray) -> FloatArray:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, check_count
+from rbl_gym.geometry import rotations
+from rbl_gym.placement.building import Problem, Zone, free_places
 from rbl_gym.placement.problem import Context, PlacementTask, positions
 
-__all__ = ["Sample", "of_context"]
+__all__ = ["Sample", "of_context", "sample"]
+
+# Places of a zone, at least.
+_LEAST_PLACES = 64
+# Rotation of the prior that regularises the bound, and information where the tilt is known.
+_PRIOR_ROTATION_RAD, _KNOWN = math.radians(60), 1e12
 
 
 class Sample(NamedTuple):
@@ -35,6 +43,96 @@ class Sample(NamedTuple):
     prior: FloatArray
     zone: np.ndarray
     turns: int = 1
+
+    def every(self, step: int, first: int) -> np.ndarray:
+        """Indices of the poses at every so many places of each zone, from the first on."""
+        zone = self.zone[:: self.turns]
+        rank = np.empty(len(zone), dtype=np.int64)
+        for index in np.unique(zone):
+            rank[zone == index] = np.arange((zone == index).sum())
+        return np.flatnonzero(np.repeat(rank % step == first, self.turns))
+
+    def part(self, index: np.ndarray) -> Sample:
+        """The poses of indices, with weights that leave each zone what it counts."""
+        arrays = Sample(*(field[index] for field in self[:5]), self.turns)
+        whole = np.bincount(self.zone, self.weight)
+        here = np.bincount(arrays.zone, arrays.weight, minlength=len(whole))
+        ratio = whole / np.where(here > 0, here, 1.0)
+        return arrays._replace(weight=arrays.weight * ratio[arrays.zone])
+
+
+def sample(problem: Problem, n_places: int = 1024, turns: int = 1, seed: int = 0) -> Sample:
+    """Poses that fill the zones of a problem evenly, those inside obstacles left out.
+
+    Parameters
+    ----------
+    problem
+        Gives zones, obstacles and what is known before the first range.
+    n_places
+        How many places, shared among the zones by their weights; each zone has at least 64. Those
+        of a smaller number are among those of a larger one.
+    turns
+        Poses at each place: any turn, or about the vertical where the attitude of the zone is
+        level or the heading alone is estimated.
+    seed
+        Of the turns.
+
+    Raises
+    ------
+    ValueError
+        Where a zone has no free place, and on numbers below 1.
+    """
+    n_places = check_count("n_places", n_places, least=1)
+    turns = check_count("turns", turns, least=1)
+    total = sum(zone.weight for zone in problem.zones)
+    rows = []
+    for index, zone in enumerate(problem.zones):
+        count = max(round(n_places * zone.weight / total), min(_LEAST_PLACES, n_places))
+        places = free_places(zone, problem.obstacles, count)
+        if not len(places):
+            raise ValueError(f"zone {zone.name!r} has no free place")
+        n = len(places)
+        rng = np.random.default_rng([seed, index])
+        rows.append(
+            (
+                _turns(rng, zone, (n, turns)),
+                places,
+                np.full(n, zone.weight / (total * n * turns)),
+                np.full(n, index),
+                # Where the place stands in its zone: any part of the sample has places of all.
+                (np.arange(n) + 0.5) / n,
+            )
+        )
+    rotation, places, weight, zone, order = (
+        np.concatenate(column) for column in zip(*rows, strict=True)
+    )
+    order = np.argsort(order, kind="stable")
+    prior = np.array([_prior(problem, zone) for zone in problem.zones])
+    zone = np.repeat(zone[order], turns)
+    return Sample(
+        rotation[order].reshape(-1, 3, 3),
+        np.repeat(places[order], turns, axis=0),
+        np.repeat(weight[order], turns),
+        prior[zone],
+        zone,
+        turns,
+    )
+
+
+def _turns(rng: np.random.Generator, zone: Zone, batch: tuple[int, ...]) -> FloatArray:
+    if zone.attitude == "free":
+        return rotations.random(rng, batch)
+    angle = rng.uniform(0, 2 * np.pi, (*batch, 1))
+    return rotations.exp(angle * np.array([0.0, 0.0, 1.0]))
+
+
+def _prior(problem: Problem, zone: Zone) -> FloatArray:
+    """(6, 6): 60 degrees, half of the extent of all zones; the tilt where it is known."""
+    extent = float(np.ptp(problem.corners(), axis=0).max())
+    diagonal = np.array([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
+    if zone.attitude == "heading":
+        diagonal[:2] = _KNOWN
+    return np.diag(diagonal)
 
 
 def of_context(task: PlacementTask, context: Context) -> Sample:

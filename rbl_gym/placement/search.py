@@ -1,4 +1,4 @@
-"""Layouts that look at the score: the best of many, greedy, greedy with swaps, CMA-ES.
+"""Layouts that look at the score: the best of many, greedy, along the gradient, CMA-ES.
 
 As in `layouts` a search is a function ``(task, context, rng) -> anchors (..., M, 3)``; options
 come as keywords. CMA-ES is the `cmaes` package's (extra ``placement``).
@@ -12,10 +12,18 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import FloatArray, check_array, check_number
-from rbl_gym.placement.layouts import Layout
+from rbl_gym.placement import exchange, setting
+from rbl_gym.placement.descent import descend
+from rbl_gym.placement.layouts import Layout, ring
 from rbl_gym.placement.problem import Context, PlacementTask, information, score, score_of
 
-__all__ = ["SEARCHES", "best_of_random", "cma_es", "greedy", "greedy_swaps", "shared_layout"]
+__all__ = [
+    "SEARCHES", "along_gradient", "best_of_random", "cma_es", "greedy", "greedy_swaps",
+    "shared_layout",
+]  # fmt: skip
+
+# Candidates past racks, rounds of fresh ones after them, and then steps along the gradient.
+_CANDIDATES, _ROUNDS, _STEPS = 100, 3, 12
 
 
 def best_of_random(
@@ -102,6 +110,45 @@ def _greedy(
                 chosen[k], best, improved = new, float(scores[new]), True
                 total = without + parts[new]
     return chosen
+
+
+def along_gradient(
+    task: PlacementTask, context: Context, rng: np.random.Generator, evaluations: int = 30
+) -> FloatArray:
+    """L-BFGS-B along the gradient of the score, from the ring; greedy and fresh candidates first
+    where something is in the way.
+
+    Parameters
+    ----------
+    task, context, rng
+        As `cma_es`.
+    evaluations
+        Of score and gradient, at most, for each context; past obstacles there are fewer.
+    """
+    batch = context.centre.shape[:-1]
+    result = ring(task, context, rng)
+    for where in np.ndindex(batch):
+        seen = setting.of_task(task, Context(*(field[where] for field in context)))
+        if seen.obstacles:
+            result[where], _ = descend(seen, _past_obstacles(task, seen, rng), _STEPS)
+        else:
+            result[where], _ = descend(seen, result[where], evaluations)
+    return result
+
+
+def _past_obstacles(
+    task: PlacementTask, seen: setting.Setting, rng: np.random.Generator
+) -> FloatArray:
+    """A layout (M, 3) by greedy with swaps and rounds of fresh candidates."""
+    region = task.scene.anchor_region
+    candidates = region.draw(rng.random((max(_CANDIDATES, 4 * task.n_anchors), 3)))
+    free = candidates[~seen.obstacles.contain(candidates)]
+    candidates = free if len(free) >= task.n_anchors else candidates
+    parts = seen.parts(candidates)
+    anchors = candidates[exchange.swap(seen, parts, exchange.choose(seen, parts, task.n_anchors))]
+    for _ in range(_ROUNDS):
+        anchors, _ = exchange.refresh(seen, anchors, rng)
+    return anchors
 
 
 def cma_es(
@@ -218,5 +265,6 @@ SEARCHES: dict[str, Layout] = {
     "best-of-random": best_of_random,
     "greedy": greedy,
     "greedy-swaps": greedy_swaps,
+    "gradient": along_gradient,
     "cma-es": cma_es,
 }

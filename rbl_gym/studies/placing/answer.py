@@ -334,8 +334,6 @@ def _comparison(
 ) -> dict[str, dict[str, Any]]:
     """The design and the usual layouts, each a row of figures."""
     rows = {"given" if found.method == "given" else "designed": found.anchors}
-    if "greedy with swaps" in found.searched:
-        rows["greedy with swaps"] = found.searched["greedy with swaps"]
     rows |= design.usual_layouts(problem, seed)
     table = {
         name: _summary(problem, anchors, judge(problem, anchors, seed, survive, PLACES))

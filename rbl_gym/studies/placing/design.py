@@ -10,7 +10,8 @@ import numpy as np
 from rbl_gym import placement
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.obstacles import Obstacles
-from rbl_gym.placement import layouts, search
+from rbl_gym.geometry.regions import Box, Shell, Walls
+from rbl_gym.placement import design, layouts
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.placing import judging
@@ -22,11 +23,10 @@ __all__ = [
     "usual_layouts",
 ]
 
-# Poses over which layouts are scored while searching: racks make the score rough.
-_N_POSES, _N_POSES_OBSTACLES = 64, 160
-# First standard deviations of CMA-ES, in units of half the legal space: near the start, and far.
-_SIGMAS = (0.1, 0.4)
-_GENERATIONS = 80
+# Poses over which the usual layouts are compared.
+_N_POSES = 64
+# Usual layouts from which the search starts too, where nothing is in the way.
+_STARTS = ("grid", "ring")
 # Random layouts whose median stands for "at random".
 _RANDOM_DRAWS = 25
 
@@ -73,51 +73,35 @@ def design_layout(
     problem: Problem,
     seed: int,
     advance: Advance = silent,
-    smaller: FloatArray | None = None,
+    start: FloatArray | None = None,
 ) -> Design:
-    """The best layout of a problem: greedy with swaps, then CMA-ES from it and from the ring.
+    """The best layout of a problem that `placement.design` finds, or a usual one.
 
     Parameters
     ----------
     problem, seed
-        What is placed, and the seed of candidates and searches.
+        What is placed, and the seed of all randomness.
     advance
         Called after each of the `SEARCH_STEPS` steps.
-    smaller
-        A good layout (M - 1, 3) of one anchor fewer: with the best candidate added, it is one
-        more start.
+    start
+        A layout (K, 3), its first rows the fixed anchors: one more start. With fewer anchors than
+        are placed, the others are added.
     """
-    context = problem.context
-    task = free_task(problem, _N_POSES_OBSTACLES if problem.obstacles else _N_POSES)
-    rng = np.random.default_rng([seed, task.n_anchors])
-    candidates = free_candidates(problem, rng, max(200, 4 * task.n_anchors))
-    greedy = search.greedy(task, context, rng, candidates, swaps=True)
-    searched = {"greedy with swaps": greedy}
-    starts = {"greedy": greedy, "ring": layouts.ring(task, context, rng)}
-    if smaller is not None:
-        added = np.concatenate(
-            [np.broadcast_to(smaller, (len(candidates), *smaller.shape)), candidates[:, None]],
-            axis=-2,
-        )
-        scores = placement.score(task, _repeated(context, len(added)), added)
-        starts["one fewer"] = searched["one added"] = added[scores.argmin()]
-    advance()
-    for sigma in _SIGMAS:
-        found = search.cma_es(
-            task,
-            _repeated(context, len(starts)),
-            rng,
-            _GENERATIONS,
-            sigma=sigma,
-            start=np.array(list(starts.values())),
-        )
-        for name, anchors in zip(starts, found, strict=True):
-            searched[f"CMA-ES from {name}, step {sigma:g}"] = anchors
-        advance()
-    # Nobody mounts to less than a millimetre.
-    region = task.scene.anchor_region
-    searched = {name: region.project(np.round(x, 3)) for name, x in searched.items()}
-    searched |= usual(task, context, rng)
+    context, fixed = problem.context, problem.fixed
+    task = free_task(problem, _N_POSES)
+    rng = np.random.default_rng([seed, problem.n_anchors])
+    drawn = {} if len(fixed) else usual(task, context, rng)
+    starts = {}
+    if isinstance(problem.mounts, Box | Shell | Walls) and not problem.obstacles:
+        starts = {name: layout for name, layout in drawn.items() if name in _STARTS}
+    if start is not None:
+        starts["given"] = start[len(fixed) :]
+    found, name = design.find_layout(problem, rng, starts, advance)
+    name = f"search from {name}"
+    searched = {name: np.concatenate([fixed, _rounded(problem, found[len(fixed) :])])}
+    if start is not None and len(start) == problem.n_anchors:
+        searched["as given"] = start
+    searched |= drawn
     legal = {
         name: anchors
         for name, anchors in searched.items()
@@ -126,25 +110,17 @@ def design_layout(
     # Judged over more places than those that the search has seen.
     scores = {name: judging.score_of(problem, x, seed) for name, x in legal.items()}
     best = min(scores, key=scores.__getitem__)
-    return Design(_in_order(legal[best], context.centre), best, searched)
+    ordered = _in_order(legal[best][len(fixed) :], context.centre)
+    return Design(np.concatenate([fixed, ordered]), best, searched)
 
 
-SEARCH_STEPS = 1 + len(_SIGMAS)
+SEARCH_STEPS = len(design.STAGES)
 
 
-def free_candidates(problem: Problem, rng: np.random.Generator, count: int) -> FloatArray:
-    """Legal places (count, 3) outside of the obstacles, uniform.
-
-    Raises
-    ------
-    ValueError
-        If hardly any place is free.
-    """
-    drawn = problem.mounts.draw(rng.random((20 * count, 3)))
-    free = drawn[~problem.obstacles.contain(drawn)]
-    if len(free) < problem.n_anchors:
-        raise ValueError("anchors have no legal place: obstacles cover all of them")
-    return free[:count]
+def _rounded(problem: Problem, anchors: FloatArray) -> FloatArray:
+    """Anchors to the millimetre where that leaves them legal: nobody mounts to less."""
+    rounded = problem.mounts.project(np.round(anchors, 3))
+    return np.where(problem.obstacles.contain(rounded)[:, None], anchors, rounded)
 
 
 def _in_order(anchors: FloatArray, centre: FloatArray) -> FloatArray:

@@ -1,0 +1,126 @@
+"""The search for the layout of a problem whose score is least.
+
+Greedy with swaps over candidates gives starts. Each is then improved in turns by fresh candidates,
+near and far, which find their way past walls, and by the gradient, which moves all anchors at
+once; first over few places, at the end over as many as it takes for the layout to be as good on
+places that the search has not seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement.building import Problem
+from rbl_gym.placement.descent import descend
+from rbl_gym.placement.exchange import choose, refresh, swap
+from rbl_gym.placement.sample import sample
+from rbl_gym.placement.setting import Setting, of_problem
+
+__all__ = ["STAGES", "find_layout", "free_candidates"]
+
+# Places of each stage, and how many of the layouts go on to the next.
+STAGES, _KEPT = (256, 1024, 2048), (2, 1, 1)
+# Rounds of fresh candidates of each stage, and then steps along the gradient.
+_FRESH, _STEPS = 3, 12
+# Steps where nothing is in the way: there the gradient alone finds the layout.
+_STEPS_FREE = 40
+# Candidates of greedy, and greedy starts: as many as make so many anchors in all, at most so many.
+_CANDIDATES, _ANCHORS, _STARTS = 400, 32, 4
+
+
+def find_layout(
+    problem: Problem,
+    rng: np.random.Generator,
+    starts: Mapping[str, FloatArray] | None = None,
+    advance: Callable[[], object] = lambda: None,
+) -> tuple[FloatArray, str]:
+    """The best layout (M, 3) that the search finds, fixed anchors first, and from which start.
+
+    Parameters
+    ----------
+    problem
+        What is placed.
+    rng
+        Of all randomness.
+    starts
+        Further starts by their names: legal places (K, 3) of the anchors that are not fixed. Where
+        K is less than how many are placed, the others are added where they help most.
+    advance
+        Called after each of the stages.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer legal places than anchors.
+    """
+    count = problem.n_anchors - len(problem.fixed)
+    if not count:
+        return problem.fixed.copy(), "fixed"
+    found: dict[str, FloatArray] = {}
+    for stage, kept in zip(STAGES, _KEPT, strict=True):
+        setting = of_problem(problem, sample(problem, stage))
+        if stage == STAGES[0]:
+            found = _starts(problem, setting, rng, count, starts or {})
+        improved = {name: _improved(setting, layout, rng) for name, layout in found.items()}
+        names = sorted(improved, key=lambda name: improved[name][1])[:kept]
+        found = {name: improved[name][0] for name in names}
+        advance()
+    name, layout = next(iter(found.items()))
+    return np.concatenate([problem.fixed, layout]), name
+
+
+def _starts(
+    problem: Problem,
+    setting: Setting,
+    rng: np.random.Generator,
+    count: int,
+    given: Mapping[str, FloatArray],
+) -> dict[str, FloatArray]:
+    """Layouts (`count`, 3): those given, and greedy with swaps among some draws of candidates."""
+    most = 1 if problem.mounts.listed() is not None else max(1, min(_STARTS, _ANCHORS // count))
+    found: dict[str, FloatArray] = {}
+    for number in range(most):
+        candidates = free_candidates(problem, rng, max(_CANDIDATES, 4 * count))
+        parts = setting.parts(candidates)
+        chosen = swap(setting, parts, choose(setting, parts, count))
+        found["greedy" if not number else f"greedy {number + 1}"] = candidates[chosen]
+        if number:
+            continue
+        for name, start in given.items():
+            seen = setting
+            if len(start):
+                seen = setting._replace(sample=setting.sample._replace(prior=setting.told(start)))
+            added = choose(seen, parts, count - len(start))
+            found[name] = np.concatenate([start, candidates[added]])
+    return found
+
+
+def _improved(
+    setting: Setting, layout: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, float]:
+    """A layout after fresh candidates and steps along the gradient, and its score."""
+    if setting.is_smooth:
+        return descend(setting, layout, _STEPS_FREE)
+    for _ in range(_FRESH):
+        layout, _ = refresh(setting, layout, rng)
+    return descend(setting, layout, _STEPS)
+
+
+def free_candidates(problem: Problem, rng: np.random.Generator, count: int) -> FloatArray:
+    """Legal places (count, 3) outside of the obstacles, uniform; or all of a list of mounts.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer legal places than anchors.
+    """
+    drawn = problem.mounts.listed()
+    if drawn is None:
+        drawn = problem.mounts.draw(rng.random((20 * count, 3)))
+    free = drawn[~problem.obstacles.contain(drawn)]
+    if len(free) < problem.n_anchors - len(problem.fixed):
+        raise ValueError("anchors have no legal place: obstacles cover all of them")
+    return free if problem.mounts.listed() is not None else free[:count]

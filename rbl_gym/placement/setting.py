@@ -1,0 +1,130 @@
+"""What a layout is judged by: the body, the law, the poses, what is in the way, on plain arrays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym import bounds
+from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry.obstacles import Obstacles
+from rbl_gym.geometry.regions import Box, Region, Shell, Walls
+from rbl_gym.measurements import ranging
+from rbl_gym.placement.building import Problem
+from rbl_gym.placement.gain import EVERYWHERE, Gain
+from rbl_gym.placement.gradient import of_arrays
+from rbl_gym.placement.problem import Context, PlacementTask, weighted_square
+from rbl_gym.placement.sample import Sample, of_context
+
+__all__ = ["Setting", "of_problem", "of_task"]
+
+
+class Setting(NamedTuple):
+    """A placement problem as the search sees it.
+
+    Attributes
+    ----------
+    tags
+        (N, 3) in the body frame, metres.
+    noise
+        The law of the ranges.
+    sample
+        The poses over which a layout is judged. Its prior has what anchors tell that stay.
+    region
+        Where anchors may stand.
+    obstacles
+        What stands in the way. Sight is judged from the anchor to the body's origin.
+    gain
+        Limit of the range, and field of view.
+    """
+
+    tags: FloatArray
+    noise: ranging.NoiseLaw
+    sample: Sample
+    region: Region
+    obstacles: Obstacles
+    gain: Gain = EVERYWHERE
+
+    def sight(self, anchors: FloatArray) -> FloatArray:
+        """Share (P, M, N) of its information that what stands in the way leaves each link."""
+        sample, links = self.sample, (len(anchors), len(self.tags))
+        if not self.obstacles:
+            return np.broadcast_to(1.0, (len(sample.places), *links))
+        share = self.obstacles.share(anchors, sample.places[:: sample.turns])
+        share = np.repeat(share, sample.turns, axis=0)[..., None]
+        return np.broadcast_to(share, (*share.shape[:-2], *links))
+
+    def parts(self, anchors: FloatArray) -> FloatArray:
+        """Information (M, P, 6, 6) of each anchor alone at each pose."""
+        sample = self.sample
+        share = np.moveaxis(self.sight(anchors), 1, 0)[..., None, :]
+        if self.gain:
+            tags = ranging.tag_positions(sample.rotation, sample.places, self.tags)
+            normals = self.region.normal(anchors)[:, None, None]
+            share = share * self.gain.share(tags - anchors[:, None, None], normals)[..., None, :]
+        places = sample.rotation, sample.places
+        return bounds.information_at(anchors[:, None, None], self.tags, *places, self.noise, share)
+
+    def told(self, anchors: FloatArray) -> FloatArray:
+        """Information (P, 6, 6) of a layout and of the prior."""
+        return self.parts(anchors).sum(axis=0) + self.sample.prior
+
+    def squares(self, information: FloatArray) -> FloatArray:
+        """Weighted mean square (...) of b, of information (..., P, 6, 6) with the prior."""
+        sample = self.sample
+        return weighted_square(information, sample.rotation, self.tags, sample.weight)
+
+    def score(self, anchors: FloatArray) -> float:
+        """The score of a layout (M, 3), metres."""
+        return float(np.sqrt(self.squares(self.told(anchors))))
+
+    def score_and_gradient(self, anchors: FloatArray) -> tuple[float, FloatArray]:
+        """Score of a layout, and its derivative (M, 3) by the anchors."""
+        normals = self.region.normal(anchors) if self.gain else np.zeros(anchors.shape)
+        law = ranging.numbers_of(self.noise, len(self.tags))
+        assert law is not None  # the laws of scenes have numbers
+        score, gradient = of_arrays(
+            anchors,
+            normals,
+            *self.sample[:4],
+            self.tags,
+            law,
+            self.gain.numbers,
+            self.sight(anchors),
+        )
+        return float(score), gradient
+
+    def legal(self, points: FloatArray) -> BoolArray:
+        """Which points (..., 3) lie in the region and outside of what stands in the way."""
+        off = np.abs(self.region.project(points) - points).max(axis=-1)
+        return (off <= 1e-6) & ~self.obstacles.contain(points)
+
+    @property
+    def is_smooth(self) -> bool:
+        """Whether the score has a gradient everywhere and anchors can go everywhere along it.
+
+        Nothing is in the way, nothing is out of reach, and the faces meet.
+        """
+        plain = isinstance(self.region, Box | Shell | Walls)
+        return plain and not self.obstacles and not self.gain
+
+    def part(self, index: np.ndarray) -> Setting:
+        """The setting over the poses of indices."""
+        return self._replace(sample=self.sample.part(index))
+
+
+def of_task(task: PlacementTask, context: Context) -> Setting:
+    """The setting of an environment's problem, a context without batch axes."""
+    scene, poses = task.scene, of_context(task, context)
+    return Setting(scene.body, scene.noise, poses, scene.anchor_region, task.obstacles(context))
+
+
+def of_problem(problem: Problem, sample: Sample) -> Setting:
+    """The setting of a problem over poses of it, its fixed anchors in the prior."""
+    setting = Setting(
+        problem.tags, problem.noise, sample, problem.mounts, problem.obstacles, problem.gain
+    )
+    if not len(problem.fixed):
+        return setting
+    return setting._replace(sample=sample._replace(prior=setting.told(problem.fixed)))
