@@ -8,10 +8,12 @@ from rbl_gym.checks import FloatArray, check_count
 from rbl_gym.estimators.bank.headings import HeadingBank
 from rbl_gym.estimators.filter import Filter, register
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf
+from rbl_gym.estimators.iekf.clock import ClockEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.odometry import OdometryEkf
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.odometry import OdometrySensor
+from rbl_gym.measurements.offsets import Clock
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
@@ -90,6 +92,7 @@ def iekf_log(
     drift_std_m: float = 0.05,
     drift_time_s: float = 3.0,
     offset: str | None = None,
+    clock: Clock | None = None,
     odometry: Mapping[str, float] | OdometrySensor | None = None,
     headings: int = 1,
 ) -> Filter:
@@ -112,6 +115,9 @@ def iekf_log(
         Standard deviations of the biases that stay: of each link, and of what all have in common.
     drift_std_m, drift_time_s
         Of the biases that move: standard deviation of each link's, and how long it lasts.
+    clock
+        Law of offsets that last, in place of `offset`, as of ``"iekf"``; with one heading and
+        no odometry.
     odometry
         Law of the odometry that `predict` is then told, an `OdometrySensor` or its fields; the
         twist is that of the body's axes. None: there is none.
@@ -122,7 +128,11 @@ def iekf_log(
     stays = LinkBias(constant_std_m, None, constant_common_m)
     moves = LinkBias(drift_std_m, drift_time_s)
     pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
-    if odometry is None:
+    if clock is not None:
+        if odometry is not None or headings != 1:
+            raise ValueError(f"clock must be None beside odometry or headings, got {clock!r:.80}")
+        filter = ClockEkf(pose, law, None, (stays, moves), clock)
+    elif odometry is None:
         filter = AugmentedEkf(pose, law, None, (stays, moves))
     else:
         sensor = odometry if isinstance(odometry, OdometrySensor) else OdometrySensor(**odometry)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym import estimators, metrics
+from rbl_gym import bounds, estimators, metrics
+from rbl_gym.bounds import twist as twist_bound
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import offsets, ranging
+from rbl_gym.measurements.link_bias import LinkBias, simulate_biases
 from rbl_gym.measurements.offsets import Clock, simulate_clocks
 from rbl_gym.motion import ProcessNoise, propagate
+from rbl_gym.motion import unknown_twist as ut
 from tests.test_offsets import distances, groups, numeric_jacobian
 
 M, N, DT = 6, 5, 0.1
@@ -144,3 +147,76 @@ def test_what_is_no_clock_is_refused():
         filter.update(state, np.ones((4, 3)), places()[0][:4])
     with pytest.raises(ValueError, match="ranges must be finite"):
         filter.update(state, np.full((M, 3), np.nan), places()[0])
+
+
+def test_what_has_no_clock_is_refused():
+    make = {"tags": places()[1], "noise": NOISE, "process": PROCESS, "clock": LAW}
+    for more in ({"headings": 4}, {"odometry": {}}):
+        with pytest.raises(ValueError, match="clock must be None beside odometry or headings"):
+            estimators.make("iekf-log", **make, **more)
+
+
+@pytest.mark.parametrize("kind", ["tag", "anchor"])
+def test_with_an_unknown_twist_and_biases_it_stands_at_its_bound(kind):
+    """100 trials: ratios scatter by 3 % (6 epochs that go together), NEES/6 by 6 %."""
+    batch, K = 100, 8
+    clock = Clock(kind, 30.0, 2.0, 0.02, 0.05)
+    anchors, tags, rng = places(1)
+    # A small body that knows no distance sees its place as directions, which are not linear.
+    tags = 2 * tags
+    law = ut.WanderingTwist(0.3, 1.0, 0.2, 0.5)
+    stays, moves = LinkBias(0.05, None, 0.05), LinkBias(0.03, 0.5)
+    G, links = groups(kind, M, N).shape[1], M * N
+    times = DT * np.arange(K)
+    path = ut.simulate_wandering(
+        np.broadcast_to(rotations.random(rng), (batch, 3, 3)), np.zeros((batch, 3)), law, PROCESS,
+        DT, K - 1, rng,
+    )  # fmt: skip
+    added = sum(simulate_biases(b, times, links, rng, (batch,)) for b in (stays, moves))
+    added = added + simulate_clocks(clock, times, G, rng, (batch,)) @ groups(kind, M, N).T
+    filter = estimators.make(
+        "iekf-log", tags=tags, noise=NOISE, process=PROCESS, robust=False, clock=clock,
+        turn_rate_rad_s=0.3, speed_m_s=1.0, turn_acceleration=0.2, acceleration=0.5,
+        constant_std_m=0.05, constant_common_m=0.05, drift_std_m=0.03, drift_time_s=0.5,
+    )  # fmt: skip
+    first = rotations.exp(0.2 * rng.standard_normal((batch, 3))) @ path.rotation[:, 0]
+    state = filter.initial(first, 0.5 * rng.standard_normal((batch, 3)), PRIOR)
+    # The bound: all states of one trial after the other's mean, F and Q by their blocks.
+    n = 12 + 2 * links + 2 * G
+    P = np.zeros((batch, n, n))
+    P[:, :6, :6], P[:, range(6, 12), range(6, 12)] = PRIOR, law.prior_std() ** 2
+    for k, bias in enumerate((stays, moves)):
+        where = slice(12 + k * links, 12 + (k + 1) * links)
+        P[:, where, where] = bias.covariance(links)
+    std = np.repeat([clock.std_m, clock.drift_m_s], G)
+    P[:, range(n - 2 * G, n), range(n - 2 * G, n)] = std**2
+    S = np.concatenate([np.eye(links), np.eye(links), groups(kind, M, N)], axis=1)
+    errors, nees, limits = [], [], []
+    for k in range(K):
+        pose = path.rotation[:, k], path.translation[:, k]
+        if k:
+            state = filter.predict(state, None, DT)
+            P = twist_bound.predict_covariance(P, path.twists[:, k - 1], DT, PROCESS, law)
+            F, Q = np.eye(n), np.zeros((n, n))
+            where, kept = slice(12 + links, 12 + 2 * links), np.exp(-DT / 0.5)
+            F[where, where] *= kept
+            Q[where, where] = (1 - kept**2) * moves.covariance(links)
+            last = slice(n - 2 * G, n)
+            F[last, last], Q[last, last] = (np.kron(a, np.eye(G)) for a in clock.transition(DT))
+            P = F @ P @ F.T + Q
+        far = ranging.distances(anchors, ranging.tag_positions(*pose, tags))
+        ranges = far + 0.05 * rng.standard_normal(far.shape) + added[:, k].reshape(far.shape)
+        state = filter.update(state, ranges, anchors)
+        _, J = bounds.range_jacobian(anchors, tags, *pose)
+        H = np.zeros((batch, links, n))
+        H[..., :6], H[..., 12 : 12 + S.shape[1]] = np.swapaxes(J, -1, -2), S
+        gain = np.linalg.solve(H @ P @ np.swapaxes(H, -1, -2) + 0.05**2 * np.eye(links), H @ P)
+        P = P - np.swapaxes(H @ P, -1, -2) @ gain
+        error = metrics.pose_error(state.rotation, state.translation, *pose)
+        errors.append(error**2)
+        nees.append(metrics.nees(error, filter.belief(state).covariance))
+        limits.append(np.diagonal(P, axis1=-2, axis2=-1)[:, :6])
+    for block in (slice(0, 3), slice(3, 6)):
+        found, limit = (np.array(a)[2:, :, block].mean() for a in (errors, limits))
+        assert np.sqrt(found / limit) == pytest.approx(1, abs=0.12)
+    assert np.mean(nees[2:]) / 6 == pytest.approx(1, abs=0.18)

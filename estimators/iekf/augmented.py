@@ -114,12 +114,7 @@ class AugmentedEkf:
             what the `sensor` read, or nothing to it (None), and without a sensor it is ignored.
         """
         dt, state = check_number("dt", dt, low=0.0), plain(state)
-        known = self.twist is None
-        if twist is None and known:
-            raise ValueError("twist must be given to a filter that does not estimate it, got None")
-        told = _AT_REST if twist is None else check_array("twist", twist, (6,))
-        if twist is not None and self.sensor is not None and not known:
-            state = _sensed(state, told, self.sensor)
+        state, told = told_twist(self, state, twist)
         return AugmentedState(
             *predict_augmented(
                 *state, told, dt, self._process, self._wander, self._laws, self._n_twist
@@ -295,6 +290,19 @@ def predict_augmented(
         P[..., block, block] += (1 - np.exp(-dt / time) ** 2) * fresh
     extra = np.broadcast_to(extra * kept[6:], (*moved[1].shape[:-1], extra.shape[-1]))
     return *moved, extra, P
+
+
+def told_twist(
+    filter: AugmentedEkf, state: AugmentedState, twist: ArrayLike | None
+) -> tuple[AugmentedState, FloatArray]:
+    """The state with what a sensor of the filter read, and the twist (..., 6) if it is known."""
+    known = filter.twist is None
+    if twist is None and known:
+        raise ValueError("twist must be given to a filter that does not estimate it, got None")
+    told = _AT_REST if twist is None else check_array("twist", twist, (6,))
+    if twist is not None and filter.sensor is not None and not known:
+        state = _sensed(state, told, filter.sensor)
+    return state, told
 
 
 def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> AugmentedState:

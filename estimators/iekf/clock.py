@@ -8,90 +8,98 @@ for every tag, every anchor or one pair for all, and biases of the ranges as tho
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbl_gym.checks import FloatArray, check_array, check_number, kernel
+from rbl_gym.bounds.twist import covariance_after
+from rbl_gym.checks import FloatArray, check_number, kernel
 from rbl_gym.estimators.costs import bias_cost
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
-from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState
-from rbl_gym.estimators.filter import PoseBelief
-from rbl_gym.estimators.iekf.manifold import IteratedEkf
-from rbl_gym.estimators.iekf.pose_steps import as_state, predict_pose
-from rbl_gym.estimators.inputs import check_epoch, check_one_process, epoch_variance, plain
-from rbl_gym.geometry import rotations
+from rbl_gym.estimators.iekf.augmented import LOSSES, AugmentedEkf, told_twist
+from rbl_gym.estimators.iekf.pose_steps import as_state
+from rbl_gym.estimators.inputs import check_batches, check_epoch, epoch_variance, plain
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.offsets import Clock
 from rbl_gym.measurements.ranging import NoiseLaw
+from rbl_gym.motion.kinematics import propagate
 
 # Behind the doors: what comes to these was checked, or made here.
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
-_EXP = kernel(rotations.exp)
-_LOSSES = {False: SQUARES, True: huber(1.5), "late": LATE}
 
 
 @dataclass(frozen=True, eq=False)
-class ClockEkf:
+class ClockEkf(AugmentedEkf):
     """Iterated extended Kalman filter of the pose, of clocks' offsets and of their drifts.
+
+    The extra states are those of `AugmentedEkf`, then offsets and drifts of the G clocks; these
+    and the biases come with the first ranges.
 
     Parameters
     ----------
     pose
         The filter of the pose alone, without an offset.
+    twist, sensor, biases
+        As `AugmentedEkf`.
     clock
         Law of the offsets.
     """
 
-    pose: IteratedEkf
-    clock: Clock
+    clock: Clock = field(default_factory=Clock)
 
     def __post_init__(self) -> None:
-        check_one_process(self.pose.process)
+        super().__post_init__()
         if not isinstance(self.clock, Clock):
             raise ValueError(f"clock must be a Clock, got {self.clock!r:.80}")
         if self.pose.offset is not None:
             raise ValueError(f"offset must be None beside a clock, got {self.pose.offset!r}")
 
-    def initial(
-        self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
-    ) -> AugmentedState:
-        """State of a prior of the pose, covariance (..., 6, 6); clocks come with the first ranges.
+    def predict(self, state: AugmentedState, twist: ArrayLike | None, dt: float) -> AugmentedState:
+        """State after `dt` seconds, the clocks running on; arguments as `AugmentedEkf.predict`."""
+        dt, state = check_number("dt", dt, low=0.0), plain(state)
+        state, told = told_twist(self, state, twist)
+        known = self.twist is None
+        moving = told if known else state.extra[..., :6]
+        moved = propagate(state.rotation, state.translation, moving, dt)
+        wander = None if known else self._wander
+        P = covariance_after(state.covariance, moving, dt, self._process, wander)
+        F, Q = self._transition(state.extra.shape[-1], dt)
+        T, noise = (np.zeros(P.shape[-2:]) for _ in range(2))
+        T[:6, :6], T[6:, 6:], noise[6:, 6:] = np.eye(6), F, Q
+        extra = np.broadcast_to(state.extra @ F.T, (*moved[1].shape[:-1], len(F)))
+        return AugmentedState(*moved, extra, T @ P @ T.T + noise)
 
-        Raises
-        ------
-        ValueError
-            As `IteratedEkf.initial`.
-        """
-        pose = self.pose.initial(rotation, translation, covariance)
-        extra = np.zeros((*pose.translation.shape[:-1], 0))
-        return AugmentedState(pose.rotation, pose.translation, extra, pose.covariance)
+    def _transition(self, extra: int, dt: float) -> tuple[FloatArray, FloatArray]:
+        """F and Q of the extra states beside what the twist does: of biases, and of clocks."""
+        F, Q = np.eye(extra), np.zeros((extra, extra))
+        clocks = self._n_clocks(extra)
+        if not clocks:
+            return F, Q
+        last = slice(extra - 2 * clocks, extra)
+        F[last, last], Q[last, last] = (
+            np.kron(a, np.eye(clocks)) for a in self.clock.transition(dt)
+        )
+        first, size = self._n_twist, (last.start - self._n_twist) // max(1, len(self.biases))
+        for law in self.biases:
+            where, kept = slice(first, first + size), law.decay(dt)
+            F[where, where] *= kept
+            Q[where, where] = (1 - kept**2) * law.covariance(size)
+            first += size
+        return F, Q
 
-    def predict(self, state: AugmentedState, twist: ArrayLike, dt: float) -> AugmentedState:
-        """State after `dt` seconds of the twist (..., 6), the clocks running on."""
-        dt, twist, state = (
-            check_number("dt", dt, low=0.0),
-            check_array("twist", twist, (6,)),
-            plain(state),
-        )
-        variance = self.pose.process.std() ** 2
-        moved = predict_pose(
-            state.rotation, state.translation, state.covariance[..., :6, :6], twist, dt, variance
-        )
-        n = state.extra.shape[-1] // 2
-        F, Q = (np.kron(a, np.eye(n)) for a in self.clock.transition(dt))
-        cross = state.covariance[..., :6, 6:] @ F.T
-        turn = _EXP(twist[..., :3] * dt)
-        batch = moved[1].shape[:-1]
-        P = np.zeros((*batch, 6 + 2 * n, 6 + 2 * n))
-        P[..., :6, :6] = moved[2]
-        P[..., :3, 6:], P[..., 3:6, 6:] = turn @ cross[..., :3, :], cross[..., 3:, :]
-        P[..., 6:, :6] = np.swapaxes(P[..., :6, 6:], -1, -2)
-        P[..., 6:, 6:] = F @ state.covariance[..., 6:, 6:] @ F.T + Q
-        extra = np.broadcast_to(state.extra @ F.T, (*batch, 2 * n))
-        return AugmentedState(moved[0], moved[1], extra, P)
+    def _n_clocks(self, extra: int) -> int:
+        """How many clocks a state of so many extra states has: none before the first ranges."""
+        return 0 if extra == self._n_twist else self._clocks_of(extra - self._n_twist)
+
+    def _clocks_of(self, more: int) -> int:
+        """Clocks of so many states of biases and clocks: of M N links and N tags."""
+        n, laws = self.pose.tags.shape[-2], len(self.biases)
+        if self.clock.offset == "anchor":
+            return more // (laws * n + 2)
+        count = n if self.clock.offset == "tag" else 1
+        return count if more >= 2 * count else 0
 
     def update(
         self,
@@ -101,7 +109,7 @@ class ClockEkf:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> AugmentedState:
-        """State after one epoch of ranges (..., M, N) of any sign; arguments as `IteratedEkf`.
+        """State after one epoch of ranges (..., M, N) of any sign; arguments as `AugmentedEkf`.
 
         Raises
         ------
@@ -111,51 +119,74 @@ class ClockEkf:
         state = plain(state)
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
         ranges, anchors, mask = check_epoch(ranges, anchors, links, self.pose.tags, signed=True)
+        check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         distance = _DISTANCES(anchors, _TAG_POSITIONS(*pose[:2], self.pose.tags))
         ranges, distance = np.broadcast_arrays(ranges, distance)
         there = np.broadcast_to(True if mask is None else mask, ranges.shape)
         variance = epoch_variance(noise, self.pose.noise, distance, mask)
-        weights = np.where(there, 1 / variance, 0.0)
+        # A start is sought as if biases were noise.
+        spread = sum(law.std_m**2 + law.common_std_m**2 for law in self.biases)
+        seen = np.where(there, 1 / (variance + spread), 0.0)
         white = dataclasses.replace(self.pose, offset=self.clock.offset)
-        start = white.start(pose, ranges, weights, anchors)
+        start = white.start(pose, ranges, seen, anchors)
         here = _DISTANCES(anchors, _TAG_POSITIONS(*start, self.pose.tags))
         state = self._with_clocks(state, ranges - here, there)
         found = AugmentedState(
             *bias_cost.update_any(
-                *state, ranges, weights, anchors, self.pose.tags, *start, pose.covariance,
-                self.pose.iterations, _LOSSES[self.pose.robust], 0, None,
-                self._sums(ranges.shape[-2:]),
+                *state, ranges, np.where(there, 1 / variance, 0.0), anchors, self.pose.tags,
+                *start, pose.covariance, self.pose.iterations, LOSSES[self.pose.robust],
+                self._n_twist, None, self._sums(ranges.shape[-2:]),
             )
         )  # fmt: skip
         as_state(*found[:2], found.covariance)
         return found
 
+    @property
+    def offset(self) -> str | None:
+        """Whose ranges have a clock in common: innovations are those of what offsets leave."""
+        return self.clock.offset
+
+    def biases_of(
+        self, state: AugmentedState, shape: tuple[int, ...]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As `AugmentedEkf.biases_of`, without the clocks."""
+        state = plain(state)
+        n = state.extra.shape[-1]
+        n -= 2 * self._n_clocks(n)
+        less = state.extra[..., :n], state.covariance[..., : 6 + n, : 6 + n]
+        return super().biases_of(AugmentedState(state.rotation, state.translation, *less), shape)
+
     def _sums(self, shape: tuple[int, ...]) -> FloatArray:
-        """Which offset, and no drift, each of (M, N) ranges has: (M N, 2 G)."""
+        """Which biases, which offset, and no drift, each of (M, N) ranges has: (M N, K)."""
+        links = shape[0] * shape[1]
+        own = bias_cost.sums_of(self._n_twist, len(self.biases), links)
         columns = offsets.columns(self.clock.offset, shape[0], shape[1])
-        return np.concatenate([columns, np.zeros_like(columns)], axis=1)
+        return np.concatenate([own, columns, np.zeros_like(columns)], axis=1)
 
     def _with_clocks(
         self, state: AugmentedState, gaps: FloatArray, there: np.ndarray
     ) -> AugmentedState:
-        """The state with clocks, at first set by the ranges less distances (..., M, N)."""
+        """The state with biases and clocks, at first set by ranges less distances (..., M, N)."""
         guess = offsets.median(gaps, there, self.clock.offset)
+        shape = gaps.shape[-2:]
+        biases = len(self.biases) * shape[0] * shape[1]
         n = guess.shape[-2] * guess.shape[-1]
-        have = state.extra.shape[-1] // 2
-        if have == n:
+        have, first = state.extra.shape[-1], self._n_twist
+        if have == first + biases + 2 * n:
             return state
-        if have:
-            raise ValueError(f"anchors must be the {have} whose clocks the state holds, got {n}")
-        batch = guess.shape[:-2]
-        P = np.zeros((*batch, 6 + 2 * n, 6 + 2 * n))
-        P[..., :6, :6] = state.covariance
+        if have > first:
+            held = self._n_clocks(have)
+            raise ValueError(f"anchors must be the {held} whose clocks the state holds, got {n}")
+        batch, start = guess.shape[:-2], 6 + first
+        total = start + biases + 2 * n
+        P = np.zeros((*batch, total, total))
+        P[..., :start, :start] = state.covariance
+        for k, law in enumerate(self.biases):
+            block = slice(start + k * shape[0] * shape[1], start + (k + 1) * shape[0] * shape[1])
+            P[..., block, block] = law.covariance(shape[0] * shape[1])
         std = np.repeat([self.clock.std_m, self.clock.drift_m_s], n)
-        P[..., range(6, 6 + 2 * n), range(6, 6 + 2 * n)] = std**2
-        extra = np.concatenate([guess.reshape((*batch, n)), np.zeros((*batch, n))], axis=-1)
+        P[..., range(total - 2 * n, total), range(total - 2 * n, total)] = std**2
+        extra = np.zeros((*batch, total - 6))
+        extra[..., :first] = state.extra
+        extra[..., first + biases : first + biases + n] = guess.reshape((*batch, n))
         return AugmentedState(state.rotation, state.translation, extra, P)
-
-    def belief(self, state: AugmentedState) -> PoseBelief:
-        """What the state says about the pose (copies)."""
-        rotation = state.rotation.copy()
-        covariance = state.covariance[..., :6, :6].copy()
-        return PoseBelief(rotation, state.translation.copy(), covariance, rotation)

@@ -240,7 +240,7 @@ def iterated_ekf(
         raise ValueError("range_noise must be None where noise is the law of the ranges")
     filter = IteratedEkf(tags, noise, process, iterations, robust, offset)
     if anchor_std_m is None:
-        return filter if clock is None else ClockEkf(filter, clock)
+        return filter if clock is None else ClockEkf(filter, clock=clock)
     if clock is not None:
         raise ValueError(f"clock must be None beside anchor_std_m, got {clock!r:.80}")
     return SurveyedEkf(filter, anchor_std_m=anchor_std_m)
