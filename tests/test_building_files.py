@@ -76,9 +76,8 @@ def test_the_office_is_read():
     assert (second.share, second.heading_deg) == (0.9, None)
     assert first.has_requirement
     assert {zone.attitude for zone in problem.zones} <= set(building.ATTITUDES)
-    # Six pieces of outer wall, two of drywall, the core; the cupboard is a box.
-    assert len(problem.obstacles.prisms) == 9
-    assert len(problem.obstacles) == 10
+    # Six pieces of outer wall, two of drywall, the core and the cupboard.
+    assert len(problem.obstacles.prisms) == len(problem.obstacles) == 10
     share = problem.obstacles.prisms.share
     np.testing.assert_array_equal(share[~np.isnan(share)], [0.05, 0.6, 0.6])
 
@@ -232,6 +231,11 @@ def test_every_kind_of_mount():
     assert (area[corner, 2] > 1.5 - 1e-9).all()
     assert problem.mounts.listed() is None
     assert (problem.mounts.cost(points)[names == "points 3"] == 7).all()
+    # On an opaque box too.
+    rack = tables | {"mounts": [{"kind": "column", "polygon": [[3, 3], [5, 3], [5, 5], [3, 5]],
+                                 "high_m": 1.5}]}  # fmt: skip
+    problem_of_rack = scene_files.of_mapping(rack)
+    assert not problem_of_rack.obstacles.contain(anywhere(problem_of_rack)).any()
     # What stands on the face of the pillar sees past it, not through it.
     west = points[names == "pillar 1"]
     share = problem.obstacles.share(west, np.array([[1.5, -3.0, 1.0], [1.2, 5.0, 1.0]]))

@@ -53,7 +53,7 @@ def read_obstacles(
     Parameters
     ----------
     tables
-        The read tables ``obstacles``, ``walls`` and ``slabs``.
+        The read tables: ``obstacles``, ``walls``, ``slabs``, and whether there are ``mounts``.
     materials
         Shares by name.
     blocked
@@ -69,9 +69,11 @@ def read_obstacles(
         low, high = np.array(table["low"]), np.array(table["high"])
         if not (high > low).all():
             raise ValueError(f"{name}: low must lie below high, got {show(low)}, {show(high)}")
-        if not math.isnan(share) and (high - low).min() < 1e-3:
+        # A box holds its own faces too, and then nothing may hang on them.
+        is_box = math.isnan(share) and not tables.get("mounts")
+        if not is_box and (high - low).min() < 1e-3:
             raise ValueError(f"{name} must be at least a millimetre wide, got {show(high - low)}")
-        if math.isnan(share):
+        if is_box:
             boxes.append([*0.5 * (low + high), *0.5 * (high - low)])
         else:
             solids.add(rectangle(low, high), low[2], high[2], share)
@@ -172,9 +174,9 @@ def read_mounts(tables: list[dict[str, Any]], walls: WallPieces) -> list[Mount]:
     for index, table in enumerate(tables):
         kind = table["kind"]
         faces = _SHAPES[kind](f"mounts[{index}]", table, walls)
-        name = table["name"] or f"{kind} {index + 1}"
+        name, mark = (table["name"], " ") if table["name"] else (f"{kind} {index + 1}", ".")
         for k, face in enumerate(faces):
-            label = f"{name} {k + 1}" if len(faces) > 1 and kind != "points" else name
+            label = f"{name}{mark}{k + 1}" if len(faces) > 1 and kind != "points" else name
             found.append(face._replace(cost=table["cost"], name=label))
     return found
 
