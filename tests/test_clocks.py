@@ -7,6 +7,7 @@ import pytest
 
 from rbl_gym import bounds, estimators, metrics
 from rbl_gym.bounds import twist as twist_bound
+from rbl_gym.estimators import smoothing
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.link_bias import LinkBias, simulate_biases
@@ -220,3 +221,66 @@ def test_with_an_unknown_twist_and_biases_it_stands_at_its_bound(kind):
         found, limit = (np.array(a)[2:, :, block].mean() for a in (errors, limits))
         assert np.sqrt(found / limit) == pytest.approx(1, abs=0.12)
     assert np.mean(nees[2:]) / 6 == pytest.approx(1, abs=0.18)
+
+
+@pytest.mark.parametrize("kind", ["tag", "anchor"])
+def test_the_smoother_stands_at_the_bound_of_the_whole_log(kind):
+    """60 tracks of 6 epochs: ratios scatter by 5 %, NEES/6 by 6 %; covariances by the dense one."""
+    batch, K = 60, 6
+    law = Clock(kind, 30.0, 2.0, 0.02, 0.05)
+    anchors, tags, rng = places(2)
+    U = groups(kind, M, N)
+    G = U.shape[1]
+    clocks = simulate_clocks(law, DT * np.arange(K), G, rng, (batch,))
+    twists = np.tile([0.1, -0.2, 0.3, 1.0, 0.5, -0.2], (batch, K - 1, 1))
+    rotation, translation = rotations.random(rng), np.zeros(3)
+    Q, t = [np.broadcast_to(rotation, (batch, 3, 3))], [np.zeros((batch, 3))]
+    for k in range(K - 1):
+        walked = twists[:, k] + rng.standard_normal((batch, 6)) * PROCESS.std() / np.sqrt(DT)
+        for track, new in zip((Q, t), propagate(Q[-1], t[-1], walked, DT), strict=True):
+            track.append(new)
+    Q, t = np.stack(Q, axis=1), np.stack(t, axis=1)
+    far = ranging.distances(anchors, ranging.tag_positions(Q, t, tags))
+    added = (clocks @ U.T).reshape(far.shape)
+    ranges = far + 0.05 * rng.standard_normal(far.shape) + added
+    prior = (
+        rotations.exp(0.2 * rng.standard_normal((batch, 3))) @ rotation,
+        translation + 0.5 * rng.standard_normal((batch, 3)),
+        PRIOR,
+    )
+    filter = estimators.make("iekf", tags=tags, noise=NOISE, process=PROCESS, clock=law)
+    log = smoothing.RangeLog(DT * np.arange(K), ranges, anchors)
+    start = smoothing.causal_track(filter, log, prior, twists)
+    model = smoothing.LogModel(tags, NOISE, smoothing.KnownTwist(PROCESS, twists), clock=law)
+    found = estimators.smooth(log, model, prior, start)
+    assert found.converged.all()
+    # All poses and clocks of the first track as one dense problem, at its truth.
+    n = 6 + 2 * G
+    H = np.zeros((n * K, n * K))
+    H[:6, :6] = np.linalg.inv(PRIOR)
+    H[range(6, n), range(6, n)] = np.repeat([law.std_m, law.drift_m_s], G) ** -2.0
+    for k in range(K):
+        own = slice(n * k, n * k + n)
+        J = np.zeros((M * N, n))
+        J[:, :6], J[:, 6 : 6 + G] = numeric_jacobian(anchors, tags, Q[0, k], t[0, k]), U
+        H[own, own] += J.T @ J / 0.05**2
+        if k:
+            F, noise = np.eye(n), np.zeros((n, n))
+            F[:3, :3] = rotations.exp(DT * twists[0, 0, :3])
+            noise[:6, :6] = PROCESS.covariance(twists[0, 0], DT)
+            F[6:, 6:], noise[6:, 6:] = (np.kron(a, np.eye(G)) for a in law.transition(DT))
+            both, step = slice(n * k - n, n * k + n), np.hstack([-F, np.eye(n)])
+            H[both, both] += step.T @ np.linalg.solve(noise, step)
+    dense = np.linalg.inv(H)
+    limit = np.array([dense[n * k : n * k + 6, n * k : n * k + 6] for k in range(K)])
+    scale = np.sqrt(np.diagonal(limit, axis1=-2, axis2=-1))
+    ratio = (found.covariance[0] - limit) / scale[:, :, None] / scale[:, None, :]
+    assert np.abs(ratio).max() < 0.1
+    error = metrics.pose_error(found.rotation, found.translation, Q, t)
+    for block in (slice(0, 3), slice(3, 6)):
+        square = np.square(error[..., block]).sum(axis=-1).mean()
+        bound = np.trace(limit[:, block, block], axis1=-2, axis2=-1).mean()
+        assert np.sqrt(square / bound) == pytest.approx(1, abs=0.15)
+    assert metrics.nees(error, found.covariance).mean() / 6 == pytest.approx(1, abs=0.2)
+    with pytest.raises(ValueError, match="offset must be None beside a clock"):
+        smoothing.LogModel(tags, NOISE, model.motion, offset="tag", clock=law)

@@ -19,22 +19,22 @@ _LEAST_NEW = 1e-12
 
 
 class BiasBlock(NamedTuple):
-    """Biases of one kind: of every link, or one that all have in common.
+    """Biases of one kind: of every link, one that all have in common, offsets of clocks.
 
     Attributes
     ----------
     where
         Their places among the extra states of an epoch, or among the constants.
-    each
-        True: one a link; False: one for all.
+    of_link
+        Which of them each of the M N links has.
     std
         Metres.
     time_s
-        Of the drift; None: constants.
+        Of the drift; None: constants. Infinite: the law is a clock's (`clocks`).
     """
 
     where: slice
-    each: bool
+    of_link: np.ndarray
     std: float
     time_s: float | None
 
@@ -56,9 +56,10 @@ def bias_blocks(
         for each, std in ((True, law.std_m), (False, law.common_std_m)):
             if std == 0:
                 continue
+            of_link = np.arange(links) if each else np.zeros(links, dtype=np.intp)
             size = links if each else 1
             start = constants if law.time_s is None else extra
-            blocks.append(BiasBlock(slice(start, start + size), each, std, law.time_s))
+            blocks.append(BiasBlock(slice(start, start + size), of_link, std, law.time_s))
             if law.time_s is None:
                 constants += size
             else:
@@ -70,10 +71,11 @@ def bias_of(blocks: list[BiasBlock], state: LogState, links: int) -> FloatArray:
     """Biases (..., K, links) of a state, metres: all kinds together."""
     total = np.zeros((*state.translation.shape[:-1], links))
     for block in blocks:
+        values = state.extra
         if block.time_s is None:
-            total += state.constants[..., None, block.where]
-        else:
-            total += state.extra[..., block.where]
+            values = state.constants[..., None, :]
+        if block.time_s != np.inf:
+            total += values[..., block.where][..., block.of_link]
     return total
 
 
@@ -83,6 +85,8 @@ def add_biases(
     """The priors of the biases, and their drift: Gauss-Markov processes of the same variance."""
     for block in blocks:
         where, std = block.where, block.std
+        if block.time_s == np.inf:
+            continue
         if block.time_s is None:
             equations.add_constants_prior(where, state.constants[..., where], np.asarray(std))
             continue
@@ -178,10 +182,8 @@ class LogRanges:
                 if block.time_s is None
                 else state.extra[..., block.where]
             )
-            if block.each:
-                values = np.broadcast_to(values, (*self.link.shape[:-1], values.shape[-1]))
-                values = np.take_along_axis(values, self.link, axis=-1)
-            total += values
+            values = np.broadcast_to(values, (*self.link.shape[:-1], values.shape[-1]))
+            total += np.take_along_axis(values, block.of_link[self.link], axis=-1)
         residual = np.where(self.weights > 0, distance + total - self.ranges, 0.0)
         if self.offset is not None:
             weights = self.spread(self.weights)
@@ -218,9 +220,7 @@ class LogRanges:
         for block in self.blocks:
             target, shift = (constants, 0) if block.time_s is None else (before, 6)
             columns = target[..., block.where.start + shift : block.where.stop + shift]
-            columns[...] = 1.0
-            if block.each:
-                columns[...] = self.link[..., None] == np.arange(columns.shape[-1])
+            columns[...] = block.of_link[self.link][..., None] == np.arange(columns.shape[-1])
         before = self._centred(before, weights) * root[..., None]
         constants = self._centred(constants, weights) * root[..., None]
         rows = Rows(root * residual, before, None, constants)

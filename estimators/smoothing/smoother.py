@@ -24,6 +24,7 @@ from rbl_gym.estimators.inputs import (
     check_offset_epoch,
     epoch_variance,
 )
+from rbl_gym.estimators.smoothing.clocks import add_clocks, clock_block, first_offsets
 from rbl_gym.estimators.smoothing.equations import (
     Equations,
     Factor,
@@ -33,11 +34,18 @@ from rbl_gym.estimators.smoothing.equations import (
     with_turning,
 )
 from rbl_gym.estimators.smoothing.motion import Motion
-from rbl_gym.estimators.smoothing.ranges import LogRanges, add_biases, bias_blocks, bias_of
+from rbl_gym.estimators.smoothing.ranges import (
+    BiasBlock,
+    LogRanges,
+    add_biases,
+    bias_blocks,
+    bias_of,
+)
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.noise_laws import NoiseLaw
+from rbl_gym.measurements.offsets import Clock
 
 __all__ = ["LogModel", "RangeLog", "Smoothed", "smooth"]
 
@@ -98,6 +106,8 @@ class LogModel:
     offset
         Whose ranges have an unknown offset in common, new at every epoch, as `IteratedEkf`;
         variances are then taken at the distances from the start.
+    clock
+        Law of offsets that last, in place of `offset`; their states are eliminated with the rest.
     """
 
     tags: FloatArray
@@ -107,6 +117,7 @@ class LogModel:
     factors: tuple[Factor, ...] = ()
     loss: FloatArray = dataclasses.field(default_factory=lambda: SQUARES)
     offset: str | None = None
+    clock: Clock | None = None
 
     def __post_init__(self) -> None:
         tags = check_array("tags", self.tags, ("N", 3))
@@ -114,6 +125,10 @@ class LogModel:
             raise ValueError(f"tags must be (N, 3), got shape {tags.shape}")
         object.__setattr__(self, "tags", tags)
         offsets.check_offset(self.offset)
+        if not isinstance(self.clock, Clock | None):
+            raise ValueError(f"clock must be a Clock or None, got {self.clock!r:.80}")
+        if self.clock is not None and self.offset is not None:
+            raise ValueError(f"offset must be None beside a clock, got {self.offset!r}")
         for law in self.biases:
             if not isinstance(law, LinkBias):
                 raise ValueError(f"biases must be a tuple of LinkBias, got {law!r:.80}")
@@ -236,6 +251,7 @@ class _Problem:
     factors: tuple[Factor, ...]
     prior: PoseState
     information: FloatArray
+    clocks: tuple[BiasBlock, Clock, FloatArray] | None = None
 
     def linearize(self, state: LogState, loss: FloatArray) -> Equations:
         batch, K = state.translation.shape[:-2], state.translation.shape[-2]
@@ -253,6 +269,8 @@ class _Problem:
                 equations.add_constants_prior(where, own, factor.constants_std)
             first = where.stop
         add_biases(equations, self.ranges.blocks, state, self.times)
+        if self.clocks is not None:
+            add_clocks(equations, *self.clocks, state, self.times)
         self.ranges.add(equations, state, loss)
         return equations
 
@@ -307,7 +325,9 @@ def _checked(
     if (np.diff(times) < 0).any():
         raise ValueError("times must not decrease")
     if model.offset is None:
-        ranges, anchors, mask = check_epoch(log.ranges, log.anchors, log.links, model.tags)
+        signed = model.clock is not None
+        epoch = log.ranges, log.anchors, log.links, model.tags
+        ranges, anchors, mask = check_epoch(*epoch, signed=signed)
     else:
         epoch = log.ranges, log.anchors, log.links, model.tags
         ranges, anchors, mask = check_offset_epoch(*epoch, model.offset)
@@ -332,15 +352,24 @@ def _checked(
             f"{anchors.shape}, start {Q.shape} and {t.shape}, prior {covariance.shape}"
         ) from error
     told = ranges
-    if model.offset is not None:
+    if model.offset is not None or model.clock is not None:
         told = ranging.distances(anchors, ranging.tag_positions(Q, t, model.tags))
     variance = epoch_variance(log.noise, model.noise, told, mask)
     motion, factors = model.motion, model.factors
     M, N = ranges.shape[-2:]
     constants = sum(len(factor.constants_std) for factor in (motion, *factors))
     blocks, extra, constants = bias_blocks(model.biases, M * N, len(motion.extra_std), constants)
+    clocks, first = None, extra
+    if model.clock is not None:
+        block = clock_block(model.clock, (M, N), extra)
+        there = np.broadcast_to(True if mask is None else mask, ranges.shape)
+        found, mean = first_offsets(ranges - told, there, model.clock.offset)
+        blocks, extra = [*blocks, block], extra + 2 * mean.shape[-1]
+        clocks = block, model.clock, mean
     gathered = LogRanges.gathered(ranges, variance, mask, anchors, model.tags, blocks, model.offset)
     state = LogState(Q, t, np.zeros((*batch, K, extra)), np.zeros((*batch, constants)))
+    if clocks is not None:
+        state.extra[..., first : first + found.shape[-1]] = found  # pyright: ignore[reportPossiblyUnboundVariable]
     pose = PoseState(rotation, translation, covariance)
     information = positive_inverse(covariance)
-    return _Problem(times, gathered, motion, factors, pose, information), state
+    return _Problem(times, gathered, motion, factors, pose, information, clocks), state
