@@ -226,7 +226,7 @@ def bank_run(rng, headings, batch=()):
         assert isinstance(at, simulation.Epoch)
         if k:
             state = filter.predict(state, at.readings, scene.dt)
-        measured = simulation.measure(scene, at, episode.anchors)
+        measured = simulation.measure_epoch(scene, at, episode.anchors)
         state = filter.update(state, measured.ranges, episode.anchors, measured.links)
     return filter, state, episode
 

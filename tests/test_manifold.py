@@ -260,3 +260,25 @@ def test_prediction_turns_the_covariance_with_the_body():
         state.covariance[:3, :3], np.diag([0.2, 0.1, 0.3]) + 0.02**2 * Jl @ Jl.T, atol=1e-12
     )
     np.testing.assert_allclose(state.translation, [1, 0, 0])
+
+
+@pytest.mark.parametrize("proportional", [0.0, 0.01])
+def test_lost_links_by_the_filters_own_law_are_those_of_the_same_deviations(proportional):
+    rng = np.random.default_rng(8)
+    anchors, tags, rotation, translation = random_world(rng, 6, 4)
+    noise = ranging.RangeNoise(0.05, proportional)
+    filter = estimators.make("iekf", tags=tags, noise=noise, process=motion.ProcessNoise(0.1, 0.1))
+    state = filter.initial(rotation, translation, np.diag([0.01] * 3 + [0.04] * 3))
+    ranges = ranging.simulate(anchors, tags, rotation, translation, noise, rng).ranges
+    links = rng.random(ranges.shape) < 0.6
+    # What is not measured may be anything that is a number.
+    ranges[~links] = -1e3
+    told = ranging.LinkNoise(
+        np.where(links, noise.floor_m**2 + (proportional * ranges) ** 2, 1) ** 0.5
+    )
+    for mine, theirs in zip(
+        filter.update(state, ranges, anchors, links),
+        filter.update(state, ranges, anchors, links, noise=told),
+        strict=True,
+    ):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-12)

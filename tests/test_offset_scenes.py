@@ -54,8 +54,8 @@ def test_offsets_are_those_of_their_groups(offset):
     rng = np.random.default_rng(0)
     episode = simulation.draw_episode(scene, rng, (4,))
     at = simulation.epoch_of(episode, 3)
-    got = simulation.measure(scene, at, episode.anchors).ranges
-    added = got - simulation.measure(plain, at, episode.anchors).ranges
+    got = simulation.measure_epoch(scene, at, episode.anchors).ranges
+    added = got - simulation.measure_epoch(plain, at, episode.anchors).ranges
     assert np.abs(added).max() > 1.0
     np.testing.assert_allclose(offsets.centred(added, np.ones_like(added), offset), 0.0, atol=1e-9)
 

@@ -30,7 +30,7 @@ def test_steps_equal_the_plain_recursion(name, links):
     scene = scenes.get({"name": name, "links": links, "steps": 6})
     episode = simulation.draw_episode(scene, np.random.default_rng(1), (7,))
     whole = simulation.whole(episode)
-    seen = simulation.measure(scene, whole, episode.anchors[:, None]).links
+    seen = simulation.measure_epoch(scene, whole, episode.anchors[:, None]).links
     want, got = np.linalg.inv(episode.prior_covariance), None
     for k in range(scene.steps + 1):
         at = simulation.epoch_of(episode, k)

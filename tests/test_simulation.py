@@ -344,7 +344,7 @@ def test_measure_equals_a_loop_over_the_links(name):
     assert episode.uniforms is not None
     for k in (0, 3, 5):
         clean = ranges_by_hand(scene, episode, k, episode.anchors)
-        got = simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors)
+        got = simulation.measure_epoch(scene, simulation.epoch_of(episode, k), episode.anchors)
         for m, n in np.ndindex(clean.shape):
             dropped = episode.uniforms[k, 0, m, n] < 0.3
             reflected = episode.uniforms[k, 1, m, n] < 0.2
@@ -358,10 +358,10 @@ def test_measure_equals_a_loop_over_the_links(name):
 def test_measure_of_a_batch_equals_its_episodes_one_by_one(name):
     scene = change(name, steps=4, links=BAD_LINKS)
     batch = draw(scene, 10, (3,))
-    together = simulation.measure(scene, simulation.epoch_of(batch, 2), batch.anchors)
+    together = simulation.measure_epoch(scene, simulation.epoch_of(batch, 2), batch.anchors)
     for b in range(3):
         single = Episode(*(None if array is None else array[b] for array in batch))  # type: ignore[arg-type]
-        alone = simulation.measure(scene, simulation.epoch_of(single, 2), single.anchors)
+        alone = simulation.measure_epoch(scene, simulation.epoch_of(single, 2), single.anchors)
         for got, want in zip(together, alone, strict=True):
             np.testing.assert_allclose(got[b], want, rtol=1e-13)
 
@@ -370,7 +370,7 @@ def test_measure_of_a_batch_equals_its_episodes_one_by_one(name):
 def test_measurements_of_an_epoch_depend_on_no_other_epoch(name):
     scene = change(name, steps=6, links=BAD_LINKS)
     episode = draw(scene, 11)
-    want = simulation.measure(scene, simulation.epoch_of(episode, 3), episode.anchors)
+    want = simulation.measure_epoch(scene, simulation.epoch_of(episode, 3), episode.anchors)
 
     def spoil(array: np.ndarray) -> np.ndarray:
         others = np.arange(7) != 3
@@ -378,7 +378,7 @@ def test_measurements_of_an_epoch_depend_on_no_other_epoch(name):
 
     per_epoch = ("rotation", "translation", "twists", "normals", "uniforms")
     spoilt = episode._replace(**{key: spoil(getattr(episode, key)) for key in per_epoch})
-    got = simulation.measure(scene, simulation.epoch_of(spoilt, 3), episode.anchors)
+    got = simulation.measure_epoch(scene, simulation.epoch_of(spoilt, 3), episode.anchors)
     for a, b in zip(got, want, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -419,7 +419,7 @@ def test_limit_of_a_changed_scene_does_not_cut_its_ranges(override):
     scene = scenes.get({"name": "uwb_room", **override})
     episode = draw(scene, 0)
     want = ranges_by_hand(scene, episode, 0, episode.anchors)
-    got = simulation.measure(scene, simulation.epoch_of(episode, 0), episode.anchors).ranges
+    got = simulation.measure_epoch(scene, simulation.epoch_of(episode, 0), episode.anchors).ranges
     np.testing.assert_allclose(got, want)
 
 
@@ -428,7 +428,7 @@ def test_an_impossible_range_is_cut_to_the_limit(name):
     scene = change(name, steps=2)
     episode = draw(scene, 12)
     wild = episode._replace(normals=np.full_like(episode.normals, 1e12))
-    ranges = simulation.measure(scene, simulation.epoch_of(wild, 1), episode.anchors).ranges
+    ranges = simulation.measure_epoch(scene, simulation.epoch_of(wild, 1), episode.anchors).ranges
     np.testing.assert_array_equal(ranges, np.full_like(ranges, scene.range_limit_m))
 
 
@@ -436,7 +436,7 @@ def test_a_range_of_zero_is_no_link():
     scene = change("uwb_room", steps=2)
     episode = draw(scene, 13)
     none = episode._replace(normals=np.full_like(episode.normals, -1e6))
-    measured = simulation.measure(scene, simulation.epoch_of(none, 1), episode.anchors)
+    measured = simulation.measure_epoch(scene, simulation.epoch_of(none, 1), episode.anchors)
     assert not measured.links.any()
     assert not measured.ranges.any()
 
@@ -450,7 +450,7 @@ def test_links_drop_as_often_as_said(probability):
     episode = draw(scene, 14)
     lost = np.concatenate(
         [
-            ~simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors).links
+            ~simulation.measure_epoch(scene, simulation.epoch_of(episode, k), episode.anchors).links
             for k in range(101)
         ]
     )
@@ -465,8 +465,8 @@ def test_links_end_at_the_reach():
     seen = []
     for k in range(0, 101, 5):
         distances = distances_by_hand(scene, episode, k, episode.anchors)
-        free = simulation.measure(clean, simulation.epoch_of(episode, k), episode.anchors)
-        got = simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors)
+        free = simulation.measure_epoch(clean, simulation.epoch_of(episode, k), episode.anchors)
+        got = simulation.measure_epoch(scene, simulation.epoch_of(episode, k), episode.anchors)
         np.testing.assert_array_equal(got.links, distances <= 70.0)
         np.testing.assert_array_equal(got.ranges, np.where(distances <= 70.0, free.ranges, 0.0))
         seen.append(got.links)
@@ -480,9 +480,9 @@ def test_reflected_paths_are_longer_by_the_bias_and_as_frequent_as_said():
     np.testing.assert_array_equal(episode.normals, free.normals)
     flags = []
     for k in range(101):
-        got = simulation.measure(scene, simulation.epoch_of(episode, k), episode.anchors)
+        got = simulation.measure_epoch(scene, simulation.epoch_of(episode, k), episode.anchors)
         want = (
-            simulation.measure(clean, simulation.epoch_of(free, k), free.anchors).ranges
+            simulation.measure_epoch(clean, simulation.epoch_of(free, k), free.anchors).ranges
             + 3.0 * got.nlos
         )
         np.testing.assert_allclose(got.ranges, want, rtol=1e-14)
@@ -588,7 +588,7 @@ def test_posterior_information_equals_a_naive_recursion_and_that_of_bounds(name)
     P, J, stepped = episode.prior_covariance, None, None
     for k in range(scene.steps + 1):
         anchors = anchors + rng.normal(0, 0.1, anchors.shape)
-        links = simulation.measure(scene, simulation.epoch_of(episode, k), anchors).links
+        links = simulation.measure_epoch(scene, simulation.epoch_of(episode, k), anchors).links
         twist = episode.twists[k]
         if k > 0:
             P = predicted_covariance(scene, P, twist)
@@ -663,7 +663,7 @@ def test_a_blocked_link_without_information_gives_no_range():
     for scene in (dim, dark):
         episode = simulation.draw_episode(scene, np.random.default_rng(5), (50,))
         at = simulation.epoch_of(episode, 3)
-        measured.append(simulation.measure(scene, at, episode.anchors))
+        measured.append(simulation.measure_epoch(scene, at, episode.anchors))
         quality = simulation.link_quality(scene, at, episode.anchors)
     assert measured[0].links.all()
     np.testing.assert_array_equal(measured[1].links, np.repeat(quality[..., None] > 0, 6, axis=-1))

@@ -202,7 +202,7 @@ def follow(
             quality = None
             if obstacles:
                 quality = obstacles.share(anchors, at.translation[..., None, :])[..., 0, :]
-            ranges, links, _ = simulation.measure(scene, at, anchors, quality)
+            ranges, links, _ = simulation.measure_epoch(scene, at, anchors, quality)
             epoch = {"ranges": ranges, "links": links, "anchors": anchors}
             epoch |= {} if quality is None else {"quality": quality}
             state = update(filter, state, epoch, scene)

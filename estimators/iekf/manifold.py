@@ -233,14 +233,17 @@ class IteratedEkf:
             return None, None
         if type(noise) is LinkNoise and noise.std_m.shape == ranges.shape and noise.std_m.min() > 0:
             return links / (noise.std_m * noise.std_m), WEIGHTS
-        weakened = type(noise) is WeakenedNoise and noise.share.shape == ranges.shape[:-1]
-        if not (weakened or noise is None):
+        share: Any = 1.0
+        law = self.noise
+        if type(noise) is WeakenedNoise and noise.share.shape == ranges.shape[:-1]:
+            law, share = noise.law, noise.share[..., None]
+        elif noise is not None:
             return None, None
-        numbers = numbers_of(noise.law if weakened else self.noise, len(self.tags))
+        numbers = numbers_of(law, len(self.tags))
         if numbers is None or numbers[3] >= 0:
             # The range of a reference tag may be lost.
             return None, None
-        return links * (noise.share[..., None] if weakened else 1.0), numbers
+        return links * share, numbers
 
     def weighed(
         self,

@@ -166,7 +166,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self._measured: dict[str, np.ndarray] | None = None
         if self.scene.anchor_speed_m_s == 0:
             # No action can change what anchors that stand still will measure.
-            self._measured = measure(self.scene, simulation.whole(episode), episode.anchors[None])
+            self._measured = observed(self.scene, simulation.whole(episode), episode.anchors[None])
         self._information: FloatArray | None = None
         observation, info, _ = self._observe()
         info["prior_rotation"] = episode.prior_rotation.copy()
@@ -198,7 +198,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         assert self._episode is not None
         k, at = self._epoch, simulation.epoch_of(self._episode, self._epoch)
         if self._measured is None:
-            observation = measure(self.scene, at, self._anchors)
+            observation = observed(self.scene, at, self._anchors)
         else:
             observation = {key: field[k].copy() for key, field in self._measured.items()}
         info: dict[str, Any] = {
@@ -246,10 +246,10 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         return float(score)
 
 
-def measure(scene: Scene, at: simulation.Epoch, anchors: FloatArray) -> dict[str, np.ndarray]:
+def observed(scene: Scene, at: simulation.Epoch, anchors: FloatArray) -> dict[str, np.ndarray]:
     """What an epoch tells: ranges and links with `nlos`, behind obstacles `quality`."""
     quality = simulation.link_quality(scene, at, anchors) if scene.obstacles else None
-    measured = simulation.measure(scene, at, anchors, quality)
+    measured = simulation.measure_epoch(scene, at, anchors, quality)
     told: dict[str, np.ndarray] = {
         "ranges": measured.ranges,
         "links": measured.links.view(np.int8),

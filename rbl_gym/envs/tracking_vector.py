@@ -15,8 +15,8 @@ from rbl_gym.envs.episodes import EpisodeStore, FamilyStore
 from rbl_gym.envs.tracking import (
     REWARDS,
     action_space,
-    measure,
     observation_space,
+    observed,
     worlds_of,
 )
 from rbl_gym.worlds import scene_bounds, simulation
@@ -137,7 +137,7 @@ class TrackingVectorEnv(BatchEnv):
         """
         if self._seen is None:
             at = self._episodes.at(self._epochs)
-            self._seen = at, measure(self.world, at, self._anchors)  # pyright: ignore[reportArgumentType]
+            self._seen = at, observed(self.world, at, self._anchors)  # pyright: ignore[reportArgumentType]
         return self._seen
 
     def _observe(self) -> dict[str, np.ndarray]:

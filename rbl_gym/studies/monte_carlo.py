@@ -87,7 +87,7 @@ def simulate_trials(scene: Scene, trials: int, rng: np.random.Generator) -> Simu
 def measure_episode(scene: Scene, episode: simulation.Episode) -> list[ranging.Measurement]:
     """Ranges and links (B, M, N) of every epoch of episodes whose anchors stand still."""
     anchors = episode.anchors[:, None]
-    measured = simulation.measure(scene, simulation.whole(episode), anchors)
+    measured = simulation.measure_epoch(scene, simulation.whole(episode), anchors)
     columns = (np.moveaxis(column, 1, 0) for column in measured)
     return [ranging.Measurement(*epoch) for epoch in zip(*columns, strict=True)]
 

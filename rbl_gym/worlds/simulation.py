@@ -22,7 +22,7 @@ from rbl_gym.worlds import inertial_motion
 from rbl_gym.worlds.scene import Scene
 
 __all__ = [
-    "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure", "move_anchors",
+    "Episode", "Epoch", "draw_episode", "epoch_of", "link_quality", "measure_epoch", "move_anchors",
 ]  # fmt: skip
 
 
@@ -294,7 +294,7 @@ def whole(episode: Episode) -> Epoch:
     return Epoch(*episode[: len(Epoch._fields)])  # pyright: ignore[reportArgumentType]
 
 
-def measure(
+def measure_epoch(
     scene: Scene, at: Epoch, anchors: FloatArray, quality: FloatArray | None = None
 ) -> ranging.Measurement:
     """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).

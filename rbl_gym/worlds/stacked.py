@@ -1,8 +1,8 @@
 """Many scenes of a family side by side, as arrays: what an epoch of a vector environment needs.
 
-`StackedScenes` has the attributes of a `Scene` that `simulation.measure`, the posterior bound and
-the filters ask for, with a leading axis (B,). Anchors and tags that a scene does not have are
-padded; their links never measure.
+`StackedScenes` has the attributes of a `Scene` that `simulation.measure_epoch`, the posterior
+bound and the filters ask for, with a leading axis (B,). Anchors and tags that a scene does not have
+are padded; their links never measure.
 """
 
 from __future__ import annotations
