@@ -23,6 +23,7 @@ from rbl_gym.estimators.filter import Filter
 from rbl_gym.estimators.inputs import check_epoch, check_offset_epoch, check_variance
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets
+from rbl_gym.measurements.direction_bias import direction_bias
 from rbl_gym.measurements.ranging import NoiseLaw
 
 # Standard deviations of a range beyond which it contradicts the pose after the update: it is
@@ -82,7 +83,7 @@ def innovations(
     Parameters
     ----------
     filter
-        Any filter. One whose states bias the ranges has a method ``biases_of(state, (M, N))``: the
+        Any filter. One whose states bias the ranges has a method ``biases_of(state, anchors)``: the
         states besides the pose (..., K), the covariance (..., 6 + K, 6 + K) of the pose's error
         and theirs, and by how much (M N, K) each of them lengthens every range. One whose ranges
         have an offset in common has an attribute ``offset``; NIS and likelihood are then those of
@@ -106,13 +107,16 @@ def innovations(
         ranges, anchors, mask = check_epoch(ranges, anchors, links, tags)
     else:
         ranges, anchors, mask = check_offset_epoch(ranges, anchors, links, tags, offset)
-    pose, x, P, S = _states(filter, before, ranges.shape[-2:])
-    new, y, _, _ = _states(filter, after, ranges.shape[-2:])
+    pose, x, P, S = _states(filter, before, anchors, tags)
+    new, y, _, _ = _states(filter, after, anchors, tags)
     distance, H = bounds.range_jacobian(anchors, tags, *new)
     variance = check_variance(noise.variance(ranges if offset is None else distance, mask), mask)
     shape = np.broadcast_shapes(distance.shape, ranges.shape, (*P.shape[:-2], 1, 1))
     flat = (*shape[:-2], shape[-2] * shape[-1])
     links = np.broadcast_to(True if mask is None else mask, shape).reshape(flat)
+    law = getattr(getattr(filter, "filter", filter), "directions", None)
+    if law is not None:
+        variance = variance * np.exp(2 * direction_bias(law, *new, anchors, tags).log_std)
     variance = np.broadcast_to(variance, shape).reshape(flat)
     residual = np.broadcast_to(ranges - distance, shape).reshape(flat) - y @ S.T
     if offset is not None:
@@ -178,7 +182,7 @@ def _divided(
 
 
 def _states(
-    filter: Filter, state: Any, shape: tuple[int, ...]
+    filter: Filter, state: Any, anchors: FloatArray, tags: FloatArray
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray]:
     """Pose, further states x, covariance P of both, and what x adds to the ranges (M N, K)."""
     if hasattr(filter, "leader"):
@@ -186,7 +190,7 @@ def _states(
         filter, state = filter.filter, filter.leader(state)  # pyright: ignore[reportAttributeAccessIssue]
     own = getattr(filter, "biases_of", None)
     if own is not None:
-        return (state.rotation, state.translation), *own(state, shape)
+        return (state.rotation, state.translation), *own(state, anchors)
     belief = filter.belief(state)
     x = np.zeros((*belief.translation.shape[:-1], 0))
-    return belief[:2], x, belief.covariance, np.zeros((shape[0] * shape[1], 0))
+    return belief[:2], x, belief.covariance, np.zeros((anchors.shape[-2] * tags.shape[-2], 0))

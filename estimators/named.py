@@ -11,6 +11,7 @@ from rbl_gym.estimators.iekf.augmented import AugmentedEkf
 from rbl_gym.estimators.iekf.clock import ClockEkf
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.odometry import OdometryEkf
+from rbl_gym.measurements.direction_bias import DirectionLaw
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.odometry import OdometrySensor
 from rbl_gym.measurements.offsets import Clock
@@ -62,6 +63,7 @@ def iekf_bias(
     bias_time_s: float | None = None,
     common_std_m: float = 0.1,
     offset: str | None = None,
+    directions: DirectionLaw | None = None,
 ) -> AugmentedEkf:
     """The filter ``"iekf-bias"``: the pose, and a bias of every link that it learns on the way.
 
@@ -72,9 +74,12 @@ def iekf_bias(
     bias_std_m, bias_time_s, common_std_m
         As `LinkBias`. A short time marginalises errors that are correlated rather than learning
         them.
+    directions
+        As `AugmentedEkf`.
     """
     pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
-    return AugmentedEkf(pose, biases=(LinkBias(bias_std_m, bias_time_s, common_std_m),))
+    law = LinkBias(bias_std_m, bias_time_s, common_std_m)
+    return AugmentedEkf(pose, biases=(law,), directions=directions)
 
 
 def iekf_log(
@@ -95,6 +100,7 @@ def iekf_log(
     clock: Clock | None = None,
     odometry: Mapping[str, float] | OdometrySensor | None = None,
     headings: int = 1,
+    directions: DirectionLaw | None = None,
 ) -> Filter:
     """The filter ``"iekf-log"``: a log of raw ranges of which nothing else is known.
 
@@ -123,22 +129,26 @@ def iekf_log(
         twist is that of the body's axes. None: there is none.
     headings
         1, or how many hypotheses of the heading there are at the start, as of `iekf-imu`.
+    directions
+        As `AugmentedEkf`.
     """
     law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
     stays = LinkBias(constant_std_m, None, constant_common_m)
     moves = LinkBias(drift_std_m, drift_time_s)
     pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
     if clock is not None:
-        if odometry is not None or headings != 1:
-            raise ValueError(f"clock must be None beside odometry or headings, got {clock!r:.80}")
-        filter = ClockEkf(pose, law, None, (stays, moves), clock)
+        if odometry is not None or headings != 1 or directions is not None:
+            raise ValueError(
+                f"clock must be None beside odometry, headings or directions, got {clock!r:.80}"
+            )
+        filter = ClockEkf(pose, law, None, (stays, moves), clock=clock)
     elif odometry is None:
-        filter = AugmentedEkf(pose, law, None, (stays, moves))
+        filter = AugmentedEkf(pose, law, None, (stays, moves), directions)
     else:
         sensor = odometry if isinstance(odometry, OdometrySensor) else OdometrySensor(**odometry)
         # A bias that cannot be needs no states.
         biases = tuple(bias for bias in (stays, moves) if bias.std_m or bias.common_std_m)
-        filter = OdometryEkf(pose, law, None, biases, sensor)
+        filter = OdometryEkf(pose, law, None, biases, directions, sensor)
     return filter if check_count("headings", headings) == 1 else HeadingBank(filter, headings)
 
 

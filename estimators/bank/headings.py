@@ -25,6 +25,7 @@ from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.innovation import innovations
 from rbl_gym.estimators.inputs import check_epoch, epoch_variance
 from rbl_gym.geometry import rotations
+from rbl_gym.measurements.direction_bias import DirectionLaw
 from rbl_gym.measurements.inertial import InertialSensor
 from rbl_gym.measurements.inertial import sensor as sensor_of
 from rbl_gym.measurements.link_bias import LinkBias
@@ -234,6 +235,7 @@ def iekf_imu(
     drift_time_s: float = 20.0,
     headings: int = 1,
     offset: str | None = None,
+    directions: DirectionLaw | None = None,
 ) -> Filter:
     """The filter ``"iekf-imu"``: pose, velocity and the biases of an inertial sensor.
 
@@ -253,6 +255,8 @@ def iekf_imu(
         Biases of the links that drift, and in what time; as `LinkBias`. 0: there are none.
     headings
         1, or how many hypotheses of the heading there are at the start.
+    directions
+        As `AugmentedEkf`.
     """
     if offset is not None and headings != 1:
         raise ValueError(f"offset goes with headings 1, got {headings!r}")
@@ -264,6 +268,7 @@ def iekf_imu(
     filter = InertialEkf(
         IteratedEkf(tags, noise, process, iterations, robust, offset),
         biases=tuple(biases),
+        directions=directions,
         inertial=sensor_of(inertial),
         speed_m_s=speed_m_s,
         gravity_tilt_rad=gravity_tilt_rad,

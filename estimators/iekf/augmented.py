@@ -24,6 +24,7 @@ from rbl_gym.estimators.costs.bias_cost import AugmentedState, update_any, updat
 from rbl_gym.estimators.costs.losses import LATE, SQUARES, huber
 from rbl_gym.estimators.costs.map_problem import PoseState, pose_error, positive_inverse
 from rbl_gym.estimators.filter import PoseBelief
+from rbl_gym.estimators.iekf.directed import directed, undirected
 from rbl_gym.estimators.iekf.manifold import IteratedEkf
 from rbl_gym.estimators.iekf.pose_steps import as_state
 from rbl_gym.estimators.inputs import (
@@ -34,6 +35,7 @@ from rbl_gym.estimators.inputs import (
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
+from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import propagate
@@ -43,6 +45,8 @@ from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
 # noise: Huber's threshold of 1.0 was measured better than 1.5.
 LOSSES = {False: SQUARES, True: huber(1.0), "late": LATE}
 _AT_REST = np.zeros(6)
+# How often a law of directions is made linear in an update: at the start, and where that leads.
+_PASSES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +63,16 @@ class AugmentedEkf:
         Reads the twist with noise; None: what `predict` is told of an unknown twist is ignored.
     biases
         Laws of the links' biases, which add up; empty: there are none.
+    directions
+        What ranges have too much by the direction of the ray, at the pose that is sought; None:
+        nothing.
     """
 
     pose: IteratedEkf
     twist: WanderingTwist | None = None
     sensor: TwistSensor | None = None
     biases: tuple[LinkBias, ...] = ()
+    directions: DirectionLaw | None = None
 
     def __post_init__(self) -> None:
         check_one_process(self.pose.process)
@@ -162,7 +170,7 @@ class AugmentedEkf:
         """
         state = plain(state)
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
-        if not self.biases:
+        if not self.biases and self.directions is None:
             return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))
         ranges, variance, anchors, mask = self.pose.measured(state, ranges, anchors, links, noise)
         ranges, variance = np.broadcast_arrays(ranges, variance)
@@ -178,16 +186,37 @@ class AugmentedEkf:
                 np.where(vague[..., None], found.translation, start[1]),
             )
             covariance = np.where(vague[..., None, None], found.covariance, covariance)
+        if self.directions is None:
+            found = self._updated(state, ranges, weights, anchors, start, covariance)
+        else:
+            links = ranges.shape[-2] * ranges.shape[-1]
+            factor = direction_bias(self.directions, *start, anchors, self.pose.tags).log_std
+            weights = weights * np.exp(-2 * factor)
+            for _ in range(_PASSES):
+                whole = directed(state, self.directions, start, anchors, self.pose.tags)
+                found = self._updated(whole, ranges, weights, anchors, start, covariance)
+                start, covariance = found[:2], found.covariance[..., :6, :6]
+            found = undirected(found, links)  # pyright: ignore[reportPossiblyUnbound]
+        as_state(*found[:2], found.covariance)
+        return found
+
+    def _updated(
+        self,
+        state: AugmentedState,
+        ranges: FloatArray,
+        weights: FloatArray,
+        anchors: FloatArray,
+        start: tuple[FloatArray, FloatArray],
+        covariance: FloatArray,
+    ) -> AugmentedState:
+        """The most likely state of an epoch near a start and the covariance of its pose."""
         epoch: tuple[Any, ...] = (
             *state, ranges, weights, anchors, self.pose.tags, *start, covariance,
             self.pose.iterations, LOSSES[self.pose.robust], self._n_twist,
         )  # fmt: skip
         if self.offset is None:
-            found = AugmentedState(*update_augmented(*epoch))
-        else:
-            found = AugmentedState(*update_any(*epoch, self.offset))  # pyright: ignore[reportCallIssue]
-        as_state(*found[:2], found.covariance)
-        return found
+            return AugmentedState(*update_augmented(*epoch))
+        return AugmentedState(*update_any(*epoch, self.offset))  # pyright: ignore[reportCallIssue]
 
     def _with_biases(self, state: AugmentedState, shape: tuple[int, ...]) -> AugmentedState:
         """The state with room for the biases of (M, N) links."""
@@ -232,12 +261,18 @@ class AugmentedEkf:
         return self.pose.update(prior, left, anchors, mask, law)
 
     def biases_of(
-        self, state: AugmentedState, shape: tuple[int, ...]
+        self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Extra states (..., K), covariance, and what they add to (M, N) ranges (M N, K)."""
+        """Extra states (..., K), covariance, and what they add to the ranges (M N, K) of anchors
+        (..., M, 3).
+        """
+        shape, count = (anchors.shape[-2], len(self.pose.tags)), len(self.biases)
         if self.biases:
             state = self._with_biases(plain(state), shape)
-        sums = bias_cost.sums_of(self._n_twist, len(self.biases), math.prod(shape))
+        if self.directions is not None:
+            about, count = (state.rotation, state.translation), count + 1
+            state = directed(state, self.directions, about, anchors, self.pose.tags)
+        sums = bias_cost.sums_of(self._n_twist, count, math.prod(shape))
         return state.extra, state.covariance, sums
 
     def belief(self, state: AugmentedState) -> PoseBelief:

@@ -147,14 +147,14 @@ class ClockEkf(AugmentedEkf):
         return self.clock.offset
 
     def biases_of(
-        self, state: AugmentedState, shape: tuple[int, ...]
+        self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As `AugmentedEkf.biases_of`, without the clocks."""
         state = plain(state)
         n = state.extra.shape[-1]
         n -= 2 * self._n_clocks(n)
         less = state.extra[..., :n], state.covariance[..., : 6 + n, : 6 + n]
-        return super().biases_of(AugmentedState(state.rotation, state.translation, *less), shape)
+        return super().biases_of(AugmentedState(state.rotation, state.translation, *less), anchors)
 
     def _sums(self, shape: tuple[int, ...]) -> FloatArray:
         """Which biases, which offset, and no drift, each of (M, N) ranges has: (M N, K)."""

@@ -115,12 +115,12 @@ class SurveyedEkf(AugmentedEkf):
         return found
 
     def biases_of(
-        self, state: AugmentedState, shape: tuple[int, ...]
+        self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As `AugmentedEkf.biases_of`: innovations are judged as if the told places were right."""
         state, n = plain(state), self._n_twist
         less = state.extra[..., :n], state.covariance[..., : 6 + n, : 6 + n]
-        return super().biases_of(AugmentedState(state.rotation, state.translation, *less), shape)
+        return super().biases_of(AugmentedState(state.rotation, state.translation, *less), anchors)
 
     def _off(self, extra: FloatArray) -> FloatArray:
         """True places less told ones (..., M, 3), of extra states."""

@@ -11,6 +11,7 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.costs.losses import SQUARES, loss_of
 from rbl_gym.estimators.costs.range_cost import offset_of
 from rbl_gym.estimators.smoothing.equations import Equations, LogState, Rows
+from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.offsets import axes_of
 
@@ -105,6 +106,14 @@ def add_biases(
         equations.gradient[..., 1:, shifted] += weight * residual
 
 
+class Layout(NamedTuple):
+    """A law of biases by direction, anchors (..., K or 1, M, 3) and tags (N, 3)."""
+
+    law: DirectionLaw
+    anchors: FloatArray
+    tags: FloatArray
+
+
 @dataclass(frozen=True, eq=False)
 class LogRanges:
     """The ranges that were measured, at most S of an epoch, side by side.
@@ -123,6 +132,8 @@ class LogRanges:
         Of the biases.
     offset
         Whose ranges have an unknown offset in common, new at every epoch; None: nobody's.
+    layout
+        A law of biases by direction, and what it is evaluated at; None: there is none.
     """
 
     link: np.ndarray
@@ -133,6 +144,7 @@ class LogRanges:
     shape: tuple[int, int]
     blocks: list[BiasBlock]
     offset: str | None = None
+    layout: Layout | None = None
 
     @classmethod
     def gathered(
@@ -176,6 +188,14 @@ class LogRanges:
         unit = gap / np.where(distance > 0, distance, 1.0)[..., None]
         J = np.concatenate([np.cross(turned, unit), unit], axis=-1)
         total = np.zeros(distance.shape)
+        if self.layout is not None:
+            found = direction_bias(
+                self.layout.law, state.rotation, state.translation, *self.layout[1:]
+            )
+            flat = (*found.bias.shape[:-2], -1)
+            total += np.take_along_axis(found.bias.reshape(flat), self.link, axis=-1)
+            slope = found.jacobian.reshape((*flat, 6))
+            J = J + np.take_along_axis(slope, self.link[..., None], axis=-2)
         for block in self.blocks:
             values = (
                 state.constants[..., None, block.where]

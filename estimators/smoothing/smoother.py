@@ -36,6 +36,7 @@ from rbl_gym.estimators.smoothing.equations import (
 from rbl_gym.estimators.smoothing.motion import Motion
 from rbl_gym.estimators.smoothing.ranges import (
     BiasBlock,
+    Layout,
     LogRanges,
     add_biases,
     bias_blocks,
@@ -43,6 +44,7 @@ from rbl_gym.estimators.smoothing.ranges import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets, ranging
+from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.noise_laws import NoiseLaw
 from rbl_gym.measurements.offsets import Clock
@@ -108,6 +110,9 @@ class LogModel:
         variances are then taken at the distances from the start.
     clock
         Law of offsets that last, in place of `offset`; their states are eliminated with the rest.
+    directions
+        What ranges have too much by the direction of the ray, at the poses that are sought; its
+        deviations are taken at the start.
     """
 
     tags: FloatArray
@@ -118,6 +123,7 @@ class LogModel:
     loss: FloatArray = dataclasses.field(default_factory=lambda: SQUARES)
     offset: str | None = None
     clock: Clock | None = None
+    directions: DirectionLaw | None = None
 
     def __post_init__(self) -> None:
         tags = check_array("tags", self.tags, ("N", 3))
@@ -355,6 +361,9 @@ def _checked(
     if model.offset is not None or model.clock is not None:
         told = ranging.distances(anchors, ranging.tag_positions(Q, t, model.tags))
     variance = epoch_variance(log.noise, model.noise, told, mask)
+    if model.directions is not None:
+        factor = direction_bias(model.directions, Q, t, anchors, model.tags).log_std
+        variance = variance * np.exp(2 * factor)
     motion, factors = model.motion, model.factors
     M, N = ranges.shape[-2:]
     constants = sum(len(factor.constants_std) for factor in (motion, *factors))
@@ -367,6 +376,9 @@ def _checked(
         blocks, extra = [*blocks, block], extra + 2 * mean.shape[-1]
         clocks = block, model.clock, mean
     gathered = LogRanges.gathered(ranges, variance, mask, anchors, model.tags, blocks, model.offset)
+    if model.directions is not None:
+        layout = Layout(model.directions, anchors, model.tags)
+        gathered = dataclasses.replace(gathered, layout=layout)
     state = LogState(Q, t, np.zeros((*batch, K, extra)), np.zeros((*batch, constants)))
     if clocks is not None:
         state.extra[..., first : first + found.shape[-1]] = found  # pyright: ignore[reportPossiblyUnboundVariable]

@@ -2,6 +2,7 @@
 
 from rbl_gym.recordings.align import ALIGNMENTS, Alignment, align_positions, apply_alignment
 from rbl_gym.recordings.bags import convert_bag, list_topics, show_message
+from rbl_gym.recordings.directions import read_directions
 from rbl_gym.recordings.format import Format
 from rbl_gym.recordings.inertial import InertialLog, read_frame, read_inertial, samples_between
 from rbl_gym.recordings.motion_offset import motion_offset
@@ -31,6 +32,7 @@ __all__ = [
     "list_topics",
     "motion_offset",
     "odometry_between",
+    "read_directions",
     "read_frame",
     "read_inertial",
     "read_odometry",

@@ -11,7 +11,17 @@ from rbl_gym.recordings.tables import METRES, Source
 
 __all__ = ["Format"]
 
-FILES = ("ranges", "anchors", "tags", "truth", "calibration", "carrier", "odometry", "imu")
+FILES = (
+    "ranges",
+    "anchors",
+    "tags",
+    "truth",
+    "calibration",
+    "directions",
+    "carrier",
+    "odometry",
+    "imu",
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,7 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.measurements.inertial import turned
 from rbl_gym.recordings.calibration import calibrated
+from rbl_gym.recordings.directions import read_directions
 from rbl_gym.recordings.format import Format
 from rbl_gym.recordings.inertial import InertialLog, read_frame, read_inertial
 from rbl_gym.recordings.odometry import read_odometry
@@ -46,6 +47,7 @@ class _Files(NamedTuple):
     odometry: AnyPath | None = None
     imu: AnyPath | None = None
     imu_frame: AnyPath | None = None
+    directions: AnyPath | None = None
 
 
 def read_recording(
@@ -60,6 +62,7 @@ def read_recording(
     odometry: AnyPath | None = None,
     imu: AnyPath | None = None,
     imu_frame: AnyPath | None = None,
+    directions: AnyPath | None = None,
     run: str | None = None,
     format: Format = _AS_DESCRIBED,
 ) -> Recording:
@@ -98,6 +101,9 @@ def read_recording(
     imu, imu_frame
         As of `rbl_gym.recordings.read_inertial`, ``t,wx,wy,wz,ax,ay,az``, and of `read_frame`: the
         rotation of its axes into the body's.
+    directions
+        As of `rbl_gym.recordings.read_directions`: bias by the direction of the ray at its ends.
+        It is a part of the measurement model, and not taken off the ranges.
     run
         Of several runs in one file (column `run`) the one to read; see `read_runs`.
     format
@@ -119,8 +125,9 @@ def read_recording(
         range or row that would be dropped or sorted.
     """
     files = _Files(
-        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame
-    )
+        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame,
+        directions,
+    )  # fmt: skip
     said = Said()
     table = read_table(ranges, format.of("ranges"))
     runs = _runs_of(table)
@@ -148,6 +155,7 @@ def read_runs(
     odometry: AnyPath | None = None,
     imu: AnyPath | None = None,
     imu_frame: AnyPath | None = None,
+    directions: AnyPath | None = None,
     format: Format = _AS_DESCRIBED,
 ) -> dict[str, Recording]:
     """The runs of a log, each a recording, by the names in column `run` and in their order.
@@ -157,8 +165,9 @@ def read_runs(
     single pose of a run is of a body that stands.
     """
     files = _Files(
-        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame
-    )
+        ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame,
+        directions,
+    )  # fmt: skip
     table = read_table(ranges, format.of("ranges"))
     runs = _runs_of(table)
     return {
@@ -207,6 +216,9 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
     if files.odometry is not None:
         how = {"wheelbase_m": format.wheelbase_m, "turn_unit": format.turn_unit}
         odometry = read_odometry(files.odometry, format.of("odometry"), said, **how)
+    law = None
+    if files.directions is not None:
+        law = read_directions(files.directions, ids, format.of("directions"), said)
     links = log.links
     if not links.any():
         raise ValueError(f"{table.path}: must have an epoch with a link, got none")
@@ -217,7 +229,7 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
         check_units((paths[0], paths[1], paths[2]), log.times, log.ranges, links, *points, how)
     return Recording(
         log.times, log.ranges, links, log.range_std, places, log.tags.places, *ids, poses,
-        said.report(), log.offset, odometry, _inertial(files, format),
+        said.report(), log.offset, odometry, _inertial(files, format), law,
     )  # fmt: skip
 
 

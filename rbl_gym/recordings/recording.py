@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.measurements.direction_bias import DirectionLaw
 from rbl_gym.recordings.inertial import InertialLog
 from rbl_gym.recordings.odometry import OdometryLog
 from rbl_gym.recordings.report import Report
@@ -31,6 +32,7 @@ class Recording(NamedTuple):
     offset: str | None = None  # whose ranges have an unknown offset in common, and any sign
     odometry: OdometryLog | None = None  # on the clock of `times`
     inertial: InertialLog | None = None  # in the body frame, on the clock of `times`
+    directions: DirectionLaw | None = None  # what ranges have too much by the ray's direction
 
     @property
     def anchors_by_epoch(self) -> FloatArray:

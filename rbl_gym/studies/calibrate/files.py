@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.measurements.direction_bias import DirectionLaw
 
-__all__ = ["write_link_table", "write_points"]
+__all__ = ["write_directions", "write_link_table", "write_points"]
 
 
 def write_link_table(
@@ -67,8 +68,36 @@ def write_points(
     _write(path, (kind, "x", "y", "z"), rows)
 
 
+def write_directions(
+    path: str | os.PathLike[str],
+    ids: tuple[Sequence[str], Sequence[str]],
+    law: DirectionLaw,
+) -> None:
+    """Write ``end,id,harmonic,bias_cos_m,...``, as `rbl_gym.recordings.read_directions` reads it.
+
+    Parameters
+    ----------
+    path
+        File; its folder is made.
+    ids
+        Of the anchors and of the tags, in the order of the arrays.
+    law
+        Ends without a harmonic have no row.
+    """
+    rows = []
+    sides = (("anchor", law.anchors, law.anchors_log_std), ("tag", law.tags, law.tags_log_std))
+    for (end, bias, log_std), names in zip(sides, ids, strict=True):
+        for k in range(0, bias.shape[1], 2):
+            rows += [
+                [end, name, k // 2 + 1, *(f"{x:.6f}" for x in (*row[k : k + 2], *factor[k : k + 2]))]
+                for name, row, factor in zip(names, bias, log_std, strict=True)
+            ]
+    header = ("end", "id", "harmonic", "bias_cos_m", "bias_sin_m", "log_std_cos", "log_std_sin")
+    _write(path, header, rows)
+
+
 def _write(
-    path: str | os.PathLike[str], header: Sequence[str], rows: Iterable[Iterable[str]]
+    path: str | os.PathLike[str], header: Sequence[str], rows: Iterable[Iterable[object]]
 ) -> None:
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with Path(path).open("w", newline="", encoding="utf-8") as file:

@@ -134,6 +134,7 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
         () if level is None else (level,),
         loss=LATE if robust_of(settings) else SQUARES,
         offset=recording.offset,
+        directions=recording.directions,
     )
 
 

@@ -42,6 +42,8 @@ __all__ = [
     "track_recording",
 ]
 
+# Filters with biases by the direction of the ray in their measurement model.
+_DIRECTED = ("iekf-log", "iekf-bias", "iekf-imu")
 # How much wider than the belief its mirror image starts.
 _IMAGE_RAD, _IMAGE_M = 0.1, 0.2
 
@@ -195,14 +197,22 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
     Raises
     ------
     ValueError
-        As `named_filter`, and where the recording has odometry that the filter does not read.
+        As `named_filter`, and where the recording has a sensor, or biases by direction, that the
+        filter does not read.
     """
     if (recording.inertial is None) == (settings.filter == "iekf-imu"):
         what = "iekf-imu needs imu" if recording.inertial is None else "imu is read by iekf-imu"
         raise ValueError(f"{what}, and the filter is {settings.filter!r}")
     if recording.odometry is not None and settings.filter != "iekf-log":
         raise ValueError(f"odometry is read by the filter iekf-log, not by {settings.filter!r}")
-    return named_filter(recording, settings, settings.filter, _options(recording, settings))
+    options = _options(recording, settings)
+    if recording.directions is not None:
+        if settings.filter not in _DIRECTED:
+            raise ValueError(
+                f"directions are read by {', '.join(_DIRECTED)}, not by {settings.filter!r}"
+            )
+        options["directions"] = recording.directions
+    return named_filter(recording, settings, settings.filter, options)
 
 
 def named_filter(

@@ -1,0 +1,60 @@
+"""Biases by the direction of the ray as states of an epoch, which hang on the pose alone.
+
+About a pose x the bias of a link is ``beta(x) + B e``, e the pose's error: a state without
+uncertainty of its own, wholly correlated with the pose. So it goes through the update of biases
+as it is, and is dropped after it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators.costs.bias_cost import AugmentedState
+from rbl_gym.geometry import rotations
+from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
+
+
+def directed(
+    state: AugmentedState,
+    law: DirectionLaw,
+    about: tuple[FloatArray, FloatArray],
+    anchors: FloatArray,
+    tags: FloatArray,
+) -> AugmentedState:
+    """The state with the biases (M N) of the directions behind the others.
+
+    Parameters
+    ----------
+    state
+        Of the filter, before or after an update.
+    law
+        Of M anchors and N tags.
+    about
+        Rotation (..., 3, 3) and translation (..., 3) where the law is made linear.
+    anchors, tags
+        (..., M, 3) and (N, 3).
+    """
+    found = direction_bias(law, *about, anchors, tags)
+    links = found.bias.shape[-2] * found.bias.shape[-1]
+    batch = np.broadcast_shapes(found.bias.shape[:-2], state.translation.shape[:-1])
+    slope = np.broadcast_to(found.jacobian, (*batch, *found.jacobian.shape[-3:]))
+    slope = slope.reshape((*batch, links, 6))
+    beta = np.broadcast_to(found.bias, (*batch, *found.bias.shape[-2:])).reshape((*batch, links))
+    turn = rotations.error(state.rotation, about[0])
+    away = np.concatenate([turn, state.translation - about[1]], axis=-1)
+    beta = beta + (slope @ away[..., None])[..., 0]
+    P, n = state.covariance, state.covariance.shape[-1]
+    whole = np.empty((*batch, n + links, n + links))
+    whole[..., :n, :n] = P
+    whole[..., n:, :n] = slope @ P[..., :6, :]
+    whole[..., :n, n:] = np.swapaxes(whole[..., n:, :n], -1, -2)
+    whole[..., n:, n:] = whole[..., n:, :6] @ np.swapaxes(slope, -1, -2)
+    extra = np.broadcast_to(state.extra, (*batch, state.extra.shape[-1]))
+    return state._replace(extra=np.concatenate([extra, beta], axis=-1), covariance=whole)
+
+
+def undirected(state: AugmentedState, links: int) -> AugmentedState:
+    """The state without the biases of so many links that `directed` has put behind."""
+    n = state.covariance.shape[-1] - links
+    return state._replace(extra=state.extra[..., : n - 6], covariance=state.covariance[..., :n, :n])
