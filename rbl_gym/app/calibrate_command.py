@@ -19,12 +19,14 @@ def add_calibrate(commands: Any) -> None:
     )
     add_reading(calibrate)
     _add_plane(calibrate.add_argument_group("what is known of the body's place"))
-    _add_links(calibrate.add_argument_group("what is estimated with --truth"))
+    with_truth = calibrate.add_argument_group("what is estimated with --truth")
+    _add_links(with_truth)
+    _add_directions(with_truth)
     _add_truth(calibrate.add_argument_group("the truth"))
     _add_anchors(calibrate.add_argument_group("anchors surveyed without --truth"))
     output = calibrate.add_argument_group("output")
     output.add_argument(
-        "--out", metavar="DIR", help="folder of calibration.csv and tags.csv, which replay reads"
+        "--out", metavar="DIR", help="folder of calibration.csv, tags.csv, ..., which replay reads"
     )
     output.add_argument("--plot", metavar="F", help="picture of the links and their residuals")
     add_json(output)
@@ -52,6 +54,21 @@ def _add_links(group: Any) -> None:
         choices=("held", "turned", "free"),
         help="the table of tags holds; is turned and shifted as a whole (default); or every tag is "
         "found by itself",
+    )
+
+
+def _add_directions(group: Any) -> None:
+    group.add_argument(
+        "--harmonics",
+        type=int,
+        metavar="N",
+        help="bias by the direction in which a ray leaves the body: at most so many harmonics of "
+        "its bearing, as many as foretell what was left out; default 0, none",
+    )
+    group.add_argument(
+        "--ends",
+        choices=("tags", "both"),
+        help="directions at the tags (default), or at both ends: the anchors are on a body too",
     )
 
 
@@ -116,6 +133,8 @@ _WITH_TRUTH = {
     "biases": "--model",
     "slopes": "--no-slopes",
     "tags_model": "--arms",
+    "harmonics": "--harmonics",
+    "ends": "--ends",
     "time_offset": "--time-offset",
     "truth_gap_s": "--truth-gap-s",
     "truth_exclude": "--truth-exclude",
@@ -131,8 +150,9 @@ _WITHOUT = {
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    if options.calibration is not None:
-        raise ValueError("calibrate takes ranges as the radios gave them, without --calibration")
+    for name in ("calibration", "directions"):
+        if getattr(options, name) is not None:
+            raise ValueError(f"calibrate takes ranges as the radios gave them, without --{name}")
     mine, others = (_WITH_TRUTH, _WITHOUT) if options.truth else (_WITHOUT, _WITH_TRUTH)
     if wrong := [option for name, option in others.items() if getattr(options, name) is not None]:
         raise ValueError(f"{wrong[0]} means nothing with{'' if options.truth else 'out'} --truth")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,12 +54,18 @@ def _anchors_figure(found: SurveyedAnchors) -> Figure:
 
 def _links_figure(found: CalibratedLinks) -> Figure:
     """Biases of the links, residuals over distance, their histogram; tags in the body frame."""
-    figure = new_figure(12, 7.2)
-    axes = figure.subplots(2, 2)
-    _biases(axes[0, 0], found)
-    _over_distance(axes[0, 1], found)
-    _histogram(axes[1, 0], found)
-    _tags(axes[1, 1], found)
+    ends = []
+    if found.directions is not None:
+        law = found.directions.law
+        ends = [end for end, field in (("tag", law.tags), ("anchor", law.anchors)) if field.any()]
+    figure = new_figure(16 if ends else 12, 7.2)
+    panels = [_biases, _over_distance, _histogram, _tags]
+    panels += [partial(_directions, end=end) for end in ends]
+    axes = figure.subplots(2, 3 if ends else 2).ravel()
+    for axis, panel in zip(axes, panels, strict=False):
+        panel(axis, found)
+    for axis in axes[len(panels) :]:
+        axis.remove()
     return figure
 
 
@@ -104,6 +111,27 @@ def _histogram(axes: Any, found: CalibratedLinks) -> None:
     axes.set_xlabel("residual [m], the ends hold what is beyond")
     axes.set_ylabel("ranges")
     axes.legend(frameon=False, fontsize=8)
+
+
+def _directions(axes: Any, found: CalibratedLinks, end: str) -> None:
+    """Bias over the bearing of the ray at one end, a line a node."""
+    assert found.directions is not None
+    law = found.directions.law
+    field = law.anchors if end == "anchor" else law.tags
+    names = found.anchor_ids if end == "anchor" else found.tag_ids
+    frame = "anchors' frame" if end == "anchor" else "body"
+    bearing = np.linspace(-180, 180, 181)
+    angle = np.radians(bearing)[:, None] * (1 + np.arange(field.shape[1] // 2))
+    for name, row in zip(names, field, strict=True):
+        curve = np.cos(angle) @ row[::2] + np.sin(angle) @ row[1::2]
+        axes.plot(bearing, curve, lw=1.4, label=name)
+    axes.set_xlim(-180, 180)
+    axes.set_xticks(range(-180, 181, 60))
+    axes.set_xlabel(f"bearing of the ray at the {end} [deg], in the {frame}")
+    axes.set_ylabel("bias by direction [m]")
+    axes.grid(alpha=0.25, lw=0.5)
+    if len(names) <= 12:
+        axes.legend(title=end, frameon=False, fontsize=8, ncols=4)
 
 
 def _tags(axes: Any, found: CalibratedLinks) -> None:

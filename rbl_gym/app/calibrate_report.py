@@ -92,6 +92,17 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
         said.append(text)
         for row, off in zip(figures["tags"], turn.get("off_table_m", ()), strict=False):
             said.append(f"Tag {row['tag']} is {_three(off, 3)} m off its place in the table.")
+    if told := figures.get("directions"):
+        kind = told["bias"]
+        text = "Bias by the direction of the ray: no harmonic foretells what was left out."
+        if kind["harmonics"]:
+            whose = "one law for all antennas of a body" if kind["shared"] else "of each by itself"
+            text = (
+                f"Bias by the direction of the ray: {kind['harmonics']} harmonics at "
+                f"{'both ends' if kind['ends'] == 'both' else 'the tags'}, {whose}; they explain "
+                f"{100 * told['explained']:.0f} % of the variance of ranges left out."
+            )
+        said.append(text)
     noise = figures["noise"]
     text = f"Noise of a range: {noise['std_m']:.3f} m (median of the links)"
     if noise["slow_time_s"]:

@@ -14,7 +14,9 @@ _COLUMNS = ("end", "id", "harmonic", "bias_cos_m", "bias_sin_m", "log_std_cos", 
 _MOST = 12
 
 
-def read_directions(path: AnyPath, ids: Ids, source: Source = AS_NAMED, said: Said | None = None) -> DirectionLaw:
+def read_directions(
+    path: AnyPath, ids: Ids, source: Source = AS_NAMED, said: Said | None = None
+) -> DirectionLaw:
     """Bias of ranges by the direction of the ray at its ends: a table of harmonics.
 
     Parameters

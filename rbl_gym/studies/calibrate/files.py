@@ -89,7 +89,12 @@ def write_directions(
     for (end, bias, log_std), names in zip(sides, ids, strict=True):
         for k in range(0, bias.shape[1], 2):
             rows += [
-                [end, name, k // 2 + 1, *(f"{x:.6f}" for x in (*row[k : k + 2], *factor[k : k + 2]))]
+                [
+                    end,
+                    name,
+                    k // 2 + 1,
+                    *(f"{x:.6f}" for x in (*row[k : k + 2], *factor[k : k + 2])),
+                ]
                 for name, row, factor in zip(names, bias, log_std, strict=True)
             ]
     header = ("end", "id", "harmonic", "bias_cos_m", "bias_sin_m", "log_std_cos", "log_std_sin")

@@ -8,13 +8,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
-from rbl_gym.estimators.calibration import KnownPath, LinkFit, LinkModel, fit_links
+from rbl_gym.estimators.calibration import LinkFit, LinkModel
 from rbl_gym.estimators.calibration.clock import Clock
-from rbl_gym.estimators.calibration.link_equations import ARM_M, BIAS_M, SLOPE, TURN_RAD
+from rbl_gym.estimators.calibration.harmonics import FoundDirections
+from rbl_gym.estimators.calibration.link_equations import (
+    ARM_M,
+    BIAS_M,
+    SLOPE,
+    TURN_RAD,
+    carried_tags,
+    directions,
+)
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings.recording import Recording
-from rbl_gym.studies.calibrate.files import write_link_table, write_points
+from rbl_gym.studies.calibrate.directed import fit_log, with_directions
+from rbl_gym.studies.calibrate.files import write_directions, write_link_table, write_points
 from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_of, path_at
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
@@ -25,8 +33,6 @@ __all__ = ["CalibratedLinks", "calibrate_links"]
 _UNTOLD = 0.5
 # Links with fewer ranges than this (median) have antenna delays of nodes only.
 _FEW_RANGES = 30
-# Epochs that tell where tags are about, and how a fit moves with the clock.
-_FEW_EPOCHS = 1000
 
 
 class CalibratedLinks(NamedTuple):
@@ -46,6 +52,8 @@ class CalibratedLinks(NamedTuple):
         (K, M, N) along the path, metres; NaN where there is no range.
     figures
         Plain numbers: what `rbl-gym calibrate --json` writes.
+    directions
+        Bias by the direction of the ray; None where it was not looked for.
     """
 
     settings: LinkSettings
@@ -55,9 +63,12 @@ class CalibratedLinks(NamedTuple):
     tag_ids: tuple[str, ...]
     distances: Any
     figures: dict[str, Any]
+    directions: FoundDirections | None = None
 
     def write(self, folder: str | os.PathLike[str]) -> dict[str, str]:
-        """Write ``calibration.csv`` and ``tags.csv`` into a folder; their paths by name."""
+        """Write ``calibration.csv``, ``tags.csv`` and, where biases by direction were looked for,
+        ``directions.csv`` into a folder; their paths by name.
+        """
         paths = {name: os.path.join(folder, f"{name}.csv") for name in ("calibration", "tags")}
         fit = self.fit
         columns = {
@@ -70,6 +81,9 @@ class CalibratedLinks(NamedTuple):
         ids = self.anchor_ids, self.tag_ids
         write_link_table(paths["calibration"], *ids, columns, fit.counts > 0)
         write_points(paths["tags"], "tag", self.tag_ids, fit.tags)
+        if self.directions is not None and self.directions.bias.harmonics:
+            paths["directions"] = os.path.join(folder, "directions.csv")
+            write_directions(paths["directions"], ids, self.directions.law)
         return paths
 
 
@@ -125,36 +139,27 @@ def calibrate_links(
                       settings.planar)  # fmt: skip
     if clock is not None:
         # A clock is told well by tags that are where they belong.
-        coarse = _fit(log, settings, first, turn, shift, few=True)
+        coarse = fit_log(log, settings, first, turn, shift, few=True)
         turn, clock = coarse.rotation, clock_of(log, settings, coarse.tags) or clock
         shift = clock.offset_s
     advance()
-    fit = _fit(log, settings, first, turn, shift)
+    fit = fit_log(log, settings, first, turn, shift)
     advance()
     model = first
     if tags == "free":
         model = LinkModel(biases, settings.slopes, "free", settings.planar)
-        fit = _fit(log, settings, model, fit.rotation, shift)
+        fit = fit_log(log, settings, model, fit.rotation, shift)
+    found = None
+    if settings.harmonics or tags == "free":
+        fit, found = with_directions(log, settings, model, fit, shift)
     if clock is not None:
         fit = _with_clock(log, settings, model, fit, clock)
+    if tags == "free" and found is not None:
+        # A first harmonic as large as the others looks like a shift of its tag.
+        told = fit.tags_std_m > 0
+        fit = fit._replace(tags_std_m=np.where(told, np.hypot(fit.tags_std_m, found.spread_m), 0.0))
     advance()
-    return _result(log, settings, model, fit, clock, shift)
-
-
-def _fit(
-    log: Log,
-    settings: LinkSettings,
-    model: LinkModel,
-    turn: FloatArray,
-    shift: float,
-    few: bool = False,
-) -> LinkFit:
-    """The fit to all epochs, or to `few` of them, by the truth so many seconds later."""
-    at = slice(None, None, max(1, len(log.times) // _FEW_EPOCHS) if few else 1)
-    path, known = path_at(log, settings, shift)
-    links = (log.links & known[:, None, None])[at]
-    path = KnownPath(*(a[at] for a in path))
-    return fit_links(log.ranges[at], links, log.anchors[at], log.tags, path, model, turn)
+    return _result(log, settings, model, fit, clock, shift, found)
 
 
 def _with_clock(
@@ -162,7 +167,7 @@ def _with_clock(
 ) -> LinkFit:
     """Standard deviations with what the clock's own adds, by two fits to fewer epochs."""
     fits = [
-        _fit(log, settings, model, fit.rotation, shift, few=True)
+        fit_log(log, settings, model, fit.rotation, shift, few=True)
         for shift in (clock.offset_s, clock.offset_s + clock.std_s)
     ]
     moved = {
@@ -177,13 +182,13 @@ def _with_clock(
 
 def _result(
     log: Log, settings: LinkSettings, model: LinkModel, fit: LinkFit, clock: Clock | None,
-    shift: float,
+    shift: float, found: FoundDirections | None,
 ) -> CalibratedLinks:  # fmt: skip
     anchor_ids, tag_ids = log.runs[0].anchor_ids, log.runs[0].tag_ids
     told = fit.counts > 0
-    distance = np.where(
-        log.links, (log.ranges - fit.bias_m - fit.residuals) / (1 + fit.slope), np.nan
-    )
+    path, known = path_at(log, settings, shift)
+    distance = directions(log.anchors, carried_tags(path, fit.tags))[1]
+    distance = np.where(log.links & known[:, None, None], distance, np.nan)
     left = fit.residuals[log.links & (fit.residuals != 0)]
     figures: dict[str, Any] = {
         "ranges": int(fit.counts.sum()),
@@ -237,8 +242,17 @@ def _result(
         }
     elif model.tags == "free" and len(log.tags) > 1:
         figures["turn"] = _table_beside(log.tags, fit, settings.planar)
-    figures["not_determined"] = _untold(fit, model, settings, clock, (anchor_ids, tag_ids))
-    return CalibratedLinks(settings, fit, clock, anchor_ids, tag_ids, distance, figures)
+    figures["not_determined"] = _untold(fit, model, settings, clock, (anchor_ids, tag_ids), found)
+    if found is not None and settings.harmonics:
+        figures["directions"] = {
+            "bias": found.bias._asdict(),
+            "deviation": found.deviation._asdict(),
+            "explained": found.gain,
+            "size_m": found.spread_m,
+        }
+    else:
+        found = None
+    return CalibratedLinks(settings, fit, clock, anchor_ids, tag_ids, distance, figures, found)
 
 
 def _table_beside(table: Any, fit: LinkFit, planar: bool) -> dict[str, Any]:
@@ -261,8 +275,9 @@ def _table_beside(table: Any, fit: LinkFit, planar: bool) -> dict[str, Any]:
 
 
 def _untold(
-    fit: LinkFit, model: LinkModel, settings: LinkSettings, clock: Clock | None, ids: Any
-) -> list[str]:
+    fit: LinkFit, model: LinkModel, settings: LinkSettings, clock: Clock | None, ids: Any,
+    found: FoundDirections | None,
+) -> list[str]:  # fmt: skip
     """What the ranges do not determine, a sentence each."""
     said = []
     none = np.argwhere(fit.counts == 0)
@@ -289,6 +304,12 @@ def _untold(
         said += [f"turn of the tags about {axis}" for axis in turns]
         said += [f"shift of the tags along {axis}" for axis in shifts]
     elif model.tags == "free":
+        if found is not None and found.spread_m > 0.005:
+            said.append(
+                f"places of the tags to better than {found.spread_m:.3f} m: their ranges depend on "
+                "the direction of the ray by harmonics of this size, and the first one of a tag is "
+                "the same as a shift of it"
+            )
         for n, i in np.argwhere(fit.tags_std_m > _UNTOLD * ARM_M):
             said.append(f"{axes[i]} of tag {ids[1][n]}")
     return said

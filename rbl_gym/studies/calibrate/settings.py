@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rbl_gym.checks import check_number, check_one_of
+from rbl_gym.checks import check_count, check_number, check_one_of
 
 __all__ = ["LinkSettings"]
 
@@ -22,6 +22,12 @@ class LinkSettings:
         Whether ranges grow with the distance by more or less than one.
     tags
         ``"held"``, ``"turned"`` or ``"free"``, as of `LinkModel`.
+    harmonics
+        Of the bias by the direction in which a ray leaves the body: how many at the most; of
+        these as many as foretell what was left out (0: none is looked for).
+    ends
+        ``"tags"``: of the direction at the tags; ``"both"``: at the anchors too, where these are on
+        a body themselves.
     planar
         The body moves in a level plane: only the heading of the truth is read, and tags keep
         their heights.
@@ -38,6 +44,8 @@ class LinkSettings:
     biases: str = "auto"
     slopes: bool = True
     tags: str = "turned"
+    harmonics: int = 0
+    ends: str = "tags"
     planar: bool = False
     height_offset_m: float | None = None
     time_offset: float | str = "auto"
@@ -47,6 +55,8 @@ class LinkSettings:
     def __post_init__(self) -> None:
         check_one_of("biases", self.biases, ("auto", "link", "node", "common"))
         check_one_of("tags", self.tags, ("held", "turned", "free"))
+        check_count("harmonics", self.harmonics, least=0, most=8)
+        check_one_of("ends", self.ends, ("tags", "both"))
         check_number("truth_gap_s", self.truth_gap_s, low=0.0)
         if self.height_offset_m is not None:
             check_number("height_offset_m", self.height_offset_m)
