@@ -10,9 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from rbl_gym.app.cli import main
 from rbl_gym.estimators.calibration import KnownPath
-from rbl_gym.estimators.calibration.harmonics import Candidate, candidates_of, fit_harmonics
+from rbl_gym.estimators.calibration.harmonics import (
+    Candidate,
+    FoundDirections,
+    candidates_of,
+    fit_harmonics,
+)
 from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
-from rbl_gym.recordings import Truth, read_directions
+from rbl_gym.recordings import InertialLog, Truth, read_directions, read_frame
 from rbl_gym.studies import calibrate
 from rbl_gym.studies.calibrate import LinkSettings
 from tests.test_calibrate_links import ANCHORS, TAGS, path_of, ranges_of, recording_of
@@ -42,7 +47,7 @@ def test_patterns_of_tags_are_found_and_taken_off():
         calibrate.calibrate_links(recording, LinkSettings(planar=True, time_offset=0.0, **more))
         for more in ({}, {"harmonics": 4})
     )
-    assert found.directions is not None
+    assert isinstance(found.directions, FoundDirections)
     assert found.directions.bias.harmonics >= 3
     assert not found.directions.bias.shared
     np.testing.assert_allclose(found.directions.law.tags[:, 2:6], law.tags[:, 2:], atol=0.012)
@@ -139,3 +144,29 @@ def test_the_command_writes_directions_that_replay_reads(tmp_path, capsys):
     assert "directions are read by iekf-log" in capsys.readouterr().err
     assert main(["calibrate", *logs[:8], *wrong[2:]]) == 2
     assert "without --directions" in capsys.readouterr().err
+
+
+def test_an_inertial_sensor_of_the_log_is_calibrated_with_it(tmp_path):
+    """Its clock is 0.7 s ahead of the truth's, that 0.2 s of the ranges'."""
+    rng = np.random.default_rng(5)
+    ranges = ranges_of(TIMES, rng)
+    truth = Truth(TIMES + 0.2, *path_of(TIMES))
+    fine = 0.01 * np.arange(-50, 4050)
+    path = Rotation.from_matrix(path_of(fine)[0])
+    body = (path[:-1].inv() * path[1:]).as_rotvec() / 0.01
+    turn = Rotation.from_rotvec([0.3, -2.0, 0.5]).as_matrix()
+    readings = np.concatenate([body @ turn + 0.01, np.zeros_like(body)], axis=1)
+    log = InertialLog(fine[:-1] + 0.005 + 0.9, readings)
+    recording = recording_of(TIMES, ranges, truth)._replace(inertial=log)
+    found = calibrate.calibrate_links(recording, LinkSettings(time_offset=0.2))
+    told = found.figures["inertial"]
+    assert told["offset_s"] == pytest.approx(0.9, abs=0.01)
+    paths = found.write(tmp_path)
+    off = Rotation.from_matrix(read_frame(paths["imu_frame"]) @ turn.T).magnitude()
+    assert np.degrees(off) < 0.5
+    calibrate.write_frame(tmp_path / "again.csv", turn)
+    np.testing.assert_allclose(read_frame(tmp_path / "again.csv"), turn, atol=1e-8)
+    still = recording._replace(inertial=log._replace(readings=0 * readings))
+    found = calibrate.calibrate_links(still, LinkSettings(time_offset=0.2))
+    assert found.inertial is None
+    assert "how the inertial sensor sits" in " ".join(found.figures["not_determined"])

@@ -14,8 +14,9 @@ def add_calibrate(commands: Any) -> None:
     calibrate = commands.add_parser(
         "calibrate",
         help="biases, lever arms, clock and noise by truth; without truth the anchors' places",
-        description="With --truth: biases and slopes of links, tags, clock, noise. Without it: "
-        "anchors surveyed by the ranges of a moving body. See docs/calibration.md.",
+        description="With --truth: biases and slopes of links, tags, clocks, noise, bias by the "
+        "direction of the ray, and with --imu how the inertial sensor sits. Without it: anchors "
+        "surveyed by the ranges of a moving body. See docs/calibration.md.",
     )
     add_reading(calibrate)
     _add_plane(calibrate.add_argument_group("what is known of the body's place"))
@@ -153,6 +154,10 @@ def _calibrate(options: argparse.Namespace) -> int:
     for name in ("calibration", "directions"):
         if getattr(options, name) is not None:
             raise ValueError(f"calibrate takes ranges as the radios gave them, without --{name}")
+    if options.imu_frame is not None:
+        raise ValueError("calibrate finds how the sensor of --imu sits, without --imu-frame")
+    if options.imu is not None and not options.truth:
+        raise ValueError("--imu means nothing without --truth")
     mine, others = (_WITH_TRUTH, _WITHOUT) if options.truth else (_WITHOUT, _WITH_TRUTH)
     if wrong := [option for name, option in others.items() if getattr(options, name) is not None]:
         raise ValueError(f"{wrong[0]} means nothing with{'' if options.truth else 'out'} --truth")

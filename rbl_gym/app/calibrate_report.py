@@ -92,6 +92,14 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
         said.append(text)
         for row, off in zip(figures["tags"], turn.get("off_table_m", ()), strict=False):
             said.append(f"Tag {row['tag']} is {_three(off, 3)} m off its place in the table.")
+    if told := figures.get("inertial"):
+        said.append(
+            f"The inertial sensor is turned by {_three(told['rotation_vector_deg'], 1)} deg, +- "
+            f"{_three(told['rotation_std_deg'], 2)}, its clock {told['offset_s']:.4f} s ahead of "
+            f"the ranges', +- {told['offset_std_s']:.4f} (replay --time-offset "
+            f"imu={told['offset_s']:.4f}); biases of its gyroscope "
+            f"{_three(told['gyro_bias_deg_s'], 2)} deg/s, noise {told['gyro_noise_deg_s']:.2g}."
+        )
     if told := figures.get("directions"):
         kind = told["bias"]
         text = "Bias by the direction of the ray: no harmonic foretells what was left out."

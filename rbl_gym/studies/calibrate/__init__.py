@@ -6,7 +6,12 @@ from rbl_gym.studies.calibrate.anchors import (
     read_anchor_ranges,
     survey_anchors,
 )
-from rbl_gym.studies.calibrate.files import write_directions, write_link_table, write_points
+from rbl_gym.studies.calibrate.files import (
+    write_directions,
+    write_frame,
+    write_link_table,
+    write_points,
+)
 from rbl_gym.studies.calibrate.inertial import CalibratedInertial, calibrate_inertial
 from rbl_gym.studies.calibrate.links import CalibratedLinks, calibrate_links
 from rbl_gym.studies.calibrate.settings import LinkSettings
@@ -22,6 +27,7 @@ __all__ = [
     "read_anchor_ranges",
     "survey_anchors",
     "write_directions",
+    "write_frame",
     "write_link_table",
     "write_points",
 ]

@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry import rotations
 from rbl_gym.measurements.direction_bias import DirectionLaw
 
-__all__ = ["write_directions", "write_link_table", "write_points"]
+__all__ = ["write_directions", "write_frame", "write_link_table", "write_points"]
 
 
 def write_link_table(
@@ -99,6 +100,19 @@ def write_directions(
             ]
     header = ("end", "id", "harmonic", "bias_cos_m", "bias_sin_m", "log_std_cos", "log_std_sin")
     _write(path, header, rows)
+
+
+def write_frame(path: str | os.PathLike[str], rotation: FloatArray) -> None:
+    """Write ``qw,qx,qy,qz``, as `rbl_gym.recordings.read_frame` reads it.
+
+    Parameters
+    ----------
+    path
+        File; its folder is made.
+    rotation
+        (3, 3) from the sensor's axes to those of the body.
+    """
+    _write(path, ("qw", "qx", "qy", "qz"), [[f"{x:.9f}" for x in rotations.quaternion(rotation)]])
 
 
 def _write(

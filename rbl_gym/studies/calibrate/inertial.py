@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -72,6 +72,20 @@ def calibrate_inertial(
         known &= times[after] - times[after - 1] <= _LONGEST_GAP_S
         rates.append(_smoothed(times, values, grid))
     return CalibratedInertial(align_turn_rates(rates[0][known], rates[1][known]), clock)
+
+
+def inertial_figures(found: CalibratedInertial, ahead_s: float) -> dict[str, Any]:
+    """Plain numbers of a sensor, where the truth's clock is so far ahead of that of the ranges."""
+    turn, clock = found
+    return {
+        "rotation_vector_deg": np.rad2deg(rotations.log(turn.rotation)).tolist(),
+        "rotation_std_deg": np.rad2deg(turn.rotation_std_rad).tolist(),
+        "gyro_bias_deg_s": np.rad2deg(turn.bias).tolist(),
+        "gyro_bias_std_deg_s": np.rad2deg(turn.bias_std).tolist(),
+        "gyro_noise_deg_s": float(np.rad2deg(turn.noise_std_rad_s)),
+        "offset_s": float(clock.offset_s + ahead_s),
+        "offset_std_s": float(clock.std_s),
+    }
 
 
 def _smoothed(times: FloatArray, values: FloatArray, grid: FloatArray) -> FloatArray:
