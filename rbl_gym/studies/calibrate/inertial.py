@@ -17,6 +17,8 @@ __all__ = ["CalibratedInertial", "calibrate_inertial"]
 # Rates of both are those of a grid of this spacing, smoothed by so many points of it.
 _STEP_S, _SMOOTH = 0.02, 5.0
 _LONGEST_GAP_S = 0.2
+# Clock and turn are found in turn so often.
+_ROUNDS = 2
 
 
 class CalibratedInertial(NamedTuple):
@@ -61,9 +63,18 @@ def calibrate_inertial(
     world = rotations.error(truth.rotation[1:], truth.rotation[:-1]) / step[:, None]
     body = np.einsum("kji,kj->ki", truth.rotation[:-1], world)
     gyro = log.readings[:, :3]
-    lengths = (np.linalg.norm(a, axis=1) for a in (body, gyro))
-    clock = time_offset(middle, next(lengths), log.times, next(lengths), search_s)
-    stamps = log.times - clock.offset_s
+    bias = np.zeros(3)
+    for _ in range(_ROUNDS):
+        # Lengths do not hang on how the sensor sits, but on its bias.
+        lengths = (np.linalg.norm(a, axis=1) for a in (body, gyro - bias))
+        clock = time_offset(middle, next(lengths), log.times, next(lengths), search_s)
+        turn = _turn(log.times - clock.offset_s, gyro, middle, body)
+        bias = turn.bias
+    return CalibratedInertial(turn, clock)  # pyright: ignore[reportPossiblyUnbound]
+
+
+def _turn(stamps: FloatArray, gyro: FloatArray, middle: FloatArray, body: FloatArray) -> SensorTurn:
+    """The turn that takes rates of the sensor to those of the body, each at its times."""
     grid = np.arange(max(middle[0], stamps[0]), min(middle[-1], stamps[-1]), _STEP_S)
     known = np.ones(len(grid), dtype=bool)
     rates = []
@@ -71,7 +82,7 @@ def calibrate_inertial(
         after = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
         known &= times[after] - times[after - 1] <= _LONGEST_GAP_S
         rates.append(_smoothed(times, values, grid))
-    return CalibratedInertial(align_turn_rates(rates[0][known], rates[1][known]), clock)
+    return align_turn_rates(rates[0][known], rates[1][known])
 
 
 def inertial_figures(found: CalibratedInertial, ahead_s: float) -> dict[str, Any]:
