@@ -266,7 +266,7 @@ class AugmentedEkf:
         """Extra states (..., K), covariance, and what they add to the ranges (M N, K) of anchors
         (..., M, 3).
         """
-        shape, count = (anchors.shape[-2], len(self.pose.tags)), len(self.biases)
+        shape, count = (anchors.shape[-2], self.pose.tags.shape[-2]), len(self.biases)
         if self.biases:
             state = self._with_biases(plain(state), shape)
         if self.directions is not None:
