@@ -381,7 +381,7 @@ def _check_within(check: dict[str, Any]) -> Rows:
     return Rows("checked in each zone: horizontal position, heading", headings, rows)
 
 
-def _numbers(numbers: list[dict[str, float]]) -> Rows:
+def _numbers(numbers: list[dict[str, Any]]) -> Rows:
     rows = [
         [
             str(row["n_anchors"]),
