@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from typing import Any
 
 from rbl_gym.app.reading_options import add_reading, read_runs
@@ -24,7 +25,9 @@ def add_calibrate(commands: Any) -> None:
     _add_anchors(calibrate.add_argument_group("anchors surveyed without --truth"))
     output = calibrate.add_argument_group("output")
     output.add_argument(
-        "--out", metavar="DIR", help="folder of calibration.csv and tags.csv, which replay reads"
+        "--out",
+        metavar="DIR",
+        help="folder of calibration.csv, tags.csv and, of --imu, imu_frame.csv: replay reads them",
     )
     output.add_argument("--plot", metavar="F", help="picture of the links and their residuals")
     add_json(output)
@@ -133,6 +136,10 @@ _WITHOUT = {
 def _calibrate(options: argparse.Namespace) -> int:
     if options.calibration is not None:
         raise ValueError("calibrate takes ranges as the radios gave them, without --calibration")
+    if options.imu_frame is not None:
+        raise ValueError("calibrate finds the axes of --imu: leave out --imu-frame")
+    if options.imu is not None and not options.truth:
+        raise ValueError("--imu means nothing without --truth")
     mine, others = (_WITH_TRUTH, _WITHOUT) if options.truth else (_WITHOUT, _WITH_TRUTH)
     if wrong := [option for name, option in others.items() if getattr(options, name) is not None]:
         raise ValueError(f"{wrong[0]} means nothing with{'' if options.truth else 'out'} --truth")
@@ -140,6 +147,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     found = (_links if options.truth else _anchors)(options, given)
     files = found.write(options.out) if options.out else {}
+    if options.imu is not None:
+        files |= _inertial(options, found.figures)
     if options.plot:
         from rbl_gym.app import calibrate_figures, figures
 
@@ -163,6 +172,24 @@ def _links(options: argparse.Namespace, given: dict[str, Any]) -> Any:
     runs = read_runs(options)
     with progress("calibrate", 4) as advance:
         return calibrate.calibrate_links(runs, settings, advance)
+
+
+def _inertial(options: argparse.Namespace, figures: dict[str, Any]) -> dict[str, str]:
+    """Axes and clock of the inertial sensor, put into the figures; the file that was written."""
+    from rbl_gym.studies import calibrate
+
+    longest = max(read_runs(options).values(), key=lambda run: len(run.times))
+    assert longest.inertial is not None
+    assert longest.truth is not None
+    found = calibrate.calibrate_inertial(longest.inertial, longest.truth)
+    clock, told = figures.get("time_offset"), options.time_offset
+    ahead = clock["offset_s"] if clock else told if isinstance(told, float) else 0.0
+    figures["inertial"] = calibrate.inertial_figures(found, ahead)
+    if not options.out:
+        return {}
+    path = os.path.join(options.out, "imu_frame.csv")
+    calibrate.write_frame(path, found.turn.rotation)
+    return {"imu_frame": path}
 
 
 def _anchors(options: argparse.Namespace, given: dict[str, Any]) -> Any:

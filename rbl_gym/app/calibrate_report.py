@@ -84,6 +84,13 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
             f"The ranges fit the truth {clock['offset_s']:.4f} s later than its stamps say, +- "
             f"{clock['std_s']:.4f} (replay --time-offset {clock['offset_s']:.4f})."
         )
+    if sensor := figures.get("inertial"):
+        said.append(
+            f"The axes of imu are turned by {_three(sensor['rotation_vector_deg'], 2)} deg against "
+            f"the body's, +- {_three(sensor['rotation_std_deg'], 2)} (replay --imu-frame); its "
+            f"clock is ahead of that of the ranges by {sensor['imu_offset_s']:.4f} s, +- "
+            f"{sensor['imu_offset_std_s']:.4f} (replay --time-offset imu=...)."
+        )
     if turn := figures.get("turn"):
         text = f"The table of tags is turned by {_three(turn['rotation_vector_deg'], 2)} deg"
         if "std_deg" in turn:

@@ -6,8 +6,12 @@ from rbl_gym.studies.calibrate.anchors import (
     read_anchor_ranges,
     survey_anchors,
 )
-from rbl_gym.studies.calibrate.files import write_link_table, write_points
-from rbl_gym.studies.calibrate.inertial import CalibratedInertial, calibrate_inertial
+from rbl_gym.studies.calibrate.files import write_frame, write_link_table, write_points
+from rbl_gym.studies.calibrate.inertial import (
+    CalibratedInertial,
+    calibrate_inertial,
+    inertial_figures,
+)
 from rbl_gym.studies.calibrate.links import CalibratedLinks, calibrate_links
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
@@ -19,8 +23,10 @@ __all__ = [
     "SurveyedAnchors",
     "calibrate_inertial",
     "calibrate_links",
+    "inertial_figures",
     "read_anchor_ranges",
     "survey_anchors",
+    "write_frame",
     "write_link_table",
     "write_points",
 ]

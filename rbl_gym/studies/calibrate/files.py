@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry import rotations
 
-__all__ = ["write_link_table", "write_points"]
+__all__ = ["write_frame", "write_link_table", "write_points"]
 
 
 def write_link_table(
@@ -65,6 +66,19 @@ def write_points(
     """
     rows = [[name, *(f"{x:.6f}" for x in place)] for name, place in zip(ids, places, strict=True)]
     _write(path, (kind, "x", "y", "z"), rows)
+
+
+def write_frame(path: str | os.PathLike[str], rotation: FloatArray) -> None:
+    """Write ``qw,qx,qy,qz`` of the rotation (3, 3) from a sensor's axes to the body's.
+
+    Parameters
+    ----------
+    path
+        File, which `replay --imu-frame` reads; its folder is made.
+    rotation
+        Of `calibrate_inertial`, ``turn.rotation``.
+    """
+    _write(path, ("qw", "qx", "qy", "qz"), [[f"{x:.8f}" for x in rotations.quaternion(rotation)]])
 
 
 def _write(
