@@ -7,12 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym.estimators.calibration.inertial_clock import TaggedRanges, inertial_clock
+from rbl_gym.app.cli import main
+from rbl_gym.estimators.calibration.inertial_clock import (
+    InertialClock,
+    TaggedRanges,
+    inertial_clock,
+)
 from rbl_gym.estimators.calibration.range_track import range_track
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import inertial
 from rbl_gym.motion import smooth
-from rbl_gym.recordings import InertialLog, Recording
+from rbl_gym.recordings import InertialLog, Recording, read_frame
 from rbl_gym.studies import replay
 
 ANCHORS = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0], [8, 3, 0.5]])
@@ -69,6 +74,7 @@ def test_the_offset_is_found_within_what_it_claims():
     for seed in range(8):
         told, times, readings, _ = moving(seed)
         found = inertial_clock(told, times, readings, [4.0, 3, 1])
+        assert isinstance(found, InertialClock)
         assert found.gain > 4
         assert abs(found.rival_s - found.offset_s) > 0.2
         scaled.append((found.offset_s - AHEAD_S) / found.std_s)
@@ -105,3 +111,53 @@ def test_what_tells_no_clock_is_refused():
         inertial_clock(told, times, readings, [4.0, 3, 1])
     with pytest.raises(ValueError, match="must last 10 s"):
         inertial_clock(told, times[:500], readings[:500], [4.0, 3, 1])
+
+
+def test_axes_and_clock_of_an_imu_on_the_command_line(tmp_path, capsys):
+    """`calibrate` writes the axes that `replay` reads; it needs a truth, and finds them itself."""
+    rng = np.random.default_rng(5)
+    when = np.arange(0, SECONDS, 0.01)
+    turn = rotations.exp([1.0, 0.5, -0.7])
+    phases = rng.uniform(0, 6, (4, 6))
+    rates = rng.uniform(0.5, 3.0, (4, 6))
+
+    def pose(t):
+        swing = np.sin(rates * t[:, None, None] + phases).sum(axis=1)
+        return rotations.exp(0.3 * swing[:, 3:]), np.array([4, 3, 1.2]) + 0.4 * swing[:, :3]
+
+    moved = smooth.from_function(pose, when)
+    force = inertial.specific_force(moved.rotation, moved.acceleration)
+    body = inertial.simulate(inertial.sensor("consumer"), moved.turn_rate, force, rng).readings
+    read = inertial.turned(body, turn.T)
+    times = np.arange(1.0, SECONDS - 1, 0.02)
+    Q, p = pose(times)
+    ends = p[:, None] + np.einsum("kij,nj->kni", Q, TAGS)
+
+    def write(name, header, rows):
+        np.savetxt(tmp_path / name, rows, delimiter=",", header=header, comments="", fmt="%.7f")
+        return str(tmp_path / name)
+
+    anchor, tag = rng.integers(0, 6, len(times)), rng.integers(0, 2, len(times))
+    distance = np.linalg.norm(ends[np.arange(len(times)), tag] - ANCHORS[anchor], axis=1)
+    rows = np.column_stack([times, anchor, tag, distance + 0.02 * rng.standard_normal(len(times))])
+    files = {
+        "ranges": write("ranges.csv", "t,anchor,tag,range", rows),
+        "anchors": write("anchors.csv", "anchor,x,y,z", np.column_stack([np.arange(6), ANCHORS])),
+        "tags": write("tags.csv", "tag,x,y,z", np.column_stack([np.arange(2), TAGS])),
+        "truth": write(
+            "truth.csv", "t,x,y,z,qw,qx,qy,qz", np.column_stack([times, p, rotations.quaternion(Q)])
+        ),
+        "imu": write(
+            "imu.csv", "t,wx,wy,wz,ax,ay,az", np.column_stack([when[: len(read)] + 0.7, read])
+        ),
+    }
+    told = [f"--{name}={path}" for name, path in files.items()]
+    out = tmp_path / "out"
+    assert main(["calibrate", *told, f"--out={out}", "--arms=held"]) == 0
+    assert "replay --imu-frame" in capsys.readouterr().out
+    off = rotations.log(read_frame(out / "imu_frame.csv") @ turn.T)
+    assert np.degrees(np.linalg.norm(off)) < 0.5
+    assert main(["calibrate", *told, "--imu-frame=1,2,3"]) == 2
+    assert "leave out --imu-frame" in capsys.readouterr().err
+    assert main(["calibrate", *[x for x in told if "truth" not in x]]) == 2
+    assert "--imu means nothing without --truth" in capsys.readouterr().err

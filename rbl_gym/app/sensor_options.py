@@ -38,7 +38,7 @@ def add_inertial(group: Any) -> None:
     """Options of `rbl_gym.studies.replay.Inertial`."""
     for name, text in (
         ("gyro-noise", "density of its white noise, rad/s/sqrt(Hz), default 0.003"),
-        ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.11"),
+        ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.05"),
         ("gravity-tilt-deg", "of the world's z axis against the vertical, default 1"),
         (
             "recorded-share",

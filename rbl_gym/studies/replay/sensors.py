@@ -79,7 +79,7 @@ class Inertial:
     """
 
     gyro_noise: float = 3e-3
-    accel_noise: float = 0.11
+    accel_noise: float = 0.05
     gravity_tilt_deg: float = 1.0
     recorded_share: float = 0.5
     imu_offset_s: float = 0.0
