@@ -152,7 +152,7 @@ def innovations(
         log_det = log_det + np.linalg.slogdet(total)[1]
         dof = dof - (~empty).sum(axis=-1)
     likelihood = dof * LOG_USED - 0.5 * (nis + log_det) + refused * LOG_REFUSED
-    if hasattr(after, "log_evidence"):
+    if hasattr(after, "log_evidence") and after.log_weights.shape[-1] > 1:
         likelihood = after.log_evidence - before.log_evidence
     std = np.sqrt(variance * (1 + own))
     v, std, residual = (np.where(links, a, 0.0).reshape(shape) for a in (v, std, residual))

@@ -17,9 +17,9 @@ DESK = [(0, 0), (1.6, 0), (1.6, 0.8), (0, 0.8)]
 
 def write_dxf(path: Path, insunits: int = 4, scale: float = 1000.0) -> str:
     """The office by ezdxf, in units of 1 / `scale` metres, on layers as architects call them."""
-    import ezdxf
+    from ezdxf.filemanagement import new
 
-    document = ezdxf.new("R2010")
+    document = new("R2010")
     document.header["$INSUNITS"] = insunits
     model = document.modelspace()
 

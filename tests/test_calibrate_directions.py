@@ -18,7 +18,7 @@ from rbl_gym.estimators.calibration.directions import (
 )
 from rbl_gym.estimators.calibration.turn_rates import SensorTurn, align_turn_rates
 from rbl_gym.estimators.smoothing.knowledge import Level
-from rbl_gym.recordings import InertialLog, Truth, read_inertial, read_truth
+from rbl_gym.recordings import InertialLog, Truth, read_frame, read_inertial, read_truth
 from rbl_gym.studies import calibrate
 from tests.helpers import ROOT
 
@@ -163,7 +163,7 @@ def recorded(trial: int, base: int, target: int):
     )
 
 
-def test_clock_and_turn_of_a_sensor_by_a_track():
+def test_clock_and_turn_of_a_sensor_by_a_track(tmp_path):
     """The sensor's clock is 1.7 s ahead, it sits turned, and its bias is small."""
     rng = np.random.default_rng(3)
     times = 0.01 * np.arange(3000)
@@ -183,6 +183,13 @@ def test_clock_and_turn_of_a_sensor_by_a_track():
     off = Rotation.from_matrix(found.turn.rotation @ turn.T).magnitude()
     assert np.degrees(off) < 0.3
     np.testing.assert_allclose(found.turn.bias, bias, atol=0.005)
+    calibrate.write_frame(tmp_path / "imu_frame.csv", found.turn.rotation)
+    read = read_frame(tmp_path / "imu_frame.csv")
+    np.testing.assert_allclose(read, found.turn.rotation, atol=1e-7)
+    figures = calibrate.inertial_figures(found, 0.2)
+    assert figures["imu_offset_s"] == pytest.approx(1.9, abs=0.005)
+    vector = Rotation.from_matrix(read).as_rotvec(degrees=True)
+    np.testing.assert_allclose(figures["rotation_vector_deg"], vector, atol=1e-4)
     with pytest.raises(ValueError, match="rotations"):
         calibrate.calibrate_inertial(log, truth._replace(rotation=None))
 

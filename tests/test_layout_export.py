@@ -86,7 +86,7 @@ def test_geojson_stands_in_the_coordinates_of_its_plan(problem, tmp_path):
 
 @needs("ezdxf")
 def test_dxf_is_a_layer_in_a_copy_of_the_drawing(problem, tmp_path):
-    import ezdxf
+    from ezdxf.filemanagement import readfile
 
     plan = {"drawing": write_dxf(tmp_path / "x.dxf"), "units": "mm", "zero": [100.0, 200.0]}
     tables = {**TABLES, "plan": plan}
@@ -96,7 +96,7 @@ def test_dxf_is_a_layer_in_a_copy_of_the_drawing(problem, tmp_path):
         write_layout(drawn, ANCHORS, path)
         write_layout(drawn, ANCHORS, plan["drawing"])
     for name in (path, plan["drawing"]):
-        model = ezdxf.readfile(name).modelspace()
+        model = readfile(name).modelspace()
         places = [point.dxf.location for point in model.query(f'POINT[layer=="{LAYER}"]')]
         expected = ANCHORS * 1000 + (100, 200, 0)
         np.testing.assert_allclose([tuple(place) for place in places], expected)

@@ -398,6 +398,32 @@ def test_replay_with_an_inertial_sensor_finds_the_pose():
     assert np.degrees(np.sqrt(np.mean(errors.rotation[30:] ** 2))) < 4
 
 
+def test_a_track_by_an_inertial_sensor_is_smoothed():
+    """From an unknown heading, which the smoother knows from the first epoch on."""
+    settings = INERTIAL.changed(smooth=True)
+    replayed: Any = replay.replay_recording(an_inertial_log(), settings)
+    assert replayed.smoothed.found.converged
+    causal, smoothed = replayed.errors, replayed.smoothed_errors
+    assert np.degrees(np.sqrt(np.mean(smoothed.rotation**2))) < 4
+    for name in ("position", "rotation"):
+        square = [np.mean(getattr(errors, name) ** 2) for errors in (causal, smoothed)]
+        assert square[1] < 0.5 * square[0]
+    assert 0.3 < np.mean(smoothed.nees) / smoothed.freedom < 2.5
+
+
+def test_ranges_that_state_their_deviations_count_by_a_share():
+    """What they state is noise and biases: by half of it the filter is told half of it."""
+    log = an_inertial_log()
+    std = np.full(log.ranges.shape, 0.06)
+    own = INERTIAL.changed(range_std_m=None, recorded_share=0.5)
+    tracks = [
+        replay.track_recording(log._replace(range_std=std), own),
+        replay.track_recording(log, INERTIAL.changed(range_std_m=0.03)),
+    ]
+    np.testing.assert_allclose(tracks[0].translation, tracks[1].translation, atol=1e-9)
+    assert replay.Settings.of(filter="iekf-imu").biases.drift_time_s == 20
+
+
 def test_epochs_without_readings_are_left_out_by_the_clock():
     log = an_inertial_log(ahead=3.0)
     short = replay.covered(log, INERTIAL)
@@ -407,8 +433,6 @@ def test_epochs_without_readings_are_left_out_by_the_clock():
         replay.covered(log, INERTIAL.changed(imu_offset_s=-50.0))
     with pytest.raises(ValueError, match="needs imu"):
         replay.replay_recording(log._replace(inertial=None), INERTIAL)
-    with pytest.raises(ValueError, match="smooth knows no imu"):
-        replay.replay_recording(log, INERTIAL.changed(smooth=True))
 
 
 def test_axes_of_a_sensor_by_a_vector_or_a_file(tmp_path):

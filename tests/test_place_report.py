@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 pytest.importorskip("shapely", reason="needs the extra placement")
 pytest.importorskip("plotly", reason="needs the extra viz")
@@ -102,7 +103,8 @@ def test_plan_writes_a_file_that_place_reads(tmp_path, capsys):
     assert picture.stat().st_size > 20_000
     problem = scene_files.problem(str(out))
     assert (problem.name, problem.n_anchors, len(problem.zones)) == ("office", 6, 2)
-    assert problem.plan.drawing.endswith("office.geojson")
+    assert problem.plan is not None
+    assert str(problem.plan.drawing).endswith("office.geojson")
     assert "rbl-gym plan" in out.read_text().splitlines()[0]
     # The file can be drawn too, over a picture.
     over = ["--picture", write_png(tmp_path / "x.png"), "--metres-per-pixel", "0.05"]
@@ -207,7 +209,7 @@ def test_labels_lie_on_no_other(placed):
         assert (np.abs(a - b) >= (44, 16)).any()
     assert np.linalg.norm(found - points, axis=-1).max() < 120
     figure = place_figures.place_figure(placed)
-    renderer = figure.canvas.get_renderer()
+    renderer = FigureCanvasAgg(figure).get_renderer()
     for axes in figure.axes:
         boxes = [
             text.get_window_extent(renderer) for text in axes.texts if text.get_text().isdigit()
@@ -233,7 +235,8 @@ def test_the_page_needs_no_network_and_says_it_all(placed, tmp_path):
     assert 'name="viewport" content="width=device-width' in page
     for text in ("PASS", "FAIL", "mounting list", 'data-map="heading/', "store", "Plotly.newPlot"):
         assert text in page
-    data = json.loads(re.search(r'<script type="application/json">(.*?)</script>', page)[1])
+    (text,) = re.findall(r'<script type="application/json">(.*?)</script>', page)
+    data = json.loads(text)
     assert data["first"] == "relative"
     zone = data["maps"][data["level"]][0]
     assert zone["zone"] == "open plan"
@@ -279,6 +282,8 @@ def test_slits_of_holes_are_not_drawn():
     hole = np.array([(3, 3), (3, 6), (6, 6), (6, 3.0)])
     from rbl_gym.placement.plans.rings import opened
 
-    sides = shapes.sides_of(opened(outline, (hole,)))
+    ring = opened(outline, (hole,))
+    assert ring is not None
+    sides = shapes.sides_of(ring)
     lengths = np.linalg.norm(np.diff(sides, axis=1)[:, 0], axis=-1)
     assert lengths.sum() == pytest.approx(36 + 12, abs=0.01)

@@ -85,9 +85,9 @@ def test_what_cannot_be_read_is_counted_by_kind(tmp_path):
 
 @needs("ezdxf")
 def test_hatches_keep_their_holes_and_far_plans_come_near(tmp_path):
-    import ezdxf
+    from ezdxf.filemanagement import new
 
-    document = ezdxf.new()
+    document = new()
     document.header["$INSUNITS"] = 6
     far = np.array([500_000.3, 5_000_000.7])
     hatch = document.modelspace().add_hatch(dxfattribs={"layer": "ZONES"})
@@ -270,6 +270,12 @@ def test_marks_are_places_of_mounts_and_of_fixed_anchors():
     assert made.tables["anchors"] == {"number": 8, "fixed": [[1, 1, 3.0], [2, 1, 3.0]]}
 
 
+def test_a_layer_may_be_called_anything():
+    made = layers.building(plan_of(square(0, 0, 9, 'a]\n[[x]]\x07 "q"')), uses("zones a*"))
+    text = toml_text.to_toml(made.tables, made.said)
+    assert tomllib.loads(text) == toml_text.plain(made.tables)
+
+
 def test_without_mounts_and_zones_what_was_taken_is_said():
     made = layers.building(plan_of(square(0, 0, 9, "walls")))
     assert isinstance(made, layers.Building)
@@ -306,6 +312,7 @@ def test_holes_are_cut_open_to_one_simple_ring():
     ring = square(0, 0, 10).points
     holes = (square(2, 2, 2).points, square(6, 5, 2).points[::-1])
     found = rings.opened(ring, holes)
+    assert found is not None
     assert polygons.area(found) == pytest.approx(100 - 8, abs=0.02)
     for point, inside in (((3, 3), False), ((7, 6), False), ((5, 5), True), ((9, 1), True)):
         assert polygons.contains(found, np.array([point], float))[0] == inside

@@ -18,6 +18,7 @@ from scipy import special
 
 from rbl_gym.checks import FloatArray, check_count
 from rbl_gym.estimators.costs.bias_cost import AugmentedState
+from rbl_gym.estimators.costs.losses import LATE, loss_of
 from rbl_gym.estimators.filter import Filter, PoseBelief, reads, register
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf
 from rbl_gym.estimators.iekf.inertial import InertialEkf
@@ -39,6 +40,8 @@ _ANY_RAD = 1.8
 # Nearer to the leader than so many of its standard deviations, squared and over six states, a
 # hypothesis is the same.
 _SAME = 0.1
+# Weight of the middle heading in the mean of all, where these say nothing.
+_MIDDLE = 0.05
 
 
 class HeadingState(NamedTuple):
@@ -150,21 +153,31 @@ class HeadingBank:
         mask, law = None if mask is None else mask[..., None, :, :], LinkNoise(std)
         before = _filtered(state)
         after = self.filter.update(before, measured, places, mask, law)
-        told = innovations(self.filter, before, after, measured, places, pose.tags, law, mask)
+        if state.log_weights.shape[-1] == 1:
+            return HeadingState(*after, *state[4:])
+        epoch = measured, places, pose.tags
+        told = innovations(self.filter, before, after, *epoch, law, mask)
         weights = state.log_weights + told.log_likelihood
         evidence = state.log_evidence + special.logsumexp(weights, axis=-1)
+        if pose.robust == "late":
+            # A late range must not choose a heading by a weight that it has not in the update.
+            residual, links = told.residual / std, told.residual != 0
+            cost, share = loss_of(residual**2, LATE, residual > 0)
+            wider = LinkNoise(std / np.sqrt(share))
+            told = innovations(self.filter, before, after, *epoch, wider, mask)
+            lost = 0.5 * np.log(share) + cost - 0.5 * share * residual**2
+            weights = state.log_weights + told.log_likelihood
+            weights = weights - np.where(links, lost, 0.0).sum(axis=(-2, -1))
         return _pruned(HeadingState(*after, _normal(weights), evidence))
 
     def belief(self, state: HeadingState) -> PoseBelief:
-        """Mean place of all, heading of the likeliest, with the covariance of all about these."""
-        best = np.argmax(state.log_weights, axis=-1)
+        """Mean place and mean rotation of all, with the covariance of all about these."""
+        if state.log_weights.shape[-1] == 1:
+            return self.filter.belief(self.leader(state))
         weights = np.exp(state.log_weights)[..., None, None]
-
-        def leading(field: FloatArray, trailing: int) -> FloatArray:
-            index = best.reshape(*best.shape, *[1] * (trailing + 1))
-            return np.take_along_axis(field, index, axis=-1 - trailing).squeeze(-1 - trailing)
-
-        rotation = leading(state.rotation, 2)
+        # Of headings all around the circle the mean is any: a little of the middle one.
+        middle = state.rotation[..., state.rotation.shape[-3] // 2, :, :]
+        rotation = rotations.nearest((weights * state.rotation).sum(axis=-3) + _MIDDLE * middle)
         translation = (weights[..., 0] * state.translation).sum(axis=-2)
         turn = rotations.error(rotation[..., None, :, :], state.rotation)
         gap = np.concatenate([turn, translation[..., None, :] - state.translation], axis=-1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from typing import Any
 
 from rbl_gym.app.reading_options import add_reading, read_runs
@@ -155,7 +156,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         if getattr(options, name) is not None:
             raise ValueError(f"calibrate takes ranges as the radios gave them, without --{name}")
     if options.imu_frame is not None:
-        raise ValueError("calibrate finds how the sensor of --imu sits, without --imu-frame")
+        raise ValueError("calibrate finds the axes of --imu: leave out --imu-frame")
     if options.imu is not None and not options.truth:
         raise ValueError("--imu means nothing without --truth")
     mine, others = (_WITH_TRUTH, _WITHOUT) if options.truth else (_WITHOUT, _WITH_TRUTH)
@@ -165,6 +166,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     found = (_links if options.truth else _anchors)(options, given)
     files = found.write(options.out) if options.out else {}
+    if options.imu is not None:
+        files |= _inertial(options, found.figures)
     if options.plot:
         from rbl_gym.app import calibrate_figures, figures
 
@@ -188,6 +191,24 @@ def _links(options: argparse.Namespace, given: dict[str, Any]) -> Any:
     runs = read_runs(options)
     with progress("calibrate", 4) as advance:
         return calibrate.calibrate_links(runs, settings, advance)
+
+
+def _inertial(options: argparse.Namespace, figures: dict[str, Any]) -> dict[str, str]:
+    """Axes and clock of the inertial sensor, put into the figures; the file that was written."""
+    from rbl_gym.studies import calibrate
+
+    longest = max(read_runs(options).values(), key=lambda run: len(run.times))
+    assert longest.inertial is not None
+    assert longest.truth is not None
+    found = calibrate.calibrate_inertial(longest.inertial, longest.truth)
+    clock, told = figures.get("time_offset"), options.time_offset
+    ahead = clock["offset_s"] if clock else told if isinstance(told, float) else 0.0
+    figures["inertial"] = calibrate.inertial_figures(found, ahead)
+    if not options.out:
+        return {}
+    path = os.path.join(options.out, "imu_frame.csv")
+    calibrate.write_frame(path, found.turn.rotation)
+    return {"imu_frame": path}
 
 
 def _anchors(options: argparse.Namespace, given: dict[str, Any]) -> Any:

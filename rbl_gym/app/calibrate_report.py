@@ -84,6 +84,13 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
             f"The ranges fit the truth {clock['offset_s']:.4f} s later than its stamps say, +- "
             f"{clock['std_s']:.4f} (replay --time-offset {clock['offset_s']:.4f})."
         )
+    if sensor := figures.get("inertial"):
+        said.append(
+            f"The axes of imu are turned by {_three(sensor['rotation_vector_deg'], 2)} deg against "
+            f"the body's, +- {_three(sensor['rotation_std_deg'], 2)} (replay --imu-frame); its "
+            f"clock is ahead of that of the ranges by {sensor['imu_offset_s']:.4f} s, +- "
+            f"{sensor['imu_offset_std_s']:.4f} (replay --time-offset imu=...)."
+        )
     if turn := figures.get("turn"):
         text = f"The table of tags is turned by {_three(turn['rotation_vector_deg'], 2)} deg"
         if "std_deg" in turn:
@@ -92,14 +99,6 @@ def _sentences(figures: dict[str, Any]) -> list[str]:
         said.append(text)
         for row, off in zip(figures["tags"], turn.get("off_table_m", ()), strict=False):
             said.append(f"Tag {row['tag']} is {_three(off, 3)} m off its place in the table.")
-    if told := figures.get("inertial"):
-        said.append(
-            f"The inertial sensor is turned by {_three(told['rotation_vector_deg'], 1)} deg, +- "
-            f"{_three(told['rotation_std_deg'], 2)}, its clock {told['offset_s']:.4f} s ahead of "
-            f"the ranges', +- {told['offset_std_s']:.4f} (replay --time-offset "
-            f"imu={told['offset_s']:.4f}); biases of its gyroscope "
-            f"{_three(told['gyro_bias_deg_s'], 2)} deg/s, noise {told['gyro_noise_deg_s']:.2g}."
-        )
     if told := figures.get("directions"):
         kind = told["bias"]
         text = "Bias by the direction of the ray: no harmonic foretells what was left out."

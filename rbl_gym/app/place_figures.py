@@ -7,6 +7,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 
 from rbl_gym.app import place_answer, place_draw
 from rbl_gym.app import place_shapes as shapes
@@ -63,7 +64,7 @@ def building_figure(problem: Problem) -> Figure:
     edges = shapes.limits(problem, nothing)
     step = next(s for s in (1, 2, 5, 10, 20, 50, 100, 1e9) if np.ptp(edges, axis=0).max() / s < 25)
     for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(matplotlib.ticker.MultipleLocator(step))
+        axis.set_major_locator(MultipleLocator(step))
     axes.grid(color="0.6", lw=0.4, zorder=0.5)
     axes.plot(*problem.fixed[:, :2].T, "s", ms=7, color=place_draw.KEPT, mec="white", zorder=7)
     axes.set_title(f"{problem.name}: the building as it was read, a line every {step:g} m")

@@ -190,10 +190,11 @@ def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
             continue
         needs = row["would_pass"]
         limits = [_figure(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
-        rows.append([row["name"], row["verdict"], *_share(row), *limits])
+        factor = f"{needs['factor']:.3f}"
+        rows.append([row["name"], row["verdict"], *_share(row), *limits, factor])
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
-        "would pass: position (m)", "height (m)", "heading (deg)",
+        "would pass: position (m)", "height (m)", "heading (deg)", "all times",
     ]  # fmt: skip
     yield Rows(f"with one anchor less, {less['n_anchors']}", headings, rows)
 
@@ -381,7 +382,7 @@ def _check_within(check: dict[str, Any]) -> Rows:
     return Rows("checked in each zone: horizontal position, heading", headings, rows)
 
 
-def _numbers(numbers: list[dict[str, float]]) -> Rows:
+def _numbers(numbers: list[dict[str, Any]]) -> Rows:
     rows = [
         [
             str(row["n_anchors"]),

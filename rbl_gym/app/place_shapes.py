@@ -225,7 +225,9 @@ def layer_of(zone: Any, one: Map, values: FloatArray) -> Layer:
     """A map whose holes are filled from their nearest neighbours: what is there is drawn on top."""
     free = np.isfinite(values)
     if free.any() and not free.all():
-        nearest = ndimage.distance_transform_edt(~free, return_distances=False, return_indices=True)
+        nearest: Any = ndimage.distance_transform_edt(
+            ~free, return_distances=False, return_indices=True
+        )
         values = values[tuple(nearest)]
     (left, right), (bottom, top) = (_edges(axis) for axis in (one.columns, one.rows))
     return Layer(zone, left, right, bottom, top, values, free)

@@ -188,10 +188,15 @@ def compared(result: dict[str, Any]) -> list[str]:
     for what in ("odometry", "imu"):
         if (found := result.get(f"{what}_clock")) is None:
             continue
+        how = f"the likelihood of the ranges (higher by {found['gain']:.1f})"
+        if found["correlation"] is not None:
+            how = (
+                f"accelerations of the ranges' track (correlation {found['correlation']:.2f}; "
+                f"log-likelihood higher by {found['gain']:.1f} than at any other offset)"
+            )
         parts.append(
             f"the clock of --{what} is ahead by {found['offset_s']:.3f} s "
-            f"+- {found['std_s']:.3f} s by the likelihood of the ranges "
-            f"(higher by {found['gain']:.1f})"
+            f"+- {found['std_s']:.3f} s by {how}"
         )
     if "time_offset" in result:
         found = result["time_offset"]

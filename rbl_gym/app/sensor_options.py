@@ -38,8 +38,12 @@ def add_inertial(group: Any) -> None:
     """Options of `rbl_gym.studies.replay.Inertial`."""
     for name, text in (
         ("gyro-noise", "density of its white noise, rad/s/sqrt(Hz), default 0.003"),
-        ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.11"),
+        ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.05"),
         ("gravity-tilt-deg", "of the world's z axis against the vertical, default 1"),
+        (
+            "recorded-share",
+            "of the log's own deviations, what is noise, default 0.5",
+        ),
     ):
         group.add_argument(f"--{name}", type=float, metavar="X", help=text)
 
@@ -53,8 +57,9 @@ def add_clocks(group: Any) -> None:
         dest="time_offsets",
         metavar="[WHAT=]S",
         help="how far the truth's clock is ahead of that of the ranges, seconds; auto: found by "
-        "the motion; odometry=S and imu=S of those, odometry=auto and imu=auto by the likelihood "
-        "of the ranges, to 2.4 s; may be given more than once",
+        "the motion; odometry=S and imu=S of those; odometry=auto by the likelihood of the "
+        "ranges, to 2.4 s; imu=auto by accelerations of their track, to 10 s; may be given more "
+        "than once",
     )
 
 

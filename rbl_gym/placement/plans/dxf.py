@@ -178,8 +178,9 @@ def _middle(entity: Any, kind: str) -> FloatArray:
 def _open(path: str) -> Any:
     """The document; a damaged one is mended as far as it can be."""
     try:
-        import ezdxf
         from ezdxf import recover
+        from ezdxf.filemanagement import readfile
+        from ezdxf.lldxf.const import DXFError
     except ImportError:
         raise ValueError(
             f"{path}: a DXF needs the extra placement: pip install 'rbl-gym[placement]'"
@@ -187,12 +188,12 @@ def _open(path: str) -> Any:
     with Path(path).open("rb"):  # an OSError names the file
         pass
     try:
-        return ezdxf.readfile(path)
-    except (OSError, ezdxf.DXFError, UnicodeError, ValueError):
+        return readfile(path)
+    except (OSError, DXFError, UnicodeError, ValueError):
         pass
     try:
         document, auditor = recover.readfile(path)
-    except (OSError, ezdxf.DXFError, UnicodeError, ValueError, LookupError) as error:
+    except (OSError, DXFError, UnicodeError, ValueError, LookupError) as error:
         raise ValueError(f"{path}: this is no DXF: {error}") from error
     if auditor.has_errors:
         raise ValueError(f"{path}: damaged DXF: {auditor.errors[0].message}")

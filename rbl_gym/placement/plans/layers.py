@@ -177,7 +177,7 @@ class _Maker:
         return self._rings(lines, marks, layer, use, KEYS["forbidden"], heights)
 
     def _zones(self, lines: list[Shape], marks: list[Shape], layer: str, use: Use) -> Any:
-        heights = dict(zip(("low_m", "high_m"), ZONE_M, strict=True))
+        heights: dict[str, Any] = dict(zip(("low_m", "high_m"), ZONE_M, strict=True))
         rows, left = self._rings(lines, marks, layer, use, KEYS["zones"], heights)
         texts = [label for label in self.drawing.labels if label.layer == layer]
         for count, row in enumerate(rows, start=1):

@@ -49,8 +49,10 @@ def to_toml(tables: Mapping[str, Any], head: list[str]) -> str:
         for number, entry in enumerate(entries):
             if number:
                 lines.append("")
-            head = f"[[{key}]]" if _is_tables(value) else f"[{key}]"
-            lines.append(f"{head}  # {entry['#']}" if "#" in entry else head)
+            table = f"[[{key}]]" if _is_tables(value) else f"[{key}]"
+            # A layer may be called anything: the comment stays on its line.
+            note = " ".join(str(entry.get("#", "")).split())
+            lines.append(f"{table}  # {note}" if note.isprintable() and note else table)
             lines += [_assigned(name, item) for name, item in entry.items() if name != "#"]
     return "\n".join(lines) + "\n"
 
@@ -71,7 +73,8 @@ def _assigned(key: str, value: Any) -> str:
     line = f"{key} = {_value(value)}"
     if len(line) <= _WIDTH or not isinstance(value, list):
         return line
-    rows, row = [f"{key} = ["], "   "
+    rows = [f"{key} = ["]
+    row = "   "
     for item in value:
         text = f" {_value(item)},"
         if len(row) + len(text) > _WIDTH and row.strip():

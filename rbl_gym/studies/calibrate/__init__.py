@@ -12,7 +12,11 @@ from rbl_gym.studies.calibrate.files import (
     write_link_table,
     write_points,
 )
-from rbl_gym.studies.calibrate.inertial import CalibratedInertial, calibrate_inertial
+from rbl_gym.studies.calibrate.inertial import (
+    CalibratedInertial,
+    calibrate_inertial,
+    inertial_figures,
+)
 from rbl_gym.studies.calibrate.links import CalibratedLinks, calibrate_links
 from rbl_gym.studies.calibrate.settings import LinkSettings
 
@@ -24,6 +28,7 @@ __all__ = [
     "SurveyedAnchors",
     "calibrate_inertial",
     "calibrate_links",
+    "inertial_figures",
     "read_anchor_ranges",
     "survey_anchors",
     "write_directions",

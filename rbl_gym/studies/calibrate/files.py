@@ -103,16 +103,16 @@ def write_directions(
 
 
 def write_frame(path: str | os.PathLike[str], rotation: FloatArray) -> None:
-    """Write ``qw,qx,qy,qz``, as `rbl_gym.recordings.read_frame` reads it.
+    """Write ``qw,qx,qy,qz`` of the rotation (3, 3) from a sensor's axes to the body's.
 
     Parameters
     ----------
     path
-        File; its folder is made.
+        File, which `replay --imu-frame` reads; its folder is made.
     rotation
-        (3, 3) from the sensor's axes to those of the body.
+        Of `calibrate_inertial`, ``turn.rotation``.
     """
-    _write(path, ("qw", "qx", "qy", "qz"), [[f"{x:.9f}" for x in rotations.quaternion(rotation)]])
+    _write(path, ("qw", "qx", "qy", "qz"), [[f"{x:.8f}" for x in rotations.quaternion(rotation)]])
 
 
 def _write(

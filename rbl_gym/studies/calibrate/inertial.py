@@ -12,7 +12,7 @@ from rbl_gym.estimators.calibration.turn_rates import SensorTurn, align_turn_rat
 from rbl_gym.geometry import rotations
 from rbl_gym.recordings import InertialLog, TimeOffset, Truth, time_offset
 
-__all__ = ["CalibratedInertial", "calibrate_inertial"]
+__all__ = ["CalibratedInertial", "calibrate_inertial", "inertial_figures"]
 
 # Rates of both are those of a grid of this spacing, smoothed by so many points of it.
 _STEP_S, _SMOOTH = 0.02, 5.0
@@ -85,17 +85,24 @@ def _turn(stamps: FloatArray, gyro: FloatArray, middle: FloatArray, body: FloatA
     return align_turn_rates(rates[0][known], rates[1][known])
 
 
-def inertial_figures(found: CalibratedInertial, ahead_s: float) -> dict[str, Any]:
-    """Plain numbers of a sensor, where the truth's clock is so far ahead of that of the ranges."""
-    turn, clock = found
+def inertial_figures(found: CalibratedInertial, truth_offset_s: float = 0.0) -> dict[str, Any]:
+    """Plain numbers of a sensor: its axes in the body's, its bias, its clock.
+
+    Parameters
+    ----------
+    found
+        Of `calibrate_inertial`.
+    truth_offset_s
+        How far the truth's clock is ahead of that of the ranges: ``imu_offset_s`` is against these.
+    """
+    turn = found.turn
     return {
         "rotation_vector_deg": np.rad2deg(rotations.log(turn.rotation)).tolist(),
         "rotation_std_deg": np.rad2deg(turn.rotation_std_rad).tolist(),
-        "gyro_bias_deg_s": np.rad2deg(turn.bias).tolist(),
-        "gyro_bias_std_deg_s": np.rad2deg(turn.bias_std).tolist(),
-        "gyro_noise_deg_s": float(np.rad2deg(turn.noise_std_rad_s)),
-        "offset_s": float(clock.offset_s + ahead_s),
-        "offset_std_s": float(clock.std_s),
+        "gyro_bias_rad_s": turn.bias.tolist(),
+        "gyro_bias_std": turn.bias_std.tolist(),
+        "imu_offset_s": found.clock.offset_s + truth_offset_s,
+        "imu_offset_std_s": found.clock.std_s,
     }
 
 

@@ -24,14 +24,8 @@ from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.calibrate.directed import fit_log, with_directions
 from rbl_gym.studies.calibrate.files import (
     write_directions,
-    write_frame,
     write_link_table,
     write_points,
-)
-from rbl_gym.studies.calibrate.inertial import (
-    CalibratedInertial,
-    calibrate_inertial,
-    inertial_figures,
 )
 from rbl_gym.studies.calibrate.known_path import Log, clock_of, first_turn, log_of, path_at
 from rbl_gym.studies.calibrate.settings import LinkSettings
@@ -64,9 +58,6 @@ class CalibratedLinks(NamedTuple):
         Plain numbers: what `rbl-gym calibrate --json` writes.
     directions
         Bias by the direction of the ray; None where it was not looked for.
-    inertial
-        How the recording's inertial sensor sits, and its clock; None: there is none, or the turns
-        do not tell.
     """
 
     settings: LinkSettings
@@ -77,13 +68,11 @@ class CalibratedLinks(NamedTuple):
     distances: Any
     figures: dict[str, Any]
     directions: FoundDirections | None = None
-    inertial: CalibratedInertial | None = None
 
     def write(self, folder: str | os.PathLike[str]) -> dict[str, str]:
         """Write what was found into a folder; the paths by name.
 
-        ``calibration.csv``, ``tags.csv``, ``directions.csv`` of biases by direction,
-        ``imu_frame.csv`` of an inertial sensor.
+        ``calibration.csv``, ``tags.csv`` and, of biases by direction, ``directions.csv``.
         """
         paths = {name: os.path.join(folder, f"{name}.csv") for name in ("calibration", "tags")}
         fit = self.fit
@@ -100,9 +89,6 @@ class CalibratedLinks(NamedTuple):
         if self.directions is not None and self.directions.bias.harmonics:
             paths["directions"] = os.path.join(folder, "directions.csv")
             write_directions(paths["directions"], ids, self.directions.law)
-        if self.inertial is not None:
-            paths["imu_frame"] = os.path.join(folder, "imu_frame.csv")
-            write_frame(paths["imu_frame"], self.inertial.turn.rotation)
         return paths
 
 
@@ -271,25 +257,7 @@ def _result(
         }
     else:
         found = None
-    sits = _sensor(log, figures, shift)
-    return CalibratedLinks(
-        settings, fit, clock, anchor_ids, tag_ids, distance, figures, found, sits
-    )
-
-
-def _sensor(log: Log, figures: dict[str, Any], shift: float) -> CalibratedInertial | None:
-    """How the inertial sensor of the longest run sits; where not, `figures` say why."""
-    runs = [run for run in log.runs if run.inertial is not None and run.truth is not None]
-    if not runs:
-        return None
-    run = max(runs, key=lambda run: len(run.times))
-    try:
-        found = calibrate_inertial(run.inertial, run.truth)  # pyright: ignore[reportArgumentType]
-    except ValueError as error:
-        figures["not_determined"].append(f"how the inertial sensor sits: {error}")
-        return None
-    figures["inertial"] = inertial_figures(found, shift)
-    return found
+    return CalibratedLinks(settings, fit, clock, anchor_ids, tag_ids, distance, figures, found)
 
 
 def _table_beside(table: Any, fit: LinkFit, planar: bool) -> dict[str, Any]:

@@ -182,12 +182,13 @@ def accuracy_map(
         found[:, free] = accuracy(problem, anchors, places[free], zone)
     errors = Errors(*found)
     return Map(
-        *centres,
-        errors.position,
-        np.rad2deg(errors.rotation),
-        errors.horizontal,
-        errors.height,
-        np.rad2deg(errors.heading),
+        columns=centres[0],
+        rows=centres[1],
+        position=errors.position,
+        rotation=np.rad2deg(errors.rotation),
+        horizontal=errors.horizontal,
+        height=errors.height,
+        heading=np.rad2deg(errors.heading),
         across=0,
         up=up,
         at=at,

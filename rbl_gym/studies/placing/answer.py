@@ -162,17 +162,16 @@ def _designed(
 ) -> Design:
     """The best layout for b; where it misses a requirement, or one may fail, exchanges from it."""
     seed, survive = question.seed, question.survive
-    if question.optimise or len(problem.fixed):
-        advance(0, more=1)
-        anchors = choosing.chosen_layout(problem, seed, survive, start)
-        advance()
-        return Design(anchors, "exchanges", {})
     advance(0, more=design.SEARCH_STEPS)
     found = design.design_layout(problem, seed, advance, start)
     asks = any(limits_of(zone).any() for zone in problem.zones)
     if not survive and (not asks or choosing.is_met(judge(problem, found.anchors, seed))):
         return found
-    better, _ = choosing.improved(problem, found.anchors, seed, survive)
+    starts = [found.anchors]
+    if question.optimise and start is not None and len(start) == problem.n_anchors:
+        starts.append(start)
+    tried = [choosing.improved(problem, one, seed, survive) for one in starts]
+    better, _ = min(tried, key=lambda pair: pair[1])
     why = "loss of one" if survive else "requirements"
     return found._replace(anchors=better, method=f"{found.method}, exchanges for {why}")
 

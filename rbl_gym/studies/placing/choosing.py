@@ -25,7 +25,7 @@ from rbl_gym.studies.placing.swaps import (
 )
 from rbl_gym.studies.progress import Advance, silent
 
-__all__ = ["Fewest", "chosen_layout", "fewest_anchors", "next_anchor"]
+__all__ = ["Fewest", "fewest_anchors", "next_anchor"]
 
 # Poses over which choices are made: places in all zones together, at least in each; turns.
 _PLACES, _LEAST_PLACES, _TURNS = 400, 128, 3
@@ -125,39 +125,6 @@ def is_met(judged: list[Judged]) -> bool:
 
 
 # --- exchanges -----------------------------------------------------------------------------------
-
-
-def chosen_layout(
-    problem: Problem, seed: int, survive: int = 0, start: FloatArray | None = None
-) -> FloatArray:
-    """A layout (M, 3): greedy from the start, then `improved`.
-
-    Parameters
-    ----------
-    problem
-        What is placed.
-    seed, survive
-        As in `improved`.
-    start
-        Anchors to begin with, the problem's fixed ones first; None: these alone.
-
-    Raises
-    ------
-    ValueError
-        If there are not as many mounts.
-    """
-    start = problem.fixed if start is None else start
-    rng = np.random.default_rng([seed, 10])
-    points = _first(start, candidates(problem, rng, max(_CANDIDATES, 4 * problem.n_anchors)))
-    if len(points) < problem.n_anchors:
-        raise ValueError(
-            f"the number of anchors must be at most {len(points)}, as many as there are mounts, "
-            f"got {problem.n_anchors}"
-        )
-    stock, chosen = stock_of(problem, points, seed), list(range(len(start)))
-    for more, _ in grown(stock, range(len(start)), problem.n_anchors, survive):
-        chosen = more
-    return improved(problem, points[chosen], seed, survive)[0]
 
 
 def improved(

@@ -210,17 +210,17 @@ def _write_geojson(problem: Problem, rows: list[dict[str, Any]], path: str) -> N
 
 
 def _write_dxf(problem: Problem, rows: list[dict[str, Any]], path: str) -> None:
-    import ezdxf
+    from ezdxf.filemanagement import new, readfile
 
     plan = problem.plan
     if plan is not None and plan.drawing and plan.drawing.lower().endswith(".dxf"):
-        document = ezdxf.readfile(plan.drawing)
+        document = readfile(plan.drawing)
         scale, zero = 1 / UNITS[plan.units], np.array(plan.zero)
     else:
-        document, scale, zero = ezdxf.new(), 1.0, np.zeros(2)
+        document, scale, zero = new(), 1.0, np.zeros(2)
         document.header["$INSUNITS"] = 6
         _draw_building(document, problem)
-    model = document.modelspace()
+    model: Any = document.modelspace()
     if LAYER in document.layers:
         for entity in model.query(f'*[layer=="{LAYER}"]'):
             model.delete_entity(entity)

@@ -17,8 +17,6 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.placing.requirements import (
-    Asked,
-    Errors,
     Limits,
     asked_of,
     errors_of,
@@ -89,7 +87,7 @@ class Stock(NamedTuple):
         return any(zone.limits.any() for zone in self.zones)
 
 
-Base = list[FloatArray]  # information (L, T, 6, 6) of each zone
+Base = Sequence[FloatArray]  # information (L, T, 6, 6) of each zone
 
 
 def value(stock: Stock, chosen: Sequence[int], survive: int = 0) -> float:
@@ -304,29 +302,22 @@ def _with_candidates(
 
 def _values(stock: Stock, base: Base, added: np.ndarray | slice | None = None) -> FloatArray:
     """Value (J,) of information (..., L, T, 6, 6) with each of the added candidates, or none."""
-    found = []
-    for zone, total, part in zip(stock.zones, base, stock.parts, strict=True):
-        more = None if added is None else part[added]
-        asked = stock.asks
-        found.append(
-            asked_of(total, more) if asked else errors_of(total, zone.rotation, zone.tags, more)
-        )
-    return np.atleast_1d(_objective(stock, found))
-
-
-def _objective(stock: Stock, errors: list[Errors | Asked]) -> FloatArray:
-    """Value (...) of errors (..., L) at the places of every zone."""
+    more = [None if added is None else part[added] for part in stock.parts]
+    of_zones = list(zip(stock.zones, base, more, strict=True))
     if not stock.asks:
         weights = np.array([zone.weight for zone in stock.zones])
-        squares = [(of_zone.score**2).mean(axis=-1) for of_zone in errors]
-        return np.sqrt(np.tensordot(weights / weights.sum(), squares, axes=1))
+        scores = [
+            errors_of(total, zone.rotation, zone.tags, part).score for zone, total, part in of_zones
+        ]
+        squares = [(score**2).mean(axis=-1) for score in scores]
+        return np.atleast_1d(np.sqrt(np.tensordot(weights / weights.sum(), squares, axes=1)))
     worst, mean = [], []
-    for zone, of_zone in zip(stock.zones, errors, strict=True):
+    for zone, total, part in of_zones:
         if zone.limits.any():
-            relative = relative_errors(of_zone, zone.limits)
+            relative = relative_errors(asked_of(total, part), zone.limits)
             worst.append(value_at_share(relative, zone.share))
             mean.append(relative.mean(axis=-1))
     q, slope = np.max(worst, axis=0), _OF_MEAN * np.mean(mean, axis=0)
     # On the side of 1 that the requirements say.
     met = (1 - _OF_MEAN) * q + np.minimum(slope, _OF_MEAN)
-    return np.where(q <= 1, met, q + slope)
+    return np.atleast_1d(np.where(q <= 1, met, q + slope))

@@ -8,12 +8,15 @@ most of that.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import Innovations
 from rbl_gym.estimators.innovation import LOG_REFUSED, LOG_USED
+from rbl_gym.geometry import rotations
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.evidence import Evidence, Trial, evidence, std_of
 from rbl_gym.studies.replay.settings import Settings
@@ -51,7 +54,12 @@ class Cause(NamedTuple):
     mended: float
 
 
-def likely_causes(recording: Recording, settings: Settings, found: Innovations) -> list[Cause]:
+def likely_causes(
+    recording: Recording,
+    settings: Settings,
+    found: Innovations,
+    poses: tuple[FloatArray, FloatArray] | None = None,
+) -> list[Cause]:
     """Faults that explain most of what a filter did not foretell, at most two; empty: none does.
 
     Parameters
@@ -60,8 +68,15 @@ def likely_causes(recording: Recording, settings: Settings, found: Innovations) 
         What was filtered, and how; the truth is not looked at.
     found
         Innovations of that run.
+    poses
+        Rotations (K, 3, 3) and places (K, 3) of that run. With an inertial sensor, where headings
+        take long to find, the part that is looked at starts there.
     """
-    trial = local_trial(_strained_part(recording, found), settings)
+    part = _strained_part(recording, found)
+    if poses is not None and settings.filter == "iekf-imu":
+        yaw = math.degrees(float(rotations.yaw(poses[0][part.start])))
+        settings = settings.changed(start=(*poses[1][part.start].tolist(), yaw))
+    trial = local_trial(cut(recording, part), settings)
     excess, left = 0.0, 1.0
     causes: list[Cause] = []
     while len(causes) < 2 and left > _WORTH:
@@ -105,16 +120,16 @@ def _excess(trial: Trial, seen: Evidence) -> float:
     return float(0.5 * (nis - dof) + (links.sum() - dof) * (usual - LOG_REFUSED))
 
 
-def _strained_part(recording: Recording, found: Innovations) -> Recording:
-    """The part of a log that is contradicted most."""
+def _strained_part(recording: Recording, found: Innovations) -> slice:
+    """The epochs of the part of a log that is contradicted most."""
     links = recording.links.sum(axis=(1, 2))
     size = int(np.clip(_RANGES / max(links.mean(), 1), _FEWEST, _MOST))
     if size >= len(links):
-        return recording
+        return slice(0, len(links))
     refused = -LOG_REFUSED * (links - found.dof)
     strain = np.concatenate([[0.0], np.cumsum(0.5 * (found.nis - found.dof) + refused)])
     first = int(np.argmax(strain[size:] - strain[:-size]))
-    return cut(recording, slice(first, first + size))
+    return slice(first, first + size)
 
 
 def cut(recording: Recording, epochs: slice) -> Recording:

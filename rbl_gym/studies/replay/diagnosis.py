@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-from rbl_gym.estimators import Innovations
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.causes import Cause, likely_causes
 from rbl_gym.studies.replay.consistency import MOST_NIS, MOST_REFUSED, consistency_figures
 from rbl_gym.studies.replay.settings import Settings
+from rbl_gym.studies.replay.tracking import Track
 
 # Below this NIS per degree of freedom the filter expects much more scatter than there is.
 _WIDE = 0.25
 
 
 def diagnose(
-    recording: Recording, settings: Settings, found: Innovations
+    recording: Recording, settings: Settings, track: Track
 ) -> tuple[dict[str, Any], list[str]]:
     """Figures as of `consistency_figures`, ``causes`` of a contradiction, and notes.
 
@@ -23,9 +23,11 @@ def diagnose(
     ----------
     recording, settings
         What was filtered, and how.
-    found
-        Innovations of the filter, arrays (K, ...).
+    track
+        Of the filter, with its innovations.
     """
+    found = track.innovations
+    assert found is not None
     figures = consistency_figures(found, recording)
     ratio = figures["nis_per_dof"]
     if not figures["contradicts"]:
@@ -40,7 +42,7 @@ def diagnose(
         # What is supposed of ranges does not hold of their differences.
         text = _subject(figures) + "Look at the residuals of anchors, tags and links; see --tune."
         return {**figures, "causes": []}, [text]
-    causes = likely_causes(recording, settings, found)
+    causes = likely_causes(recording, settings, found, track[1:3])
     return {**figures, "causes": [cause._asdict() for cause in causes]}, [_warning(figures, causes)]
 
 

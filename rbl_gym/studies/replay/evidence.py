@@ -15,9 +15,9 @@ from rbl_gym.estimators import IteratedEkf, hold_level
 from rbl_gym.measurements.ranging import LinkNoise, RangeNoise
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import Reading, innovations_of, stack_beliefs, track_epochs
-from rbl_gym.studies.replay.place import level_of
+from rbl_gym.studies.replay.place import level_of, own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
-from rbl_gym.studies.replay.tracking import has_own_std, prior_of, recording_filter, sensed
+from rbl_gym.studies.replay.tracking import prior_of, recording_filter, sensed
 
 # Trials that run at once: more fall out of the processor's caches.
 _TOGETHER = 64
@@ -152,7 +152,8 @@ def _readings(trials: list[Trial]) -> Iterator[Reading]:
 
 def std_of(recording: Recording, settings: Settings) -> FloatArray:
     """Standard deviations (K, M, N) of the ranges."""
-    if has_own_std(recording, settings) and recording.range_std is not None:
-        return recording.range_std
+    own = own_std(recording, settings)
+    if own is not None:
+        return own
     std = settings.range_std_m or DEFAULT_RANGE_STD_M
     return np.broadcast_to(np.float64(std), recording.ranges.shape)

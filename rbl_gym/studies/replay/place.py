@@ -130,6 +130,14 @@ def has_own_std(recording: Recording, settings: Settings) -> bool:
     return settings.range_std_m is None and recording.range_std is not None
 
 
+def own_std(recording: Recording, settings: Settings) -> FloatArray | None:
+    """Standard deviations (K, M, N) of the ranges' own; None: they have none that count."""
+    std = recording.range_std
+    if std is None or not has_own_std(recording, settings):
+        return None
+    return settings.inertial.recorded_share * std if settings.filter == "iekf-imu" else std
+
+
 def height_offset(recording: Recording, settings: Settings) -> float:
     """How far the tags lie below the anchors [m]; a ValueError where that has to be said."""
     heights, known = recording.anchors[..., 2], settings.knowledge

@@ -71,18 +71,23 @@ class Inertial:
         off the body's origin adds.
     gravity_tilt_deg
         Standard deviation of the angle between the world's z axis and the vertical.
+    recorded_share
+        How much of the standard deviations that a recording states for its ranges is noise from
+        one to the next. The rest is biases that last, which the filter estimates.
     imu_offset_s
         How far its clock is ahead of that of the ranges.
     """
 
     gyro_noise: float = 3e-3
-    accel_noise: float = 0.11
+    accel_noise: float = 0.05
     gravity_tilt_deg: float = 1.0
+    recorded_share: float = 0.5
     imu_offset_s: float = 0.0
 
     def __post_init__(self) -> None:
         check_number("imu_offset_s", self.imu_offset_s)
         check_number("gravity_tilt_deg", self.gravity_tilt_deg, low=0.0, high=20.0)
+        check_number("recorded_share", self.recorded_share, low=1e-3)
         self.sensor()
 
     def sensor(self) -> InertialSensor:
@@ -91,6 +96,7 @@ class Inertial:
             gyro_noise=self.gyro_noise,
             accel_noise=self.accel_noise,
             gyro_walk=1e-4,
+            gyro_bias_rad_s=0.01,
             accel_walk=2e-3,
             accel_bias_m_s2=0.06,
         )

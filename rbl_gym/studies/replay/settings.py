@@ -22,6 +22,8 @@ __all__ = [
 ]
 
 DEFAULT_RANGE_STD_M = 0.12
+# Of the filter iekf-imu: what a link keeps for long is not told from what all keep.
+_INERTIAL_BIASES = {"constant_std_m": 0.0, "constant_common_m": 0.073, "drift_time_s": 20.0}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,9 +61,9 @@ class Biases:
     bias_std_m, bias_time_s, bias_common_m
         Of the filter ``"iekf-bias"``: as of `rbl_gym.measurements.link_bias.LinkBias`.
     constant_std_m, constant_common_m
-        Of the filter ``"iekf-log"``: biases that stay, of each link and in common to all.
+        Of ``"iekf-log"`` and ``"iekf-imu"``: biases that stay, of each link and in common to all.
     drift_std_m, drift_time_s
-        Of the filter ``"iekf-log"``: biases that move as the body does.
+        Of the same: biases that move as the body does.
     """
 
     bias_std_m: float = 0.02
@@ -270,12 +272,17 @@ class Settings:
     def of(cls, **fields: Any) -> Settings:
         """The settings with these fields, of whatever group.
 
+        Biases of the links default to those of the filter: of ``"iekf-imu"``, which knows the
+        motion well, one that all have in common and stays (0.073 m), and of each one that drifts
+        in 20 s.
+
         Raises
         ------
         ValueError
             On a field that no group has, and as the groups.
         """
-        return cls().changed(**fields)
+        usual = _INERTIAL_BIASES if fields.get("filter") == "iekf-imu" else {}
+        return cls().changed(**{**usual, **fields})
 
     def changed(self, **fields: Any) -> Settings:
         """These settings with new values of fields, of whatever group; errors as of `of`."""

@@ -13,6 +13,7 @@ from rbl_gym import estimators
 from rbl_gym.checks import FloatArray
 from rbl_gym.estimators import smoothing
 from rbl_gym.estimators.costs.losses import LATE, SQUARES
+from rbl_gym.estimators.smoothing.inertial import InertialMotion
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.motion.unknown_twist import WanderingTwist
@@ -20,10 +21,11 @@ from rbl_gym.recordings.odometry import OdometryLog
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.epochs import stack_beliefs
 from rbl_gym.studies.replay.mirror import covering
-from rbl_gym.studies.replay.place import has_own_std, level_of, origin_of, start_of
+from rbl_gym.studies.replay.place import level_of, origin_of, own_std, start_of
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import (
     Track,
+    prior_of,
     readings_of,
     recording_filter,
     recording_steps,
@@ -80,12 +82,10 @@ def smooth_recording(recording: Recording, settings: Settings, track: Track) -> 
     began = time.process_time()
     origin = origin_of(recording)
     local = recording._replace(anchors=recording.anchors - origin)
-    rotation, translation, covariance = start_of(recording, settings)
+    rotation, translation, covariance = prior_of(recording, settings)
     prior = rotation, translation - origin, covariance
-    own = has_own_std(recording, settings)
-    noise = (
-        ranging.LinkNoise(recording.range_std) if own and recording.range_std is not None else None
-    )
+    own = own_std(recording, settings)
+    noise = None if own is None else ranging.LinkNoise(own)
     log = smoothing.RangeLog(local.times, local.ranges, local.anchors, local.links, noise)
     model, best = model_of(recording, settings), None
     for rotation, translation in _starts(recording, settings, track):
@@ -111,6 +111,10 @@ def _along(axes: tuple[int, int, int], size: float) -> tuple[float, float, float
 def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
     """What the settings take for true of a recording."""
     laws, planar = settings.smoothing, settings.knowledge.planar
+    biases = (
+        LinkBias(laws.smooth_constant_m, None, laws.smooth_common_m),
+        LinkBias(laws.smooth_bias_std_m, laws.smooth_bias_time_s),
+    )
     level = level_of(settings, origin_of(recording))
     turn, shift = ((0, 0, 1), (1, 1, 0)) if planar else ((1, 1, 1), (1, 1, 1))
     wander = WanderingTwist(
@@ -123,14 +127,20 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
     if recording.odometry is not None:
         told = smoothing.padded(readings_of(recording, settings))
         motion = smoothing.OdometryMotion(*told, settings.odometry.sensor())
+    if settings.filter == "iekf-imu":
+        told = smoothing.padded(readings_of(recording, settings))
+        tilt = math.radians(settings.inertial.gravity_tilt_deg)
+        motion = InertialMotion(*told, settings.inertial.sensor(), gravity_tilt_rad=tilt)
+        causal = settings.biases
+        biases = (
+            LinkBias(causal.constant_std_m, None, causal.constant_common_m),
+            LinkBias(causal.drift_std_m, causal.drift_time_s),
+        )
     return smoothing.LogModel(
         recording.tags,
         ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M),
         motion,
-        (
-            LinkBias(laws.smooth_constant_m, None, laws.smooth_common_m),
-            LinkBias(laws.smooth_bias_std_m, laws.smooth_bias_time_s),
-        ),
+        biases,
         () if level is None else (level,),
         loss=LATE if robust_of(settings) else SQUARES,
         offset=recording.offset,
@@ -143,6 +153,9 @@ def _starts(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Tracks to start from, the likeliest to be near first."""
     yield track.rotation, track.translation
+    if settings.filter == "iekf-imu":
+        # No body at rest, and none that falls upwards backwards in time, reads what this one did.
+        return
     times = recording.times
     moving = recording.anchors.ndim == 3
     backwards = recording._replace(
@@ -176,9 +189,12 @@ def _backwards(recording: Recording, settings: Settings) -> OdometryLog | None:
 def _check_size(recording: Recording, settings: Settings) -> None:
     K, M, N = recording.ranges.shape
     drifting = settings.smoothing.smooth_bias_std_m > 0
+    if settings.filter == "iekf-imu":
+        drifting = settings.biases.drift_std_m > 0
     memory = 5 * 8 * K * (12 + drifting * M * N) ** 2
     if memory > _MOST_MEMORY:
         raise ValueError(
             f"smoothing {K} epochs with drifting biases of {M * N} links would take "
-            f"{memory / 1e9:.0f} GB: set smooth_bias_std_m to 0, or smooth shorter logs"
+            f"{memory / 1e9:.0f} GB: set smooth_bias_std_m (of iekf-imu drift_std_m) to 0, or "
+            "smooth shorter logs"
         )

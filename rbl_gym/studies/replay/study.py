@@ -65,8 +65,6 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
     offset = height_offset(recording, settings)
     settings = settings.changed(height_offset_m=offset, robust=robust_of(settings))
     recording_filter(recording, settings)
-    if settings.filter == "iekf-imu" and settings.smoothing.smooth:
-        raise ValueError("smooth knows no imu: leave out one of them")
     comparison = settings.comparison
     if recording.truth is not None and comparison.time_offset != "auto":
         truth = in_clock(recording.truth, settings)
@@ -111,8 +109,7 @@ def replay_recording(
     if offset is not None:
         lags = smoothed is None
         figures["time_offset"] = {**offset._asdict(), "track": "causal" if lags else "smoothed"}
-    assert track.innovations is not None
-    figures["consistency"], notes = diagnose(recording, settings, track.innovations)
+    figures["consistency"], notes = diagnose(recording, settings, track)
     figures["notes"] = figures["notes"] + notes
     if smoothed is None:
         return Replayed(settings, track, errors, figures)

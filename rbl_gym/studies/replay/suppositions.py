@@ -13,6 +13,7 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.evidence import Evidence, Trial, std_of
+from rbl_gym.studies.replay.place import own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M
 from rbl_gym.studies.replay.tracking import accel_of, recording_filter, robust_of
 
@@ -153,7 +154,9 @@ def _of_settings(trial: Trial) -> Iterator[Supposition]:
         return Supposition(kind, text, Trial(recording, settings.changed(**fields)))
 
     motion = settings.motion
-    if getattr(recording_filter(recording, settings), "twist", None) is not None:
+    if settings.filter == "iekf-imu":
+        pass  # what moves the body is measured
+    elif getattr(recording_filter(recording, settings), "twist", None) is not None:
         accel_m, accel_deg = accel_of(settings)
         for wider in _WIDER:
             changed = {"accel_m": wider * accel_m, "accel_deg": wider * accel_deg}
@@ -172,8 +175,9 @@ def _of_settings(trial: Trial) -> Iterator[Supposition]:
 def _noisier(trial: Trial, more: float) -> Supposition:
     recording, settings = trial
     std = settings.range_std_m
-    if std is None and recording.range_std is not None:
-        std = float(np.median(recording.range_std[recording.links]))
+    own = own_std(recording, settings)
+    if std is None and own is not None:
+        std = float(np.median(own[recording.links]))
     value = more * (std or DEFAULT_RANGE_STD_M)
     text = f"the ranges scatter more than they are said to: --range-std-m {value:.2g} or so"
     return Supposition(

@@ -27,6 +27,7 @@ from rbl_gym.studies.replay.place import (
     has_own_std,
     level_of,
     origin_of,
+    own_std,
     reach_of,
     start_of,
     volume_of,
@@ -128,7 +129,7 @@ def recording_steps(
 
 def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
     """The epochs of a recording."""
-    own = recording.range_std if has_own_std(recording, settings) else None
+    own = own_std(recording, settings)
     elapsed = np.diff(recording.times, prepend=recording.times[0])
     anchors = recording.anchors_by_epoch
     for k, dt in enumerate(elapsed.tolist()):
@@ -150,9 +151,10 @@ def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, Floa
 
 
 def readings_of(recording: Recording, settings: Settings) -> list[tuple[FloatArray, FloatArray]]:
-    """Readings of the odometry and the seconds that they count for, between all epochs."""
+    """Readings of the body's sensor and the seconds that they count for, between all epochs."""
+    what = "inertial" if settings.filter == "iekf-imu" else "odometry"
     found = (sensed(recording, settings, *ends) for ends in pairwise(recording.times.tolist()))
-    return [(one["odometry"], one["steps"]) for one in found]
+    return [(one[what], one["steps"]) for one in found]
 
 
 def sensed(

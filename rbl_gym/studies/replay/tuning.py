@@ -11,6 +11,7 @@ from rbl_gym.checks import FloatArray, check_number
 from rbl_gym.recordings.recording import Recording
 from rbl_gym.studies.replay.causes import cut, local_trial
 from rbl_gym.studies.replay.evidence import Trial, evidence
+from rbl_gym.studies.replay.place import own_std
 from rbl_gym.studies.replay.settings import DEFAULT_RANGE_STD_M, Settings
 from rbl_gym.studies.replay.tracking import accel_of, recording_filter
 
@@ -170,8 +171,9 @@ def _start(trial: Trial) -> dict[str, float]:
     """What is tuned, as it is now."""
     recording, settings = trial
     std = settings.range_std_m
-    if std is None and recording.range_std is not None:
-        std = float(np.median(recording.range_std[recording.links]))
+    own = own_std(recording, settings)
+    if std is None and own is not None:
+        std = float(np.median(own[recording.links]))
     start: dict[str, Any] = {"range_std_m": std or DEFAULT_RANGE_STD_M}
     if recording.odometry is not None:
         known = settings.flat()
