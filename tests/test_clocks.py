@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -151,10 +153,12 @@ def test_what_is_no_clock_is_refused():
 
 
 def test_what_has_no_clock_is_refused():
-    make = {"tags": places()[1], "noise": NOISE, "process": PROCESS, "clock": LAW}
-    for more in ({"headings": 4}, {"odometry": {}}):
+    make: dict[str, Any] = {
+        "tags": places()[1], "noise": NOISE, "process": PROCESS, "clock": LAW,
+    }  # fmt: skip
+    for key, value in (("headings", 4), ("odometry", {})):
         with pytest.raises(ValueError, match="clock must be None beside odometry or headings"):
-            estimators.make("iekf-log", **make, **more)
+            estimators.make("iekf-log", **make, **{key: value})
 
 
 @pytest.mark.parametrize("kind", ["tag", "anchor"])
@@ -196,7 +200,7 @@ def test_with_an_unknown_twist_and_biases_it_stands_at_its_bound(kind):
     for k in range(K):
         pose = path.rotation[:, k], path.translation[:, k]
         if k:
-            state = filter.predict(state, None, DT)
+            state = filter.predict(state, np.zeros(6), DT)
             P = twist_bound.predict_covariance(P, path.twists[:, k - 1], DT, PROCESS, law)
             F, Q = np.eye(n), np.zeros((n, n))
             where, kept = slice(12 + links, 12 + 2 * links), np.exp(-DT / 0.5)
@@ -234,7 +238,8 @@ def test_the_smoother_stands_at_the_bound_of_the_whole_log(kind):
     clocks = simulate_clocks(law, DT * np.arange(K), G, rng, (batch,))
     twists = np.tile([0.1, -0.2, 0.3, 1.0, 0.5, -0.2], (batch, K - 1, 1))
     rotation, translation = rotations.random(rng), np.zeros(3)
-    Q, t = [np.broadcast_to(rotation, (batch, 3, 3))], [np.zeros((batch, 3))]
+    Q: list[Any] = [np.broadcast_to(rotation, (batch, 3, 3))]
+    t: list[Any] = [np.zeros((batch, 3))]
     for k in range(K - 1):
         walked = twists[:, k] + rng.standard_normal((batch, 6)) * PROCESS.std() / np.sqrt(DT)
         for track, new in zip((Q, t), propagate(Q[-1], t[-1], walked, DT), strict=True):

@@ -1,3 +1,4 @@
+# pyright: reportCallIssue=false, reportAttributeAccessIssue=false
 """Anchors off by their survey: scenes of them, and the filter whose states their places are."""
 
 from __future__ import annotations

@@ -307,7 +307,7 @@ def weighted_rows(
     rotation: FloatArray,
     translation: FloatArray,
     noise: ranging.NoiseLaw,
-    share: FloatArray,
+    share: Any,
     offset: str | None,
     anchor_std: FloatArray | None,
     further: FloatArray | None = None,

@@ -54,7 +54,8 @@ class Sample(NamedTuple):
 
     def part(self, index: np.ndarray) -> Sample:
         """The poses of indices, with weights that leave each zone what it counts."""
-        arrays = Sample(*(field[index] for field in self[:5]), self.turns)
+        rotation, places, weight, prior, zone = (field[index] for field in self[:5])
+        arrays = Sample(rotation, places, weight, prior, zone, self.turns)
         whole = np.bincount(self.zone, self.weight)
         here = np.bincount(arrays.zone, arrays.weight, minlength=len(whole))
         ratio = whole / np.where(here > 0, here, 1.0)
