@@ -156,9 +156,10 @@ def test_what_has_no_clock_is_refused():
     make: dict[str, Any] = {
         "tags": places()[1], "noise": NOISE, "process": PROCESS, "clock": LAW,
     }  # fmt: skip
-    for key, value in (("headings", 4), ("odometry", {})):
+    refused: list[tuple[str, Any]] = [("headings", 4), ("odometry", {})]
+    for key, value in refused:
         with pytest.raises(ValueError, match="clock must be None beside odometry or headings"):
-            estimators.make("iekf-log", **make, **{key: value})
+            estimators.make("iekf-log", **(make | {key: value}))
 
 
 @pytest.mark.parametrize("kind", ["tag", "anchor"])
@@ -238,13 +239,15 @@ def test_the_smoother_stands_at_the_bound_of_the_whole_log(kind):
     clocks = simulate_clocks(law, DT * np.arange(K), G, rng, (batch,))
     twists = np.tile([0.1, -0.2, 0.3, 1.0, 0.5, -0.2], (batch, K - 1, 1))
     rotation, translation = rotations.random(rng), np.zeros(3)
-    Q: list[Any] = [np.broadcast_to(rotation, (batch, 3, 3))]
-    t: list[Any] = [np.zeros((batch, 3))]
+    turned: list[Any] = [np.broadcast_to(rotation, (batch, 3, 3))]
+    gone: list[Any] = [np.zeros((batch, 3))]
     for k in range(K - 1):
         walked = twists[:, k] + rng.standard_normal((batch, 6)) * PROCESS.std() / np.sqrt(DT)
-        for track, new in zip((Q, t), propagate(Q[-1], t[-1], walked, DT), strict=True):
+        for track, new in zip(
+            (turned, gone), propagate(turned[-1], gone[-1], walked, DT), strict=True
+        ):
             track.append(new)
-    Q, t = np.stack(Q, axis=1), np.stack(t, axis=1)
+    Q, t = np.stack(turned, axis=1), np.stack(gone, axis=1)
     far = ranging.distances(anchors, ranging.tag_positions(Q, t, tags))
     added = (clocks @ U.T).reshape(far.shape)
     ranges = far + 0.05 * rng.standard_normal(far.shape) + added

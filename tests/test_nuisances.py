@@ -1,6 +1,6 @@
 """Bounds with nuisances: brute force over all parameters, finite differences, Monte Carlo."""
 
-# pyright: reportCallIssue=false
+# pyright: reportCallIssue=false, reportOperatorIssue=false
 from __future__ import annotations
 
 import numpy as np
@@ -245,7 +245,7 @@ def body_step(log, moved, n):
         F[3:6, 9:12] = log.dt * np.eye(3)
         return F, twist.predict_covariance(Q, log.twists[0], log.dt, PROCESS, moved.law)
     gone = navigation.preintegrate(moved.readings, moved.steps, np.zeros(6), moved.sensor)
-    before, T = np.matmul(log.poses[1][0], gone.rotation.T), float(gone.duration)
+    before, T = np.matmul(np.array(log.poses[1][0]), gone.rotation.T), float(gone.duration)
     W = np.kron(np.eye(3), before)
     F[3:6, :3] = -rotations.hat(before @ gone.translation)
     F[6:9, :3] = -rotations.hat(before @ gone.velocity)

@@ -18,6 +18,7 @@ from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import NOISE_LAWS, RangeNoise
 from rbl_gym.placement import building, layouts, scene_files
 from rbl_gym.placement.file_tables import read_table
+from rbl_gym.placement.problem import PlacementTask
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scenes import SCENES
 from tests.helpers import ROOT, needs, share_by_hand
@@ -49,7 +50,7 @@ def changed(path: str, value: object) -> dict:
 
 def test_the_example_is_read():
     problem = scene_files.problem(str(ROOT / "examples" / "warehouse.toml"))
-    task, context = problem.task, problem.context
+    task, context = PlacementTask(problem.scene, problem.n_anchors), problem.context
     assert problem.name == "warehouse"
     assert task.n_anchors == task.scene.n_anchors == 8
     assert task.scene.anchor_region == Walls((-20, -10, 0.5), (20, 10, 6))
@@ -103,16 +104,16 @@ floor_m = 0.1
 """)
     first, second = (scene_files.problem(str(tmp_path / f"a.{end}")) for end in ("json", "toml"))
     assert first.name == second.name == "a"
-    assert first.task == second.task
+    assert (first.scene, first.n_anchors) == (second.scene, second.n_anchors)
     np.testing.assert_array_equal(first.context.racks, second.context.racks)
 
 
 def test_what_a_file_leaves_open_has_a_default():
     problem = scene_files.of_mapping(changed("obstacles", None))
     assert problem.context.racks.shape == (0, 6)
-    assert problem.task.blocked_information == 0.01
-    assert problem.task.scene.initial_translation_m == 0.5
-    assert problem.task.scene.initial_rotation_rad == pytest.approx(math.radians(10))
+    assert problem.obstacles.blocked_information == 0.01
+    assert problem.scene.initial_translation_m == 0.5
+    assert problem.scene.initial_rotation_rad == pytest.approx(math.radians(10))
 
 
 def test_other_regions_bodies_and_priors():
@@ -121,38 +122,39 @@ def test_other_regions_bodies_and_priors():
     tables["prior"] = {"rotation_deg": 30, "position_m": 2}
     tables["noise"]["blocked_information"] = 0.0
     problem = scene_files.of_mapping(tables)
-    assert problem.task.scene.anchor_region == Shell(20, 50)
-    assert problem.task.scene.tags == ((0, 0, 0), (1, 0, 0), (0, 1, 0))
-    assert problem.task.scene.initial_translation_m == 2
-    assert problem.task.blocked_information == 0
+    assert problem.scene.anchor_region == Shell(20, 50)
+    assert problem.scene.tags == ((0, 0, 0), (1, 0, 0), (0, 1, 0))
+    assert problem.scene.initial_translation_m == 2
+    assert problem.obstacles.blocked_information == 0
     tables["anchors"] = {"kind": "box", "low": [0, 0, 0], "high": [5, 5, 0], "number": 4}
-    assert scene_files.of_mapping(tables).task.scene.anchor_region == Box((0, 0, 0), (5, 5, 0))
+    assert scene_files.of_mapping(tables).scene.anchor_region == Box((0, 0, 0), (5, 5, 0))
 
 
 @pytest.mark.parametrize(("kind", "law"), NOISE_LAWS.items())
 def test_every_law_of_the_ranges_has_its_kind(kind, law):
     problem = scene_files.of_mapping(changed("noise", {"kind": kind, "blocked_information": 0.5}))
-    assert problem.task.scene.noise == law()
-    assert problem.task.blocked_information == 0.5
-    anchors = layouts.corners(problem.task, problem.context, np.random.default_rng(0))
-    assert np.isfinite(placement.score(problem.task, problem.context, anchors))
+    assert problem.scene.noise == law()
+    assert problem.obstacles.blocked_information == 0.5
+    task = PlacementTask(problem.scene, problem.n_anchors)
+    anchors = layouts.corners(task, problem.context, np.random.default_rng(0))
+    assert np.isfinite(placement.score(task, problem.context, anchors))
 
 
 def test_arguments_go_before_the_file(tmp_path):
     problem = scene_files.of_mapping(GOOD, n_anchors=7, region=([2, 2, 1], [3, 3, 1]))
-    assert problem.task.n_anchors == problem.task.scene.n_anchors == 7
+    assert problem.n_anchors == problem.scene.n_anchors == 7
     np.testing.assert_array_equal(problem.corners(), [[2, 2, 1], [3, 3, 1]])
     without = changed("anchors.number", None)
-    assert scene_files.of_mapping(without, n_anchors=4).task.n_anchors == 4
-    assert scene_files.with_anchors(problem, 3).task.n_anchors == 3
+    assert scene_files.of_mapping(without, n_anchors=4).n_anchors == 4
+    assert scene_files.with_anchors(problem, 3).n_anchors == 3
 
 
 def test_named_scenes():
     problem = scene_files.problem("uwb_room")
-    assert problem.task.n_anchors == 6
+    assert problem.n_anchors == 6
     np.testing.assert_array_equal(problem.corners(), [[1, 1, 0.5], [9, 7, 2.2]])
     with_racks = [scene_files.problem("uwb_room", racks=2, seed=seed) for seed in (3, 3, 4)]
-    assert with_racks[0].task.n_anchors == 5
+    assert with_racks[0].n_anchors == 5
     first, same, other = (problem.context.racks for problem in with_racks)
     np.testing.assert_array_equal(first, same)
     assert (first != other).any()
@@ -162,8 +164,8 @@ def test_a_named_scene_keeps_its_own_obstacles():
     hall = SCENES["hall"]
     problem = scene_files.problem("hall")
     np.testing.assert_array_equal(problem.context.racks, hall.obstacles)
-    assert problem.task.scene.obstacles == hall.obstacles
-    assert problem.task.blocked_information == hall.blocked_information
+    assert problem.scene.obstacles == hall.obstacles
+    assert problem.obstacles.blocked_information == hall.blocked_information
     more = scene_files.problem("hall", racks=2, seed=1).context.racks
     assert more.shape == (6, 6)
     np.testing.assert_array_equal(more[:4], hall.obstacles)
@@ -187,11 +189,11 @@ def test_what_is_predicted_of_a_hall_is_what_its_simulation_tells():
     share = problem.obstacles.share(anchors, at.translation)
     assert 0.1 < (share < 1).mean() < 0.9
     mine = bounds.information_at(
-        anchors, tags, at.rotation, at.translation, problem.task.scene.noise, share[..., None]
+        anchors, tags, at.rotation, at.translation, problem.scene.noise, share[..., None]
     )
     np.testing.assert_allclose(mine, told, rtol=1e-12)
     # And the score of a layout, pose by pose.
-    task = problem.task
+    task = PlacementTask(problem.scene, problem.n_anchors)
     places = placement.positions(task, problem.context)
     for k in range(0, task.n_poses, 5):
         wanted = [

@@ -19,7 +19,7 @@ from rbl_gym.geometry.regions import Box, Region
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.placement.gain import Gain
-from rbl_gym.placement.problem import Context, PlacementTask
+from rbl_gym.placement.problem import Context
 from rbl_gym.worlds.scene import Scene
 
 __all__ = ["ATTITUDES", "Plan", "Prior", "Problem", "Zone", "free_places"]
@@ -221,13 +221,8 @@ class Problem:
         )
 
     @functools.cached_property
-    def task(self) -> PlacementTask:
-        """The problem as a task, whose poses fill the box around all zones."""
-        return PlacementTask(self.scene, self.n_anchors)
-
-    @functools.cached_property
     def context(self) -> Context:
-        """Box around all zones and boxes in the way, for `task`."""
+        """Box around all zones and boxes in the way, as `layouts` and `criteria` take them."""
         low, high = self.corners()
         return Context(0.5 * (low + high), 0.5 * (high - low), self.obstacles.boxes)
 
