@@ -162,18 +162,19 @@ def _draw_scores(axes: Any, rows: dict[str, dict[str, Any]]) -> None:
 def _draw_margins(axes: Any, result: dict[str, Any]) -> None:
     """How far every layout is from the requirements, the best on top."""
     rows = result["layouts"]
-    margins = {
-        name: min(zone["margin"] for zone in row["zones"] if "margin" in zone)
-        for name, row in rows.items()
-    }
-    names = sorted(margins, key=margins.__getitem__)
     # The design was judged at more places than the others.
     own = _own(rows)
+    zones = {name: row["zones"] for name, row in rows.items()} | {own: result["zones"]}
+    margins = {
+        name: min(zone["margin"] for zone in found if "margin" in zone)
+        for name, found in zones.items()
+    }
+    names = sorted(margins, key=margins.__getitem__)
     verdicts = {name: row["verdict"] for name, row in rows.items()}
     verdicts[own] = place_answer.verdict(result)
     texts = [f"{margins[name]:.2f}  {place_answer.SIGNS[verdicts[name]]}" for name in names]
     values = [margins[name] for name in names]
-    _draw_bars(axes, names, values, texts, own, 1.3 * max(1.0, *values))
+    _draw_bars(axes, names, values, texts, own, 1.45 * max(1.0, *values))
     axes.axvline(1.0, color="0.2", lw=1.2, ls=(0, (4, 2)))
     axes.set_xlabel("margin: what is allowed over what is reached, in the worst zone; 1 is enough")
     axes.set_title("this layout and the usual ones, against what the zones ask for")
@@ -192,7 +193,7 @@ def _draw_bars(
     axes.barh(places, values, color=colours, height=0.7)
     axes.set_xlim(0, edge)
     for place, value, text in zip(places, values, texts, strict=True):
-        inside = value > 0.7 * edge
+        inside = value > 0.75 * edge
         axes.annotate(
             text + (" >" if value > edge else ""),
             (min(value, edge), place),
@@ -202,6 +203,8 @@ def _draw_bars(
             va="center",
             fontsize=8,
             color="white" if inside and names[place] == own else "black",
+            bbox=None if inside else {"fc": "white", "ec": "none", "pad": 1.0},
+            zorder=4,
         )
     axes.set_yticks(places, names)
     axes.spines[["top", "right"]].set_visible(False)
