@@ -186,7 +186,9 @@ def test_descent_finds_a_place_without_slope(scene):
 
 
 def test_layouts_are_legal_the_same_by_seed_and_better_past_walls_than_greedy(monkeypatch):
-    monkeypatch.setattr(design, "STAGES", (64, 128, 128))
+    monkeypatch.setattr(design, "STAGES", (64, 96, 96))
+    monkeypatch.setattr(design, "_CANDIDATES", 80)
+    monkeypatch.setattr(design, "_ANCHORS", 10)
     hall = problem(obstacles=WALLS)
     found, name = design.find_layout(hall, rng())
     assert name.startswith("greedy")
@@ -200,7 +202,9 @@ def test_layouts_are_legal_the_same_by_seed_and_better_past_walls_than_greedy(mo
 
 
 def test_anchors_that_stay_come_first_and_starts_are_completed(monkeypatch):
-    monkeypatch.setattr(design, "STAGES", (64, 64, 64))
+    monkeypatch.setattr(design, "STAGES", (16, 16, 16))
+    monkeypatch.setattr(design, "_CANDIDATES", 20)
+    monkeypatch.setattr(design, "_ANCHORS", 5)
     office = problem(OFFICE)
     steps: list[int] = []
     start = office.mounts.draw(rng().random((2, 3)))

@@ -17,14 +17,13 @@ from rbl_gym.checks import FloatArray, check_count, check_number, check_one_of
 from rbl_gym.envs.batch import check_actions
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
-from rbl_gym.worlds import scenes
-from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers import views
 from rbl_gym.wrappers.compositions import TaskEnv, VectorTaskEnv
 from rbl_gym.wrappers.estimate import EstimatePose, check_options_of
 from rbl_gym.wrappers.rewards import RewardLike
 from rbl_gym.wrappers.select_anchors import SelectAnchors, VectorSelectAnchors
+from rbl_gym.wrappers.task_worlds import Usual, family_of_task, made_of, world_of
 from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
 # An observation is of order one; what is far outside says no more than that.
@@ -38,44 +37,10 @@ SELECTIONS = ("top-k", "priced")
 _ITERATIONS = 2
 
 
-def _world(scene: Any, **defaults: Any) -> Scene:
-    """The scene; `defaults` stand where it says nothing of its own."""
-    changes = {"name": scene} if isinstance(scene, str) else scene
-    return scenes.get({**defaults, **changes} if isinstance(changes, Mapping) else changes)
-
-
 def _options(filter: Any, options: Mapping[str, Any] | None) -> dict[str, Any]:
     """The options of the filter, the tasks' own where none are given."""
     usual = {"iterations": _ITERATIONS} if isinstance(filter, str) and filter == "iekf" else {}
     return {**usual, **check_options_of(options)}
-
-
-def _family(value: Any, scene: Any, usual: Any, **defaults: Any) -> SceneFamily | None:
-    """The family that `scenes` names, None without one; `defaults` stand where a member says none.
-
-    A `scene` other than the `usual` one is refused beside it.
-    """
-    if value is None:
-        return None
-    if scene != usual:
-        raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
-    members = [{"name": one} if isinstance(one, str) else one for one in family(value).members]
-    return family([{**defaults, **one} if isinstance(one, Mapping) else one for one in members])
-
-
-def _made_of(task: Any) -> dict[str, Any]:
-    """Arguments of the environment of a task."""
-    worlds = {"scene": task.scene} if task.family is None else {"scenes": task.family}
-    return {**worlds, "reward": "none"}
-
-
-class _Usual:
-    """What is usual in a scene, or the most in those of a family: variances of the prior, speed."""
-
-    def __init__(self, *worlds: Scene) -> None:
-        self.variance = np.max([np.diagonal(one.prior_covariance) for one in worlds], axis=0)
-        speeds = [(one.speed_m_s, float(np.abs(one.twist[3:]).max())) for one in worlds]
-        self.speed = max(np.max(speeds), 1e-3)
 
 
 def _worlds(batch: tuple[int, ...]) -> tuple[np.ndarray, ...]:
@@ -100,8 +65,8 @@ class _MobileAnchors:
 
     def _configure(self, difficulty: str, scene: Any, sort_craft: bool, scenes: Any) -> None:
         level = DIFFICULTIES[check_one_of("difficulty", difficulty, list(DIFFICULTIES))]
-        found = _family(scenes, scene, "auv_craft", **level)
-        worlds = (_world(scene, **level),) if found is None else found.corners
+        found = family_of_task(scenes, scene, "auv_craft", **level)
+        worlds = (world_of(scene, **level),) if found is None else found.corners
         if any(one.anchor_speed_m_s <= 0 for one in worlds):
             raise ValueError("scene must have anchors that move, got anchor_speed_m_s = 0")
         if not isinstance(sort_craft, bool):
@@ -110,7 +75,7 @@ class _MobileAnchors:
         self.family, self.scene = found, worlds[0]
         self._n_craft = (found or self.scene).n_anchors
         self._limits = np.full(15 + 3 * self._n_craft, _LIMIT)
-        self._usual = _Usual(*worlds)
+        self._usual = Usual(*worlds)
 
     def _spaces(self) -> tuple[spaces.Box, spaces.Box]:
         m = self._n_craft
@@ -181,7 +146,7 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
         self._configure(difficulty, scene, sort_craft, scenes)
         self.single_observation_space, self.single_action_space = self._spaces()
         envs = TrackingVectorEnv(
-            num_envs, **_made_of(self), render_mode=render_mode,
+            num_envs, **made_of(self), render_mode=render_mode,
             max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
         )  # fmt: skip
         self._compose(VectorEstimatePose(envs, filter, _options(filter, options), reward))
@@ -259,7 +224,7 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     ) -> None:
         self._configure(difficulty, scene, sort_craft, scenes)
         self.observation_space, self.action_space = self._spaces()
-        env = TrackingEnv(**_made_of(self), render_mode=render_mode)
+        env = TrackingEnv(**made_of(self), render_mode=render_mode)
         self._compose(EstimatePose(env, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> FloatArray:
@@ -277,15 +242,15 @@ class _AnchorSelection:
     seen: Any
 
     def _configure(self, mode: str, k: int, price: float, scene: Any, scenes: Any) -> None:
-        found = _family(scenes, scene, "hall", steps=50)
-        worlds = (_world(scene, steps=50),) if found is None else found.corners
+        found = family_of_task(scenes, scene, "hall", steps=50)
+        worlds = (world_of(scene, steps=50),) if found is None else found.corners
         self.family, self.scene = found, worlds[0]
         self._most = (found or self.scene).n_anchors
         self.mode = check_one_of("mode", mode, SELECTIONS)
         self.k = check_count("k", k, most=min(one.n_anchors for one in worlds))
         self.price = check_number("price", price, low=0.0)
         self._limits = np.full(18, _LIMIT)
-        self._usual = _Usual(*worlds)
+        self._usual = Usual(*worlds)
         corners = np.array([one.volume.bounds() for one in worlds])
         low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
         self._centre = 0.5 * (low + high)
@@ -347,7 +312,7 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
         self._configure(mode, k, price, scene, scenes)
         self.single_observation_space, self.single_action_space = self._spaces()
         envs = TrackingVectorEnv(
-            num_envs, **_made_of(self), render_mode=render_mode,
+            num_envs, **made_of(self), render_mode=render_mode,
             max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
         )  # fmt: skip
         selected = VectorSelectAnchors(envs)
@@ -422,7 +387,7 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     ) -> None:
         self._configure(mode, k, price, scene, scenes)
         self.observation_space, self.action_space = self._spaces()
-        env = SelectAnchors(TrackingEnv(**_made_of(self), render_mode=render_mode))
+        env = SelectAnchors(TrackingEnv(**made_of(self), render_mode=render_mode))
         self._compose(EstimatePose(env, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> np.ndarray:

@@ -158,16 +158,16 @@ class HeadingBank:
         epoch = measured, places, pose.tags
         told = innovations(self.filter, before, after, *epoch, law, mask)
         weights = state.log_weights + told.log_likelihood
-        evidence = state.log_evidence + special.logsumexp(weights, axis=-1)
+        evidence = state.log_evidence + np.asarray(special.logsumexp(weights, axis=-1))
         if pose.robust == "late":
             # A late range must not choose a heading by a weight that it has not in the update.
-            residual, links = told.residual / std, told.residual != 0
+            residual, there = told.residual / std, told.residual != 0
             cost, share = loss_of(residual**2, LATE, residual > 0)
             wider = LinkNoise(std / np.sqrt(share))
             told = innovations(self.filter, before, after, *epoch, wider, mask)
             lost = 0.5 * np.log(share) + cost - 0.5 * share * residual**2
             weights = state.log_weights + told.log_likelihood
-            weights = weights - np.where(links, lost, 0.0).sum(axis=(-2, -1))
+            weights = weights - np.where(there, lost, 0.0).sum(axis=(-2, -1))
         return _pruned(HeadingState(*after, _normal(weights), evidence))
 
     def belief(self, state: HeadingState) -> PoseBelief:

@@ -182,7 +182,7 @@ def _agreement(moved: FloatArray, window: _Window) -> tuple[np.ndarray, FloatArr
     """Of a window at every place of the path: products across, complex by its yaw, and upwards."""
     across = [a[:, 0] + 1j * a[:, 1] for a in (moved, window.force)]
     return (
-        np.correlate(*across, "valid"),
+        np.correlate(across[0], across[1], "valid"),
         np.correlate(moved[:, 2], window.force[:, 2], "valid"),
     )
 

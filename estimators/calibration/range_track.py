@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
@@ -64,15 +66,16 @@ def range_track(
     count = int(np.ceil(length / _KNOT_S))
     knots = times[0] + length / count * np.arange(-3, count + 4)
     inside = np.clip(times, knots[3], np.nextafter(knots[-4], -np.inf))
-    basis = BSpline.design_matrix(inside, knots, 3).tocsr()
+    # Their types are not told by scipy's stubs.
+    basis: Any = BSpline.design_matrix(inside, knots, 3).tocsr()
     m = basis.shape[1]
-    bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(m - 2, m))
+    bend = sparse.eye(m - 2, m) - 2 * sparse.eye(m - 2, m, k=1) + sparse.eye(m - 2, m, k=2)
     bend = bend / ((length / count) ** 2 * _ACCELERATION)
     link = np.zeros(len(times), dtype=int) if links is None else np.asarray(links, dtype=int)
     count = int(link.max()) + 1
     of_link = sparse.csr_matrix((np.ones(len(link)), (np.arange(len(link)), link)))
     biases = np.linalg.inv(_LINK_M**2 * np.eye(count) + _COMMON_M**2)
-    held = sparse.block_diag([bend.T @ bend] * 3 + [biases]) + 1e-9 * sparse.eye(3 * m + count)
+    held: Any = sparse.block_diag([bend.T @ bend] * 3 + [biases]) + 1e-9 * sparse.eye(3 * m + count)
     losses = [LATE]
     if isinstance(start, BSpline):
         first = start.c
@@ -88,7 +91,7 @@ def range_track(
             share = loss_of(error[:, None, None] ** 2, loss, error[:, None, None] > 0)[1]
             weight = share[:, 0, 0] / std
             columns = [basis.multiply(a[:, None]) for a in (away / distance[:, None]).T]
-            A = sparse.hstack([*columns, of_link]).tocsr()
+            A: Any = sparse.hstack([*columns, of_link]).tocsr()
             H = A.T @ A.multiply((weight / std)[:, None]) + held
             step = spsolve(H.tocsc(), A.T @ (weight * error) - held @ x)
             x = x + step

@@ -83,7 +83,7 @@ def plan_part(placed: Placed) -> str:
         f'<div class="stage" style="aspect-ratio: {size[0]:.1f} / {size[1]:.1f}">{svg}'
         f"{_labels(placed, edges)}</div>"
         f"{''.join(_scale(problem, q, ranges[q.field], maps) for q in panels)}"
-        f'<p class="note">{html.escape(legend_text(problem))}</p>'
+        f'<p class="note">{html.escape(" · ".join(legend_text(problem).split("     ")))}</p>'
         '<p class="readout">Touch the map or an anchor for its figures.</p>'
         f'<script type="application/json">{_data(placed, panels, maps, edges, middle)}</script>'
         "</figure>"

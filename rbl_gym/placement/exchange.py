@@ -133,7 +133,7 @@ def refresh(
     total = sample.prior + parts.sum(axis=0)
     least = float(setting.squares(total))
     step = max(1, len(sample.places) // _SCREEN)
-    indices = [sample.every(step, first) for first in range(step)]
+    indices = [sample.every(step, first) for first in range(step)] if step > 1 else []
     parts_of_sample = [(index, setting.part(index)) for index in indices]
     for m in rng.permutation(len(anchors)):
         near = anchors[m] + spreads[:, None] * rng.standard_normal((len(spreads), 3))

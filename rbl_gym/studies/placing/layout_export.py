@@ -90,7 +90,7 @@ def direction(normal: FloatArray) -> str:
 
 
 def _corners(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[dict[str, float]]:
-    """The two ends of the wall, or the two nearest corners of what is flat; none of points."""
+    """The two ends of the wall, or two near corners of what is flat; none of points."""
     faces, plan = problem.mounts.faces, anchor[:2]
     if not len(faces.origin) or not normal.any():
         return []
@@ -107,14 +107,20 @@ def _corners(problem: Problem, anchor: FloatArray, normal: FloatArray) -> list[d
         for k in flat:
             corners = np.concatenate([corners, corners + extents[k] * axes[k, :2]])
     distance = np.linalg.norm(corners - plan, axis=-1)
-    nearest = np.argsort(distance, kind="stable")[:2] if len(corners) > 1 else []
+    nearest = np.argsort(distance, kind="stable").tolist() if len(corners) > 1 else []
+    if len(flat) == 2 and nearest:
+        # Two tapes tell a place where they do not run along each other.
+        to = (corners - plan) / np.maximum(distance, 1e-9)[:, None]
+        sine = np.abs(to[:, 0] * to[nearest[0], 1] - to[:, 1] * to[nearest[0], 0])
+        across = [k for k in nearest[1:] if sine[k] >= 0.5] or [int(sine.argmax())]
+        nearest = [nearest[0], across[0]]
     return [
         {
             "x_m": round(float(corners[k, 0]), 3),
             "y_m": round(float(corners[k, 1]), 3),
             "distance_m": round(float(distance[k]), 3),
         }
-        for k in nearest
+        for k in nearest[:2]
     ]
 
 

@@ -1,0 +1,46 @@
+"""The worlds of learning tasks: one scene, or a family of scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.worlds import scenes
+from rbl_gym.worlds.families import SceneFamily, family
+from rbl_gym.worlds.scene import Scene
+
+
+def world_of(scene: Any, **defaults: Any) -> Scene:
+    """The scene; `defaults` stand where it says nothing of its own."""
+    changes = {"name": scene} if isinstance(scene, str) else scene
+    return scenes.get({**defaults, **changes} if isinstance(changes, Mapping) else changes)
+
+
+def family_of_task(value: Any, scene: Any, usual: Any, **defaults: Any) -> SceneFamily | None:
+    """The family that `scenes` names, None without one; `defaults` stand where a member says none.
+
+    A `scene` other than the `usual` one is refused beside it.
+    """
+    if value is None:
+        return None
+    if scene != usual:
+        raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
+    members = [{"name": one} if isinstance(one, str) else one for one in family(value).members]
+    return family([{**defaults, **one} if isinstance(one, Mapping) else one for one in members])
+
+
+def made_of(task: Any) -> dict[str, Any]:
+    """Arguments of the environment of a task."""
+    worlds = {"scene": task.scene} if task.family is None else {"scenes": task.family}
+    return {**worlds, "reward": "none"}
+
+
+class Usual:
+    """What is usual in a scene, or the most in those of a family: variances of the prior, speed."""
+
+    def __init__(self, *worlds: Scene) -> None:
+        self.variance = np.max([np.diagonal(one.prior_covariance) for one in worlds], axis=0)
+        speeds = [(one.speed_m_s, float(np.abs(one.twist[3:]).max())) for one in worlds]
+        self.speed = max(np.max(speeds), 1e-3)
