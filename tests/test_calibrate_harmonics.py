@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,9 +44,10 @@ def test_patterns_of_tags_are_found_and_taken_off():
     law = pattern(rng)
     ranges, rotation, place = with_pattern(rng, law)
     recording = recording_of(TIMES, ranges, Truth(TIMES, rotation, place))
+    cases: tuple[dict[str, Any], ...] = {}, {"harmonics": 4}
     plain, found = (
         calibrate.calibrate_links(recording, LinkSettings(planar=True, time_offset=0.0, **more))
-        for more in ({}, {"harmonics": 4})
+        for more in cases
     )
     assert isinstance(found.directions, FoundDirections)
     assert found.directions.bias.harmonics >= 3

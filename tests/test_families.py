@@ -143,7 +143,7 @@ def test_an_episode_equals_that_of_its_scene_alone():
         generator, _ = seeding.np_random(seed)
         family(MIXED).draw(generator)
         alone.np_random = generator
-        want = [alone.reset()]
+        want: list[Any] = [alone.reset()]
         env.action_space.seed(seed)
         for _ in results[1:]:
             action = env.action_space.sample()

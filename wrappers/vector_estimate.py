@@ -172,14 +172,17 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def _figures(self, info: Mapping[str, Any]) -> metrics.Figures:
         """Errors of the beliefs against the true poses of the infos."""
         assert self._belief is not None
-        told: tuple[Any, ...] = *self._belief[:3], info["rotation"], info["translation"]
+        belief, truth = self._belief[:3], (info["rotation"], info["translation"])
         if not self._varied:
-            return metrics.judge(*told, self._scene.body)
+            return metrics.judge(*belief, *truth, self._scene.body)
         figures = np.empty((len(metrics.Figures._fields), self.num_envs))
         for count, alike in self._scene.bodies():
+            rotation, translation, covariance = (field[alike] for field in belief)
+            turned, moved = (field[alike] for field in truth)
             tags = self._scene.body[alike, :count]
-            own = [field[alike] for field in told]
-            figures[:, alike] = metrics.judge(*own, tags)
+            figures[:, alike] = metrics.judge(
+                rotation, translation, covariance, turned, moved, tags
+            )
         return metrics.Figures(*figures)
 
     def _finish(self, info: dict[str, Any], figures: metrics.Figures, last: BoolArray) -> None:

@@ -189,14 +189,14 @@ class AugmentedEkf:
         if self.directions is None:
             found = self._updated(state, ranges, weights, anchors, start, covariance)
         else:
-            links = ranges.shape[-2] * ranges.shape[-1]
             factor = direction_bias(self.directions, *start, anchors, self.pose.tags).log_std
             weights = weights * np.exp(-2 * factor)
             for _ in range(_PASSES):
                 whole = directed(state, self.directions, start, anchors, self.pose.tags)
                 found = self._updated(whole, ranges, weights, anchors, start, covariance)
                 start, covariance = found[:2], found.covariance[..., :6, :6]
-            found = undirected(found, links)  # pyright: ignore[reportPossiblyUnbound]
+            count = ranges.shape[-2] * ranges.shape[-1]
+            found = undirected(found, count)  # pyright: ignore
         as_state(*found[:2], found.covariance)
         return found
 

@@ -38,7 +38,7 @@ class Mounts(Faced):
 
     pieces: FloatArray
     piece_face: np.ndarray
-    faces: Faces  # pyright: ignore[reportIncompatibleMethodOverride]
+    faces: Faces  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper corner (3,) of the smallest box around it."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -69,9 +69,14 @@ class Faces(NamedTuple):
 
 
 class Faced:
-    """What a region knows of its points by its `faces`."""
+    """What a region knows of its points by its `faces`: a field, or computed once."""
 
-    faces: Faces
+    if TYPE_CHECKING:
+
+        @property
+        def faces(self) -> Faces:
+            """The faces within which the region lies."""
+            ...
 
     def face_of(self, points: FloatArray) -> np.ndarray:
         """Index (...) of the face on which legal points (..., 3) stand: the nearest."""
@@ -171,9 +176,13 @@ class Box(Faced):
         """Lower and upper corner, not to be written to."""
         return self._corners
 
-    @functools.cached_property
-    def faces(self) -> Faces:  # pyright: ignore[reportIncompatibleMethodOverride]
+    @property
+    def faces(self) -> Faces:
         """One, the box itself."""
+        return self._known_faces
+
+    @functools.cached_property
+    def _known_faces(self) -> Faces:
         low, high = self.bounds()
         return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "box")])
 
@@ -222,9 +231,13 @@ class Walls(Faced):
     def _corners(self) -> tuple[FloatArray, FloatArray]:
         return _fixed(self.low), _fixed(self.high)
 
-    @functools.cached_property
-    def faces(self) -> Faces:  # pyright: ignore[reportIncompatibleMethodOverride]
+    @property
+    def faces(self) -> Faces:
         """The walls to the west, east, south and north, and the ceiling."""
+        return self._known_faces
+
+    @functools.cached_property
+    def _known_faces(self) -> Faces:
         low, high = self.bounds()
         names = ("west wall", "east wall", "south wall", "north wall", "ceiling")
         rows = []
@@ -311,9 +324,13 @@ class Shell(Faced):
         """The cube around the outer sphere."""
         return np.full(3, -self.outer_m), np.full(3, self.outer_m)
 
-    @functools.cached_property
-    def faces(self) -> Faces:  # pyright: ignore[reportIncompatibleMethodOverride]
+    @property
+    def faces(self) -> Faces:
         """One, the cube around the outer sphere."""
+        return self._known_faces
+
+    @functools.cached_property
+    def _known_faces(self) -> Faces:
         low, high = self.bounds()
         return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "shell")])
 
