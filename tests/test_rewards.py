@@ -84,7 +84,7 @@ def test_the_bound_is_told_where_the_environment_computes_it():
         far_anchors,
         "tests.test_rewards:far_anchors",
     ],
-    ids=str,
+    ids=["name", "dict", "function", "path"],
 )
 def test_vector_equals_scalar(mode, reward):
     scene, n = short("auv_buoys", 4), 3
