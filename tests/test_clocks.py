@@ -158,7 +158,7 @@ def test_what_has_no_clock_is_refused():
     }  # fmt: skip
     refused: list[tuple[str, Any]] = [("headings", 4), ("odometry", {})]
     for key, value in refused:
-        with pytest.raises(ValueError, match="clock must be None beside odometry or headings"):
+        with pytest.raises(ValueError, match="clock must be None beside odometry, headings"):
             estimators.make("iekf-log", **(make | {key: value}))
 
 

@@ -13,6 +13,9 @@ from rbl_gym.placement import design, scene_files, setting
 from rbl_gym.placement.descent import descend
 from rbl_gym.placement.exchange import choose, refresh, swap
 from rbl_gym.placement.sample import of_context, sample
+from tests.helpers import needs
+
+shapely = needs("shapely")
 
 HALL = {
     "name": "hall",
@@ -60,6 +63,7 @@ def seen(problem, n_places=60):
     return setting.of_problem(problem, sample(problem, n_places))
 
 
+@shapely
 def test_samples_are_of_all_zones_by_their_weights():
     office = problem(OFFICE)
     poses = sample(office, 400, turns=2, seed=3)
@@ -97,6 +101,7 @@ def test_a_setting_of_an_environment_has_its_score():
     assert of_context(task, context).weight.sum() == pytest.approx(1)
 
 
+@shapely
 def test_parts_add_up_and_anchors_that_stay_are_in_the_prior():
     office = problem(OFFICE)
     free = office.mounts.draw(rng().random((5, 3)))
@@ -154,7 +159,11 @@ def test_swaps_leave_no_better_neighbour():
     assert swap(one, parts, list(range(9))) == list(range(9))
 
 
-@pytest.mark.parametrize("tables", [{**HALL, "obstacles": WALLS}, OFFICE], ids=["hall", "office"])
+@pytest.mark.parametrize(
+    "tables",
+    [{**HALL, "obstacles": WALLS}, pytest.param(OFFICE, marks=shapely)],
+    ids=["hall", "office"],
+)
 def test_fresh_candidates_and_descent_stay_legal_and_never_hurt(tables):
     one = seen(problem(tables))
     anchors = one.region.draw(rng(2).random((200, 3)))
@@ -182,7 +191,7 @@ def test_descent_finds_a_place_without_slope(scene):
     assert one.legal(found).all()
     size = 1e-4 * float(np.ptp(one.region.bounds(), axis=0).max())
     near = one.region.project(found + size * rng(4).normal(size=(60, *found.shape)))
-    assert min(one.score(layout) for layout in near) > score * (1 - 1e-5)
+    assert min(one.score(layout) for layout in near) > score * (1 - 1e-4)
 
 
 def test_layouts_are_legal_the_same_by_seed_and_better_past_walls_than_greedy(monkeypatch):
@@ -201,6 +210,7 @@ def test_layouts_are_legal_the_same_by_seed_and_better_past_walls_than_greedy(mo
     assert judge.score(found) < 0.97 * judge.score(greedy)
 
 
+@shapely
 def test_anchors_that_stay_come_first_and_starts_are_completed(monkeypatch):
     monkeypatch.setattr(design, "STAGES", (16, 16, 16))
     monkeypatch.setattr(design, "_CANDIDATES", 20)
@@ -217,6 +227,7 @@ def test_anchors_that_stay_come_first_and_starts_are_completed(monkeypatch):
     assert design.find_layout(every, rng())[1] == "fixed"
 
 
+@shapely
 def test_of_a_list_of_mounts_the_best_are_taken(monkeypatch):
     monkeypatch.setattr(design, "STAGES", (64, 64, 64))
     points = problem().mounts.draw(rng(5).random((9, 3))).tolist()
