@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import estimators, motion
+from rbl_gym import estimators, kernels, motion
 from rbl_gym.estimators.filter import reads
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
@@ -28,6 +28,10 @@ def needs(*packages: str) -> Any:
     """Marks a test of what these packages are for: extras that need not be installed."""
     missing = [name for name in packages if find_spec(name) is None]
     return pytest.mark.skipif(bool(missing), reason=f"needs {', '.join(missing)}")
+
+
+# Whole logs and many filters side by side: minutes without kernels.
+with_kernels = pytest.mark.skipif(not kernels.enabled(), reason="slow without kernels")
 
 
 class Told(Advance):

@@ -17,7 +17,7 @@ from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import replay
 from rbl_gym.studies.papers import camsap2013
-from tests.helpers import ROOT, assert_table_holds
+from tests.helpers import ROOT, assert_table_holds, with_kernels
 
 LIAS = ROOT.parent / "shared" / "data" / "lias_planar"
 
@@ -210,6 +210,7 @@ def raw_files(tmp_path):
     }  # fmt: skip
 
 
+@with_kernels
 def test_replay_of_raw_ranges_learns_the_biases(raw_files, capsys):
     options = ["--planar", "--height-offset-m", "0.08", "--walk-m", "0.3", "--walk-deg", "10"]
     options += ["--range-std-m", "0.05", "--json"]

@@ -7,7 +7,6 @@ import re
 import numpy as np
 import pytest
 
-from rbl_gym import kernels
 from rbl_gym.app import consistency, figures, reports
 from rbl_gym.estimators import Innovations
 from rbl_gym.geometry import rotations
@@ -16,9 +15,7 @@ from rbl_gym.recordings import Recording
 from rbl_gym.studies import replay
 from rbl_gym.studies.epochs import Reading, innovations_of, track_epochs
 from rbl_gym.studies.replay.tracking import start_of
-
-# Many filters run side by side.
-with_kernels = pytest.mark.skipif(not kernels.enabled(), reason="slow without kernels")
+from tests.helpers import with_kernels
 
 ANCHORS = np.array(
     [[0, 0, 2.5], [10, 0, 0.5], [10, 8, 3], [0, 8, 0.4], [4, 3, 3], [7, 6, 2.8], [2, 7, 1.2]],

@@ -28,6 +28,7 @@ from rbl_gym.recordings.tables import Source
 from rbl_gym.recordings.truth import Truth
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay import smoothing as replay_smoothing
+from tests.helpers import with_kernels
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "labyrinth_single_tag"
 ANCHORS = np.array([[0.0, 0, 0], [6, 0, 2], [6, 5, 0], [0, 5, 2]])
@@ -333,6 +334,7 @@ def test_rows_of_the_smoother_have_the_derivatives_of_differences():
         assert np.allclose(change, base.constants[..., i], atol=0.02 * np.abs(change).max())
 
 
+@with_kernels
 def test_the_clock_of_the_odometry_by_the_likelihood():
     found = replay.sensor_clock(a_log(K=120, ahead=0.5), SETTINGS.changed(start=START))
     assert abs(found.offset_s - 0.5) < 3 * found.std_s
@@ -342,6 +344,7 @@ def test_the_clock_of_the_odometry_by_the_likelihood():
     assert replay.CLOCK_TRIALS > 1
 
 
+@with_kernels
 def test_tuning_finds_the_noise_of_the_odometry():
     log = a_log(K=40)
     rough = SETTINGS.changed(odometry_m=0.5, odometry_deg=60.0, start=START)

@@ -10,6 +10,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from tests.helpers import with_kernels
 
 ROOM = np.array([[0, 0, 0.3], [8, 0, 2.7], [8, 6, 0.3], [0, 6, 2.7], [4, 0, 2.0], [8, 3, 0.5]])
 TAGS = np.array([[0.3, 0.2, 0], [-0.3, 0.2, 0], [-0.3, -0.2, 0.05], [0.3, -0.2, 0.25]])
@@ -48,6 +49,7 @@ def test_anchors_that_stand_may_be_told_at_every_epoch(options):
     np.testing.assert_array_equal(got.track.covariance, want.track.covariance)
 
 
+@with_kernels
 def test_a_track_among_anchors_that_move():
     """0.05 m a range, 24 ranges an epoch: some centimetres; a metre off if they were held still."""
     log = recording(swaying)

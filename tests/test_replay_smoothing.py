@@ -14,6 +14,7 @@ from rbl_gym.geometry import bodies
 from rbl_gym.measurements import ranging
 from rbl_gym.recordings import Recording, Truth
 from rbl_gym.studies import replay
+from tests.helpers import with_kernels
 
 REAL = Path(__file__).parents[2] / "shared" / "data"
 LIAS, LABYRINTH = REAL / "lias_planar", REAL / "labyrinth_single_tag"
@@ -110,6 +111,7 @@ def test_laws_that_cannot_be_are_named(options):
         replay.Smoothing(**options)
 
 
+@with_kernels
 def test_soft_knowledge_and_the_loss_for_late_ranges():
     log = recording()
     log = log._replace(

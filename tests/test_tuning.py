@@ -10,7 +10,8 @@ import pytest
 from rbl_gym.app import cli
 from rbl_gym.recordings import Truth
 from rbl_gym.studies import replay
-from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording, with_kernels
+from tests.helpers import with_kernels
+from tests.test_diagnosis import ANCHORS, RANGES, SETTINGS, TAGS, recording
 
 DEFAULTS = replay.Settings()
 
