@@ -15,7 +15,7 @@ def test_every_python_block_of_the_readme_runs(monkeypatch, capsys):
     # What a block registers is forgotten after the test.
     monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(blocks) >= 6
+    assert blocks
     names: dict = {}
     for block in blocks:
         exec(compile(block, "README.md", "exec"), names)

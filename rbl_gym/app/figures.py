@@ -270,12 +270,10 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
 def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     """The track from above with the anchors; over time the errors, where truth exists, and NIS."""
     track, found = replayed.track, replayed.errors
-    curves = []
+    labels = []
     if found is not None:
-        curves.append(("position error [m]", found.position))
-        if found.yaw is not None:
-            curves.append(("yaw error [deg]", np.rad2deg(found.yaw)))
-    rows = len(curves) + (track.innovations is not None)
+        labels = ["position error [m]"] + ["yaw error [deg]"] * (found.yaw is not None)
+    rows = len(labels) + (track.innovations is not None)
     figure = new_figure(12, 5.2 if found is None else 6.4)
     grid = figure.add_gridspec(
         max(rows, 1), 2 if rows else 1, width_ratios=[1, 1.2][: 2 if rows else 1]
@@ -297,10 +295,16 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(frameon=False, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    for row, (label, values) in enumerate(curves):
-        assert found is not None
+    drawn = ((found, "iterated EKF"), (replayed.smoothed_errors, "KF"))
+    for row, label in enumerate(labels):
         axes = figure.add_subplot(grid[row, 1])
-        axes.plot(track.times[found.known], values[found.known], color=COLOURS["UC-KF"], lw=0.7)
+        for errors, colour in drawn:
+            if errors is not None:
+                values = errors.position
+                if row and errors.yaw is not None:
+                    values = np.rad2deg(errors.yaw)
+                times = track.times[errors.known]
+                axes.plot(times, values[errors.known], color=COLOURS[colour], lw=0.8)
         axes.set_ylabel(label)
         axes.set_xlabel("time [s]")
         axes.grid(alpha=0.25, lw=0.5)
