@@ -1,25 +1,39 @@
-"""The README's Python runs as it stands, block after block."""
+"""The README: its Python runs as it stands, and its example log gives the figures it states."""
 
 from __future__ import annotations
 
+import json
 import re
+import shlex
 
 import numpy as np
+import pytest
 
-from rbl_gym import estimators
-from rbl_gym.estimators import filter as belief
-from tests.helpers import ROOT
+from rbl_gym.app.cli import main
+from tests.helpers import ROOT, with_kernels
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_every_python_block_of_the_readme_runs(monkeypatch, capsys):
-    # What a block registers is forgotten after the test.
-    monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def test_every_python_block_of_the_readme_runs(capsys):
+    blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     assert blocks
     names: dict = {}
     for block in blocks:
         exec(compile(block, "README.md", "exec"), names)
-    assert "standstill" in estimators.names()
     assert np.isfinite([float(word) for word in capsys.readouterr().out.split()]).all()
-    assert names["estimate"].rank == 6
-    assert np.linalg.norm(names["belief"].translation) < 0.5
+
+
+@with_kernels
+def test_the_example_log_gives_the_figures_of_the_readme(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    command = re.search(r"^rbl-gym (replay .*?)\n```", README, re.DOTALL | re.MULTILINE)
+    stated = re.search(r"RMSE of ([\d.]+) m in position and ([\d.]+) degrees in yaw", README)
+    assert command and stated
+    words = shlex.split(command[1].replace("\\\n", " "))
+    assert main([*words, "--json", "figures.json"]) in (0, None)
+    found = json.loads((tmp_path / "figures.json").read_text())["smoothed"]
+    assert found["position_rmse_m"] == pytest.approx(float(stated[1]), abs=0.002)
+    assert found["yaw_rmse_deg"] == pytest.approx(float(stated[2]), abs=0.1)
+    assert (tmp_path / "out" / "track.png").stat().st_size > 10_000
