@@ -30,7 +30,8 @@ def test_the_example_log_gives_the_figures_of_the_readme(tmp_path, monkeypatch, 
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     command = re.search(r"^rbl-gym (replay .*?)\n```", README, re.DOTALL | re.MULTILINE)
     stated = re.search(r"RMSE of ([\d.]+) m in position and ([\d.]+) degrees in yaw", README)
-    assert command and stated
+    assert command
+    assert stated
     words = shlex.split(command[1].replace("\\\n", " "))
     assert main([*words, "--json", "figures.json"]) in (0, None)
     found = json.loads((tmp_path / "figures.json").read_text())["smoothed"]
