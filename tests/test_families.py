@@ -99,12 +99,77 @@ def test_one_scene_is_a_family_too():
         ({"name": {"choice": []}}, "name.choice must be a list of values"),
         ({"name": {"choice": "hall"}}, "name.choice must be a list of values"),
         ({"name": "hall", "n_anchors": {"integers": [0, 4]}}, "n_anchors"),
+        ({"name": "hall", "tags": {"repeat": 3}}, "repeat must be a dict with count and of, got 3"),
+        (
+            {"name": "hall", "tags": {"repeat": {"count": [1, 2, 3], "of": [0, 0, 0]}}},
+            r"repeat.count must be a number or \[low, high\]",
+        ),
+        ({"name": "hall", "anchors": [[0, 0, {"uniform": [2, 1]}]]}, r"anchors\[0\]\[2\].uniform"),
         ({"name": "hall", "inertial": "consumer"}, "scenes must have no inertial sensor"),
     ],
 )
 def test_wrong_families_are_named(value, named):
     with pytest.raises(ValueError, match=named):
         family(value)
+
+
+RACKS = {
+    "name": "hall",
+    "stretch": [{"uniform": [0.6, 1.4]}, {"uniform": [0.6, 1.4]}, 1.0],
+    "obstacles": {
+        "repeat": {
+            "count": [0, 5],
+            "of": {
+                "choice": [
+                    [{"uniform": [-15, 15]}, {"uniform": [-7, 7]}, 1.5, 0.5, 3.0, 1.5],
+                    [{"uniform": [-15, 15]}, {"uniform": [-7, 7]}, 1.5, 3.0, 0.5, 1.5],
+                ]
+            },
+        }
+    },
+    "steps": 5,
+}
+
+
+def test_lists_choices_and_copies_hold_laws():
+    drawn = draws(RACKS)
+    counts = np.bincount([len(overrides["obstacles"]) for _, overrides in drawn], minlength=6)
+    # 400 draws of six.
+    assert (np.abs(counts - 400 / 6) < 4.5 * 7.5).all()
+    boxes = np.concatenate([o["obstacles"] for _, o in drawn if o["obstacles"]])
+    assert (np.abs(boxes[:, :2]) <= [15, 7]).all()
+    assert (np.ptp(boxes[:, :2], axis=0) > [28, 13]).all()
+    long_in_x = boxes[:, 3] == 3.0
+    assert abs(long_in_x.mean() - 0.5) < 4.5 * 0.5 / np.sqrt(len(boxes))
+    assert family(RACKS).n_boxes == 5
+    assert len(family(RACKS).corners) == 4
+
+
+def test_a_stretched_scene_has_its_places_multiplied():
+    factors = np.array([1.5, 0.5, 2.0])
+    plain, long = scenes.get("hall"), scenes.get({"name": "hall", "stretch": factors.tolist()})
+    for name in ("volume", "anchor_region"):
+        got, want = getattr(long, name).bounds(), getattr(plain, name).bounds()
+        np.testing.assert_allclose(got, np.array(want) * factors)
+    np.testing.assert_allclose(long.anchors, np.array(plain.anchors) * factors)
+    np.testing.assert_allclose(long.obstacles, np.array(plain.obstacles) * np.tile(factors, 2))
+    assert long.tags == plain.tags
+    # Anchors on the walls stay on them.
+    anchors = np.array(long.anchors)
+    np.testing.assert_allclose(long.anchor_region.project(anchors), anchors, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("scene", "named"),
+    [
+        ({"name": "hall", "stretch": [1.0, 0.0, 1.0]}, "stretch must be three positive numbers"),
+        ({"name": "hall", "stretch": 2.0}, "scene.stretch must have shape"),
+        ({"name": "satellite", "stretch": [1, 1, 2]}, "stretch needs a box or walls"),
+    ],
+)
+def test_what_cannot_be_stretched_is_named(scene, named):
+    with pytest.raises(ValueError, match=named):
+        scenes.get(scene)
 
 
 def test_too_many_combinations_are_refused():
@@ -339,9 +404,10 @@ HALLS = [
     },
 ]
 TASKS = [
-    ("RBL/MobileAnchors-v0", {"scenes": CRAFT}),
+    ("RBL/MobileAnchors-v0", {"scenes": CRAFT, "difficulty": "hard"}),
     ("RBL/MobileAnchors-v0", {"scenes": CRAFT, "sort_craft": False, "reward": "error"}),
     ("RBL/AnchorSelection-v0", {"scenes": HALLS}),
+    ("RBL/AnchorSelection-v0", {"scenes": [RACKS, *HALLS]}),
     ("RBL/AnchorSelection-v0", {"scenes": HALLS, "mode": "priced", "reward": "error"}),
 ]
 
@@ -368,7 +434,8 @@ def test_craft_that_are_not_there_are_zeros():
         flat, info = env.reset(seed=seed)
         m = json.loads(info["scene"])["n_anchors"]
         seen.add(m)
-        np.testing.assert_array_equal(flat[30:], np.arange(5) < m)
+        np.testing.assert_array_equal(flat[31:], np.arange(5) < m)
+        assert flat[30] == np.float32(0.8)
         assert flat[15 : 15 + 2 * m].all()
         assert not flat[15 + 2 * m : 25].any()
         assert not flat[25 + m : 30].any()
@@ -378,10 +445,41 @@ def test_craft_that_are_not_there_are_zeros():
         # The same view of the same belief and craft.
         told = {**env.unwrapped.seen, "anchors": env.unwrapped.seen["anchors"][:m]}
         told.pop("anchor_mask")
-        own = alone._show(told)
+        own = alone._show(told, alone.scene)
         np.testing.assert_array_equal(flat[15 : 15 + 2 * m], own[15 : 15 + 2 * m])
         np.testing.assert_array_equal(flat[25 : 25 + m], own[15 + 2 * m :])
     assert seen == {2, 3, 4, 5}
+
+
+def test_the_selection_shows_the_drawn_hall_and_what_was_learned():
+    """Every entry by hand, from the scene that the infos name."""
+    env: Any = gym.make("rbl_gym:RBL/AnchorSelection-v0", scenes=[RACKS, *HALLS])
+    extent = max(float(scene.scales.extent) for scene in env.unwrapped.family.corners)
+    rng, counts = np.random.default_rng(1), set()
+    for seed in range(8):
+        flat, info = env.reset(seed=seed)
+        scene = scenes.get(json.loads(info["scene"]))
+        m, told, age = scene.n_anchors, np.zeros(12), np.full(12, np.inf)
+        counts.add(m)
+        low, high = scene.volume.bounds()
+        for _ in range(scene.steps):
+            flat, *_, info = env.step(rng.uniform(-1, 1, 12).astype(np.float32))
+            seen = env.unwrapped.seen
+            age += 1
+            for k in np.flatnonzero(info["chosen"]):
+                assert k < m
+                quality = seen["quality"][k] if "quality" in seen else 1.0
+                told[k] = 2 * quality * seen["links"][k].any() - 1
+                age[k] = 0
+            place = seen["belief_translation"]
+            gap = np.zeros((12, 3))
+            gap[:m] = (seen["anchors"][:m] - place) / extent
+            want = [
+                (place - (low + high) / 2) / ((high - low) / 2), flat[3:18],
+                (high - low) / 2 / extent, gap.ravel(), told, np.exp(-age / 10), np.arange(12) < m,
+            ]  # fmt: skip
+            np.testing.assert_allclose(flat, np.concatenate(want), rtol=2e-6, atol=1e-6)
+    assert counts == {7, 12}
 
 
 @pytest.mark.parametrize(

@@ -432,13 +432,13 @@ def test_craft_numbers_change_nothing_when_sorted(sort):
     seen = env.seen
     assert seen is not None
     other = {**seen, "anchors": seen["anchors"][:, turn]}
-    assert np.array_equal(env._show(seen), env._show(other)) is sort
+    assert np.array_equal(env._show(seen, env.scene), env._show(other, env.scene)) is sort
     actions = np.random.default_rng(0).uniform(-1, 1, (8, 8))
     env.step(actions)
     moved = env.anchors
     env.reset(seed=3)
     env.seen = other
-    env._show(other)
+    env._show(other, env.scene)
     renumbered = env._velocities(actions).reshape(8, 4, 3)
     env.seen = seen
     # The same craft get the same commands, whatever their numbers.

@@ -85,9 +85,19 @@ class _Task(StatedLength):
         """The action of `inner`, or a ValueError."""
         raise NotImplementedError
 
-    def _show(self, observation: dict[str, np.ndarray]) -> np.ndarray:
-        """The policy's view of an observation of `inner`."""
+    def _show(self, observation: dict[str, np.ndarray], world: Any) -> np.ndarray:
+        """The policy's view of an observation of `inner`, made in a `Scene` or `StackedScenes`."""
         raise NotImplementedError
+
+    def _shown(self) -> np.ndarray:
+        """The policy's view now."""
+        return self._show(self._told(), self.world)
+
+    @property
+    def world(self) -> Any:
+        """The scene of this episode; of many worlds with their own, these side by side."""
+        env = self.inner.unwrapped
+        return getattr(env, "world", env.scene)
 
     def _price(self, info: dict[str, Any]) -> Any:
         """What the step that these infos are of costs."""
@@ -109,12 +119,12 @@ class TaskEnv(_Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVa
         self.seen, info = self.inner.reset(seed=seed, options=options)
         world = self.inner.unwrapped
         self._np_random, self._np_random_seed = world.np_random, world.np_random_seed
-        return self._show(self._told()), info
+        return self._shown(), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step of the world and of its filter."""
         self.seen, reward, *ended, info = self.inner.step(self._command(action))
-        return self._show(self._told()), float(reward - self._price(info)), *ended, info
+        return self._shown(), float(reward - self._price(info)), *ended, info
 
     def close(self) -> None:
         """Close the stack."""
@@ -135,20 +145,22 @@ class VectorTaskEnv(_Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportI
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
         self.seen, info = self.inner.reset(seed=seed, options=options)
-        return self._show(self._told()), info
+        return self._shown(), info
 
     def step(
         self, actions: Any
     ) -> tuple[np.ndarray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """One step of every world and of its filter."""
+        world = self.world
         self.seen, reward, *ended, info = self.inner.step(self._command(actions))
         price = self._price(info)
         if "final_obs" in info:
             final = info["_final_obs"]
             for i in np.flatnonzero(final):
-                info["final_obs"][i] = self._show(info["final_obs"][i])
+                scene = world if isinstance(world, Scene) else world.scenes[i]
+                info["final_obs"][i] = self._show(info["final_obs"][i], scene)
             price = np.where(final, self._price(info["final_info"]), price)
-        return self._show(self._told()), reward - price, *ended, info
+        return self._shown(), reward - price, *ended, info
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the stack, where there is one: a refused constructor is closed by `__del__` too."""

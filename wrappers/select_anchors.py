@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +17,9 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import check_actions
 from rbl_gym.wrappers.estimate import scene_of
 
+# The age of what was never learned, in steps.
+_NEVER = 1e6
+
 
 class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     """Only the anchors that the action chooses measure, and all of them stand still.
@@ -23,6 +27,15 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     Wraps `RBL/Tracking-v0`, below `EstimatePose`. The action is ``MultiBinary(M)``. Links of the
     other anchors are 0, and so are their ranges; their `quality` is 1, for it is learned with a
     range. At reset nothing was chosen yet, and nothing is measured.
+
+    Parameters
+    ----------
+    env
+        The environment.
+    memory
+        Whether the observation also has `known` (M,), the quality that the last choice of each
+        anchor told: 1 in sight, 0 where it gave no range; and `age` (M,), the steps since then.
+        Before its first choice an anchor has `known` 0 and `age` 1e6.
 
     Info
     ----
@@ -40,40 +53,47 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     np.int64(3)
     """
 
-    def __init__(self, env: gym.Env[Any, Any]) -> None:
-        RecordConstructorArgs.__init__(self)
+    def __init__(self, env: gym.Env[Any, Any], memory: bool = False) -> None:
+        RecordConstructorArgs.__init__(self, memory=memory)
         gym.Wrapper.__init__(self, env)
         scene_of(env)
         self._n_anchors = env.observation_space["links"].shape[0]  # pyright: ignore[reportIndexIssue]
         self._rendered = getattr(env.unwrapped, "film", None) is not None
         self.action_space = spaces.MultiBinary(self._n_anchors)
         self._still = _zeros(env.action_space)
+        self._memory = _Memory((self._n_anchors,)) if _is_flag(memory) else None
+        if self._memory is not None:
+            self.observation_space = _with_memory(env.observation_space)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode: its first epoch has no range."""
         observation, info = self.env.reset(seed=seed, options=options)
+        if self._memory is not None:
+            self._memory.forget(...)
         return self._selected(observation, info, np.zeros(self._n_anchors, dtype=np.bool_)), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Step the environment; `action` (M,) says which anchors measure."""
         chosen = check_actions("action", action, self.action_space).view(np.bool_)
         observation, reward, terminated, truncated, info = self.env.step(self._still)
+        if self._memory is not None:
+            self._memory.learn(observation, chosen)
         return self._selected(observation, info, chosen), reward, terminated, truncated, info
 
     def _selected(self, observation: Any, info: dict[str, Any], chosen: BoolArray) -> Any:
         info["chosen"] = chosen.astype(np.int8)
         if self._rendered:
             rendering.select(self.env, chosen)
-        return select(observation, chosen)
+        return select(observation, chosen, self._memory)
 
 
 class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
     """`SelectAnchors` for a vector environment, in every autoreset mode."""
 
-    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
-        RecordConstructorArgs.__init__(self)
+    def __init__(self, env: VectorEnv[Any, Any, Any], memory: bool = False) -> None:
+        RecordConstructorArgs.__init__(self, memory=memory)
         VectorWrapper.__init__(self, env)
         scene_of(env)
         self._shape = env.num_envs, env.single_observation_space["links"].shape[0]  # pyright: ignore[reportIndexIssue]
@@ -81,6 +101,10 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
         self.action_space = batch_space(self.single_action_space, env.num_envs)
         self._still = _zeros(env.action_space)
         self._chosen = np.zeros(self._shape, dtype=np.bool_)
+        self._memory = _Memory(self._shape) if _is_flag(memory) else None
+        if self._memory is not None:
+            self.single_observation_space = _with_memory(env.single_observation_space)
+            self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -94,10 +118,13 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
         space = self.single_action_space
         chosen = check_actions("actions", actions, space, self.num_envs).view(np.bool_)
         observation, *result, info = self.env.step(self._still)
+        if self._memory is not None:
+            self._memory.learn(_final(observation, info), chosen)
         if "final_obs" in info:
             last = info["_final_obs"]
             for i in np.flatnonzero(last):
-                info["final_obs"][i] = select(info["final_obs"][i], chosen[i])
+                memory = None if self._memory is None else self._memory.row(i)
+                info["final_obs"][i] = select(info["final_obs"][i], chosen[i], memory)
             info["final_info"]["chosen"] = (chosen & last[:, None]).astype(np.int8)
             info["final_info"]["_chosen"] = last.copy()
         return self._selected(observation, info, chosen), *result, info
@@ -106,20 +133,76 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
         """The selection of the worlds that went on; those that began have chosen nothing."""
         began = info.get("_prior_rotation", np.zeros(self.num_envs, dtype=np.bool_))
         self._chosen = chosen = chosen & ~began[:, None]
+        if self._memory is not None:
+            self._memory.forget(began)
         info["chosen"] = chosen.astype(np.int8)
         info["_chosen"] = np.ones(self.num_envs, dtype=np.bool_)
         rendering.select(self.env, chosen)
-        return select(observation, chosen)
+        return select(observation, chosen, self._memory)
 
 
-def select(observation: dict[str, np.ndarray], chosen: BoolArray) -> dict[str, np.ndarray]:
-    """An observation with the links (..., M, N) of the chosen anchors (..., M) alone."""
+class _Memory:
+    """What the choices of each anchor told last; arrays (..., M)."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.known, self.age = np.zeros(shape), np.full(shape, _NEVER)
+
+    def forget(self, where: Any) -> None:
+        """Begin anew in some worlds."""
+        self.known[where], self.age[where] = 0.0, _NEVER
+
+    def learn(self, observation: Mapping[str, np.ndarray], chosen: BoolArray) -> None:
+        """A step of all worlds, in which the chosen anchors (..., M) measured."""
+        quality = observation["links"].any(axis=-1) * observation.get("quality", 1.0)
+        if "anchor_mask" in observation:
+            chosen = chosen & observation["anchor_mask"].astype(np.bool_)
+        self.known = np.where(chosen, quality, self.known)
+        self.age = np.where(chosen, 0.0, np.minimum(self.age + 1, _NEVER))
+
+    def row(self, world: int) -> _Memory:
+        """That of one world."""
+        one = _Memory(self.known.shape[1:])
+        one.known, one.age = self.known[world], self.age[world]
+        return one
+
+
+def _is_flag(memory: Any) -> bool:
+    if not isinstance(memory, bool):
+        raise ValueError(f"memory must be True or False, got {memory!r:.80}")
+    return memory
+
+
+def _with_memory(space: Any) -> spaces.Dict:
+    """The space of an observation with a memory."""
+    m = space["links"].shape[0]
+    known, age = spaces.Box(0.0, 1.0, (m,), np.float64), spaces.Box(0.0, _NEVER, (m,), np.float64)
+    return spaces.Dict({**space.spaces, "known": known, "age": age})
+
+
+def _final(observation: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:
+    """What the steps led to: of ended worlds the final observations."""
+    if "final_obs" not in info:
+        return observation
+    last = info["_final_obs"]
+    keys = ("links", "quality", "anchor_mask")
+    reached = {key: observation[key].copy() for key in keys if key in observation}
+    for key, value in reached.items():
+        value[last] = np.stack([one[key] for one in info["final_obs"][last]])
+    return reached
+
+
+def select(
+    observation: dict[str, np.ndarray], chosen: BoolArray, memory: _Memory | None = None
+) -> dict[str, np.ndarray]:
+    """An observation with the links (..., M, N) of the chosen anchors (..., M), and the memory."""
     each = chosen[..., None]
     selected = observation.copy()
     selected["ranges"] = observation["ranges"] * each
     selected["links"] = observation["links"] * each
     if "quality" in observation:
         selected["quality"] = np.where(chosen, observation["quality"], 1.0)
+    if memory is not None:
+        selected["known"], selected["age"] = memory.known.copy(), memory.age.copy()
     return selected
 
 

@@ -79,7 +79,7 @@ class _MobileAnchors:
 
     def _spaces(self) -> tuple[spaces.Box, spaces.Box]:
         m = self._n_craft
-        size = 15 + (3 if self.family is None else 4) * m
+        size = 15 + 3 * m if self.family is None else 16 + 4 * m
         return (
             spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32),
             spaces.Box(-1.0, 1.0, (2 * m,), np.float32),
@@ -93,12 +93,13 @@ class _MobileAnchors:
         velocity[(*_worlds(batch), self.order, slice(2))] = level.reshape(*batch, m, 2)
         return velocity.reshape(*batch, 3 * m)
 
-    def _show(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+    def _show(self, observation: Mapping[str, np.ndarray], world: Any) -> np.ndarray:
         told = [observation[key] for key in _CRAFT_VIEW]
         if self.family is None:
             order, flat = self._view(*told)
         else:
-            order, flat = self._padded_view(told, observation["anchor_mask"])
+            reach = views.reach_of_craft(world)
+            order, flat = views.padded_craft(self._view, told, observation["anchor_mask"], reach)
         if observation is self.seen:
             self.order = order
         return flat.astype(np.float32)
@@ -107,23 +108,6 @@ class _MobileAnchors:
         size = 15 + 3 * told[-1].shape[-2]
         usual = self._usual.variance, self._usual.speed
         return views.mobile_anchors(*told, *usual, self.sort_craft, self._limits[:size])
-
-    def _padded_view(
-        self, told: list[np.ndarray], mask: np.ndarray
-    ) -> tuple[np.ndarray, FloatArray]:
-        """The view of craft that there are, in arrays for the most; their mask is the end of it."""
-        m, counts = self._n_craft, mask.sum(axis=-1)
-        order = np.broadcast_to(np.arange(m), mask.shape).copy()
-        flat = np.zeros((*counts.shape, 15 + 4 * m))
-        flat[..., 15 + 3 * m :] = mask
-        for count in np.unique(counts).tolist():
-            rows = counts == count
-            *belief, anchors = (field[rows] for field in told)
-            order[rows, :count], seen = self._view(*belief, anchors[:, :count])
-            # Places, then distances: each part is padded by itself.
-            flat[rows, : 15 + 2 * count] = seen[:, : 15 + 2 * count]
-            flat[rows, 15 + 2 * m : 15 + 2 * m + count] = seen[:, 15 + 2 * count :]
-        return order, flat
 
 
 class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
@@ -201,8 +185,9 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
 
     `scenes`: a family of such in its place, see `RBL/Tracking-v0`, as
     ``scenes=[{"name": "auv_craft", "n_anchors": {"integers": [2, 5]}}]``. M is then the largest
-    number of craft. Entries of craft that are not there are 0. The observation has M more entries:
-    1 for the craft that are there.
+    number of craft, and its difficulty stands where a scene says nothing of its own. Entries of
+    craft that are not there are 0. The observation has 1 + M more entries: how far the craft of the
+    drawn scene go in a step (10 m), and 1 for the craft that are there.
 
     `filter`, `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options`
     say else.
@@ -257,11 +242,13 @@ class _AnchorSelection:
         # In a volume without height, deviations count by what the prior leaves open.
         prior = max(one.initial_translation_m for one in worlds)
         self._half = np.maximum(0.5 * (high - low), prior)
+        self._extent_m = max(float(one.scales.extent) for one in worlds)
 
     def _spaces(self) -> tuple[spaces.Box, spaces.Space[Any]]:
         m = self._most
+        size = 18 if self.family is None else 21 + 6 * m
         return (
-            spaces.Box(-_LIMIT, _LIMIT, (18,), np.float32),
+            spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32),
             spaces.Box(-1.0, 1.0, (m,), np.float32)
             if self.mode == "top-k"
             else spaces.MultiBinary(m),
@@ -282,12 +269,17 @@ class _AnchorSelection:
     def _price(self, info: dict[str, Any]) -> Any:
         return self.price * info["chosen"].sum(axis=-1) if self.mode == "priced" else 0.0
 
-    def _show(self, observation: Mapping[str, np.ndarray]) -> np.ndarray:
+    def _show(self, observation: Mapping[str, np.ndarray], world: Any) -> np.ndarray:
+        middle, half = self._centre, self._half
+        if self.family is not None:
+            middle, half, *_ = world.scales
         flat = views.anchor_selection(
             observation["belief_translation"], observation["belief_rotation"],
             observation["belief_covariance"], observation["twist"], self._usual.variance,
-            self._usual.speed, self._centre, self._half, self._limits,
+            self._usual.speed, middle, half, self._limits,
         )  # fmt: skip
+        if self.family is not None:
+            flat = views.padded_selection(flat, observation, half, self._extent_m)
         return flat.astype(np.float32)
 
 
@@ -315,7 +307,7 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
             num_envs, **made_of(self), render_mode=render_mode,
             max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
         )  # fmt: skip
-        selected = VectorSelectAnchors(envs)
+        selected = VectorSelectAnchors(envs, self.family is not None)
         self._compose(VectorEstimatePose(selected, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> np.ndarray:
@@ -365,9 +357,17 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", mode="priced", price=0.05)
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0", filter="uc-kf", k=6)
     ```
-    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. `scenes`: a family in its place,
-    see `RBL/Tracking-v0`; anchors that a drawn scene does not have cannot be chosen. `filter`,
-    `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options` say else.
+    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`.
+
+    `scenes`: a family of such in its place, see `RBL/Tracking-v0`. M is then the largest number of
+    anchors; those that a drawn scene does not have cannot be chosen. The observation has 21 + 6 M
+    entries: those above, the place scaled to the volume of the drawn scene; half sizes of that
+    volume (3) and the anchors relative to the estimate (3 M), both over the extent of the largest
+    scene; and M each: what the last choice of an anchor told (1: it saw the body, -1: it did not,
+    0: never chosen), ``exp(-steps since then / 10)``, and 1 if there is such an anchor.
+
+    `filter`, `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options`
+    say else.
 
     ## Version history
     * v0: first version.
@@ -387,7 +387,8 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     ) -> None:
         self._configure(mode, k, price, scene, scenes)
         self.observation_space, self.action_space = self._spaces()
-        env = SelectAnchors(TrackingEnv(**made_of(self), render_mode=render_mode))
+        world = TrackingEnv(**made_of(self), render_mode=render_mode)
+        env = SelectAnchors(world, self.family is not None)
         self._compose(EstimatePose(env, filter, _options(filter, options), reward))
 
     def _command(self, action: Any) -> np.ndarray:

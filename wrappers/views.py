@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.kernels import compiled
+from rbl_gym.worlds.scene import Scene
 
 
 def _belief(rotation: FloatArray, covariance: FloatArray, prior_variance: FloatArray) -> FloatArray:
@@ -81,3 +85,65 @@ def anchor_selection(
         _belief(rotation, covariance, prior_variance),
     ]
     return np.clip(np.concatenate(parts, axis=-1), -limits, limits)
+
+
+# --- worlds drawn anew: arrays for the most anchors, and their masks --------------------------
+
+
+def reach_of_craft(world: Any) -> FloatArray:
+    """How far the craft of a `Scene` or of `StackedScenes` go in a step (...), metres."""
+    if isinstance(world, Scene):
+        return np.asarray(world.anchor_speed_m_s * world.dt)
+    return world.arrays.speed * world.arrays.dt
+
+
+def padded_craft(
+    view: Callable[..., tuple[np.ndarray, FloatArray]],
+    told: Sequence[np.ndarray],
+    mask: np.ndarray,
+    reach_m: FloatArray,
+) -> tuple[np.ndarray, FloatArray]:
+    """Order (..., M) and view (..., 16 + 4 M) of the craft that there are.
+
+    Parameters
+    ----------
+    view
+        `mobile_anchors` of `told`.
+    told
+        Its first arguments; the last of them are the craft (..., M, 3).
+    mask
+        (..., M), 1 for those that there are.
+    reach_m
+        How far they go in a step (...).
+    """
+    m, counts = mask.shape[-1], mask.sum(axis=-1)
+    order = np.broadcast_to(np.arange(m), mask.shape).copy()
+    flat = np.zeros((*counts.shape, 16 + 4 * m))
+    flat[..., 15 + 3 * m] = np.minimum(reach_m / 10, 10.0)
+    flat[..., 16 + 3 * m :] = mask
+    for count in np.unique(counts).tolist():
+        rows = counts == count
+        *belief, anchors = (field[rows] for field in told)
+        order[rows, :count], seen = view(*belief, anchors[:, :count])
+        # Places, then distances: each part is padded by itself.
+        flat[rows, : 15 + 2 * count] = seen[:, : 15 + 2 * count]
+        flat[rows, 15 + 2 * m : 15 + 2 * m + count] = seen[:, 15 + 2 * count :]
+    return order, flat
+
+
+def padded_selection(
+    flat: FloatArray, observation: Mapping[str, np.ndarray], half: FloatArray, extent_m: float
+) -> FloatArray:
+    """The view (..., 21 + 6 M): `anchor_selection`, the volume, the anchors and what they told."""
+    mask = observation["anchor_mask"]
+    gap = observation["anchors"] - observation["belief_translation"][..., None, :]
+    heard = np.exp(-observation["age"] / 10)
+    parts = [
+        flat,
+        half / extent_m,
+        np.clip(gap / extent_m * mask[..., None], -10, 10).reshape(*mask.shape[:-1], -1),
+        np.where(heard > 0, 2 * observation["known"] - 1, 0.0),
+        heard,
+        mask,
+    ]
+    return np.concatenate(parts, axis=-1)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import functools
-import itertools
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rbl_gym.checks import check_array, check_number
-from rbl_gym.worlds import scenes
+from rbl_gym.worlds import laws, scenes
 from rbl_gym.worlds.scene import Scene
 
 __all__ = ["SceneFamily", "family"]
@@ -34,7 +31,11 @@ class SceneFamily:
 
         - ``{"uniform": [low, high]}`` and ``{"log-uniform": [low, high]}``: a number;
         - ``{"integers": [low, high]}``: a whole number, both ends included;
-        - ``{"choice": [a, b, ...]}``: one of these values, each as likely as the others.
+        - ``{"choice": [a, b, ...]}``: one of these values, each as likely as the others;
+        - ``{"repeat": {"count": [low, high], "of": value}}``: a list of so many values, a whole
+          number drawn as by `integers`.
+
+        Lists, choices and repeated values may hold laws too.
 
     Raises
     ------
@@ -72,15 +73,14 @@ class SceneFamily:
             if not isinstance(member, Mapping):
                 found.append(_made(index, member))
                 continue
-            laws = list(_laws_in(member, f"scenes[{index}]"))
-            ends = [law.ends for law in laws]
-            if math.prod(map(len, ends)) > _MOST_CORNERS:
+            laws.check(member, f"scenes[{index}]")
+            count = laws.count_of_ends(member)
+            if count > _MOST_CORNERS:
                 raise ValueError(
                     f"scenes[{index}] must have at most {_MOST_CORNERS} combinations of choices, "
-                    f"got {math.prod(map(len, ends))}"
+                    f"got {count}"
                 )
-            for values in itertools.product(*ends):
-                found.append(_made(index, _filled(member, iter(values))))
+            found += [_made(index, one) for one in laws.ends(member)]
         return tuple(found)
 
     @functools.cached_property
@@ -147,10 +147,7 @@ class SceneFamily:
         """
         if index is None:
             index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
-        member = self.members[index]
-        if isinstance(member, Mapping):
-            laws = _laws_in(member, f"scenes[{index}]")
-            member = _filled(member, (law.draw(rng) for law in laws))
+        member = laws.draw(self.members[index], rng)
         scene = _made(index, member)
         return scene, dict(member) if isinstance(member, Mapping) else {"name": scene.name}
 
@@ -172,88 +169,6 @@ def padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     result = np.zeros(shape, array.dtype)
     result[tuple(slice(size) for size in array.shape)] = array
     return result
-
-
-# --- laws -------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Law:
-    """How a value is drawn, and the values that stand for all of them in the corners."""
-
-    draw: Callable[[np.random.Generator], Any]
-    ends: tuple[Any, ...]
-
-
-def _uniform(path: str, value: Any) -> _Law:
-    low, high = _limits(path, value)
-    return _Law(lambda rng: float(rng.uniform(low, high)), (0.5 * (low + high),))
-
-
-def _log_uniform(path: str, value: Any) -> _Law:
-    low, high = _limits(path, value)
-    check_number(f"{path}[0]", low, low=1e-300)
-    a, b = math.log(low), math.log(high)
-    return _Law(lambda rng: math.exp(rng.uniform(a, b)), (math.exp(0.5 * (a + b)),))
-
-
-def _integers(path: str, value: Any) -> _Law:
-    low, high = _limits(path, value)
-    if low != int(low) or high != int(high):
-        raise ValueError(f"{path} must be two whole numbers, got {value!r:.80}")
-    ends = (int(low), int(high))
-    return _Law(lambda rng: int(rng.integers(ends[0], ends[1] + 1)), tuple(dict.fromkeys(ends)))
-
-
-def _choice(path: str, value: Any) -> _Law:
-    if not isinstance(value, Sequence) or isinstance(value, str) or not value:
-        raise ValueError(f"{path} must be a list of values, got {value!r:.80}")
-    values = tuple(value)
-    return _Law(lambda rng: values[int(rng.integers(len(values)))], values)
-
-
-_LAWS: dict[str, Callable[[str, Any], _Law]] = {
-    "uniform": _uniform,
-    "log-uniform": _log_uniform,
-    "integers": _integers,
-    "choice": _choice,
-}
-
-
-def _limits(path: str, value: Any) -> tuple[float, float]:
-    low, high = check_array(path, value, (2,)).tolist()
-    if low > high:
-        raise ValueError(f"{path} must be [low, high], got {value!r:.80}")
-    return low, high
-
-
-def _law_of(value: Any, path: str) -> _Law | None:
-    """The law that a dict with one key of `_LAWS` is; None of what is none."""
-    if not isinstance(value, Mapping) or len(value) != 1:
-        return None
-    kind = next(iter(value))
-    return _LAWS[kind](f"{path}.{kind}", value[kind]) if kind in _LAWS else None
-
-
-def _laws_in(value: Any, path: str) -> Iterator[_Law]:
-    """The laws of a nested dict, in its order."""
-    if not isinstance(value, Mapping):
-        return
-    law = _law_of(value, path)
-    if law is not None:
-        yield law
-        return
-    for key, item in value.items():
-        yield from _laws_in(item, f"{path}.{key}")
-
-
-def _filled(value: Any, values: Iterator[Any]) -> Any:
-    """The nested dict with `values` in place of its laws, in its order."""
-    if not isinstance(value, Mapping):
-        return value
-    if _law_of(value, "") is not None:
-        return next(values)
-    return {key: _filled(item, values) for key, item in value.items()}
 
 
 def _made(index: int, member: Any) -> Scene:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -196,7 +197,8 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         `noise_laws.NOISE_FORMS`: ``"range"``, ``"squared-range"``, ``"reference-range"`` with its
         `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`, `kappa` and `snr`). Another
         number of anchors than the scene has, without their places, draws them anew in the region
-        at every reset.
+        at every reset. ``"stretch": [x, y, z]`` then multiplies volume, anchor region (boxes and
+        walls), anchors and obstacles along the axes.
 
     Raises
     ------
@@ -209,11 +211,35 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         scene = {"name": scene}
     if not isinstance(scene, Mapping) or "name" not in scene:
         raise ValueError(f"scene must be a name or a dict with the key 'name', got {scene!r:.120}")
-    changes = {key: value for key, value in scene.items() if key != "name"}
+    changes = {key: value for key, value in scene.items() if key not in ("name", "stretch")}
     base = SCENES[check_one_of("scene", scene["name"], list(SCENES))]
     if changes.get("n_anchors", base.n_anchors) != base.n_anchors:
         changes.setdefault("anchors", None)
     anchors = changes.get("anchors")
     if anchors is not None:
         changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))
-    return overrides.replace(base, changes, "scene")
+    made = overrides.replace(base, changes, "scene")
+    return _stretched(made, scene["stretch"]) if "stretch" in scene else made
+
+
+def _stretched(scene: Scene, stretch: Any) -> Scene:
+    """The scene with all places multiplied along the axes; what is on the body stays."""
+    factors = check_array("scene.stretch", stretch, (3,))
+    if factors.ndim != 1 or not (factors > 0).all():
+        raise ValueError(f"scene.stretch must be three positive numbers, got {stretch!r:.80}")
+    values: dict[str, Any] = {}
+    for name in ("volume", "start_volume", "anchor_region"):
+        region = getattr(scene, name)
+        if isinstance(region, Box | Walls):
+            low, high = (tuple((corner * factors).tolist()) for corner in region.bounds())
+            values[name] = dataclasses.replace(region, low=low, high=high)
+        elif region is not None:
+            raise ValueError(
+                f"scene.stretch needs a box or walls, {name} of {scene.name!r} is {region!r:.80}"
+            )
+    for name in ("anchors", "obstacles", "start_translation"):
+        places = getattr(scene, name)
+        if places:
+            row = np.resize(factors, np.shape(places)[-1])
+            values[name] = as_tuples(np.array(places) * row)
+    return dataclasses.replace(scene, **values)
