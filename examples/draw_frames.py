@@ -42,8 +42,9 @@ def main() -> None:
     draw_frame(axes, TRANSLATION, ROTATION, 1.0, "b")
     outline = places[[0, 1, 3, 2, 0]]
     axes.plot(*outline.T, color="0.4", lw=1)
-    axes.scatter(*places.T, color="#e67e22", s=36, depthshade=False, label="tags, $s_n = Q c_n + t$")
-    axes.scatter(*ANCHORS.T, color="k", marker="^", s=60, depthshade=False, label="anchors, $a_m$")
+    drawn = {"depthshade": False}
+    axes.scatter(*places.T, color="#e67e22", s=36, label="tags, $s_n = Q c_n + t$", **drawn)
+    axes.scatter(*ANCHORS.T, color="k", marker="^", s=60, label="anchors, $a_m$", **drawn)
     for m, anchor in enumerate(ANCHORS):
         for place in places:
             link = np.stack([anchor, place]).T
