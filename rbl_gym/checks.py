@@ -23,6 +23,8 @@ BoolArray = NDArray[np.bool_]
 Axes = float | tuple[float, float, float]
 # No length, time or rate is as large; its powers still are finite numbers.
 HUGE = 1e50
+# Up to so many numbers BLAS sums in one thread.
+_ONE_THREAD = 10_000
 _FLOAT64 = np.dtype(np.float64)
 
 P = ParamSpec("P")
@@ -133,8 +135,9 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
 
 def check_finite(name: str, array: FloatArray) -> FloatArray:
     """`array` unchanged, or a ValueError with the first entry that is NaN, inf or `HUGE`."""
-    # The sum of squares of most arrays says it all, in one look; false of NaN too.
-    if np.vdot(array, array) < HUGE:
+    # The sum of squares of most arrays says it all, in one look; false of NaN too. Of larger ones
+    # BLAS would share out the sum to threads, whose start takes longer.
+    if array.size <= _ONE_THREAD and np.vdot(array, array) < HUGE:
         return array
     if not (array.min(initial=0.0) > -HUGE and array.max(initial=0.0) < HUGE):
         if np.isfinite(array).all():
@@ -152,7 +155,9 @@ def all_finite(figures: Any) -> bool:
     if figures.ndim == 0:
         return math.isfinite(figures)
     # Mostly one product tells; it may overflow.
-    return math.isfinite(np.vdot(figures, figures)) or bool(np.isfinite(figures).all())
+    if figures.size <= _ONE_THREAD and math.isfinite(np.vdot(figures, figures)):
+        return True
+    return bool(np.isfinite(figures).all())
 
 
 def are_finite(array: FloatArray, trailing: int) -> BoolArray:

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline
-from scipy.ndimage import gaussian_filter1d
 
 from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.estimators.calibration.range_track import range_track
@@ -114,7 +113,7 @@ def inertial_clock(
     if np.ptp(told.times) < _WINDOW_S or not windows:
         raise ValueError(f"imu and ranges must last {_WINDOW_S:g} s without gaps: give the offset")
     arms = np.zeros_like(told.tags)
-    path: ArrayLike | BSpline = start
+    path: ArrayLike | scipy.interpolate.BSpline = start
     first_s, slow = float(told.times[0]), _SLOW_S
     found: InertialClock | None = None
     for _ in range(_ROUNDS):
@@ -140,8 +139,8 @@ def inertial_clock(
 
 def _band(values: FloatArray, slow_s: float) -> FloatArray:
     """What of values (n, 3) changes within the band."""
-    fast = gaussian_filter1d(values, _FAST_S / _STEP_S, axis=0)
-    return fast - gaussian_filter1d(fast, slow_s / _STEP_S, axis=0)
+    fast = scipy.ndimage.gaussian_filter1d(values, _FAST_S / _STEP_S, axis=0)
+    return fast - scipy.ndimage.gaussian_filter1d(fast, slow_s / _STEP_S, axis=0)
 
 
 def _windows(

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 from scipy import sparse
-from scipy.interpolate import BSpline
 from scipy.sparse.linalg import spsolve
 
 from rbl_gym.checks import check_array, check_number
@@ -27,9 +27,9 @@ def range_track(
     ranges: ArrayLike,
     anchors: ArrayLike,
     std: ArrayLike,
-    start: ArrayLike | BSpline,
+    start: ArrayLike | scipy.interpolate.BSpline,
     links: ArrayLike | None = None,
-) -> BSpline:
+) -> scipy.interpolate.BSpline:
     """A cubic spline of positions that ranges fit best, robustly, with biases that stay.
 
     Between knots 0.2 s apart the acceleration is held to zero by 2 m/s^2.
@@ -67,7 +67,7 @@ def range_track(
     knots = times[0] + length / count * np.arange(-3, count + 4)
     inside = np.clip(times, knots[3], np.nextafter(knots[-4], -np.inf))
     # Their types are not told by scipy's stubs.
-    basis: Any = BSpline.design_matrix(inside, knots, 3).tocsr()
+    basis: Any = scipy.interpolate.BSpline.design_matrix(inside, knots, 3).tocsr()
     m = basis.shape[1]
     bend = sparse.eye(m - 2, m) - 2 * sparse.eye(m - 2, m, k=1) + sparse.eye(m - 2, m, k=2)
     bend = bend / ((length / count) ** 2 * _ACCELERATION)
@@ -77,7 +77,7 @@ def range_track(
     biases = np.linalg.inv(_LINK_M**2 * np.eye(count) + _COMMON_M**2)
     held: Any = sparse.block_diag([bend.T @ bend] * 3 + [biases]) + 1e-9 * sparse.eye(3 * m + count)
     losses = [LATE]
-    if isinstance(start, BSpline):
+    if isinstance(start, scipy.interpolate.BSpline):
         first = start.c
     else:
         first, losses = check_array("start", start, (3,)) + np.zeros((m, 3)), [huber(_HUBER), LATE]
@@ -97,4 +97,4 @@ def range_track(
             x = x + step
             if np.abs(step).max() < _CONVERGED_M:
                 break
-    return BSpline(knots, x[: 3 * m].reshape(3, m).T, 3)
+    return scipy.interpolate.BSpline(knots, x[: 3 * m].reshape(3, m).T, 3)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from rbl_gym.app.tables import new_table
 from rbl_gym.studies.replay import Replayed, nis_curve
@@ -68,6 +67,8 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 def draw_nis(axes: Axes, replayed: Replayed) -> None:
     """NIS per degree of freedom over time, with the band of an honest filter."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     found = replayed.track.innovations
     assert found is not None
     when, ratio, low, high = nis_curve(replayed.track.times, found)

@@ -16,8 +16,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from rbl_gym.checks import (
     FloatArray,
@@ -92,7 +92,9 @@ def unit_disk_edges(positions: ArrayLike, radius_m: float, blind_m: float = 0.0)
     """
     positions = check_positions(positions)
     radius_m = check_number("radius_m", radius_m, low=0.0)
-    pairs = np.sort(cKDTree(positions).query_pairs(radius_m, output_type="ndarray"), axis=1)
+    pairs = np.sort(
+        scipy.spatial.cKDTree(positions).query_pairs(radius_m, output_type="ndarray"), axis=1
+    )
     if blind_m > 0:
         apart = np.linalg.norm(positions[pairs[:, 1]] - positions[pairs[:, 0]], axis=1)
         pairs = pairs[apart >= blind_m]

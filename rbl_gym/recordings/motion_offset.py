@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
@@ -118,8 +118,10 @@ def _rates(times: FloatArray, path: FloatArray, width: float) -> tuple[FloatArra
     known = times[after] - times[after - 1] <= 2 * width
     # Of map coordinates the first is taken off: they have few digits left.
     columns = [np.interp(grid, times, column - column[0]) for column in path.T]
-    rates = [gaussian_filter1d(c, _FINE, order=1, mode="nearest") / step for c in columns]
-    near = gaussian_filter1d(known.astype(float), _FINE, mode="constant")
+    rates = [
+        scipy.ndimage.gaussian_filter1d(c, _FINE, order=1, mode="nearest") / step for c in columns
+    ]
+    near = scipy.ndimage.gaussian_filter1d(known.astype(float), _FINE, mode="constant")
     # A quarter of the weight at most may lie in gaps or beyond an end.
     used = known & (near > 0.75)
     return grid[used], np.stack(rates, axis=-1)[used]

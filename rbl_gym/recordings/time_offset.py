@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter1d
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
@@ -158,9 +157,9 @@ def _on_grid(times: FloatArray, values: FloatArray, step: float, width: float) -
     # A gap between two slow samples of a fast signal is still a gap.
     known = gap <= max(_GAP * float(np.median(np.diff(times))), 2 * width)
     columns = [np.interp(grid, times, column) for column in values.T]
-    weight = gaussian_filter1d(known.astype(float), width / step, mode="constant")
+    weight = scipy.ndimage.gaussian_filter1d(known.astype(float), width / step, mode="constant")
     smooth = [
-        gaussian_filter1d(np.where(known, column, 0.0), width / step, mode="constant")
+        scipy.ndimage.gaussian_filter1d(np.where(known, column, 0.0), width / step, mode="constant")
         for column in columns
     ]
     result = np.stack(smooth, axis=-1) / np.maximum(weight, 1e-9)[:, None]

@@ -184,9 +184,11 @@ def innovations_of(
         Law of the ranges where an epoch has none of its own.
     """
     kept: list[Step] = []
+    shapes: list[tuple[int, ...]] = []
     for step in steps:
         trials = math.prod(step.belief.translation.shape[:-1])
-        if kept and (len(kept) * trials >= _CHUNK or _shapes(step) != _shapes(kept[0])):
+        before, shapes = shapes, _shapes(step)
+        if kept and (len(kept) * trials >= _CHUNK or shapes != before):
             yield kept, _innovations(filter, kept, tags, noise)
             kept = []
         kept.append(step)

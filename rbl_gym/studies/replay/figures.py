@@ -30,6 +30,8 @@ __all__ = ["track_figures"]
 
 # The mirror pose is the one meant where its mean square error is below this share of the track's.
 _NEARER = 0.25
+# So many epochs tell how late the truth is.
+_ENOUGH = 1000
 
 
 def track_figures(
@@ -201,13 +203,23 @@ def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list
         translation=apply_alignment(reference.alignment, None, truth.translation)[1]
     )
 
-    def at(late_s: float, with_rotation: bool) -> Judged:
-        rotation = truth.rotation if with_rotation else None
+    gap_s, counts = settings.comparison.truth_gap_s, ~excluded_epochs(track.times, settings)
+    step = slice(None, None, _stride(track.times, gap_s))
+    some = Track(*(field[step] for field in track[:4]))
+
+    def at(late_s: float, whole: bool) -> Judged:
+        rotation, epochs = (truth.rotation, track) if whole else (None, some)
         moved = aligned._replace(times=truth.times - late_s, rotation=rotation)
-        there = matched(moved, *track[:3], settings.comparison.truth_gap_s)
-        return judged_of(there, track, reference.planar, ~excluded_epochs(track.times, settings))
+        there = matched(moved, *epochs[:3], gap_s)
+        return judged_of(there, epochs, reference.planar, counts if whole else counts[step])
 
     def seen(rotation: FloatArray) -> FloatArray:
         return reference.alignment.rotation @ as_judged(rotation, settings, reference.planar)
 
     return fault_hints(at, seen, reference.planar)
+
+
+def _stride(times: FloatArray, gap_s: float) -> int:
+    """The step that leaves enough of the epochs, most of them no further apart than `gap_s`."""
+    near = gap_s / float(np.median(np.diff(times))) if len(times) > 1 else 1.0
+    return max(int(min(len(times) / _ENOUGH, near)), 1)

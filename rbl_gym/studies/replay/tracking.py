@@ -122,7 +122,11 @@ def recording_steps(
     readings = _readings(local, settings)
     rotation, translation, covariance = prior_of(recording, settings)
     prior = rotation, translation - origin, covariance
-    for step in track_epochs(filter, prior, readings, restart, hold):
+    steps = track_epochs(filter, prior, readings, restart, hold)
+    if not origin.any():
+        yield from steps
+        return
+    for step in steps:
         belief = step.belief
         yield step._replace(belief=belief._replace(translation=belief.translation + origin))
 

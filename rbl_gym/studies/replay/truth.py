@@ -159,7 +159,7 @@ def fault_hints(
     ----------
     at
         What is judged, with the truth's rotations as they are in the file, its stamps taken to be
-        late by so many seconds; with or without rotations.
+        late by so many seconds; of all epochs, or without rotations and of some.
     seen
         Rotations (L, 3, 3) of the file as they are judged.
     planar
@@ -175,6 +175,8 @@ def fault_hints(
     if len(as_read.times) < _FEWEST:
         return []
     judged = mended(as_read)
+    if judged.excess() < _LARGE:
+        return []
     faults = [(text, mended(other)) for text, other in (*_faults(as_read), *_late(at))]
     hints: list[str] = []
     while judged.excess() >= _LARGE and len(hints) < 2:
