@@ -26,6 +26,7 @@ benchmarks: .venv/dev.stamp
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 
 format: .venv/dev.stamp
 	$(BIN)/ruff check --fix .
