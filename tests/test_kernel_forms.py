@@ -413,7 +413,7 @@ def test_scores_of_layouts(law, batch, m):
     args = (
         anchors, poses.rotation, poses.translation, world.tags, 0.1 * np.eye(6), law.numbers, share
     )  # fmt: skip
-    assert_equal_forms(placement._mean_square, *args)
+    assert_equal_forms(placement.mean_square, *args)
     assert_equal_forms(
         placement.weighted_square, poses.matrix, poses.rotation, world.tags, world.rng.random(6)
     )
@@ -453,7 +453,7 @@ def test_places_on_walls(batch):
     actions = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     actions = np.concatenate([actions, np.random.default_rng(0).normal(0, 1, (100, 3))])
     actions = actions.reshape(-1, *(1 for _ in batch), 3) * np.ones((*batch, 1))
-    assert_equal_forms(regions._place_on_walls, actions, low, high)
+    assert_equal_forms(regions.place_on_walls, actions, low, high)
     assert_equal_forms(regions._project_on_walls, 0.7 + 3.1 * actions, low, high)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +13,7 @@ from gymnasium.vector import VectorEnv, VectorWrapper
 
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.placement import AnchorPlacementEnv, AnchorPlacementVectorEnv
+from rbl_gym.envs.placement_family import PlacementFamilyEnv, PlacementFamilyVectorEnv
 from rbl_gym.estimators import Filter
 from rbl_gym.estimators.filter import check_takes_noise, reads
 from rbl_gym.placement import Context, PlacementTask
@@ -20,20 +21,55 @@ from rbl_gym.wrappers.estimate import make_filter
 from rbl_gym.wrappers.filter_tracks import check_determined, track_error
 
 REWARDS = ("bound", "filter")
+# What the infos tell of a layout.
+_TOLD = ("region", "racks", "anchors", "rack_mask", "anchor_mask")
 
 
-def filter_of(env: Any, name: str, options: Mapping[str, Any] | None) -> Filter:
-    """The filter of a placement environment, or a ValueError where the scene does not do."""
-    task = getattr(env.unwrapped, "task", None)
-    if not isinstance(task, PlacementTask):
-        raise ValueError(f"env must be RBL/AnchorPlacement-v0, got {env.unwrapped}")
+def filter_of(env: Any, task: PlacementTask, name: str, options: Any) -> Filter:
+    """The filter of a task, or a ValueError where its scene does not do."""
     filter = make_filter(env, task.scene, name, options)
     if reads(filter) != "twist":
         raise ValueError(f"filter must be one that is told the twist, got {name!r}")
     if task.racks:
         check_takes_noise(name, filter, "the racks give every epoch its own noise")
-    check_determined(task, name, filter)
     return filter
+
+
+class _Judge:
+    """How well a named filter tracks with complete layouts, in one task or in a family of them."""
+
+    def __init__(self, env: Any, name: str, options: Mapping[str, Any] | None) -> None:
+        self._env, self._named = env, (name, options)
+        tasks = _tasks_of(env)
+        family = getattr(env.unwrapped, "family", None)
+        self._one = filter_of(env, tasks[0], name, options) if family is None else None
+        for task in tasks[:1] if family is None else family.smallest:
+            check_determined(task, name, filter_of(env, task, name, options))
+
+    def errors(self, tasks: Sequence[PlacementTask], info: Mapping[str, Any]) -> FloatArray:
+        """Errors (R,) of the filter in layouts (R, ...) of these tasks, as the infos tell them."""
+        if self._one is not None:
+            return _errors(tasks[0], self._one, info)
+        found = []
+        for row, task in enumerate(tasks):
+            boxes, placed = info["rack_mask"][row] > 0, info["anchor_mask"][row] > 0
+            own = {
+                "region": info["region"][row],
+                "racks": info["racks"][row][boxes],
+                "anchors": info["anchors"][row][placed],
+            }
+            found.append(_errors(task, filter_of(self._env, task, *self._named), own))
+        return np.array(found)
+
+
+def _tasks_of(env: Any) -> Sequence[PlacementTask]:
+    """The tasks of the worlds of a placement environment, or a ValueError."""
+    tasks = getattr(env.unwrapped, "tasks", None)
+    if tasks is None:
+        tasks = [getattr(env.unwrapped, "task", None)]
+    if not isinstance(tasks[0], PlacementTask):
+        raise ValueError(f"env must be RBL/AnchorPlacement-v0, got {env.unwrapped}")
+    return tasks
 
 
 # --- wrappers ---------------------------------------------------------------------------------
@@ -84,7 +120,7 @@ class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     ) -> None:
         RecordConstructorArgs.__init__(self, filter=filter, options=options)
         gym.Wrapper.__init__(self, env)
-        self._filter = filter_of(env, filter, options)
+        self._judge = _Judge(env, filter, options)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -98,7 +134,8 @@ class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         observation, _, terminated, truncated, info = self.env.step(action)
         error, reward = 0.0, 0.0
         if terminated:
-            error = float(_errors(self.env, self._filter, info))
+            rows = {key: np.asarray(value)[None] for key, value in info.items()}
+            error = float(self._judge.errors(_tasks_of(self.env), rows)[0])
             reward = -math.log(error)
         return observation, reward, terminated, truncated, {**info, "tag_error_m": error}
 
@@ -114,7 +151,7 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
     ) -> None:
         RecordConstructorArgs.__init__(self, filter=filter, options=options)
         VectorWrapper.__init__(self, env)
-        self._filter = filter_of(env, filter, options)
+        self._judge = _Judge(env, filter, options)
         self._error_m = np.zeros(env.num_envs)
 
     def reset(
@@ -128,12 +165,14 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """Place anchors; the last one of each world is paid."""
+        tasks = _tasks_of(self.env)
         observation, _, terminated, truncated, info = self.env.step(actions)
         error, reward = np.zeros(self.num_envs), np.zeros(self.num_envs)
         final = info.get("final_info", info)
         if terminated.any():
-            complete = {key: final[key][terminated] for key in ("region", "racks", "anchors")}
-            error[terminated] = _errors(self.env, self._filter, complete)
+            complete = {key: final[key][terminated] for key in _TOLD if key in final}
+            ended = [tasks[i % len(tasks)] for i in np.flatnonzero(terminated)]
+            error[terminated] = self._judge.errors(ended, complete)
             reward[terminated] = -np.log(error[terminated])
         if final is not info:
             final["tag_error_m"], final["_tag_error_m"] = error, info["_final_info"].copy()
@@ -149,11 +188,11 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
         return {**info, **told}
 
 
-def _errors(env: Any, filter: Filter, info: Mapping[str, np.ndarray]) -> FloatArray:
+def _errors(task: PlacementTask, filter: Filter, info: Mapping[str, np.ndarray]) -> FloatArray:
     """Errors (...) of the filter in complete layouts, as the infos describe them."""
     region = info["region"]
     context = Context(region[..., :3], region[..., 3:], info["racks"])
-    return track_error(env.unwrapped.task, context, info["anchors"], filter)
+    return track_error(task, context, info["anchors"], filter)
 
 
 # --- what the id makes ------------------------------------------------------------------------
@@ -175,14 +214,15 @@ def anchor_placement(
     filter, options
         As `FilterReward`; only with ``reward="filter"``.
     **arguments
-        As `AnchorPlacementEnv`.
+        As `AnchorPlacementEnv`; with `scenes` as `PlacementFamilyEnv`.
 
     Raises
     ------
     ValueError
         On a reward, or a filter, that does not go with the scene.
     """
-    env = AnchorPlacementEnv(**arguments)
+    form = PlacementFamilyEnv if arguments.get("scenes") is not None else AnchorPlacementEnv
+    env = form(**_worlds(arguments))
     return FilterReward(env, filter, options) if _is_filtered(reward, filter, options) else env
 
 
@@ -194,9 +234,20 @@ def anchor_placement_vector(
     **arguments: Any,
 ) -> VectorEnv[Any, Any, Any]:
     """`anchor_placement` of many problems, with `AnchorPlacementVectorEnv`."""
-    envs = AnchorPlacementVectorEnv(**arguments)
+    drawn = arguments.get("scenes") is not None
+    form = PlacementFamilyVectorEnv if drawn else AnchorPlacementVectorEnv
+    envs = form(**_worlds(arguments))
     filtered = _is_filtered(reward, filter, options)
     return VectorFilterReward(envs, filter, options) if filtered else envs
+
+
+def _worlds(arguments: dict[str, Any]) -> dict[str, Any]:
+    """The arguments with `scene` or `scenes`, or a ValueError where both are given."""
+    scene, scenes = arguments.get("scene", "auv_buoys"), arguments.get("scenes")
+    if scenes is not None and scene != "auv_buoys":
+        raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
+    left_out = "scenes" if scenes is None else "scene"
+    return {key: value for key, value in arguments.items() if key != left_out}
 
 
 def _is_filtered(reward: str, filter: Any, options: Any) -> bool:

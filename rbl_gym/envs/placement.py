@@ -25,7 +25,7 @@ _MIRRORS = ((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1))
 _LEVEL = np.array([1.0, 1.0, 0.0])
 MODES = ("sequential", "one-shot", "mounts")
 # Score from which the shaped reward of the mounts counts, metres.
-_EMPTY_SCORE_M = 3.0
+EMPTY_SCORE_M = 3.0
 
 
 class AnchorPlacementVectorEnv(BatchEnv):
@@ -124,7 +124,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
         if self.mode == "mounts":
             self._taken[rows] = False
             self._information[rows] = 0.0
-            self._log_score[rows] = math.log(_EMPTY_SCORE_M)
+            self._log_score[rows] = math.log(EMPTY_SCORE_M)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         complete = moving & (self._epochs == self._placements)

@@ -274,7 +274,7 @@ class Walls(Faced):
         A ray that points down is cut at the floor's height; one to the floor itself goes to the
         nearest legal point.
         """
-        return _place_on_walls(action, *self._corners)
+        return place_on_walls(action, *self._corners)
 
     def action(self, points: FloatArray) -> FloatArray:
         """An inverse of `place`: the point itself, in units of the room's half size."""
@@ -282,25 +282,28 @@ class Walls(Faced):
 
 
 def _faces(low: FloatArray, high: FloatArray) -> tuple[np.ndarray, FloatArray]:
-    """The axis on which each wall and the ceiling stands, and where."""
-    return np.array([0, 0, 1, 1, 2]), np.array([low[0], high[0], low[1], high[1], high[2]])
+    """The axis (5,) on which each wall and the ceiling stands, and where (..., 5)."""
+    values = low[..., 0], high[..., 0], low[..., 1], high[..., 1], high[..., 2]
+    return np.array([0, 0, 1, 1, 2]), np.stack(values, axis=-1)
 
 
 @compiled("walls:project")
 def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """`Walls.project` in a room between two corners (3,)."""
+    """`Walls.project` in rooms between two corners (..., 3)."""
     axes, values = _faces(low, high)
     inside = np.minimum(np.maximum(points, low), high)
     outside = (points - inside) ** 2
     # Squared distance to each surface; below the floor the nearest gap alone misleads.
     squares = outside.sum(axis=-1)[..., None] - outside[..., axes]
     face = (squares + (points[..., axes] - values) ** 2).argmin(axis=-1)[..., None]
-    return np.where(axes[face] == np.arange(3), values[face], inside)
+    values = np.broadcast_to(values, squares.shape)
+    chosen = np.take_along_axis(values, face, axis=-1)
+    return np.where(axes[face] == np.arange(3), chosen, inside)
 
 
 @compiled("walls:place")
-def _place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """`Walls.place` in a room between two corners (3,)."""
+def place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """`Walls.place` in rooms between two corners (..., 3)."""
     action = _cut(action)
     middle, half = _middle(low, high)
     reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])

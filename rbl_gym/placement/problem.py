@@ -269,11 +269,11 @@ def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatAr
 
 def score_of_checked(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """`score`, of arrays that the caller has checked."""
-    return root_of(_mean_square(*arguments(task, context, anchors)))
+    return root_of(mean_square(*arguments(task, context, anchors)))
 
 
 def arguments(task: PlacementTask, context: Context, anchors: FloatArray) -> tuple[FloatArray, ...]:
-    """What the score is computed from: arguments of `_mean_square`."""
+    """What the score is computed from: arguments of `mean_square`."""
     places = positions(task, context)
     share = _share(task, context, anchors, places)
     law = ranging.numbers_of(task.scene.noise, len(task.scene.tags))
@@ -282,7 +282,7 @@ def arguments(task: PlacementTask, context: Context, anchors: FloatArray) -> tup
 
 
 @compiled("layout_score:mean_square")
-def _mean_square(
+def mean_square(
     anchors: FloatArray,
     rotation: FloatArray,
     places: FloatArray,
@@ -297,7 +297,7 @@ def _mean_square(
         tags[..., None, :, :],
         rotation,
         places,
-        ranging.law_of(law),
+        ranging.law_of(law if law.ndim == 1 else law[..., None, :]),
         share[..., None],
     )
     weight = np.full(rotation.shape[-3], 1 / rotation.shape[-3])

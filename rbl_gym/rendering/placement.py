@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,6 +47,29 @@ def film_of(render_mode: str | None, task: PlacementTask) -> Film | None:
     if check_mode(render_mode) is None:
         return None
     return Film(functools.partial(_frame, task), task.n_anchors)
+
+
+def film_of_many(
+    render_mode: str | None, task_of: Callable[[int], PlacementTask], steps: int
+) -> Film | None:
+    """A film of worlds with tasks of their own, whose anchors and boxes are padded."""
+    if check_mode(render_mode) is None:
+        return None
+    return Film(functools.partial(_frame_of_many, task_of), steps)
+
+
+def _frame_of_many(
+    task_of: Callable[[int], PlacementTask],
+    world: int,
+    epochs: np.ndarray,
+    shots: Sequence[Layout],
+    beliefs: Any,
+) -> Image:
+    last = shots[-1]
+    centre, half, racks = (field[[world]] for field in last.context)
+    context = Context(centre, half, racks[:, racks[0, :, 3] > 0])
+    own = Layout(context, last.anchors[[world]], last.placed[[world]])
+    return _frame(task_of(world), 0, epochs, [own], beliefs)
 
 
 def _frame(

@@ -14,9 +14,6 @@ from rbl_gym.worlds.scene import Scene
 
 __all__ = ["SceneFamily", "family"]
 
-# Every combination of choices and ends of integers is tried when a family is made, up to so many.
-_MOST_CORNERS = 10_000
-
 
 @dataclass(frozen=True, eq=False)
 class SceneFamily:
@@ -46,8 +43,7 @@ class SceneFamily:
     members: tuple[Any, ...]
 
     def __post_init__(self) -> None:
-        if not self.members:
-            raise ValueError("scenes must hold at least one scene, got none")
+        members_of(self.members)
         for scene in self.corners:
             if scene.inertial is not None:
                 raise ValueError(
@@ -70,17 +66,7 @@ class SceneFamily:
         """A scene of every choice and of both ends of all integers; other numbers in the middle."""
         found: list[Scene] = []
         for index, member in enumerate(self.members):
-            if not isinstance(member, Mapping):
-                found.append(_made(index, member))
-                continue
-            laws.check(member, f"scenes[{index}]")
-            count = laws.count_of_ends(member)
-            if count > _MOST_CORNERS:
-                raise ValueError(
-                    f"scenes[{index}] must have at most {_MOST_CORNERS} combinations of choices, "
-                    f"got {count}"
-                )
-            found += [_made(index, one) for one in laws.ends(member)]
+            found += [_made(index, one) for one in laws.corners(member, f"scenes[{index}]")]
         return tuple(found)
 
     @functools.cached_property
@@ -156,12 +142,20 @@ def family(value: Any) -> SceneFamily:
     """The family of a list of scenes, of one scene with laws, or of one scene alone."""
     if isinstance(value, SceneFamily):
         return value
-    alone = isinstance(value, str | Mapping | Scene)
-    if not alone and not isinstance(value, Sequence):
+    return SceneFamily(members_of(value))
+
+
+def members_of(value: Any) -> tuple[Any, ...]:
+    """The members of a family: of a list those in it, of one scene this; or a ValueError."""
+    if isinstance(value, str | Mapping | Scene):
+        return (value,)
+    if not isinstance(value, Sequence):
         raise ValueError(
             f"scenes must be a list of scenes, a name or a dict of overrides, got {value!r:.80}"
         )
-    return SceneFamily((value,) if alone else tuple(value))
+    if not value:
+        raise ValueError("scenes must hold at least one scene, got none")
+    return tuple(value)
 
 
 def padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -13,6 +13,8 @@ from rbl_gym.checks import check_array, check_count, check_number
 
 # More copies than any scene has boxes or anchors.
 _MOST_COPIES = 10_000
+# Every combination of choices and ends of integers is tried when a family is made, up to so many.
+_MOST_CORNERS = 10_000
 
 
 class _Law(NamedTuple):
@@ -70,6 +72,17 @@ def count_of_ends(value: Any) -> int:
     if law is not None:
         return law.count(next(iter(value.values())))
     return math.prod(count_of_ends(item) for _, item in _items(value))
+
+
+def corners(value: Any, path: str) -> list[Any]:
+    """All `ends` of a value that is checked first; `path` is how errors call it."""
+    check(value, path)
+    count = count_of_ends(value)
+    if count > _MOST_CORNERS:
+        raise ValueError(
+            f"{path} must have at most {_MOST_CORNERS} combinations of choices, got {count}"
+        )
+    return list(ends(value))
 
 
 def _items(value: Any) -> list[tuple[Any, Any]]:
