@@ -19,6 +19,7 @@ from rbl_gym.app import (
     place_command,
     plan_command,
     replay_command,
+    studio_command,
 )
 from rbl_gym.studies.extras import MissingExtraError
 
@@ -50,6 +51,7 @@ def _parser() -> argparse.ArgumentParser:
     paper_commands.add_demo(commands)
     place_command.add_place(commands)
     plan_command.add_plan(commands)
+    studio_command.add_studio(commands)
     learning_commands.add_train(commands)
     learning_commands.add_evaluate(commands)
     learning_commands.add_transfer(commands)

@@ -9,6 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.polygons import ears
 from rbl_gym.rendering.drawing import RADIUS_95, gapped
 
 # Latitudes and longitudes of an ellipsoid's net.
@@ -69,32 +70,6 @@ def prisms(found: Sequence[tuple[FloatArray, float, float]], **style: Any) -> go
         showlegend=True,
         **style,
     )
-
-
-def ears(corners: FloatArray) -> np.ndarray:
-    """Triangles (V - 2, 3) of a simple polygon (V, 2), indices of its corners: by cutting ears."""
-
-    def turn(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-        u, v = b - a, c - a
-        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
-
-    x, y = corners.T
-    area = x @ np.roll(y, -1) - y @ np.roll(x, -1)
-    left = list(range(len(corners)))[:: 1 if area >= 0 else -1]
-    found = []
-    while len(left) > 3:
-        for k in range(len(left)):
-            a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
-            others = corners[[n for n in left if n not in (a, b, c)]]
-            pairs = ((a, b), (b, c), (c, a))
-            sides = [turn(corners[p], corners[q], others) for p, q in pairs]
-            if turn(*corners[[a, b, c]]) > 0 and not (np.min(sides, axis=0) >= 0).any():
-                break
-        else:  # what is left has no area
-            break
-        found.append([a, b, c])
-        left.remove(b)
-    return np.array([*found, left[:3]])
 
 
 def ellipsoid(centre: FloatArray, covariance: FloatArray) -> dict[str, list[float | None]]:

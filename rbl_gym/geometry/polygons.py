@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array
 
-__all__ = ["area", "check_line", "check_polygon", "contains"]
+__all__ = ["area", "check_line", "check_polygon", "contains", "ears"]
 
 # Corners nearer to each other than this are one, and lines that come so close touch, metres.
 TOUCH_M = 1e-9
@@ -132,3 +132,29 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def _show(point: FloatArray) -> str:
     return f"({point[0]:g}, {point[1]:g})"
+
+
+def ears(corners: FloatArray) -> np.ndarray:
+    """Triangles (V - 2, 3) of a simple polygon (V, 2), indices of its corners: by cutting ears."""
+
+    def turn(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+        u, v = b - a, c - a
+        return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+    x, y = corners.T
+    area = x @ np.roll(y, -1) - y @ np.roll(x, -1)
+    left = list(range(len(corners)))[:: 1 if area >= 0 else -1]
+    found = []
+    while len(left) > 3:
+        for k in range(len(left)):
+            a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
+            others = corners[[n for n in left if n not in (a, b, c)]]
+            pairs = ((a, b), (b, c), (c, a))
+            sides = [turn(corners[p], corners[q], others) for p, q in pairs]
+            if turn(*corners[[a, b, c]]) > 0 and not (np.min(sides, axis=0) >= 0).any():
+                break
+        else:  # what is left has no area
+            break
+        found.append([a, b, c])
+        left.remove(b)
+    return np.array([*found, left[:3]])

@@ -1,0 +1,95 @@
+"""The figures beside the map: the score, the zones, other layouts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement.building import Problem, Zone
+from rbl_gym.studies.monte_carlo import rms
+from rbl_gym.studies.placing import design
+from rbl_gym.studies.placing.accuracy import accuracy
+from rbl_gym.studies.placing.judging import Judged
+from rbl_gym.studies.placing.requirements import share_within
+from rbl_gym.studio.state import State
+from rbl_gym.studio.world import World
+
+# Links at the places of all zones while an anchor is dragged, about.
+_FEW = 1200
+
+
+class ZoneFigures(NamedTuple):
+    """What a layout promises in a zone: root mean squares, and the share that meets what it asks.
+
+    Attributes
+    ----------
+    name, verdict
+        Of the zone; ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``.
+    share, required
+        Of the places; NaN where nothing is asked.
+    position_m, height_m, heading_deg
+        Horizontal position, height, heading: one sigma.
+    """
+
+    name: str
+    verdict: str
+    share: float
+    required: float
+    position_m: float
+    height_m: float
+    heading_deg: float
+
+
+class Figures(NamedTuple):
+    """b of a layout in metres, and each zone."""
+
+    score_m: float
+    zones: tuple[ZoneFigures, ...]
+
+
+def figures(state: State, few: bool = False) -> Figures:
+    """The figures of a state; of `few` places while an anchor is dragged.
+
+    Parameters
+    ----------
+    state
+        The problem and the layout.
+    few
+        Fewer places of each zone; the score is the same.
+    """
+    world, anchors = state.world, state.anchors
+    zones = world.problem.zones
+    most = max(24, _FEW // (len(anchors) * len(zones))) if few else None
+    return Figures(
+        state.score,
+        tuple(
+            _zone_figures(world.problem, zone, anchors, places[:most])
+            for zone, places in zip(zones, world.places, strict=True)
+        ),
+    )
+
+
+def _zone_figures(
+    problem: Problem, zone: Zone, anchors: FloatArray, places: FloatArray
+) -> ZoneFigures:
+    errors = accuracy(problem, anchors, places, zone)
+    judged = Judged(zone, places, errors)
+    share = float(share_within(judged.relative)) if judged.asks else np.nan
+    return ZoneFigures(
+        zone.name,
+        judged.verdict,
+        share,
+        zone.share if judged.asks else np.nan,
+        float(rms(errors.horizontal)),
+        float(rms(errors.height)),
+        float(np.rad2deg(rms(errors.heading))),
+    )
+
+
+def usual_scores(world: World, n_anchors: int) -> dict[str, float]:
+    """b of the usual layouts of so many anchors by their names, the best first, metres."""
+    found = design.usual_layouts(world.problem.with_anchors(n_anchors), 0)
+    scores = {name: world.score(anchors) for name, anchors in found.items()}
+    return dict(sorted(scores.items(), key=lambda item: item[1]))

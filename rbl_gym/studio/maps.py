@@ -1,0 +1,201 @@
+"""The map of a slice: what the Cramer-Rao bound promises there, and its picture."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement.building import Problem
+from rbl_gym.studies.placing.accuracy import accuracy
+from rbl_gym.studies.placing.judging import limits_of
+from rbl_gym.studies.placing.requirements import Errors, relative_errors
+from rbl_gym.studio.state import Slice, State
+
+# Cells of a map while an anchor is dragged, and when it is let go; links of so many anchors.
+COARSE, REFINED, _ANCHORS = 800, 3200, 8
+# Cells of a map, at least.
+_LEAST_CELLS = 200
+# A map that hardly varies must not look as if it did: its colours span at least this ratio.
+_LEAST_CONTRAST = 1.3
+# Pixels of a picture along its longer side.
+_PIXELS = 640
+# Within and beyond a requirement (Okabe and Ito): told apart by everyone.
+WITHIN, BEYOND = (86, 180, 233), (213, 94, 0)
+# Green for small errors over yellow to red for large ones, light enough for black lines.
+_COLOURS = np.array(
+    [
+        (38, 130, 142), (66, 173, 141), (140, 205, 130), (222, 227, 140),
+        (253, 212, 110), (250, 160, 85), (226, 95, 75),
+    ],
+    float,
+)  # fmt: skip
+
+
+class Quantity(NamedTuple):
+    """What a map can show: a field of `Errors`, its name, its unit, and metres or radians to it."""
+
+    field: str
+    name: str
+    unit: str
+    scale: float = 1.0
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "position": Quantity("position", "Position error", "m"),
+    "horizontal": Quantity("horizontal", "Horizontal position error", "m"),
+    "height": Quantity("height", "Height error", "m"),
+    "heading": Quantity("heading", "Heading error", "deg", 180 / math.pi),
+    "rotation": Quantity("rotation", "Orientation error", "deg", 180 / math.pi),
+    "requirement": Quantity("", "Error over its limit", ""),
+}
+
+
+class SliceMap(NamedTuple):
+    """Values on a plane.
+
+    Attributes
+    ----------
+    values
+        (rows, columns), NaN off the zones and inside of obstacles. In the unit of the quantity;
+        of ``"requirement"`` the error over its limit, the largest: within where at most 1.
+    low, high
+        Corners (3,) of the plane, metres.
+    up
+        The axis of the rows; that of the columns is x.
+    quantity
+        What is shown.
+    """
+
+    values: FloatArray
+    low: FloatArray
+    high: FloatArray
+    up: int
+    quantity: Quantity
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Between which values the colours run: most of the cells lie there."""
+        if not np.isfinite(self.values).any():
+            return 0.0, 1.0
+        if self.quantity is QUANTITIES["requirement"]:
+            return 0.0, 2.0
+        low, high = np.nanquantile(self.values, (0.02, 0.98)).tolist()
+        middle = math.sqrt(low * high)
+        return min(low, middle / _LEAST_CONTRAST**0.5), max(high, middle * _LEAST_CONTRAST**0.5)
+
+
+def plane(problem: Problem, at: Slice) -> tuple[FloatArray, FloatArray]:
+    """Corners (3,) of the slice: all zones, cut at its share of the third axis."""
+    low, high = (corner.copy() for corner in problem.corners())
+    third = 3 - at.up
+    low[third] = high[third] = low[third] + at.share * (high - low)[third]
+    return low, high
+
+
+def shape_of(extent: FloatArray, cells: int) -> tuple[int, int]:
+    """Rows and columns of about so many cells over an extent (2,): columns, rows."""
+    width, height = np.maximum(extent, 1e-9)
+    columns = math.sqrt(cells * width / height)
+    # A long slice still has some rows.
+    columns = min(max(columns, 4.0), cells / 4)
+    return max(1, round(cells / columns)), max(1, round(columns))
+
+
+def slice_map(state: State, cells: int = COARSE) -> SliceMap:
+    """The map of the slice of a state.
+
+    Parameters
+    ----------
+    state
+        Gives the problem, the layout and the slice.
+    cells
+        About how many there are, with few anchors; with many there are fewer.
+    """
+    problem, at = state.world.problem, state.slice
+    low, high = plane(problem, at)
+    cells = max(_LEAST_CELLS, round(cells * min(1.0, _ANCHORS / len(state.anchors))))
+    rows, columns = shape_of((high - low)[[0, at.up]], cells)
+    places = np.empty((rows, columns, 3))
+    places[...] = low
+    for axis, count, along in ((0, columns, 1), (at.up, rows, 0)):
+        steps = (np.arange(count) + 0.5) / count * (high - low)[axis]
+        places[..., axis] += np.expand_dims(steps, axis=1 - along)
+    free = ~problem.obstacles.contain(places)
+    values = np.full((rows, columns), np.nan)
+    for zone in problem.zones:
+        here = free & zone.contains(places) & np.isnan(values)
+        if at.quantity == "requirement" and not zone.has_requirement:
+            continue
+        if here.any():
+            errors = accuracy(problem, state.anchors, places[here], zone)
+            values[here] = _shown(errors, at.quantity, zone)
+    return SliceMap(values, low, high, at.up, QUANTITIES[at.quantity])
+
+
+def _shown(errors: Errors, quantity: str, zone: object) -> FloatArray:
+    if quantity == "requirement":
+        return relative_errors(errors, limits_of(zone))  # pyright: ignore[reportArgumentType]
+    shown = QUANTITIES[quantity]
+    return shown.scale * getattr(errors, shown.field)
+
+
+def picture(found: SliceMap, limits: tuple[float, float] | None = None) -> np.ndarray:
+    """The map as pixels (height, width, 4), the upper row first; clear where there is no value.
+
+    Parameters
+    ----------
+    found
+        The map.
+    limits
+        Values between which the colours run; None: its own.
+    """
+    values = found.values[::-1]
+    free = np.isfinite(values)
+    # Colours do not run into the gaps.
+    if free.any() and not free.all():
+        nearest: Any = ndimage.distance_transform_edt(
+            ~free, return_distances=False, return_indices=True
+        )
+        values = values[tuple(nearest)]
+    zoom = max(1, round(_PIXELS / max(values.shape)))
+    fine = _enlarged(np.nan_to_num(values), zoom)
+    shown = np.empty((*fine.shape, 4), np.uint8)
+    if found.quantity is QUANTITIES["requirement"]:
+        shown[..., :3] = np.where((fine <= 1)[..., None], WITHIN, BEYOND)
+    else:
+        shown[..., :3] = colours(fine, limits or found.limits)
+    shown[..., 3] = np.where(np.repeat(np.repeat(free, zoom, 0), zoom, 1), 235, 0)
+    return shown
+
+
+def colours(values: FloatArray, limits: tuple[float, float]) -> np.ndarray:
+    """Colours (..., 3) of values between limits, by their logarithms."""
+    low, high = limits
+    span = math.log(high / low) if high > low > 0 else 1.0
+    share = np.log(np.maximum(values, 1e-300) / max(low, 1e-300)) / span
+    place = share.clip(0.0, 1.0) * (len(_COLOURS) - 1)
+    below = np.minimum(place.astype(int), len(_COLOURS) - 2)
+    part = (place - below)[..., None]
+    return np.round((1 - part) * _COLOURS[below] + part * _COLOURS[below + 1]).astype(np.uint8)
+
+
+def _enlarged(values: FloatArray, zoom: int) -> FloatArray:
+    """Every cell as zoom x zoom pixels, linear between the middles of cells."""
+    for axis in (0, 1):
+        count = values.shape[axis]
+        at = ((np.arange(count * zoom) + 0.5) / zoom - 0.5).clip(0, count - 1)
+        below = np.minimum(at.astype(int), max(count - 2, 0))
+        above = np.minimum(below + 1, count - 1)
+        part = np.expand_dims(at - below, axis=1 - axis)
+        values = (1 - part) * values.take(below, axis) + part * values.take(above, axis)
+    return values
+
+
+def css_gradient() -> str:
+    """The colours from small to large, as a background of a page."""
+    stops = ", ".join(f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in _COLOURS)
+    return f"linear-gradient(to right, {stops})"

@@ -1,0 +1,306 @@
+"""The panel beside the scene: figures, buttons, sliders. No figure is computed here."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.studio.figures import Figures, ZoneFigures
+from rbl_gym.studio.maps import BEYOND, QUANTITIES, WITHIN, SliceMap, css_gradient
+from rbl_gym.studio.scene_view import SIGNS, VERDICTS
+from rbl_gym.studio.state import State
+
+PLANES = {"Floor plan (x, y)": 1, "Section (x, z)": 2}
+_NOBODY = "none"
+_CSS = (
+    "font-family:inherit;font-size:12.5px;line-height:1.4;color:#212529;"
+    "font-variant-numeric:tabular-nums;padding:0 2px"
+)
+
+
+class Shown(NamedTuple):
+    """What the panel shows.
+
+    Attributes
+    ----------
+    state, figures, map
+        The layout, its figures, and the map.
+    others
+        b of other layouts by their names, metres; None: not known yet.
+    selected
+        Index of an anchor, or None.
+    progress
+        From 0 to 1 of a long work, or None.
+    status
+        One line.
+    """
+
+    state: State
+    figures: Figures
+    map: SliceMap
+    others: Mapping[str, float | None]
+    selected: int | None
+    progress: float | None
+    status: str
+
+
+class Panel:
+    """Handles of the panel.
+
+    Parameters
+    ----------
+    gui
+        The GUI of a viser server, in the place where the panel goes.
+    state
+        What is shown first.
+    name
+        First name for files.
+    actions
+        What is called, by name: ``undo``, ``redo``, ``add``, ``add_best``, ``remove``, ``fix``,
+        ``optimise``, ``stop``, ``design`` without arguments; ``select`` with an index or None;
+        ``slice`` and ``knobs`` with keywords; ``save`` and ``report`` with a name.
+    has_report
+        Whether there is a button for the report.
+    """
+
+    def __init__(
+        self,
+        gui: Any,
+        state: State,
+        name: str,
+        actions: Mapping[str, Callable[..., None]],
+        has_report: bool = False,
+    ) -> None:
+        self._gui, self._actions = gui, actions
+        self._filling = False
+        self._headline = gui.add_html("")
+        self._optimise = self._button("Optimise", "optimise", icon="trending-down", color="teal")
+        self._optimise.hint = "Move all free anchors downhill from here, step by step"
+        self._stop = self._button("Stop", "stop", icon="player-stop", color="gray")
+        self._progress = gui.add_progress_bar(0.0, visible=False)
+        self._history = self._group({"Undo": "undo", "Redo": "redo", "Redesign": "design"})
+        with gui.add_folder("Anchors"):
+            self._add = self._group({"Add best": "add_best", "Add": "add"})
+            self._selected = gui.add_dropdown("Selected", (_NOBODY,))
+            self._one = self._group({"Fix / release": "fix", "Remove": "remove"})
+        with gui.add_folder("Map"):
+            self._quantities = {
+                q.name: key
+                for key, q in QUANTITIES.items()
+                if key != "requirement" or any(z.has_requirement for z in state.world.base.zones)
+            }
+            shown = QUANTITIES[state.slice.quantity].name
+            self._quantity = gui.add_dropdown("Show", tuple(self._quantities), initial_value=shown)
+            self._plane = gui.add_dropdown("Slice", tuple(PLANES))
+            self._share = gui.add_slider("At", 0.0, 1.0, 0.01, state.slice.share)
+            self._legend = gui.add_html("")
+        with gui.add_folder("What if", expand_by_default=False):
+            knobs = state.world.knobs
+            largest = max(4 * knobs.noise_m, 0.5)
+            self._noise = gui.add_slider(
+                "Noise (m)", *_range(knobs.noise_m, largest), knobs.noise_m
+            )
+            self._tags = gui.add_slider("Tags", 3, max(12, knobs.n_tags), 1, knobs.n_tags)
+            self._size = gui.add_slider(
+                "Body (m)", *_range(knobs.size_m, max(3 * knobs.size_m, 1.0)), knobs.size_m
+            )
+            self._loss = gui.add_slider("Walls (dB)", 0.0, 60.0, 0.5, round(knobs.loss_db, 2))
+            self._loss.visible = bool(state.world.base.obstacles)
+            self._reset = self._button("As in the file", "reset_knobs")
+        with gui.add_folder("Save", expand_by_default=False):
+            self._name = gui.add_text("Name", name)
+            save = gui.add_button("Scene and list", icon="device-floppy")
+            save.hint = "NAME.toml for rbl-gym place and studio, NAME.csv to mount by"
+            save.on_click(lambda _: self._call("save", self._name.value))
+            if has_report:
+                report = gui.add_button("Report (PDF)", icon="file-text")
+                report.on_click(lambda _: self._call("report", self._name.value))
+            self._restore = self._button("Restore the last session", "restore")
+            self._restore.visible = False
+        self._status = gui.add_html("")
+        self._listen()
+
+    def _button(self, label: str, action: str, **style: Any) -> Any:
+        button = self._gui.add_button(label, **style)
+        button.on_click(lambda _: self._call(action))
+        return button
+
+    def _group(self, labels: Mapping[str, str]) -> Any:
+        group = self._gui.add_button_group("", tuple(labels))
+        group.on_click(lambda _: self._call(labels[group.value]))
+        return group
+
+    def _listen(self) -> None:
+        self._selected.on_update(lambda _: self._call("select", self._selection()))
+        self._quantity.on_update(
+            lambda _: self._call("slice", quantity=self._quantities[self._quantity.value])
+        )
+        self._plane.on_update(lambda _: self._call("slice", up=PLANES[self._plane.value]))
+        self._share.on_update(lambda _: self._call("slice", share=float(self._share.value)))
+        for name, handle in self._knobs().items():
+            handle.on_update(lambda _, n=name, h=handle: self._call("knobs", **{n: h.value}))
+
+    def _knobs(self) -> dict[str, Any]:
+        return {
+            "noise_m": self._noise,
+            "n_tags": self._tags,
+            "size_m": self._size,
+            "loss_db": self._loss,
+        }
+
+    def _selection(self) -> int | None:
+        text = str(self._selected.value)
+        return None if text == _NOBODY else int(text.split()[0]) - 1
+
+    def _call(self, action: str, *values: Any, **named: Any) -> None:
+        # What the server itself fills in is no wish of a user.
+        if not self._filling:
+            self._actions[action](*values, **named)
+
+    # --- what it shows ---------------------------------------------------------------------
+
+    def offer_restore(self, visible: bool) -> None:
+        """Show or hide the button that goes back to the last session."""
+        self._restore.visible = visible
+
+    def show(self, shown: Shown) -> None:
+        """Show all of it."""
+        state, selected = shown.state, shown.selected
+        self._filling = True
+        try:
+            self._headline.content = headline(shown)
+            self._legend.content = legend(shown.map, state)
+            self._status.content = f'<div style="{_CSS};color:#495057">{_text(shown.status)}</div>'
+            running = shown.progress is not None
+            self._optimise.visible, self._stop.visible = not running, running
+            self._progress.visible = running
+            self._progress.value = 100.0 * (shown.progress or 0.0)
+            names = [_NOBODY, *(_anchor_name(state, k) for k in range(len(state.anchors)))]
+            if tuple(self._selected.options) != tuple(names):
+                self._selected.options = tuple(names)
+            chosen = names[0 if selected is None else selected + 1]
+            _set(self._selected, chosen)
+            _set(self._share, round(state.slice.share, 4))
+            _set(self._quantity, QUANTITIES[state.slice.quantity].name)
+            _set(self._plane, next(k for k, up in PLANES.items() if up == state.slice.up))
+            for name, handle in self._knobs().items():
+                _set(handle, getattr(state.world.knobs, name))
+        finally:
+            self._filling = False
+
+
+def _set(handle: Any, value: Any) -> None:
+    if handle.value != value:
+        handle.value = value
+
+
+def _range(value: float, most: float) -> tuple[float, float, float]:
+    """Least, most and step of a slider that has `value` on it."""
+    step = 10.0 ** np.floor(np.log10(max(value, 1e-9))) / 20
+    return float(step), float(np.ceil(most / step) * step), float(step)
+
+
+def _anchor_name(state: State, index: int) -> str:
+    return f"{index + 1}  fixed" if state.fixed[index] else f"{index + 1}"
+
+
+def _text(text: str) -> str:
+    return html.escape(text)
+
+
+# --- parts of the page -----------------------------------------------------------------------
+
+
+def headline(shown: Shown) -> str:
+    """The score, the zones, and the scores of other layouts as bars."""
+    figures, count = shown.figures, len(shown.state.anchors)
+    parts = [
+        f'<div style="{_CSS}">',
+        '<div style="display:flex;align-items:baseline;gap:8px">'
+        f'<b style="font-size:24px;line-height:1.2">{length(figures.score_m)}</b>'
+        f'<span style="color:#495057">tag error b, {count} anchors</span></div>',
+        *(_zone(zone) for zone in figures.zones),
+        _bars(figures.score_m, shown.others),
+        "</div>",
+    ]
+    return "".join(parts)
+
+
+def _zone(zone: ZoneFigures) -> str:
+    colour = f"rgb{VERDICTS[zone.verdict]}"
+    share = ""
+    if np.isfinite(zone.share):
+        share = (
+            f'<b style="color:{colour};white-space:nowrap">{SIGNS[zone.verdict]} '
+            f"{100 * zone.share:.1f} % of {100 * zone.required:g} %</b>"
+        )
+    figures = (
+        f"{length(zone.position_m)} flat, {length(zone.height_m)} high, {zone.heading_deg:.2g}°"
+    )
+    return (
+        f'<div style="border-left:4px solid {colour};padding-left:6px;margin:5px 0">'
+        '<div style="display:flex;justify-content:space-between;gap:6px">'
+        f'<span style="overflow-wrap:anywhere">{_text(zone.name)}</span>{share}</div>'
+        f'<div style="color:#495057">{figures}</div></div>'
+    )
+
+
+def _bars(own: float, others: Mapping[str, float | None]) -> str:
+    """This layout among the others, the best first, each as a bar of its score."""
+    known = {name: score for name, score in others.items() if score is not None}
+    rows = sorted([("this layout", own), *known.items()], key=lambda row: row[1])
+    largest = max(score for _, score in rows)
+    lines = []
+    for name, score in rows:
+        mine = name == "this layout"
+        colour, weight = ("#e67700", "600") if mine else ("#adb5bd", "400")
+        lines.append(
+            f'<span style="font-weight:{weight};white-space:nowrap">{_text(name)}</span>'
+            '<span style="background:#f1f3f5;border-radius:2px;height:9px;align-self:center">'
+            f'<span style="display:block;height:9px;border-radius:2px;background:{colour};'
+            f'width:{100 * score / largest:.1f}%"></span></span>'
+            f'<span style="font-weight:{weight};text-align:right">{length(score)}</span>'
+        )
+    for name in others:
+        if name not in known:
+            lines.append(
+                f'<span style="color:#868e96">{_text(name)}</span>'
+                '<span style="color:#868e96">being searched ...</span><span></span>'
+            )
+    return (
+        '<div style="display:grid;grid-template-columns:auto 1fr auto;gap:1px 8px;margin-top:6px">'
+        f"{''.join(lines)}</div>"
+    )
+
+
+def legend(found: SliceMap, state: State) -> str:
+    """The colours of the map, and where it lies."""
+    third = "xyz"[3 - found.up]
+    at = f"{third} = {found.low[3 - found.up]:.2f} m"
+    if found.quantity is QUANTITIES["requirement"]:
+        squares = "".join(
+            f'<span style="display:inline-block;width:10px;height:10px;background:rgb{colour};'
+            f'margin:0 4px 0 8px"></span>{word}'
+            for colour, word in ((WITHIN, "within"), (BEYOND, "beyond"))
+        )
+        return f'<div style="{_CSS}">{at}{squares}</div>'
+    low, high = found.limits
+    unit = found.quantity.unit
+    return (
+        f'<div style="{_CSS}"><div style="height:10px;border-radius:2px;'
+        f'background:{css_gradient()}"></div>'
+        '<div style="display:flex;justify-content:space-between">'
+        f"<span>{low:.3g} {unit}</span><span>{at}</span><span>{high:.3g} {unit}</span></div></div>"
+    )
+
+
+def length(metres: float) -> str:
+    """Three digits, in the unit in which they are read."""
+    if metres < 0.01:
+        return f"{1000 * metres:.3g} mm"
+    if metres < 1:
+        return f"{100 * metres:.3g} cm"
+    return f"{metres:.3g} m"

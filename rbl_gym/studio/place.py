@@ -1,0 +1,398 @@
+"""The page on which anchors are placed: one state on the server, the same for every browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.placement import scene_files
+from rbl_gym.placement.building import Problem
+from rbl_gym.studies.placing import design
+from rbl_gym.studio import files, maps, state
+from rbl_gym.studio.display import Display
+from rbl_gym.studio.figures import figures, usual_scores
+from rbl_gym.studio.panel import Shown
+from rbl_gym.studio.rays import under_pointer
+from rbl_gym.studio.state import Layout, State
+from rbl_gym.studio.worker import Worker
+from rbl_gym.studio.world import knobs_of
+
+Report = Callable[[Problem, FloatArray, str], None]
+
+
+class PlacePage:
+    """Ties a state to a viser server.
+
+    Parameters
+    ----------
+    server
+        On which it is shown.
+    start
+        What is shown first.
+    tables
+        Of the file from which the problem was read.
+    folder
+        In which files are written, and only there.
+    report
+        Writes a report of a problem and a layout to a path; None: there is no button for it.
+    seed
+        Of all searches.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        start: State,
+        tables: Mapping[str, Any],
+        folder: Path,
+        report: Report | None = None,
+        seed: int = 0,
+    ) -> None:
+        self._tables, self._folder = tables, folder
+        self._report, self._seed = report, seed
+        self.state = start
+        self.figures = figures(start)
+        self.map = maps.slice_map(start)
+        self.seconds: list[float] = []
+        self._before_drag: State | None = None
+        self._selected: int | None = None
+        self._status = "Drag an anchor. Click one to select it."
+        self._progress: float | None = None
+        self._usual: dict[tuple[int, int], dict[str, float]] = {}
+        self._designed: dict[int, FloatArray] = {}
+        self._autosave_found = files.last_session(start, folder)
+        self._worker = Worker(self._failed)
+        actions = {
+            "undo": lambda: self.edit(state.undo),
+            "redo": lambda: self.edit(state.redo),
+            "add": lambda: self._edit_and_select(state.add),
+            "add_best": lambda: self._edit_and_select(state.add_best),
+            "remove": lambda: self._of_selected(state.remove),
+            "fix": lambda: self._of_selected(lambda now, k: state.fix(now, k, not now.fixed[k])),
+            "optimise": self.optimise,
+            "stop": self.stop_work,
+            "design": self.redesign,
+            "select": self.select,
+            "drag": self.drag,
+            "slice": self.slice,
+            "knobs": self.turn_knobs,
+            "reset_knobs": lambda: self.turn_knobs(**knobs_of(start.world.base)._asdict()),
+            "save": self.save,
+            "report": self.write_report,
+            "restore": self._restore,
+        }
+        self._display = Display(server, start, actions, report is not None)
+        self._display.panel.offer_restore(self._autosave_found is not None)
+        self._worker.post(self._show)
+        self._worker.post(self._refine)
+        threading.Thread(target=self._search, args=(start,), daemon=True).start()
+
+    # --- what the page asks for -------------------------------------------------------------
+
+    def edit(self, change: Callable[[State], State]) -> None:
+        """Replace the state by what `change` makes of it, and show that; later, in order."""
+        self._worker.post(lambda: self._edit(change))
+
+    def drag(self, index: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
+        """An anchor is held under a pointer: the mount on its line of sight takes it.
+
+        Parameters
+        ----------
+        index
+            Of the anchor.
+        phase
+            ``"start"``, ``"update"``, ``"end"``.
+        camera, point
+            Two points (3,) of the line, metres.
+        """
+        asked = time.perf_counter()
+        key = None if phase != "update" else ("drag", index)
+        self._worker.post(lambda: self._drag(index, phase, camera, point, asked), key)
+
+    def select(self, index: int | None) -> None:
+        """Select an anchor; None: none."""
+
+        def task() -> None:
+            self._selected = index
+            self._show()
+
+        self._worker.post(task)
+
+    def slice(self, **fields: Any) -> None:
+        """Show another map: fields of `Slice`."""
+
+        def task() -> None:
+            at = self.state.slice._replace(**fields)
+            self.state = dataclasses.replace(self.state, slice=at)
+            self._show_coarse()
+            self._refine()
+
+        self._worker.post(task, "slice")
+
+    def turn_knobs(self, **knobs: float) -> None:
+        """Turn `Knobs`, given by their names."""
+
+        def task() -> None:
+            self.state = state.turn_knobs(self.state, **knobs)
+            self._show_coarse()
+            self._refine()
+
+        self._worker.post(task, ("knobs", *knobs))
+
+    def optimise(self) -> None:
+        """Improve the layout from where it is, a step at a time; any change ends it."""
+
+        def task() -> None:
+            self._status = "Optimising ..."
+            self._worker.when_idle(self._improve(self.state))
+
+        self._worker.post(task)
+
+    def stop_work(self) -> None:
+        """End what runs; what was found stays."""
+
+        def task() -> None:
+            self._progress, self._status = None, "Stopped."
+            self._show()
+            self._refine()
+
+        self._worker.post(task)
+
+    def redesign(self) -> None:
+        """Put the designed layout of as many anchors in place; it is searched if need be."""
+
+        def task() -> None:
+            found = self._designed.get(len(self.state.anchors))
+            if found is None or self.state.fixed.any():
+                self._status = "Searching the best layout from scratch ..."
+                self._show()
+                threading.Thread(target=self._search, args=(self.state, True), daemon=True).start()
+                return
+            self._edit(lambda now: state.set_layout(now, Layout(found, now.fixed)))
+
+        self._worker.post(task)
+
+    def save(self, name: str) -> None:
+        """Write the scene file and the mounting list into the folder."""
+
+        def task() -> None:
+            paths = files.save(self.state, self._tables, self._folder, name)
+            self._say("Saved", ", ".join(path.name for path in paths), "teal")
+
+        self._worker.post(task)
+
+    def write_report(self, name: str) -> None:
+        """Write the report into the folder; it takes a while, beside everything else."""
+        now = self.state
+        threading.Thread(target=self._write_report, args=(now, name), daemon=True).start()
+        self._note("Writing the report ...")
+
+    def settle(self, timeout: float = 60.0) -> bool:
+        """Wait until all that was asked for is shown; whether that was so in time."""
+        return self._worker.settle(timeout)
+
+    def stop(self) -> None:
+        """Keep the layout, and end the worker."""
+        self._worker.post(self._autosave)
+        self._worker.stop()
+
+    # --- tasks of the worker ----------------------------------------------------------------
+
+    def _edit(self, change: Callable[[State], State]) -> None:
+        before = self.state
+        self.state = change(before)
+        self._progress = None
+        if self._selected is not None and self._selected >= len(self.state.anchors):
+            self._selected = None
+        self._status = "Nothing to change." if self.state is before else ""
+        self._show_coarse()
+        self._refine()
+
+    def _edit_and_select(self, change: Callable[[State], State]) -> None:
+        def task() -> None:
+            count = len(self.state.anchors)
+            self._edit(change)
+            if len(self.state.anchors) > count:
+                self._selected = len(self.state.anchors) - 1
+                self._status = f"Anchor {self._selected + 1} added."
+                self._show()
+
+        self._worker.post(task)
+
+    def _of_selected(self, change: Callable[[State, int], State]) -> None:
+        def task() -> None:
+            index = self._selected
+            if index is None:
+                raise ValueError("no anchor is selected: click one first")
+            self._edit(lambda now: change(now, index))
+
+        self._worker.post(task)
+
+    def _drag(
+        self, index: int, phase: str, camera: FloatArray, point: FloatArray, asked: float
+    ) -> None:
+        if phase == "start":
+            self._before_drag, self._selected, self._progress = self.state, index, None
+            self._worker.when_idle(None)
+        start = self._before_drag
+        if start is None or index >= len(start.anchors):
+            return
+        if start.fixed[index]:
+            if phase == "end":
+                self._before_drag = None
+                self._say("Fixed", f"Anchor {index + 1} is fixed: release it first.", "orange")
+            return
+        place = under_pointer(self.state.world, camera, point, self.state.anchors[index])
+        moved = state.move(start, index, place)
+        # Over an obstacle it stays where it was last.
+        if moved is not start:
+            self.state = dataclasses.replace(moved, slice=self.state.slice)
+        if phase == "end":
+            self._before_drag, self._status = None, ""
+            self._refine()
+        self._show_coarse()
+        self.seconds.append(time.perf_counter() - asked)
+
+    def _improve(self, start: State) -> Iterator[None]:
+        before = start.score
+        self._progress = 0.0
+        self._show()
+        for done, better in state.optimise(start, self._seed):
+            self.state, self._progress = better, done
+            self._show_coarse()
+            yield
+        self._progress = None
+        gain = 100 * (1 - self.state.score / before)
+        self._status = (
+            f"Optimised: b is {gain:.1f} % smaller."
+            if gain > 0.05
+            else ("Optimised: no step from here helps.")
+        )
+        self._show()
+        yield from self._refined()
+
+    # --- showing ----------------------------------------------------------------------------
+
+    def _show_coarse(self) -> None:
+        self.map = maps.slice_map(self.state, maps.COARSE)
+        self.figures = figures(self.state, few=True)
+        self._show()
+
+    def _refine(self) -> None:
+        self._worker.when_idle(self._refined())
+
+    def _refined(self) -> Iterator[None]:
+        now = self.state
+        self.figures = figures(now)
+        self._show()
+        yield
+        self.map = maps.slice_map(now, maps.REFINED)
+        self._show()
+        yield
+        count = len(now.anchors)
+        key = id(now.world), count
+        if key not in self._usual:
+            self._usual = {key: usual_scores(now.world, count)}
+        self._show()
+        yield
+        self._autosave()
+
+    def _show(self) -> None:
+        self._display.show(
+            Shown(
+                self.state,
+                self.figures,
+                self.map,
+                self._others(),
+                self._selected,
+                self._progress,
+                self._status,
+            )
+        )
+
+    def _others(self) -> dict[str, float | None]:
+        world, count = self.state.world, len(self.state.anchors)
+        usual = self._usual.get((id(world), count), {})
+        designed = self._designed.get(count)
+        found: dict[str, float | None] = {}
+        if designed is not None:
+            found["designed"] = world.score(designed)
+        elif not self._designed:
+            found["designed"] = None
+        return found | usual
+
+    # --- beside the worker ------------------------------------------------------------------
+
+    def _search(self, now: State, apply: bool = False) -> None:
+        try:
+            problem = (
+                now.problem
+                if apply
+                else scene_files.with_anchors(now.world.problem, len(now.anchors))
+            )
+            found = design.design_layout(problem, self._seed).anchors
+        except Exception as error:
+            self._worker.post(functools.partial(self._failed, error))
+            return
+
+        def task() -> None:
+            count = len(problem.fixed)
+            self._designed[len(found)] = found
+            if apply:
+                stays = np.arange(len(found)) < count
+                self._edit(lambda at: state.set_layout(at, Layout(found, stays)))
+            else:
+                self._show()
+
+        self._worker.post(task)
+
+    def _write_report(self, now: State, name: str) -> None:
+        assert self._report is not None
+        try:
+            path = files.report_path(self._folder, name)
+            files.replace(
+                path,
+                lambda p: self._report(now.problem, now.anchors, str(p)),  # type: ignore
+            )
+        except Exception as error:
+            self._worker.post(functools.partial(self._failed, error))
+            return
+        self._worker.post(lambda: self._say("Saved", path.name, "teal"))
+
+    def _restore(self) -> None:
+        anchors = self._autosave_found
+        if anchors is not None:
+            stays = np.zeros(len(anchors), bool)
+            self.edit(lambda now: state.set_layout(now, Layout(anchors, stays)))
+            self._display.panel.offer_restore(False)
+
+    def _autosave(self) -> None:
+        if self.state.past or self.state.future:
+            files.autosave(self.state, self._tables, self._folder)
+
+    def _note(self, text: str) -> None:
+        def task() -> None:
+            self._status = text
+            self._show()
+
+        self._worker.post(task)
+
+    def _say(self, title: str, text: str, colour: str) -> None:
+        self._status = f"{title}: {text}"
+        self._display.notify(title, text, colour)
+        self._show()
+
+    def _failed(self, error: Exception) -> None:
+        if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
+            traceback.print_exception(error)
+        self._progress = None
+        self._say("Not done", str(error) or type(error).__name__, "red")

@@ -1,0 +1,117 @@
+"""One thread that does what the page asks, in order; when it is idle it goes on with long work."""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from typing import Any
+
+# Threads that wait look this often whether they should end, seconds.
+_WAIT_S = 0.2
+
+
+class Worker:
+    """Runs tasks one after the other, and steps of a long work between them.
+
+    The callbacks of the page come from threads of their own. All of them hand what is to be done
+    to one worker, so that the state has one writer and needs no lock.
+
+    Parameters
+    ----------
+    failed
+        Called with the exception of a task that failed; the worker goes on.
+    """
+
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
+        self._tasks: dict[object, Callable[[], None]] = {}
+        self._idle: Iterator[Any] | None = None
+        self._busy = False
+        self._stopped = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="studio", daemon=True)
+        self._thread.start()
+
+    def post(self, task: Callable[[], None], key: object = None) -> None:
+        """Do a task after those before it.
+
+        Parameters
+        ----------
+        task
+            What is done.
+        key
+            A task of the same key that still waits is left out: the last one counts.
+        """
+        with self._changed:
+            self._tasks.pop(key, None)
+            self._tasks[object() if key is None else key] = task
+            self._changed.notify_all()
+
+    def when_idle(self, steps: Iterator[Any] | None) -> None:
+        """Go on with this in place of what was there, a step at a time, while no task waits."""
+        with self._changed:
+            self._idle = steps
+            self._changed.notify_all()
+
+    @property
+    def is_working(self) -> bool:
+        """Whether some long work is not done."""
+        return self._idle is not None
+
+    def settle(self, timeout: float = 60.0) -> bool:
+        """Wait until nothing is left to do; whether that was so in time."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: not self._tasks and self._idle is None and not self._busy, timeout
+            )
+
+    def stop(self) -> None:
+        """Do what waits, leave long work as it is, and end."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(10.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not (self._tasks or self._idle is not None or self._stopped):
+                    self._changed.wait(_WAIT_S)
+                if self._tasks:
+                    task, steps = self._tasks.pop(next(iter(self._tasks))), None
+                elif self._stopped:
+                    return
+                else:
+                    task, steps = None, self._idle
+                self._busy = True
+            try:
+                if task is not None:
+                    task()
+                elif steps is not None:
+                    self._step(steps)
+            except Exception as error:
+                if steps is not None:
+                    self._leave(steps)
+                self._tell(error)
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
+
+    def _step(self, steps: Iterator[Any]) -> None:
+        try:
+            next(steps)
+        except StopIteration:
+            self._leave(steps)
+
+    def _leave(self, steps: Iterator[Any]) -> None:
+        with self._changed:
+            if self._idle is steps:
+                self._idle = None
+
+    def _tell(self, error: Exception) -> None:
+        try:
+            self._failed(error)
+        except Exception:  # the page may be gone
+            traceback.print_exc()

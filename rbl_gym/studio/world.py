@@ -1,0 +1,154 @@
+"""What is placed, and with which radios: a problem, and the knobs that change it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.obstacles import Obstacles, Prisms
+from rbl_gym.placement.building import Problem
+from rbl_gym.placement.sample import Sample, sample
+from rbl_gym.placement.setting import Setting
+from rbl_gym.studies.placing.accuracy import draw_places
+
+# Poses over which layouts are compared, and places of each zone at which it is judged.
+N_POSES, N_PLACES = 1024, 600
+# A link that loses more than this counts as lost, decibels; fewer tags never tell a pose.
+MOST_LOSS_DB, LEAST_TAGS = 60.0, 3
+
+
+class Knobs(NamedTuple):
+    """What can be changed of a problem without moving anchors.
+
+    Attributes
+    ----------
+    noise_m
+        The constant part of a range's standard deviation, metres.
+    n_tags
+        How many tags the body has. Another number than the body's own stands evenly on a sphere.
+    size_m
+        Largest extent of the tags, metres.
+    loss_db
+        What an opaque obstacle takes from a link's information; those with a share of their own
+        change in proportion, in decibels.
+    """
+
+    noise_m: float
+    n_tags: int
+    size_m: float
+    loss_db: float
+
+
+def knobs_of(problem: Problem) -> Knobs:
+    """The knobs at which the problem is as it is."""
+    return Knobs(
+        float(getattr(problem.noise, noise_field(problem))),
+        len(problem.tags),
+        float(np.ptp(problem.tags, axis=0).max()),
+        loss_db(problem.obstacles.blocked_information),
+    )
+
+
+def noise_field(problem: Problem) -> str:
+    """The name of the constant part of the problem's noise law: its first length."""
+    fields: Any = dataclasses.fields(problem.noise)  # pyright: ignore[reportArgumentType]
+    return next(field.name for field in fields if field.name.endswith("_m"))
+
+
+def loss_db(share: float) -> float:
+    """Decibels that an obstacle takes, of the share that it leaves."""
+    return min(-10 * math.log10(max(share, 1e-12)), MOST_LOSS_DB)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A problem as it was opened, and the knobs.
+
+    Parameters
+    ----------
+    base
+        The problem as it was opened.
+    knobs
+        What is changed of it.
+    """
+
+    base: Problem
+    knobs: Knobs
+
+    @functools.cached_property
+    def problem(self) -> Problem:
+        """The problem that is placed. Where no knob was turned it is the one that was opened."""
+        base, now, was = self.base, self.knobs, knobs_of(self.base)
+        changes: dict[str, Any] = {}
+        if now.noise_m != was.noise_m:
+            law: Any = base.noise
+            changes["noise"] = dataclasses.replace(law, **{noise_field(base): now.noise_m})
+        if now[1:3] != was[1:3]:
+            changes["tags"] = _tags(base.tags, now.n_tags, now.size_m)
+        if now.loss_db != was.loss_db:
+            changes["obstacles"] = _with_loss(base.obstacles, now.loss_db)
+        return dataclasses.replace(base, **changes) if changes else base
+
+    @functools.cached_property
+    def sample(self) -> Sample:
+        """The poses over which layouts are compared."""
+        return sample(self.base, N_POSES)
+
+    @functools.cached_property
+    def setting(self) -> Setting:
+        """What layouts are compared by; no anchor counts as fixed."""
+        problem = self.problem
+        return Setting(
+            problem.tags,
+            problem.noise,
+            self.sample,
+            problem.mounts,
+            problem.obstacles,
+            problem.gain,
+        )
+
+    @functools.cached_property
+    def places(self) -> tuple[FloatArray, ...]:
+        """Places (L, 3) of every zone at which it is judged: those of `rbl-gym place`, seed 0."""
+        return tuple(
+            draw_places(self.base, zone, np.random.default_rng([0, 3]), N_PLACES)
+            for zone in self.base.zones
+        )
+
+    def score(self, anchors: FloatArray) -> float:
+        """b of a layout (M, 3) over the poses, metres: what `placement.score` says of them."""
+        return self.setting.score(anchors)
+
+    def with_knobs(self, knobs: Knobs) -> World:
+        """The same problem with other knobs."""
+        changed = World(self.base, knobs)
+        # Neither hangs on a knob.
+        for name in ("sample", "places"):
+            if name in self.__dict__:
+                changed.__dict__[name] = self.__dict__[name]
+        return changed
+
+
+def _tags(tags: FloatArray, count: int, size_m: float) -> FloatArray:
+    """Tags (count, 3) of such an extent: the body's own, or evenly on a sphere."""
+    if count != len(tags):
+        z = 1 - (2 * np.arange(count) + 1) / count
+        turn = np.pi * (3 - 5**0.5) * np.arange(count)
+        flat = np.sqrt(1 - z**2)
+        tags = np.stack([flat * np.cos(turn), flat * np.sin(turn), z], axis=-1)
+    return tags * (size_m / float(np.ptp(tags, axis=0).max()))
+
+
+def _with_loss(obstacles: Obstacles, db: float) -> Obstacles:
+    """Obstacles that take so much from a link; shares of their own change in proportion."""
+    was = loss_db(obstacles.blocked_information)
+    prisms = obstacles.prisms
+    share = prisms.share ** (db / was) if was > 0 else prisms.share
+    changed = Prisms(prisms.corners, prisms.low_m, prisms.high_m, share)
+    return Obstacles(obstacles.boxes, 10 ** (-db / 10), changed)

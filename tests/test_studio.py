@@ -1,0 +1,395 @@
+"""The studio without a browser: states, maps, files, the worker."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+
+from rbl_gym import placement, studio
+from rbl_gym.placement import scene_files
+from rbl_gym.placement.problem import PlacementTask
+from rbl_gym.studies.placing.accuracy import accuracy
+from rbl_gym.studies.placing.layout_files import read_layout
+from rbl_gym.studio import files, maps
+from rbl_gym.studio.figures import figures, usual_scores
+from rbl_gym.studio.rays import under_pointer
+from rbl_gym.studio.state import (
+    Layout,
+    Slice,
+    State,
+    add,
+    add_best,
+    fix,
+    move,
+    open_state,
+    optimise,
+    redo,
+    remove,
+    set_layout,
+    snap,
+    turn_knobs,
+    undo,
+)  # fmt: skip
+from rbl_gym.studio.worker import Worker
+from rbl_gym.studio.world import Knobs, knobs_of
+from tests.helpers import ROOT
+
+WAREHOUSE = str(ROOT / "examples" / "warehouse.toml")
+
+
+@pytest.fixture(scope="module")
+def warehouse() -> State:
+    return open_state(scene_files.problem(WAREHOUSE))
+
+
+@pytest.fixture(scope="module")
+def room() -> State:
+    return open_state(scene_files.problem("uwb_room"))
+
+
+def placement_score(now: State) -> float:
+    """`placement.score` over the poses of a world, by a task that has them."""
+    problem, sample = now.world.problem, now.world.sample
+
+    class Posed(PlacementTask):
+        poses = sample.rotation, (sample.places - problem.context.centre) / problem.context.half
+
+    task = Posed(problem.scene, len(now.anchors), n_poses=len(sample.places))
+    return float(placement.score(task, problem.context, now.anchors))
+
+
+# --- states ----------------------------------------------------------------------------------
+
+
+def test_the_score_is_that_of_placement(warehouse):
+    assert warehouse.score == pytest.approx(placement_score(warehouse), rel=1e-9)
+    moved = move(warehouse, 2, np.array([-20.0, 3.0, 2.0]))
+    assert moved.score == pytest.approx(placement_score(moved), rel=1e-9)
+    assert moved.score != warehouse.score
+
+
+def test_a_layout_opens_at_the_best_of_the_usual_ones(room):
+    assert room.score == pytest.approx(min(usual_scores(room.world, 6).values()))
+    assert not room.fixed.any()
+    assert not room.past
+
+
+def test_an_anchor_snaps_to_the_nearest_legal_mount(room):
+    moved = move(room, 0, np.array([0.3, 0.2, 9.0]))
+    high = room.world.problem.mounts.bounds()[1]
+    np.testing.assert_allclose(moved.anchors[0], [0.3, 0.2, high[2]])
+    np.testing.assert_array_equal(moved.anchors[1:], room.anchors[1:])
+    assert placement.is_legal(placement.task("uwb_room"), moved.anchors).all()
+    np.testing.assert_array_equal(snap(room.world, moved.anchors[0]), moved.anchors[0])
+
+
+def test_an_anchor_goes_neither_into_an_obstacle_nor_onto_another(room):
+    blocked = dataclasses.replace(
+        room.world.base,
+        obstacles=dataclasses.replace(
+            room.world.base.obstacles, boxes=np.array([[0.0, 0, 3, 1, 1, 3]])
+        ),
+    )
+    start = open_state(blocked, room.anchors)
+    assert move(start, 0, np.array([0.0, 0.0, 9.0])) is start
+    assert move(room, 0, room.anchors[1]) is room
+    assert move(room, 0, room.anchors[0]) is room
+    with pytest.raises(ValueError, match="taken"):
+        add(room, room.anchors[1])
+
+
+def test_undo_and_redo_go_through_the_layouts(room):
+    one = move(room, 0, np.array([0.0, 0.0, 9.0]))
+    two = remove(one, 3)
+    assert undo(two).layout is one.layout
+    assert undo(undo(two)).layout is room.layout
+    assert undo(room) is room
+    again = redo(redo(undo(undo(two))))
+    assert again.layout is two.layout
+    assert redo(again) is again
+    # A change after undo leaves nothing to redo.
+    assert redo(fix(undo(two), 1)).layout is not two.layout
+
+
+def test_fixed_anchors_stay(room):
+    held = fix(room, 1)
+    assert fix(held, 1) is held
+    for change in (lambda: move(held, 1, np.zeros(3)), lambda: remove(held, 1)):
+        with pytest.raises(ValueError, match="anchor 2 is fixed"):
+            change()
+    *_, (done, found) = optimise(held)
+    assert done == 1.0
+    np.testing.assert_array_equal(found.anchors[1], room.anchors[1])
+    np.testing.assert_array_equal(found.problem.fixed, room.anchors[[1]])
+    assert found.score < held.score
+    assert fix(held, 1, False).fixed.sum() == 0
+
+
+def test_numbers_of_anchors_have_limits(room):
+    few = set_layout(room, Layout(room.anchors[:3], room.fixed[:3]))
+    with pytest.raises(ValueError, match="fewer than 3"):
+        remove(few, 0)
+    many = set_layout(room, Layout(np.zeros((256, 3)), np.zeros(256, bool)))
+    for change in (add, add_best):
+        with pytest.raises(ValueError, match="256"):
+            change(many)
+    with pytest.raises(ValueError, match="1 to 6, got 7"):
+        move(room, 6, np.zeros(3))
+
+
+def test_one_more_anchor_helps_most_where_it_is_best(room):
+    far, best = add(room), add_best(room)
+    assert len(far.anchors) == len(best.anchors) == 7
+    assert best.score < room.score
+    assert best.score <= far.score * (1 + 1e-9)
+    assert placement.is_legal(placement.task("uwb_room"), far.anchors).all()
+
+
+@pytest.mark.parametrize("name", ["room", "warehouse"])
+def test_optimising_only_gets_better_and_is_one_change(name, request):
+    start = request.getfixturevalue(name)
+    for k in range(1, 4):
+        start = move(start, k, start.anchors[0] + 0.3 * k)
+    steps = list(optimise(start))
+    scores = [start.score, *(found.score for _, found in steps)]
+    assert (np.diff(scores) <= 1e-12).all()
+    assert scores[-1] < 0.9 * scores[0]
+    assert undo(steps[-1][1]).layout is start.layout
+    assert steps[-1][1].world.setting.legal(steps[-1][1].anchors).all()
+    assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+
+
+def test_a_state_opens_with_fixed_anchors_and_refuses_illegal_ones(room):
+    problem = room.world.base
+    held = dataclasses.replace(problem, fixed=room.anchors[:2])
+    start = open_state(held)
+    np.testing.assert_array_equal(start.anchors[:2], room.anchors[:2])
+    assert start.fixed.tolist() == [True, True, False, False, False, False]
+    # A complete layout is one to go on with.
+    whole = open_state(dataclasses.replace(problem, fixed=room.anchors))
+    assert not whole.fixed.any()
+    with pytest.raises(ValueError, match=r"anchors\[1\]"):
+        open_state(problem, room.anchors * np.where(np.arange(6) == 1, 0.5, 1.0)[:, None])
+    with pytest.raises(ValueError, match="3 to 256"):
+        open_state(problem, room.anchors[:2])
+
+
+# --- knobs -----------------------------------------------------------------------------------
+
+
+def test_knobs_as_they_are_leave_the_problem_as_it_is(warehouse):
+    assert warehouse.world.problem is warehouse.world.base
+    assert knobs_of(warehouse.world.base) == Knobs(0.1, 6, 0.8, pytest.approx(20.0))
+
+
+def test_knobs_change_what_they_say(warehouse):
+    noisy = turn_knobs(warehouse, noise_m=0.2)
+    assert noisy.world.problem.noise.floor_m == 0.2
+    assert noisy.score > warehouse.score
+    large = turn_knobs(warehouse, size_m=1.6)
+    np.testing.assert_allclose(large.world.problem.tags, 2 * warehouse.world.base.tags)
+    more = turn_knobs(warehouse, n_tags=9)
+    assert more.world.problem.tags.shape == (9, 3)
+    assert np.ptp(more.world.problem.tags, axis=0).max() == pytest.approx(0.8)
+    clear = turn_knobs(warehouse, loss_db=0.0)
+    assert clear.world.problem.obstacles.blocked_information == 1.0
+    assert clear.score < warehouse.score
+
+
+# --- maps ------------------------------------------------------------------------------------
+
+
+def test_a_map_has_the_accuracy_of_its_cells(warehouse):
+    found = maps.slice_map(warehouse)
+    rows, columns = found.values.shape
+    assert 600 <= rows * columns <= 1000
+    low, high = warehouse.world.problem.corners()
+    x = low[0] + (np.array([5, 20]) + 0.5) / columns * (high - low)[0]
+    y = low[1] + (np.array([3, 9]) + 0.5) / rows * (high - low)[1]
+    places = np.array([[x[0], y[0], 1.75], [x[1], y[1], 1.75]])
+    zone = warehouse.world.problem.zones[0]
+    want = accuracy(warehouse.world.problem, warehouse.anchors, places, zone).position
+    np.testing.assert_allclose(found.values[[3, 9], [5, 20]], want, rtol=1e-9)
+    # Inside of racks there is none.
+    assert np.isnan(found.values).any()
+
+
+def test_a_section_runs_over_x_and_z(warehouse):
+    tilted = dataclasses.replace(warehouse, slice=Slice("heading", 2, 0.25))
+    found = maps.slice_map(tilted, maps.REFINED)
+    assert found.low[1] == found.high[1] == -4.0
+    assert found.values.size == pytest.approx(maps.REFINED, rel=0.1)
+
+
+def test_many_anchors_get_fewer_cells(warehouse):
+    rng = np.random.default_rng(0)
+    many = warehouse.world.problem.mounts.draw(rng.random((64, 3)))
+    crowded = set_layout(warehouse, Layout(many, np.zeros(64, bool)))
+    assert maps.slice_map(crowded).values.size <= 220
+
+
+def test_the_picture_is_clear_off_the_zones_and_red_where_errors_are_large():
+    values = np.full((8, 10), np.nan)
+    values[:, :5], values[4:, :5] = 0.1, 0.4
+    corner = np.zeros(3)
+    found = maps.SliceMap(values, corner, corner + 1, 1, maps.QUANTITIES["position"])
+    shown = maps.picture(found)
+    height, width = shown.shape[:2]
+    assert shown[:, -1, 3].max() == 0
+    assert shown[:, 0, 3].min() > 0
+    # The upper rows of the picture are those of large y.
+    assert shown[0, 0, 0] > shown[0, 0, 2]
+    assert shown[height - 1, 0, 0] < shown[height - 1, 0, 2]
+    assert width / height == 10 / 8
+
+
+def test_figures_follow_the_layout(warehouse):
+    asking = dataclasses.replace(
+        warehouse.world.base,
+        zones=tuple(
+            dataclasses.replace(zone, position_m=0.12) for zone in warehouse.world.base.zones
+        ),
+    )
+    start = open_state(asking, warehouse.anchors)
+    *_, (_, better) = optimise(start)
+    before, after = figures(start), figures(better)
+    assert after.score_m < before.score_m
+    assert after.zones[0].share > before.zones[0].share
+    np.testing.assert_allclose(
+        figures(start, few=True).zones[0].share, before.zones[0].share, atol=0.2
+    )
+
+
+# --- the pointer -----------------------------------------------------------------------------
+
+
+def test_the_pointer_takes_the_wall_that_is_near_the_anchor(room):
+    low, high = room.world.problem.mounts.bounds()
+    camera = np.array([0.0, low[1] - 20, high[2] - 1.0])
+    level = np.array([1.0, 0.0, high[2] - 1.0])
+    for near in (low[1], high[1]):
+        anchor = np.array([0.0, near, high[2] - 1.0])
+        found = under_pointer(room.world, camera, level, anchor)
+        assert found[1] == pytest.approx(near)
+        # On the line of sight.
+        assert np.cross(found - camera, level - camera) == pytest.approx(0, abs=1e-6)
+
+
+def test_the_pointer_beside_the_room_takes_its_edge(room):
+    high = room.world.problem.mounts.bounds()[1]
+    camera = np.array([0.0, -30.0, 3.0])
+    found = under_pointer(room.world, camera, np.array([0.0, 0.0, 60.0]), room.anchors[0])
+    assert found[2] == pytest.approx(high[2])
+
+
+# --- files -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", [WAREHOUSE, "uwb_room", "auv_buoys", "satellite"])
+def test_a_saved_scene_is_the_same_problem(scene, tmp_path):
+    problem = scene_files.problem(scene)
+    tables = scene_files.load(scene) if scene.endswith(".toml") else files.tables_of(problem)
+    start = turn_knobs(open_state(problem), noise_m=0.07, size_m=1.2, loss_db=10.0)
+    start = move(start, 0, start.anchors[1] + 1.0)
+    scene_path, list_path = files.save(start, tables, tmp_path / "new", "my layout")
+    found = scene_files.problem(str(scene_path))
+    np.testing.assert_array_equal(found.fixed, start.anchors)
+    again = open_state(found)
+    assert again.score == pytest.approx(start.score, rel=1e-12)
+    np.testing.assert_allclose(read_layout(str(list_path)).positions, start.anchors, atol=1e-3)
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == [
+        "my layout.csv",
+        "my layout.toml",
+    ]
+
+
+def test_losses_of_walls_are_saved_with_them(tmp_path):
+    office = str(ROOT / "examples" / "office.toml")
+    pytest.importorskip("shapely")
+    start = turn_knobs(open_state(scene_files.problem(office)), loss_db=30.0)
+    scene_path, _ = files.save(start, scene_files.load(office), tmp_path, "office")
+    again = open_state(scene_files.problem(str(scene_path)))
+    assert again.score == pytest.approx(start.score, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["../x", "a/b", "", ".", "..", "a\\b", "x" * 90, "/etc/x", "a\n"])
+def test_names_of_files_stay_in_the_folder(name):
+    if name == "a\n":
+        assert files.check_name(name) == "a"
+        return
+    with pytest.raises(ValueError, match="name must be"):
+        files.check_name(name)
+
+
+def test_nobody_elses_file_is_written_over(room, tmp_path):
+    tables = files.tables_of(room.world.base)
+    (tmp_path / "mine.toml").write_text("name = 'mine'\n")
+    (tmp_path / "list.csv").write_text("x_m\n")
+    for name in ("mine", "list"):
+        with pytest.raises(ValueError, match="choose another name"):
+            files.save(room, tables, tmp_path, name)
+    assert (tmp_path / "mine.toml").read_text() == "name = 'mine'\n"
+    files.save(room, tables, tmp_path, "other")
+    files.save(add(room), tables, tmp_path, "other")
+    assert len(scene_files.problem(str(tmp_path / "other.toml")).fixed) == 7
+
+
+def test_a_file_that_cannot_be_written_leaves_the_old_one(room, tmp_path):
+    path = tmp_path / "x.toml"
+    path.write_text("old")
+
+    def write(_):
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        files.replace(path, write)
+    assert [p.name for p in tmp_path.iterdir()] == ["x.toml"]
+    assert path.read_text() == "old"
+
+
+def test_a_layout_is_kept_as_it_is_worked_on(room, tmp_path):
+    path = files.autosave(room, files.tables_of(room.world.base), tmp_path)
+    np.testing.assert_array_equal(scene_files.problem(str(path)).fixed, room.anchors)
+
+
+# --- the worker ------------------------------------------------------------------------------
+
+
+def test_the_worker_keeps_the_order_and_the_last_of_a_key():
+    done, errors, gate = [], [], threading.Event()
+    worker = Worker(errors.append)
+    worker.post(gate.wait)
+    for number in range(5):
+        worker.post(lambda n=number: done.append(n), "drag")
+    worker.post(lambda: done.append("after"))
+    worker.post(lambda: 1 // 0)
+    gate.set()
+    assert worker.settle(5)
+    assert done == [4, "after"]
+    assert [type(error) for error in errors] == [ZeroDivisionError]
+    worker.stop()
+
+
+def test_tasks_come_between_the_steps_of_long_work():
+    done: list = []
+    worker = Worker(done.append)
+
+    def steps():
+        for number in range(3):
+            if number == 1:
+                worker.post(lambda: done.append("task"))
+            done.append(number)
+            yield
+
+    worker.when_idle(steps())
+    assert worker.settle(5)
+    assert done == [0, 1, "task", 2]
+    worker.stop()
+
+
+def test_the_studio_says_what_it_cannot_show():
+    with pytest.raises(ValueError, match="what must be a Problem"):
+        studio.show("uwb_room", options=studio.Options(browser=False))
