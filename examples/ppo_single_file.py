@@ -48,10 +48,10 @@ class Agent(nn.Module):
         return Normal(self.mean(observation), self.log_std.exp())
 
 
-def collect(envs, agent, observation, returns):
+def collect(envs, agent, observation, returns, rollout=ROLLOUT):
     """A rollout (T, B, ...) and the observation after it; `returns` gets those of the episodes."""
     steps = []
-    for _ in range(ROLLOUT):
+    for _ in range(rollout):
         with torch.no_grad():
             policy, value = agent.policy(observation), agent.value(observation)[:, 0]
             action = policy.sample()
@@ -74,8 +74,8 @@ def advantages(agent, value, reward, done, observation):
     """Generalized advantage estimation."""
     with torch.no_grad():
         next_value = agent.value(observation)[:, 0]
-    result, running = torch.zeros_like(reward), torch.zeros(ENVS)
-    for t in reversed(range(ROLLOUT)):
+    result, running = torch.zeros_like(reward), torch.zeros_like(reward[0])
+    for t in reversed(range(len(reward))):
         alive = (~done[t]).float()
         delta = reward[t] + GAMMA * next_value * alive - value[t]
         running = delta + GAMMA * LAMBDA * alive * running
@@ -88,7 +88,7 @@ def update(agent, optimizer, rollout, advantage):
     rollout = [*rollout, advantage, advantage + rollout[3]]
     flat = [part.reshape(-1, *part.shape[2:]) for part in rollout]
     for _ in range(EPOCHS):
-        for batch in torch.randperm(ROLLOUT * ENVS).split(BATCH):
+        for batch in torch.randperm(len(flat[0])).split(BATCH):
             observation, action, old, _, _, _, advantage, target = (part[batch] for part in flat)
             advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
             ratio = (agent.policy(observation).log_prob(action).sum(-1) - old).exp()

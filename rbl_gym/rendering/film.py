@@ -84,7 +84,7 @@ class Film:
 def mapped(function: Callable[[Any], Any], part: Any) -> Any:
     """A function on every array of nested named tuples; None stays."""
     if isinstance(part, tuple):
-        return part._make(mapped(function, field) for field in part)  # pyright: ignore[reportAttributeAccessIssue]
+        return type(part)(*[mapped(function, field) for field in part])
     return None if part is None else function(part)
 
 
