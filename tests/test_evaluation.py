@@ -89,7 +89,10 @@ def test_a_placement_policy_is_played_as_in_the_scalar_environment_and_refining_
     pytest.importorskip("cmaes", reason="needs the extra placement")
     task, policy = rl_task("auv_buoys"), random_policy(sizes=(22, 8, 3))
     result = evaluate(task, {"mine": policy}, worlds=1)
-    assert list(result["methods"]) == ["random", "cma-es", "mine", "mine + cma-es"]
+    strongest = ["gradient", "hybrid", "cma-es"]
+    assert list(result["methods"]) == [
+        "random", *strongest, "mine", "mine + gradient", "best-known",
+    ]  # fmt: skip
     env, over, reward = AnchorPlacementEnv(), False, 0.0
     observation, _ = env.reset(seed=HELD_OUT_SEED)
     while not over:
@@ -97,7 +100,31 @@ def test_a_placement_policy_is_played_as_in_the_scalar_environment_and_refining_
     figures = result["methods"]
     np.testing.assert_allclose(figures["mine"]["loss"], -reward, rtol=1e-6)
     np.testing.assert_allclose(figures["mine"]["score_m"], np.exp(-reward), rtol=1e-6)
-    assert figures["cma-es"]["loss"] < figures["mine + cma-es"]["loss"] < figures["mine"]["loss"]
+    best, refined = figures["best-known"]["loss"], figures["mine + gradient"]["loss"]
+    assert best - 1e-3 < refined < figures["mine"]["loss"]
+    assert best == min(figures[name]["loss"] for name in strongest)
+
+
+def test_the_best_known_is_the_best_search_in_each_world(monkeypatch):
+    """By stand-ins: one search is good in even worlds, another in odd ones."""
+
+    def only(odd: int):
+        def layout(task, contexts, rng):
+            rows = np.arange(len(contexts.centre)) % 2 == odd
+            good, bad = layouts.ring(task, contexts, rng), layouts.corners(task, contexts, rng)
+            return np.where(rows[:, None, None], good, bad)
+
+        return layout
+
+    for name, stand_in in (("gradient", only(0)), ("hybrid", only(1)), ("cma-es", layouts.corners)):
+        monkeypatch.setitem(search.SEARCHES, name, stand_in)
+    result = evaluate(rl_task("auv_buoys"), names=["ring"], worlds=4)
+    figures = result["methods"]
+    assert (result["best_reference"], result["best_of"]) == ("best-known", list(search.STRONGEST))
+    assert figures["best-known"] == figures["ring"]
+    assert figures["ring"]["normalised"] == 1
+    for name in search.STRONGEST:
+        assert figures[name]["normalised"] < 1
 
 
 def test_normalised_by_hand_and_intervals_hold_the_mean():
@@ -213,8 +240,9 @@ def test_wrong_references_and_policies_are_named(task):
         evaluate(task, names=["best"])
     with pytest.raises(ValueError, match="policy 'mine' does not fit: it was trained on"):
         evaluate(task, {"mine": random_policy()})
-    with pytest.raises(ValueError, match="policy 'random' has the name of a reference"):
-        evaluate(task, {"random": random_policy()})
+    for name in ("random", "best-known"):
+        with pytest.raises(ValueError, match=f"policy '{name}' has the name of a reference"):
+            evaluate(task, {name: random_policy()})
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -285,13 +313,15 @@ def test_filters_and_references_by_task():
     everywhere = transfer.tracking_filters(rl_task("auv_buoys"))
     assert transfer.tracking_filters(rl_task("mounts")) == [*everywhere, "uc-kf"]
     assert transfer.transfer_references(rl_task("mounts")) == ["random", "greedy-swaps"]
-    assert transfer.transfer_references(rl_task("satellite"))[-1] == "cma-es"
+    assert transfer.transfer_references(rl_task("satellite"))[-1] == "hybrid"
 
 
-def test_the_strongest_search_stays_the_one_that_counts_as_1(monkeypatch):
+def test_the_strongest_searches_stay_those_that_count_as_1(monkeypatch):
     monkeypatch.setitem(search.SEARCHES, "later", search.best_of_random)
     names = evaluation.references(rl_task("auv_buoys"))
-    assert names[-2:] == ["later", "cma-es"]
+    assert names[-4:] == ["later", *search.STRONGEST]
+    assert evaluation.strongest(rl_task("auv_buoys")) == list(search.STRONGEST)
+    assert evaluation.strongest(rl_task("mounts")) == ["greedy-swaps"]
 
 
 def test_correlations_need_three():

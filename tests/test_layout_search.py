@@ -12,7 +12,15 @@ import pytest
 from rbl_gym import placement
 from rbl_gym.placement import Context, layouts
 from rbl_gym.placement import search as layout_search
-from rbl_gym.placement.search import SEARCHES, along_gradient, cma_es, expand, greedy, shared_layout
+from rbl_gym.placement.search import (
+    SEARCHES,
+    along_gradient,
+    cma_es,
+    expand,
+    greedy,
+    hybrid,
+    shared_layout,
+)
 from tests.helpers import needs
 
 QUICK = {"generations": 6, "population": 6}
@@ -149,6 +157,20 @@ def test_along_the_gradient_it_is_better_than_the_ring_and_than_swaps(scene, rac
     others = layouts.ring(task, context, rng()), layout_search.greedy_swaps(task, context, rng())
     ring, swapped = (np.log(placement.score(task, context, other)) for other in others)
     assert found.mean() < min(ring.mean(), swapped.mean())
+    longest = np.log(placement.score(task, context, hybrid(task, context, rng())))
+    assert longest.mean() < found.mean() + 1e-4
+
+
+def test_along_the_gradient_a_given_start_is_never_made_worse():
+    task, context = problem("uwb_room", 4, (4,), racks=1, n_poses=16)
+    start = layouts.random(task, context, rng())
+    before = placement.score(task, context, start)
+    after = placement.score(task, context, along_gradient(task, context, rng(), 10, start))
+    assert (after <= before * (1 + 1e-9)).all()
+    assert np.log(after).mean() < np.log(before).mean() - 0.1
+    shared = along_gradient(task, context, rng(), 10, start[0])
+    each = along_gradient(task, context, rng(), 10, np.broadcast_to(start[0], start.shape))
+    np.testing.assert_array_equal(shared, each)
 
 
 @needs("cmaes")
@@ -210,6 +232,7 @@ def test_without_cmaes_the_message_names_what_to_install(monkeypatch):
         (lambda t, c: greedy(t, c, rng(), np.zeros((9, 2))), "candidates must have shape"),
         (lambda t, c: layout_search.best_of_random(t, c, rng(), 0), "tries must be"),
         (lambda t, c: cma_es(t, c, rng(), start=np.zeros((3, 3))), "start must have shape"),
+        (lambda t, c: along_gradient(t, c, rng(), start=np.zeros((3, 3))), "start must have shape"),
         (lambda t, c: cma_es(t, c, rng(), start=np.full((2, 3), np.inf)), "start must be finite"),
         (lambda t, c: shared_layout(t, c, rng()), "contexts must have one batch axis"),
     ],

@@ -14,7 +14,7 @@ from rbl_gym.app.terminal import (
     write_json,
 )
 from rbl_gym.checks import check_one_of
-from rbl_gym.studies.extras import MissingExtraError, require
+from rbl_gym.studies.extras import MissingExtraError
 from rbl_gym.studies.learning.rl_tasks import TASKS, rl_task
 
 # Held-out worlds in which a trained policy is scored, those of ``evaluate``.
@@ -58,7 +58,7 @@ def add_transfer(commands: Any) -> None:
         "what is good by the bound track well?",
     )
     placements = [name for name, task in TASKS.items() if task.env_id == "RBL/AnchorPlacement-v0"]
-    _add_players(transfer, placements, worlds=48, references="random, ring, greedy-swaps, cma-es")
+    _add_players(transfer, placements, worlds=48, references="random, ring, greedy-swaps, hybrid")
     transfer.add_argument(
         "--repeats", type=positive, default=16, help="bodies in each world, default 16"
     )
@@ -127,16 +127,18 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _transfer(options: argparse.Namespace) -> int:
-    require("cmaes", "placement")
     from rbl_gym.studies.learning import transfer
 
     task = rl_task(options.task)
     loaded = _policies(options.policy)
     names = _references(options, transfer.transfer_references(task))
-    with progress(options.task) as advance:
-        result = transfer.transfer_layouts(
-            task, loaded, names, options.worlds, options.repeats, options.seed, advance
-        )
+    try:
+        with progress(options.task) as advance:
+            result = transfer.transfer_layouts(
+                task, loaded, names, options.worlds, options.repeats, options.seed, advance
+            )
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(str(error)) from error
     result["task"] = options.task
     if write_json(result, options.json):
         from rbl_gym.app import reports

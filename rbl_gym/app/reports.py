@@ -260,7 +260,9 @@ def print_evaluation(result: dict[str, Any]) -> None:
             interval,
         )
     console.print(table)
-    console.print(f"normalised: 0 is random, 1 is {result['best_reference']}")
+    best, best_of = result["best_reference"], result["best_of"]
+    what = f", the best of {', '.join(best_of)} in each world" if len(best_of) > 1 else ""
+    console.print(f"normalised: 0 is random, 1 is {best}{what}")
 
 
 def print_transfer(result: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Layouts that look at the score: the best of many, greedy, along the gradient, CMA-ES.
+"""Layouts that look at the score: the best of many, greedy, along the gradient, hybrid, CMA-ES.
 
 As in `layouts` a search is a function ``(task, context, rng) -> anchors (..., M, 3)``; options
 come as keywords. CMA-ES is the `cmaes` package's (extra ``placement``).
@@ -7,6 +7,7 @@ come as keywords. CMA-ES is the `cmaes` package's (extra ``placement``).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,12 +19,14 @@ from rbl_gym.placement.layouts import Layout, ring
 from rbl_gym.placement.problem import Context, PlacementTask, information, score, score_of
 
 __all__ = [
-    "SEARCHES", "along_gradient", "best_of_random", "cma_es", "greedy", "greedy_swaps",
-    "shared_layout",
+    "SEARCHES", "STRONGEST", "along_gradient", "best_of_random", "cma_es", "greedy",
+    "greedy_swaps", "hybrid", "shared_layout",
 ]  # fmt: skip
 
-# Candidates past racks, rounds of fresh ones after them, and then steps along the gradient.
+# Candidates of a greedy start, rounds of fresh ones after them, and then steps along the gradient.
 _CANDIDATES, _ROUNDS, _STEPS = 100, 3, 12
+# Of the hybrid search: greedy starts, turns of fresh candidates and gradient, steps of each turn.
+_STARTS, _TURNS, _STEPS_OF_TURN = 2, 2, 20
 
 
 def best_of_random(
@@ -113,7 +116,11 @@ def _greedy(
 
 
 def along_gradient(
-    task: PlacementTask, context: Context, rng: np.random.Generator, evaluations: int = 30
+    task: PlacementTask,
+    context: Context,
+    rng: np.random.Generator,
+    evaluations: int = 30,
+    start: FloatArray | None = None,
 ) -> FloatArray:
     """L-BFGS-B along the gradient of the score, from the ring; greedy and fresh candidates first
     where something is in the way.
@@ -123,32 +130,68 @@ def along_gradient(
     task, context, rng
         As `cma_es`.
     evaluations
-        Of score and gradient, at most, for each context; past obstacles there are fewer.
+        Of score and gradient, at most, for each context; behind greedy there are fewer.
+    start
+        Legal anchors (..., M, 3) to start from in place of those, for instance a policy's.
     """
-    batch = context.centre.shape[:-1]
-    result = ring(task, context, rng)
-    for where in np.ndindex(batch):
-        seen = setting.of_task(task, Context(*(field[where] for field in context)))
-        if seen.obstacles:
-            result[where], _ = descend(seen, _past_obstacles(task, seen, rng), _STEPS)
+    if start is None:
+        result = ring(task, context, rng)
+    else:
+        shape = (*context.centre.shape[:-1], task.n_anchors, 3)
+        result = np.array(np.broadcast_to(check_array("start", start, shape[-2:]), shape))
+    for where, seen in _settings(task, context):
+        if seen.obstacles and start is None:
+            begin = _greedy_start(task, seen, rng)
+            result[where], _ = _in_turns(seen, begin, rng, 1, _STEPS)
         else:
             result[where], _ = descend(seen, result[where], evaluations)
     return result
 
 
-def _past_obstacles(
+def hybrid(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
+    """Fresh candidates and the gradient in turns, from the ring and from greedy with swaps.
+
+    The search of `placement.design` over the poses of an environment's problem. It is several
+    times as long as `along_gradient`. Arguments as `cma_es`.
+    """
+    result = ring(task, context, rng)
+    for where, seen in _settings(task, context):
+        starts = [result[where], *(_greedy_start(task, seen, rng) for _ in range(_STARTS))]
+        found = [_in_turns(seen, one, rng, _TURNS, _STEPS_OF_TURN) for one in starts]
+        result[where], _ = min(found, key=lambda pair: pair[1])
+    return result
+
+
+def _settings(
+    task: PlacementTask, context: Context
+) -> Iterator[tuple[tuple[int, ...], setting.Setting]]:
+    """Each problem of a batch with its index."""
+    for where in np.ndindex(context.centre.shape[:-1]):
+        yield where, setting.of_task(task, Context(*(field[where] for field in context)))
+
+
+def _greedy_start(
     task: PlacementTask, seen: setting.Setting, rng: np.random.Generator
 ) -> FloatArray:
-    """A layout (M, 3) by greedy with swaps and rounds of fresh candidates."""
+    """A layout (M, 3) by greedy with swaps, outside of obstacles."""
     region = task.scene.anchor_region
     candidates = region.draw(rng.random((max(_CANDIDATES, 4 * task.n_anchors), 3)))
     free = candidates[~seen.obstacles.contain(candidates)]
     candidates = free if len(free) >= task.n_anchors else candidates
     parts = seen.parts(candidates)
-    anchors = candidates[exchange.swap(seen, parts, exchange.choose(seen, parts, task.n_anchors))]
-    for _ in range(_ROUNDS):
-        anchors, _ = exchange.refresh(seen, anchors, rng)
-    return anchors
+    return candidates[exchange.swap(seen, parts, exchange.choose(seen, parts, task.n_anchors))]
+
+
+def _in_turns(
+    seen: setting.Setting, anchors: FloatArray, rng: np.random.Generator, turns: int, steps: int
+) -> tuple[FloatArray, float]:
+    """A layout after `turns` of fresh candidates and of steps along the gradient; its score."""
+    score = math.inf
+    for _ in range(turns):
+        for _ in range(_ROUNDS):
+            anchors, _ = exchange.refresh(seen, anchors, rng)
+        anchors, score = descend(seen, anchors, steps)
+    return anchors, score
 
 
 def cma_es(
@@ -266,5 +309,8 @@ SEARCHES: dict[str, Layout] = {
     "greedy": greedy,
     "greedy-swaps": greedy_swaps,
     "gradient": along_gradient,
+    "hybrid": hybrid,
     "cma-es": cma_es,
 }
+# Those whose best layout counts as the best known.
+STRONGEST = ("gradient", "hybrid", "cma-es")

@@ -2,8 +2,9 @@
 
 The loss L of a policy in a world is the mean of log b: of the final layout in a placement task, of
 all steps in a task with a filter in the loop; where anchors have a price, minus the mean
-reward. Normalised = (L_random - L) / (L_random - L_best), L_best that of the strongest
-reference.
+reward. Normalised = (L_random - L) / (L_random - L_best). L_best is that of the strongest
+reference; in a placement task that of the best layout known of each world, whichever of the
+strongest searches found it.
 """
 
 from __future__ import annotations
@@ -32,23 +33,29 @@ __all__ = [
 
 # The reference that is one layout for all contexts, and the contexts it is optimised over.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
-# The search that counts as 1.
-_STRONGEST = "cma-es"
-# Random layouts of each context; and generations of CMA-ES that refine a policy's proposal.
+# The row of the best layouts of the strongest searches.
+BEST_KNOWN = "best-known"
+# Random layouts of each context; and evaluations of the gradient that refine a policy's proposal.
 _RANDOM_TRIES = 8
-REFINE_GENERATIONS = 12
-_REFINE_SIGMA = 0.1
+REFINE_EVALUATIONS = 20
 _RESAMPLES = 2000
 
 
 def references(task: RlTask) -> list[str]:
-    """Names of a task's references; the last is the strongest."""
+    """Names of a task's references; the last are the `strongest`."""
     if task.env_id == "RBL/AnchorPlacement-v0":
         if task.arguments.get("mode") == "mounts":
             return ["random", "greedy", "greedy-swaps"]
-        searches = sorted(search.SEARCHES, key=lambda name: name == _STRONGEST)
-        return [*layouts.LAYOUTS, _ONE_LAYOUT, *searches]
+        last = search.STRONGEST
+        others = [name for name in search.SEARCHES if name not in last]
+        return [*layouts.LAYOUTS, _ONE_LAYOUT, *others, *last]
     return list(_controllers(task))
+
+
+def strongest(task: RlTask) -> list[str]:
+    """The references of which the best, in each world, counts as 1."""
+    known = references(task)
+    return known[-len(search.STRONGEST) :] if known[-1] in search.STRONGEST else known[-1:]
 
 
 def _controllers(task: RlTask) -> dict[str, controllers.Controller]:
@@ -72,9 +79,10 @@ def evaluate(
         What is played.
     policies
         By the label they are to have. In a placement task each also comes refined by a few
-        generations of CMA-ES, ``LABEL + cma-es``.
+        steps along the gradient, ``LABEL + gradient``.
     names
-        Of `references`; ``random`` and the strongest come in any case.
+        Of `references`; ``random`` and the strongest come in any case. Where there are several
+        strongest, ``best-known`` is the best of them in each world.
     worlds, seed
         How many, and which.
     advance
@@ -87,13 +95,18 @@ def evaluate(
     """
     known = references(task)
     names = [check_one_of("reference", name, known) for name in names]
-    names = [name for name in known if name in {*names, known[0], known[-1]}]
+    best_of = strongest(task)
+    names = [name for name in known if name in {*names, known[0], *best_of}]
     play = _placement_losses if task.env_id == "RBL/AnchorPlacement-v0" else _loop_losses
     losses = play(task, policies, names, worlds, seed, advance)
+    best = best_of[0]
+    if len(best_of) > 1:
+        best = BEST_KNOWN
+        losses[best] = np.min([losses[name] for name in best_of], axis=0)
     rng = np.random.default_rng([seed, len(known) + 1])
     resamples = rng.integers(worlds, size=(_RESAMPLES, worlds))
     methods: dict[str, dict[str, Any]] = {
-        name: _figures(loss, losses["random"], losses[known[-1]], resamples)
+        name: _figures(loss, losses["random"], losses[best], resamples)
         for name, loss in losses.items()
     }
     for figures in methods.values():
@@ -103,7 +116,8 @@ def evaluate(
     return {
         "worlds": worlds,
         "seed": seed,
-        "best_reference": known[-1],
+        "best_reference": best,
+        "best_of": best_of,
         "methods": methods,
     }
 
@@ -154,7 +168,7 @@ def _check_policies(task: RlTask, policies: dict[str, Policy]) -> None:
     """Before hours of references: a ValueError on a policy that cannot be played or told apart."""
     envs = task.make(1)
     for label, policy in policies.items():
-        if label in references(task):
+        if label in {*references(task), BEST_KNOWN}:
             raise ValueError(f"policy {label!r} has the name of a reference: rename its file")
         check_fit(policy, label, envs)
 
@@ -247,9 +261,11 @@ def _placement_losses(
     problem, contexts, found = layouts_of(task, policies, names, worlds, seed, advance)
     if task.arguments.get("mode") != "mounts":
         advance(0, more=len(policies))
+        rng = np.random.default_rng([seed, len(references(task))])
         for label in policies:
-            rng = np.random.default_rng([seed, len(references(task))])
-            found[f"{label} + cma-es"] = _refined(problem, contexts, found[label], rng)
+            found[f"{label} + gradient"] = search.along_gradient(
+                problem, contexts, rng, REFINE_EVALUATIONS, found[label]
+            )
             advance()
     return {name: _loss_of(problem, contexts, anchors) for name, anchors in found.items()}
 
@@ -328,17 +344,3 @@ def _loss_of(problem: PlacementTask, contexts: Context, anchors: FloatArray) -> 
         scores = placement.score(problem, search.expand(contexts), anchors)
         return np.log(scores).mean(axis=-1)
     return np.log(placement.score(problem, contexts, anchors))
-
-
-def _refined(
-    problem: PlacementTask, contexts: Context, anchors: FloatArray, rng: np.random.Generator
-) -> FloatArray:
-    """Layouts after a tenth of the generations that CMA-ES alone takes."""
-    return search.cma_es(
-        problem,
-        contexts,
-        rng,
-        generations=REFINE_GENERATIONS,
-        sigma=_REFINE_SIGMA,
-        start=anchors,
-    )

@@ -49,7 +49,7 @@ FILTERS = {
 def transfer_references(task: RlTask) -> list[str]:
     """Layouts besides those of policies, as far as the task knows them."""
     known = evaluation.references(task)
-    return [name for name in ("random", "ring", "greedy-swaps", "cma-es") if name in known]
+    return [name for name in ("random", "ring", "greedy-swaps", "hybrid") if name in known]
 
 
 def tracking_filters(task: RlTask) -> list[str]:
