@@ -1,6 +1,6 @@
 """Draw the picture of docs/conventions.md: the world frame, the body frame, a range and a pose.
 
-    python examples/draw_frames.py docs/images/frames.png
+python examples/draw_frames.py docs/images/frames.png
 """
 
 from __future__ import annotations

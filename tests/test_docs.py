@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shlex
 from pathlib import Path
@@ -96,6 +97,21 @@ def test_every_command_of_a_page_is_one(page):
 def test_every_page_is_in_the_navigation():
     named = re.findall(r"^ .*: ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
     assert sorted(named) == sorted(str(page.relative_to(ROOT / "docs")) for page in PAGES)
+
+
+def test_notebooks_are_the_tutorials():
+    spec = importlib.util.spec_from_file_location("make", ROOT / "examples/notebooks/make.py")
+    assert spec is not None
+    assert spec.loader is not None
+    make = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(make)
+    pages = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+    assert {page.stem for page in pages} == {
+        book.stem for book in (ROOT / "examples" / "notebooks").glob("*.ipynb")
+    }
+    for page in pages:
+        book = ROOT / "examples" / "notebooks" / f"{page.stem}.ipynb"
+        assert book.read_text(encoding="utf-8") == make.notebook(page), "run make.py beside it"
 
 
 def test_the_version_is_the_same_everywhere():
