@@ -14,18 +14,20 @@ from rbl_gym.placement.problem import PlacementTask
 from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studies.placing.layout_files import read_layout
 from rbl_gym.studio import files, maps
-from rbl_gym.studio.figures import figures, usual_scores
+from rbl_gym.studio.figures import body_figures, figures, usual_scores
 from rbl_gym.studio.rays import under_pointer
+from rbl_gym.studio.searches import add_best, optimise
 from rbl_gym.studio.state import (
     Layout,
     Slice,
     State,
     add,
-    add_best,
+    cut,
     fix,
     move,
     open_state,
-    optimise,
+    place_body,
+    plane,
     redo,
     remove,
     set_layout,
@@ -218,10 +220,23 @@ def test_a_map_has_the_accuracy_of_its_cells(warehouse):
 
 
 def test_a_section_runs_over_x_and_z(warehouse):
-    tilted = dataclasses.replace(warehouse, slice=Slice("heading", 2, 0.25))
+    tilted = cut(warehouse, quantity="heading", up=2, share=0.25)
+    assert tilted.slice == Slice("heading", 2, 0.25)
+    assert plane(tilted)[0][1] == tilted.body[1] == -4.0
     found = maps.slice_map(tilted, maps.REFINED)
     assert found.low[1] == found.high[1] == -4.0
     assert found.values.size == pytest.approx(maps.REFINED, rel=0.1)
+
+
+def test_the_body_moves_on_the_slice_and_past_racks(warehouse):
+    moved = place_body(warehouse, np.array([5.0, 1.0, 9.0]))
+    np.testing.assert_allclose(moved.body, [5.0, 1.0, 1.75])
+    assert place_body(moved, np.array([5.0, 4.5, 0.0])).body.tolist() == moved.body.tolist()
+    told = body_figures(moved)
+    want = accuracy(moved.world.problem, moved.anchors, moved.body[None], moved.world.base.zones[0])
+    assert told.position_m == pytest.approx(want.position[0])
+    sees = moved.world.problem.obstacles.sees(moved.anchors, moved.body[None])[0]
+    np.testing.assert_array_equal(told.seen > 0.5, sees)
 
 
 def test_many_anchors_get_fewer_cells(warehouse):

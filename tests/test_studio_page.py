@@ -9,7 +9,7 @@ import pytest
 
 from rbl_gym import studio
 from rbl_gym.placement import scene_files
-from rbl_gym.studio.opening import Studio
+from rbl_gym.studio import Studio
 from tests.helpers import ROOT
 
 pytest.importorskip("viser", reason="needs the extra studio")

@@ -42,11 +42,20 @@ class ZoneFigures(NamedTuple):
     heading_deg: float
 
 
+class BodyFigures(NamedTuple):
+    """What a layout promises where the body is: one sigma; shares (M,) of links that are left."""
+
+    position_m: float
+    heading_deg: float
+    seen: FloatArray
+
+
 class Figures(NamedTuple):
-    """b of a layout in metres, and each zone."""
+    """b of a layout in metres, each zone, and the body."""
 
     score_m: float
     zones: tuple[ZoneFigures, ...]
+    body: BodyFigures
 
 
 def figures(state: State, few: bool = False) -> Figures:
@@ -68,6 +77,19 @@ def figures(state: State, few: bool = False) -> Figures:
             _zone_figures(world.problem, zone, anchors, places[:most])
             for zone, places in zip(zones, world.places, strict=True)
         ),
+        body_figures(state),
+    )
+
+
+def body_figures(state: State) -> BodyFigures:
+    """What the layout promises at the body's place, at the attitude of the zone that it is in."""
+    problem, place = state.world.problem, state.body[None]
+    zone = next((zone for zone in problem.zones if zone.contains(place)[0]), problem.zones[0])
+    errors = accuracy(problem, state.anchors, place, zone)
+    return BodyFigures(
+        float(errors.position[0]),
+        float(np.rad2deg(errors.heading[0])),
+        problem.share(state.anchors, place)[0],
     )
 
 
@@ -93,3 +115,28 @@ def usual_scores(world: World, n_anchors: int) -> dict[str, float]:
     found = design.usual_layouts(world.problem.with_anchors(n_anchors), 0)
     scores = {name: world.score(anchors) for name, anchors in found.items()}
     return dict(sorted(scores.items(), key=lambda item: item[1]))
+
+
+class Others:
+    """Layouts beside the one that is shown: the usual ones, and the designed ones by number."""
+
+    def __init__(self) -> None:
+        self.designed: dict[int, FloatArray] = {}
+        self._usual: dict[str, float] = {}
+        self._of: tuple[World | None, int] = None, 0
+
+    def search_usual(self, world: World, count: int) -> None:
+        """Score the usual layouts of so many anchors, unless that is done."""
+        if self._of[0] is not world or self._of[1] != count:
+            self._usual, self._of = usual_scores(world, count), (world, count)
+
+    def scores(self, world: World, count: int) -> dict[str, float | None]:
+        """b by names; None while the first design is searched; the usual ones where known."""
+        designed = self.designed.get(count)
+        found: dict[str, float | None] = {}
+        if designed is not None:
+            found["designed"] = world.score(designed)
+        elif not self.designed:
+            found["designed"] = None
+        known = self._of[0] is world and self._of[1] == count
+        return found | (self._usual if known else {})

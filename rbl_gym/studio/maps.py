@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -9,11 +10,10 @@ import numpy as np
 from scipy import ndimage
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studies.placing.judging import limits_of
 from rbl_gym.studies.placing.requirements import Errors, relative_errors
-from rbl_gym.studio.state import Slice, State
+from rbl_gym.studio.state import State, plane
 
 # Cells of a map while an anchor is dragged, and when it is let go; links of so many anchors.
 COARSE, REFINED, _ANCHORS = 800, 3200, 8
@@ -21,8 +21,8 @@ COARSE, REFINED, _ANCHORS = 800, 3200, 8
 _LEAST_CELLS = 200
 # A map that hardly varies must not look as if it did: its colours span at least this ratio.
 _LEAST_CONTRAST = 1.3
-# Pixels of a picture along its longer side.
-_PIXELS = 640
+# Pixels along a cell; the browser smooths the picture too. Shades of the colours.
+_ZOOM, _SHADES = 6, 256
 # Within and beyond a requirement (Okabe and Ito): told apart by everyone.
 WITHIN, BEYOND = (86, 180, 233), (213, 94, 0)
 # Green for small errors over yellow to red for large ones, light enough for black lines.
@@ -88,14 +88,6 @@ class SliceMap(NamedTuple):
         return min(low, middle / _LEAST_CONTRAST**0.5), max(high, middle * _LEAST_CONTRAST**0.5)
 
 
-def plane(problem: Problem, at: Slice) -> tuple[FloatArray, FloatArray]:
-    """Corners (3,) of the slice: all zones, cut at its share of the third axis."""
-    low, high = (corner.copy() for corner in problem.corners())
-    third = 3 - at.up
-    low[third] = high[third] = low[third] + at.share * (high - low)[third]
-    return low, high
-
-
 def shape_of(extent: FloatArray, cells: int) -> tuple[int, int]:
     """Rows and columns of about so many cells over an extent (2,): columns, rows."""
     width, height = np.maximum(extent, 1e-9)
@@ -116,7 +108,7 @@ def slice_map(state: State, cells: int = COARSE) -> SliceMap:
         About how many there are, with few anchors; with many there are fewer.
     """
     problem, at = state.world.problem, state.slice
-    low, high = plane(problem, at)
+    low, high = plane(state)
     cells = max(_LEAST_CELLS, round(cells * min(1.0, _ANCHORS / len(state.anchors))))
     rows, columns = shape_of((high - low)[[0, at.up]], cells)
     places = np.empty((rows, columns, 3))
@@ -161,8 +153,7 @@ def picture(found: SliceMap, limits: tuple[float, float] | None = None) -> np.nd
             ~free, return_distances=False, return_indices=True
         )
         values = values[tuple(nearest)]
-    zoom = max(1, round(_PIXELS / max(values.shape)))
-    fine = _enlarged(np.nan_to_num(values), zoom)
+    fine, zoom = _enlarged(np.nan_to_num(values), _ZOOM), _ZOOM
     shown = np.empty((*fine.shape, 4), np.uint8)
     if found.quantity is QUANTITIES["requirement"]:
         shown[..., :3] = np.where((fine <= 1)[..., None], WITHIN, BEYOND)
@@ -177,10 +168,15 @@ def colours(values: FloatArray, limits: tuple[float, float]) -> np.ndarray:
     low, high = limits
     span = math.log(high / low) if high > low > 0 else 1.0
     share = np.log(np.maximum(values, 1e-300) / max(low, 1e-300)) / span
-    place = share.clip(0.0, 1.0) * (len(_COLOURS) - 1)
-    below = np.minimum(place.astype(int), len(_COLOURS) - 2)
-    part = (place - below)[..., None]
-    return np.round((1 - part) * _COLOURS[below] + part * _COLOURS[below + 1]).astype(np.uint8)
+    return _shades()[(share.clip(0.0, 1.0) * (_SHADES - 1)).astype(np.intp)]
+
+
+@functools.cache
+def _shades() -> np.ndarray:
+    """The colours (256, 3) from small to large."""
+    at, known = np.linspace(0, 1, _SHADES), np.linspace(0, 1, len(_COLOURS))
+    columns = [np.interp(at, known, column) for column in _COLOURS.T]
+    return np.round(np.stack(columns, axis=-1)).astype(np.uint8)
 
 
 def _enlarged(values: FloatArray, zoom: int) -> FloatArray:

@@ -10,14 +10,14 @@ import numpy as np
 
 from rbl_gym.studio.figures import Figures, ZoneFigures
 from rbl_gym.studio.maps import BEYOND, QUANTITIES, WITHIN, SliceMap, css_gradient
-from rbl_gym.studio.scene_view import SIGNS, VERDICTS
+from rbl_gym.studio.moving_view import SEEN, SIGNS, VERDICTS
 from rbl_gym.studio.state import State
 
 PLANES = {"Floor plan (x, y)": 1, "Section (x, z)": 2}
 _NOBODY = "none"
 _CSS = (
     "font-family:inherit;font-size:12.5px;line-height:1.4;color:#212529;"
-    "font-variant-numeric:tabular-nums;padding:0 2px"
+    "font-variant-numeric:tabular-nums;padding:0 10px"
 )
 
 
@@ -60,8 +60,9 @@ class Panel:
         First name for files.
     actions
         What is called, by name: ``undo``, ``redo``, ``add``, ``add_best``, ``remove``, ``fix``,
-        ``optimise``, ``stop``, ``design`` without arguments; ``select`` with an index or None;
-        ``slice`` and ``knobs`` with keywords; ``save`` and ``report`` with a name.
+        ``optimise``, ``stop``, ``design``, ``reset_knobs``, ``restore`` without
+        arguments; ``select`` with an index or None;
+        ``cut`` and ``knobs`` with keywords; ``save`` and ``report`` with a name.
     has_report
         Whether there is a button for the report.
     """
@@ -77,15 +78,17 @@ class Panel:
         self._gui, self._actions = gui, actions
         self._filling = False
         self._headline = gui.add_html("")
-        self._optimise = self._button("Optimise", "optimise", icon="trending-down", color="teal")
-        self._optimise.hint = "Move all free anchors downhill from here, step by step"
+        self._optimise = self._button("Optimise from here", "optimise", icon="trending-down")
+        self._optimise.hint = "Move all free anchors, step by step, as long as the error falls"
         self._stop = self._button("Stop", "stop", icon="player-stop", color="gray")
         self._progress = gui.add_progress_bar(0.0, visible=False)
-        self._history = self._group({"Undo": "undo", "Redo": "redo", "Redesign": "design"})
+        self._group("Undo", {"Undo": "undo", "Redo": "redo"})
+        self._status = gui.add_html("")
         with gui.add_folder("Anchors"):
-            self._add = self._group({"Add best": "add_best", "Add": "add"})
             self._selected = gui.add_dropdown("Selected", (_NOBODY,))
-            self._one = self._group({"Fix / release": "fix", "Remove": "remove"})
+            self._one = self._group("", {"Fix / release": "fix", "Remove": "remove"})
+            self._add = self._group("One more", {"Best place": "add_best", "Anywhere": "add"})
+            self._all = self._group("All", {"Design afresh": "design"})
         with gui.add_folder("Map"):
             self._quantities = {
                 q.name: key
@@ -95,21 +98,20 @@ class Panel:
             shown = QUANTITIES[state.slice.quantity].name
             self._quantity = gui.add_dropdown("Show", tuple(self._quantities), initial_value=shown)
             self._plane = gui.add_dropdown("Slice", tuple(PLANES))
-            self._share = gui.add_slider("At", 0.0, 1.0, 0.01, state.slice.share)
+            self._at = gui.add_slider("At", 0.0, 1.0, 0.01, 0.5)
             self._legend = gui.add_html("")
         with gui.add_folder("What if", expand_by_default=False):
             knobs = state.world.knobs
-            largest = max(4 * knobs.noise_m, 0.5)
             self._noise = gui.add_slider(
-                "Noise (m)", *_range(knobs.noise_m, largest), knobs.noise_m
+                "Noise (m)", *_range(knobs.noise_m, 4 * knobs.noise_m), knobs.noise_m
             )
             self._tags = gui.add_slider("Tags", 3, max(12, knobs.n_tags), 1, knobs.n_tags)
             self._size = gui.add_slider(
-                "Body (m)", *_range(knobs.size_m, max(3 * knobs.size_m, 1.0)), knobs.size_m
+                "Body (m)", *_range(knobs.size_m, 3 * knobs.size_m), knobs.size_m
             )
             self._loss = gui.add_slider("Walls (dB)", 0.0, 60.0, 0.5, round(knobs.loss_db, 2))
             self._loss.visible = bool(state.world.base.obstacles)
-            self._reset = self._button("As in the file", "reset_knobs")
+            self._button("As in the file", "reset_knobs", color="gray")
         with gui.add_folder("Save", expand_by_default=False):
             self._name = gui.add_text("Name", name)
             save = gui.add_button("Scene and list", icon="device-floppy")
@@ -118,9 +120,8 @@ class Panel:
             if has_report:
                 report = gui.add_button("Report (PDF)", icon="file-text")
                 report.on_click(lambda _: self._call("report", self._name.value))
-            self._restore = self._button("Restore the last session", "restore")
+            self._restore = self._button("Restore the last session", "restore", color="gray")
             self._restore.visible = False
-        self._status = gui.add_html("")
         self._listen()
 
     def _button(self, label: str, action: str, **style: Any) -> Any:
@@ -128,20 +129,24 @@ class Panel:
         button.on_click(lambda _: self._call(action))
         return button
 
-    def _group(self, labels: Mapping[str, str]) -> Any:
-        group = self._gui.add_button_group("", tuple(labels))
+    def _group(self, label: str, labels: Mapping[str, str]) -> Any:
+        group = self._gui.add_button_group(label, tuple(labels))
         group.on_click(lambda _: self._call(labels[group.value]))
         return group
 
     def _listen(self) -> None:
         self._selected.on_update(lambda _: self._call("select", self._selection()))
         self._quantity.on_update(
-            lambda _: self._call("slice", quantity=self._quantities[self._quantity.value])
+            lambda _: self._call("cut", quantity=self._quantities[self._quantity.value])
         )
-        self._plane.on_update(lambda _: self._call("slice", up=PLANES[self._plane.value]))
-        self._share.on_update(lambda _: self._call("slice", share=float(self._share.value)))
+        self._plane.on_update(lambda _: self._call("cut", up=PLANES[self._plane.value]))
+        self._at.on_update(lambda _: self._call("cut", share=self._share()))
         for name, handle in self._knobs().items():
             handle.on_update(lambda _, n=name, h=handle: self._call("knobs", **{n: h.value}))
+
+    def _share(self) -> float:
+        low, high = float(self._at.min), float(self._at.max)
+        return (float(self._at.value) - low) / (high - low) if high > low else 0.5
 
     def _knobs(self) -> dict[str, Any]:
         return {
@@ -171,30 +176,43 @@ class Panel:
         state, selected = shown.state, shown.selected
         self._filling = True
         try:
-            self._headline.content = headline(shown)
-            self._legend.content = legend(shown.map, state)
-            self._status.content = f'<div style="{_CSS};color:#495057">{_text(shown.status)}</div>'
+            _set(self._headline, headline(shown), "content")
+            _set(self._legend, legend(shown.map), "content")
+            _set(self._status, status(shown), "content")
             running = shown.progress is not None
-            self._optimise.visible, self._stop.visible = not running, running
-            self._progress.visible = running
-            self._progress.value = 100.0 * (shown.progress or 0.0)
+            for handle in (self._stop, self._progress):
+                _set(handle, running, "visible")
+            _set(self._optimise, not running, "visible")
+            _set(self._progress, 100.0 * (shown.progress or 0.0))
             names = [_NOBODY, *(_anchor_name(state, k) for k in range(len(state.anchors)))]
-            if tuple(self._selected.options) != tuple(names):
-                self._selected.options = tuple(names)
-            chosen = names[0 if selected is None else selected + 1]
-            _set(self._selected, chosen)
-            _set(self._share, round(state.slice.share, 4))
+            _set(self._selected, tuple(names), "options")
+            _set(self._selected, names[0 if selected is None else selected + 1])
+            _set(self._one, selected is not None, "visible")
             _set(self._quantity, QUANTITIES[state.slice.quantity].name)
             _set(self._plane, next(k for k, up in PLANES.items() if up == state.slice.up))
+            self._show_at(state)
             for name, handle in self._knobs().items():
                 _set(handle, getattr(state.world.knobs, name))
         finally:
             self._filling = False
 
+    def _show_at(self, state: State) -> None:
+        """Where the slice is, in metres along the axis that it cuts."""
+        axis = 3 - state.slice.up
+        low, high = (float(corner[axis]) for corner in state.world.base.corners())
+        _set(self._at, high > low, "visible")
+        if high > low:
+            step = (high - low) / 100
+            _set(self._at, f"At {'xyz'[axis]} (m)", "label")
+            for name, value in (("min", low), ("max", high), ("step", step)):
+                _set(self._at, value, name)
+            _set(self._at, round(low + state.slice.share * (high - low), 6))
 
-def _set(handle: Any, value: Any) -> None:
-    if handle.value != value:
-        handle.value = value
+
+def _set(handle: Any, value: Any, name: str = "value") -> None:
+    """What is as it should be is not sent."""
+    if getattr(handle, name) != value:
+        setattr(handle, name, value)
 
 
 def _range(value: float, most: float) -> tuple[float, float, float]:
@@ -215,14 +233,22 @@ def _text(text: str) -> str:
 
 
 def headline(shown: Shown) -> str:
-    """The score, the zones, and the scores of other layouts as bars."""
+    """The score, the zones, the body, and the scores of other layouts as bars."""
     figures, count = shown.figures, len(shown.state.anchors)
+    body = figures.body
+    seen = int((body.seen >= SEEN).sum())
     parts = [
         f'<div style="{_CSS}">',
         '<div style="display:flex;align-items:baseline;gap:8px">'
-        f'<b style="font-size:24px;line-height:1.2">{length(figures.score_m)}</b>'
-        f'<span style="color:#495057">tag error b, {count} anchors</span></div>',
+        f'<b style="font-size:26px;line-height:1.25">{length(figures.score_m)}</b>'
+        f'<span style="color:#495057">error of a tag, {count} anchors</span></div>',
         *(_zone(zone) for zone in figures.zones),
+        _row(
+            "#fcc419",
+            "At the body",
+            f"{length(body.position_m)}, {body.heading_deg:.1f}° heading; {seen} of "
+            f"{count} anchors in sight",
+        ),
         _bars(figures.score_m, shown.others),
         "</div>",
     ]
@@ -230,21 +256,26 @@ def headline(shown: Shown) -> str:
 
 
 def _zone(zone: ZoneFigures) -> str:
-    colour = f"rgb{VERDICTS[zone.verdict]}"
-    share = ""
+    colour, share = f"rgb{VERDICTS[zone.verdict]}", ""
     if np.isfinite(zone.share):
         share = (
             f'<b style="color:{colour};white-space:nowrap">{SIGNS[zone.verdict]} '
             f"{100 * zone.share:.1f} % of {100 * zone.required:g} %</b>"
         )
     figures = (
-        f"{length(zone.position_m)} flat, {length(zone.height_m)} high, {zone.heading_deg:.2g}°"
+        f"{length(zone.position_m)} horizontal, {length(zone.height_m)} height, "
+        f"{zone.heading_deg:.1f}° heading"
     )
+    return _row(colour, zone.name, figures, share)
+
+
+def _row(colour: str, name: str, figures: str, right: str = "") -> str:
+    """A name, figures below it, and a mark (HTML) to the right."""
     return (
-        f'<div style="border-left:4px solid {colour};padding-left:6px;margin:5px 0">'
+        f'<div style="border-left:4px solid {colour};padding-left:7px;margin:5px 0">'
         '<div style="display:flex;justify-content:space-between;gap:6px">'
-        f'<span style="overflow-wrap:anywhere">{_text(zone.name)}</span>{share}</div>'
-        f'<div style="color:#495057">{figures}</div></div>'
+        f'<span style="overflow-wrap:anywhere">{_text(name)}</span>{right}</div>'
+        f'<div style="color:#495057;font-size:11.5px">{_text(figures)}</div></div>'
     )
 
 
@@ -256,11 +287,11 @@ def _bars(own: float, others: Mapping[str, float | None]) -> str:
     lines = []
     for name, score in rows:
         mine = name == "this layout"
-        colour, weight = ("#e67700", "600") if mine else ("#adb5bd", "400")
+        colour, weight = ("#e8590c", "600") if mine else ("#adb5bd", "400")
         lines.append(
             f'<span style="font-weight:{weight};white-space:nowrap">{_text(name)}</span>'
-            '<span style="background:#f1f3f5;border-radius:2px;height:9px;align-self:center">'
-            f'<span style="display:block;height:9px;border-radius:2px;background:{colour};'
+            '<span style="background:#f1f3f5;border-radius:2px;height:8px;align-self:center">'
+            f'<span style="display:block;height:8px;border-radius:2px;background:{colour};'
             f'width:{100 * score / largest:.1f}%"></span></span>'
             f'<span style="font-weight:{weight};text-align:right">{length(score)}</span>'
         )
@@ -268,39 +299,45 @@ def _bars(own: float, others: Mapping[str, float | None]) -> str:
         if name not in known:
             lines.append(
                 f'<span style="color:#868e96">{_text(name)}</span>'
-                '<span style="color:#868e96">being searched ...</span><span></span>'
+                '<span style="color:#868e96">is being searched</span><span></span>'
             )
     return (
-        '<div style="display:grid;grid-template-columns:auto 1fr auto;gap:1px 8px;margin-top:6px">'
-        f"{''.join(lines)}</div>"
+        '<div style="display:grid;grid-template-columns:auto 1fr auto;gap:0 8px;margin-top:6px;'
+        f'font-size:11.5px;line-height:1.45">{"".join(lines)}</div>'
     )
 
 
-def legend(found: SliceMap, state: State) -> str:
-    """The colours of the map, and where it lies."""
-    third = "xyz"[3 - found.up]
-    at = f"{third} = {found.low[3 - found.up]:.2f} m"
-    if found.quantity is QUANTITIES["requirement"]:
+def status(shown: Shown) -> str:
+    """The last message, in red where something was not done."""
+    colour = "#c92a2a" if shown.status.startswith("Not done") else "#495057"
+    return f'<div style="{_CSS};color:{colour};min-height:18px">{_text(shown.status)}</div>'
+
+
+def legend(found: SliceMap) -> str:
+    """The colours of the map."""
+    quantity = found.quantity
+    if quantity is QUANTITIES["requirement"]:
         squares = "".join(
             f'<span style="display:inline-block;width:10px;height:10px;background:rgb{colour};'
             f'margin:0 4px 0 8px"></span>{word}'
             for colour, word in ((WITHIN, "within"), (BEYOND, "beyond"))
         )
-        return f'<div style="{_CSS}">{at}{squares}</div>'
-    low, high = found.limits
-    unit = found.quantity.unit
+        return f'<div style="{_CSS}">{squares}</div>'
+    low, high = (
+        length(value) if quantity.unit == "m" else f"{value:.2g}°" for value in found.limits
+    )
     return (
         f'<div style="{_CSS}"><div style="height:10px;border-radius:2px;'
         f'background:{css_gradient()}"></div>'
         '<div style="display:flex;justify-content:space-between">'
-        f"<span>{low:.3g} {unit}</span><span>{at}</span><span>{high:.3g} {unit}</span></div></div>"
+        f"<span>{low}</span><span>{high}</span></div></div>"
     )
 
 
 def length(metres: float) -> str:
-    """Three digits, in the unit in which they are read."""
-    if metres < 0.01:
-        return f"{1000 * metres:.3g} mm"
-    if metres < 1:
-        return f"{100 * metres:.3g} cm"
-    return f"{metres:.3g} m"
+    """Three digits at most, in the unit in which they are read."""
+    for unit, scale in (("mm", 1000), ("cm", 100), ("m", 1)):
+        value = scale * metres
+        if value < (10 if unit == "mm" else 100):
+            return f"{value:.1f} {unit}" if unit != "m" or value >= 10 else f"{value:.2f} m"
+    return f"{metres:.0f} m"

@@ -17,11 +17,11 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.placement import scene_files
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing import design
-from rbl_gym.studio import files, maps, state
+from rbl_gym.studio import files, maps, searches, state
 from rbl_gym.studio.display import Display
-from rbl_gym.studio.figures import figures, usual_scores
+from rbl_gym.studio.figures import Others, body_figures, figures
 from rbl_gym.studio.panel import Shown
-from rbl_gym.studio.rays import under_pointer
+from rbl_gym.studio.rays import on_plane, under_pointer
 from rbl_gym.studio.state import Layout, State
 from rbl_gym.studio.worker import Worker
 from rbl_gym.studio.world import knobs_of
@@ -67,15 +67,14 @@ class PlacePage:
         self._selected: int | None = None
         self._status = "Drag an anchor. Click one to select it."
         self._progress: float | None = None
-        self._usual: dict[tuple[int, int], dict[str, float]] = {}
-        self._designed: dict[int, FloatArray] = {}
+        self._others = Others()
         self._autosave_found = files.last_session(start, folder)
         self._worker = Worker(self._failed)
         actions = {
             "undo": lambda: self.edit(state.undo),
             "redo": lambda: self.edit(state.redo),
             "add": lambda: self._edit_and_select(state.add),
-            "add_best": lambda: self._edit_and_select(state.add_best),
+            "add_best": lambda: self._edit_and_select(searches.add_best),
             "remove": lambda: self._of_selected(state.remove),
             "fix": lambda: self._of_selected(lambda now, k: state.fix(now, k, not now.fixed[k])),
             "optimise": self.optimise,
@@ -83,7 +82,8 @@ class PlacePage:
             "design": self.redesign,
             "select": self.select,
             "drag": self.drag,
-            "slice": self.slice,
+            "drag_body": self.drag_body,
+            "cut": self.cut,
             "knobs": self.turn_knobs,
             "reset_knobs": lambda: self.turn_knobs(**knobs_of(start.world.base)._asdict()),
             "save": self.save,
@@ -127,16 +127,27 @@ class PlacePage:
 
         self._worker.post(task)
 
-    def slice(self, **fields: Any) -> None:
+    def cut(self, **fields: Any) -> None:
         """Show another map: fields of `Slice`."""
 
         def task() -> None:
-            at = self.state.slice._replace(**fields)
-            self.state = dataclasses.replace(self.state, slice=at)
+            self.state = state.cut(self.state, **fields)
             self._show_coarse()
             self._refine()
 
         self._worker.post(task, "slice")
+
+    def drag_body(self, _: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
+        """The body is held under a pointer: it moves on the slice. Arguments as `drag`."""
+
+        def task() -> None:
+            axis, (low, _) = 3 - self.state.slice.up, state.plane(self.state)
+            place = on_plane(camera, point, axis, low[axis])
+            self.state = state.place_body(self.state, place)
+            self.figures = self.figures._replace(body=body_figures(self.state))
+            self._show()
+
+        self._worker.post(task, "body")
 
     def turn_knobs(self, **knobs: float) -> None:
         """Turn `Knobs`, given by their names."""
@@ -171,7 +182,7 @@ class PlacePage:
         """Put the designed layout of as many anchors in place; it is searched if need be."""
 
         def task() -> None:
-            found = self._designed.get(len(self.state.anchors))
+            found = self._others.designed.get(len(self.state.anchors))
             if found is None or self.state.fixed.any():
                 self._status = "Searching the best layout from scratch ..."
                 self._show()
@@ -255,7 +266,7 @@ class PlacePage:
         moved = state.move(start, index, place)
         # Over an obstacle it stays where it was last.
         if moved is not start:
-            self.state = dataclasses.replace(moved, slice=self.state.slice)
+            self.state = dataclasses.replace(moved, slice=self.state.slice, body=self.state.body)
         if phase == "end":
             self._before_drag, self._status = None, ""
             self._refine()
@@ -266,7 +277,7 @@ class PlacePage:
         before = start.score
         self._progress = 0.0
         self._show()
-        for done, better in state.optimise(start, self._seed):
+        for done, better in searches.optimise(start, self._seed):
             self.state, self._progress = better, done
             self._show_coarse()
             yield
@@ -298,10 +309,7 @@ class PlacePage:
         self.map = maps.slice_map(now, maps.REFINED)
         self._show()
         yield
-        count = len(now.anchors)
-        key = id(now.world), count
-        if key not in self._usual:
-            self._usual = {key: usual_scores(now.world, count)}
+        self._others.search_usual(now.world, len(now.anchors))
         self._show()
         yield
         self._autosave()
@@ -312,23 +320,12 @@ class PlacePage:
                 self.state,
                 self.figures,
                 self.map,
-                self._others(),
+                self._others.scores(self.state.world, len(self.state.anchors)),
                 self._selected,
                 self._progress,
                 self._status,
             )
         )
-
-    def _others(self) -> dict[str, float | None]:
-        world, count = self.state.world, len(self.state.anchors)
-        usual = self._usual.get((id(world), count), {})
-        designed = self._designed.get(count)
-        found: dict[str, float | None] = {}
-        if designed is not None:
-            found["designed"] = world.score(designed)
-        elif not self._designed:
-            found["designed"] = None
-        return found | usual
 
     # --- beside the worker ------------------------------------------------------------------
 
@@ -346,7 +343,7 @@ class PlacePage:
 
         def task() -> None:
             count = len(problem.fixed)
-            self._designed[len(found)] = found
+            self._others.designed[len(found)] = found
             if apply:
                 stays = np.arange(len(found)) < count
                 self._edit(lambda at: state.set_layout(at, Layout(found, stays)))

@@ -50,3 +50,10 @@ def under_pointer(
     best = off <= off.min() + _SAME_RAD
     distance = np.where(best, np.linalg.norm(legal - near, axis=1), np.inf)
     return legal[int(distance.argmin())]
+
+
+def on_plane(camera: FloatArray, point: FloatArray, axis: int, at: float) -> FloatArray:
+    """Where the line of sight meets the plane on which a coordinate is `at`; else the point."""
+    slope = point[axis] - camera[axis]
+    share = (at - camera[axis]) / slope if abs(slope) > 1e-9 else 0.0
+    return camera + share * (point - camera) if share > 0 else point

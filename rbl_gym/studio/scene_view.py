@@ -1,8 +1,7 @@
-"""The room in 3-D: walls, obstacles, zones, the body, anchors and the map, as viser draws them."""
+"""What stands still in 3-D: floor, walls, obstacles, where anchors may stand; and the camera."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,22 +11,9 @@ from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.polygons import ears
 from rbl_gym.geometry.regions import Walls
 from rbl_gym.placement.building import Problem
-from rbl_gym.studio.figures import ZoneFigures
-from rbl_gym.studio.maps import SliceMap, picture
 
 INK = (52, 58, 64)
-WALL, FLOOR, RACK = (206, 212, 218), (241, 243, 245), (134, 142, 150)
-ANCHOR, SELECTED, FIXED, BODY = (31, 97, 141), (230, 119, 0), (73, 80, 87), (25, 113, 60)
-# Of a zone: meets what it asks, does not, too close to tell, asks nothing.
-VERDICTS = {
-    "pass": (47, 158, 68),
-    "fail": (201, 42, 42),
-    "undecided": (230, 145, 0),
-    "no requirement": (73, 80, 87),
-}
-SIGNS = {"pass": "✓", "fail": "✗", "undecided": "?", "no requirement": ""}
-# Sizes as shares of the largest extent: anchors, lines.
-_ANCHOR, _LINE = 0.010, 0.0016
+WALL, FLOOR, GRID, RACK = (206, 212, 218), (241, 243, 245), (222, 226, 230), (173, 181, 189)
 _FOV_RAD = 0.75
 
 
@@ -73,6 +59,8 @@ def set_camera(server: Any, problem: Problem) -> None:
 def draw_room(server: Any, problem: Problem) -> None:
     """Floor, walls, obstacles and where anchors may stand."""
     scene, extent = server.scene, extent_of(problem)
+    scene.configure_default_lights(cast_shadow=False)
+    scene.add_light_ambient("/light", intensity=1.2)
     low, high = corners(problem)
     flat = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
     floor = np.column_stack([flat, np.full(4, low[2] - 0.002 * extent)])
@@ -81,7 +69,7 @@ def draw_room(server: Any, problem: Problem) -> None:
         cast_shadow=False, receive_shadow=False,
     )  # fmt: skip
     step = next(s for s in (1, 2, 5, 10, 50, 100, 1000, 1e9) if extent / s < 50)
-    _lines(scene, "/room/grid", _grid(low, high, step, floor[0, 2] + 3e-4 * extent), FLOOR_LINE, 1)
+    lines(scene, "/room/grid", _grid(low, high, step, floor[0, 2] + 3e-4 * extent), GRID, 1)
     if isinstance(problem.mounts, Walls):
         faces = _room_faces(*problem.mounts.bounds())
         # Seen from the inside alone: the walls between camera and room are left out.
@@ -89,7 +77,7 @@ def draw_room(server: Any, problem: Problem) -> None:
             "/room/walls", *faces, color=WALL, opacity=0.35, side="back",
             cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
-        _lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), INK, 1.5)
+        lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), INK, 1.5)
     elif isinstance(problem.mounts, Mounts):
         vertices, triangles = _mount_faces(problem.mounts)
         if len(triangles):
@@ -98,7 +86,7 @@ def draw_room(server: Any, problem: Problem) -> None:
                 side="double", cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
     else:
-        _lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), (173, 181, 189), 1)
+        lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), (173, 181, 189), 1)
     solids = obstacle_mesh(problem)
     if solids is not None:
         scene.add_mesh_simple(
@@ -106,10 +94,8 @@ def draw_room(server: Any, problem: Problem) -> None:
         )
 
 
-FLOOR_LINE = (222, 226, 230)
-
-
-def _lines(scene: Any, name: str, segments: FloatArray, colour: Any, width: float) -> Any:
+def lines(scene: Any, name: str, segments: FloatArray, colour: Any, width: float) -> Any:
+    """Segments (S, 2, 3) so many pixels wide."""
     return scene.add_line_segments(
         name, np.asarray(segments, np.float32), colour, thickness=width, thickness_units="screen"
     )
@@ -186,122 +172,3 @@ def obstacle_mesh(problem: Problem) -> tuple[FloatArray, np.ndarray] | None:
         triangles.append(np.concatenate(faces) + count)
         count += 2 * size
     return np.concatenate(points), np.concatenate(triangles)
-
-
-# --- what changes ----------------------------------------------------------------------------
-
-
-def draw_zones(server: Any, problem: Problem, zones: tuple[ZoneFigures, ...]) -> None:
-    """The edges of zones in the colours of their verdicts; names and shares where there is one."""
-    for index, (zone, found) in enumerate(zip(problem.zones, zones, strict=True)):
-        edges = prism_edges(zone.polygon, zone.low_m, zone.high_m)
-        _lines(server.scene, f"/zones/{index}", edges, VERDICTS[found.verdict], 2)
-        if found.verdict == "no requirement" and len(zones) == 1:
-            continue
-        text = f"{SIGNS[found.verdict]} {found.name}".strip()
-        if np.isfinite(found.share):
-            text += f"  {100 * found.share:.0f} %"
-        corner = (*zone.polygon[zone.polygon.sum(axis=1).argmin()], zone.high_m)
-        server.scene.add_label(f"/zones/{index}/name", text, position=corner, anchor="bottom-left")
-
-
-def draw_map(server: Any, found: SliceMap, handle: Any = None) -> Any:
-    """The map on its plane; with a handle of the same plane its picture alone is changed.
-
-    Returns
-    -------
-    The handle of the picture.
-    """
-    image = picture(found)
-    if handle is not None:
-        handle.image = image
-        return handle
-    size = (found.high - found.low)[[0, found.up]]
-    # The picture's own axes are x to the right and y down.
-    turn = (0.0, 1.0, 0.0, 0.0) if found.up == 1 else (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
-    return server.scene.add_image(
-        "/map", image, float(size[0]), float(size[1]), format="png",
-        wxyz=turn, position=tuple(0.5 * (found.low + found.high)),
-        cast_shadow=False, receive_shadow=False,
-    )  # fmt: skip
-
-
-def draw_body(server: Any, tags: FloatArray, place: FloatArray, extent: float) -> None:
-    """The body: its tags about a place, joined to its middle; not smaller than can be seen."""
-    grown = max(1.0, 0.02 * extent / max(float(np.ptp(tags, axis=0).max()), 1e-9))
-    spots = place + grown * tags
-    lines = np.stack([np.broadcast_to(place, spots.shape), spots], axis=1)
-    _lines(server.scene, "/body/arms", lines, BODY, 3)
-    server.scene.add_point_cloud(
-        "/body/tags", spots.astype(np.float32), BODY, point_size=0.005 * extent,
-        point_shape="circle", precision="float32",
-    )  # fmt: skip
-
-
-class AnchorView:
-    """The anchors as balls that can be taken by the hand.
-
-    Parameters
-    ----------
-    server, extent
-        Where they are drawn, and the largest extent of the room, metres.
-    dragged
-        Called with the number of the anchor, the phase (``"start"``, ``"update"``, ``"end"``),
-        the camera's place (3,) and a point (3,) under the pointer.
-    clicked
-        Called with the number of the anchor.
-    """
-
-    def __init__(
-        self,
-        server: Any,
-        extent: float,
-        dragged: Callable[[int, str, FloatArray, FloatArray], None],
-        clicked: Callable[[int], None],
-    ) -> None:
-        self._server, self._radius = server, _ANCHOR * extent
-        self._dragged, self._clicked = dragged, clicked
-        self.balls: list[Any] = []
-        self._labels: list[Any] = []
-        self._colours: list[Any] = []
-
-    def show(self, anchors: FloatArray, fixed: np.ndarray, selected: int | None) -> None:
-        """Draw them where they are (M, 3); only what changed is sent."""
-        while len(self.balls) > len(anchors):
-            self.balls.pop().remove()
-            self._labels.pop().remove()
-            self._colours.pop()
-        while len(self.balls) < len(anchors):
-            self._add(len(self.balls))
-        up = np.array([0.0, 0.0, 1.6 * self._radius])
-        for k, place in enumerate(anchors):
-            ball, label = self.balls[k], self._labels[k]
-            if (np.asarray(ball.position) != place).any():
-                ball.position = tuple(place)
-                label.position = tuple(place + up)
-            colour = SELECTED if k == selected else FIXED if fixed[k] else ANCHOR
-            text = f"{k + 1} fixed" if fixed[k] else f"{k + 1}"
-            if self._colours[k] != (colour, text):
-                self._colours[k] = colour, text
-                ball.color, label.text = colour, text
-
-    def _add(self, index: int) -> None:
-        scene = self._server.scene
-        ball = scene.add_icosphere(
-            f"/anchors/{index + 1}", radius=self._radius, color=ANCHOR, subdivisions=2
-        )
-        label = scene.add_label(f"/anchor-names/{index + 1}", "", anchor="bottom-center")
-
-        # Coroutines keep the order of the phases; threads would not.
-        @ball.on_drag
-        async def _(event: Any) -> None:
-            camera = np.array(event.client.camera.position)
-            self._dragged(index, event.phase, camera, np.array(event.end_position))
-
-        @ball.on_click
-        async def _(event: Any) -> None:
-            self._clicked(index)
-
-        self.balls.append(ball)
-        self._labels.append(label)
-        self._colours.append(None)

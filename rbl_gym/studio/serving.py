@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
+import re
 import socket
+from collections.abc import Iterator
 from typing import Any
 
 from rbl_gym.checks import check_count
@@ -12,7 +15,9 @@ from rbl_gym.studies.extras import require
 
 # Ports that are tried from the first on.
 _PORTS = 50
-BRAND = (31, 97, 141)
+BRAND = (24, 100, 171)
+# Origins of pages that this machine serves, by whatever port.
+_LOOPBACK = re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 
 
 def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym studio") -> Any:
@@ -39,14 +44,33 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym
 
     port = _free_port(host, check_count("port", port, least=0, most=65535))
     # It would print a frame of its own.
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):
+        server: Any = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+    # A browser could ask for a tunnel to the outside.
+    server.request_share_url = lambda *_, **__: None
     server.gui.configure_theme(
         control_width="medium", show_logo=False, show_share_button=False, brand_color=BRAND
     )
     server.scene.set_up_direction("+z")
     server.scene.configure_environment_map(None)
     return server
+
+
+@contextlib.contextmanager
+def _own_pages_only(host: str) -> Iterator[None]:
+    """On loopback, a server that is made here speaks to pages of this machine alone.
+
+    Any page that is open in a browser may connect to loopback; the browser says whose it is.
+    """
+    from websockets.asyncio import server
+
+    serve = server.serve
+    if host in ("127.0.0.1", "localhost", "::1"):
+        server.serve = functools.partial(serve, origins=[_LOOPBACK, None])  # type: ignore
+    try:
+        yield
+    finally:
+        server.serve = serve
 
 
 def stop_server(server: Any) -> None:

@@ -6,18 +6,14 @@ A state is never changed: every function takes one and returns another.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray, check_array
 from rbl_gym.placement.building import Problem
-from rbl_gym.placement.descent import descend
-from rbl_gym.placement.exchange import refresh
 from rbl_gym.placement.file_keys import MAX_ANCHORS, MIN_ANCHORS
-from rbl_gym.placement.setting import Setting
 from rbl_gym.studies.placing import choosing, design
 from rbl_gym.studio.world import Knobs, World, knobs_of
 
@@ -26,11 +22,12 @@ __all__ = [
     "Slice",
     "State",
     "add",
-    "add_best",
+    "cut",
     "fix",
     "move",
     "open_state",
-    "optimise",
+    "place_body",
+    "plane",
     "redo",
     "remove",
     "set_layout",
@@ -45,8 +42,6 @@ _MOST_PAST = 200
 _APART_M = 1e-3
 # Candidates among which a new anchor is the farthest from the others.
 _CANDIDATES = 400
-# Rounds of an optimisation, steps along the gradient in each; it ends where a round gains less.
-_ROUNDS, _STEPS, _LEAST_GAIN = 12, 8, 2e-3
 
 
 class Layout(NamedTuple):
@@ -87,6 +82,8 @@ class State:
         The problem and its knobs.
     layout
         The anchors.
+    body
+        (3,): where the body is shown, metres; on the slice.
     slice
         What the map shows.
     past, future
@@ -95,6 +92,7 @@ class State:
 
     world: World
     layout: Layout
+    body: FloatArray
     slice: Slice = _FIRST_SLICE
     past: tuple[Layout, ...] = ()
     future: tuple[Layout, ...] = ()
@@ -155,7 +153,8 @@ def open_state(problem: Problem, anchors: FloatArray | None = None) -> State:
             f"anchors[{k}] = {anchors[k].tolist()} stands where none may: off the mounts, or "
             "inside of an obstacle"
         )
-    return State(world, Layout(anchors, stays))
+    start = State(world, Layout(anchors, stays), np.mean(problem.corners(), axis=0))
+    return start if not problem.obstacles.contain(start.body) else _beside(start)
 
 
 def _first_layout(world: World) -> FloatArray:
@@ -221,25 +220,7 @@ def add(state: State, point: FloatArray | None = None) -> State:
     place = snap(state.world, point)
     if not _is_free(state, place, state.anchors):
         raise ValueError("no anchor may stand there: inside of an obstacle, or taken")
-    return _with_one_more(state, place)
-
-
-def add_best(state: State, seed: int = 0) -> State:
-    """One more anchor where it helps most. Arguments and errors as `add`.
-
-    Parameters
-    ----------
-    state
-        The layout as it is.
-    seed
-        Of the candidates.
-    """
-    if len(state.anchors) >= MAX_ANCHORS:
-        raise ValueError(f"there may be {MAX_ANCHORS} anchors at most")
-    found = choosing.next_anchor(state.problem, state.anchors, seed)
-    if found is None:
-        raise ValueError("no mount is left for one more anchor")
-    return _with_one_more(state, found[0])
+    return with_one_more(state, place)
 
 
 def remove(state: State, index: int) -> State:
@@ -269,7 +250,8 @@ def fix(state: State, index: int, fixed: bool = True) -> State:
     return set_layout(state, Layout(state.anchors, stays))
 
 
-def _with_one_more(state: State, place: FloatArray) -> State:
+def with_one_more(state: State, place: FloatArray) -> State:
+    """An anchor more, the last, at a legal place."""
     anchors = np.concatenate([state.anchors, place[None]])
     return set_layout(state, Layout(anchors, np.append(state.fixed, False)))
 
@@ -287,6 +269,43 @@ def _is_free(state: State, place: FloatArray, others: FloatArray) -> bool:
 def _are_one(place: FloatArray, others: FloatArray) -> BoolArray:
     """Which of the others (..., 3) stand at a place (3,)."""
     return np.abs(others - place).max(axis=-1) <= _APART_M
+
+
+# --- the slice and the body ------------------------------------------------------------------
+
+
+def plane(state: State) -> tuple[FloatArray, FloatArray]:
+    """Corners (3,) of the slice: all zones, cut at its share of the third axis; metres."""
+    low, high = (corner.copy() for corner in state.world.base.corners())
+    third = 3 - state.slice.up
+    low[third] = high[third] = low[third] + state.slice.share * (high - low)[third]
+    return low, high
+
+
+def cut(state: State, **fields: Any) -> State:
+    """With other fields of the `Slice`; the body moves onto it."""
+    changed = dataclasses.replace(state, slice=state.slice._replace(**fields))
+    return place_body(changed, state.body)
+
+
+def place_body(state: State, point: FloatArray) -> State:
+    """The body at the place of the slice that is nearest to a point, inside of no obstacle.
+
+    Inside of one only its height on the slice, or its y, is changed.
+    """
+    low, high = plane(state)
+    place = np.clip(point, low, high)
+    if state.world.problem.obstacles.contain(place[None])[0]:
+        place = np.clip(state.body, low, high)
+    return dataclasses.replace(state, body=place)
+
+
+def _beside(state: State) -> State:
+    """The body at the free place of the zones that is nearest to where it is."""
+    places = state.world.sample.places
+    return dataclasses.replace(
+        state, body=places[np.linalg.norm(places - state.body, axis=1).argmin()]
+    )
 
 
 # --- the whole layout ------------------------------------------------------------------------
@@ -320,55 +339,3 @@ def turn_knobs(state: State, **knobs: float) -> State:
     """With other `Knobs`, given by their names."""
     changed: Knobs = state.world.knobs._replace(**knobs)
     return dataclasses.replace(state, world=state.world.with_knobs(changed))
-
-
-def optimise(state: State, seed: int = 0) -> Iterator[tuple[float, State]]:
-    """Better and better layouts, from this one on; the fixed anchors stay.
-
-    In every round some steps along the gradient, and fresh candidates where something is in the
-    way. All of them are one change: undo goes back to the layout at the beginning.
-
-    Parameters
-    ----------
-    state
-        Where it begins.
-    seed
-        Of the fresh candidates.
-
-    Yields
-    ------
-    How much is done, from 0 to 1, and a state whose score is at most that of the one before.
-    """
-    world, (start, fixed) = state.world, state.layout
-    free = np.flatnonzero(~fixed)
-    if not len(free):
-        yield 1.0, state
-        return
-    setting = _with_fixed(world.setting, start[fixed])
-    rng = np.random.default_rng([seed, len(start)])
-    best, least, reached = state, state.score, start[free]
-    for number in range(_ROUNDS):
-        before = least
-        reached, score = descend(setting, reached, _STEPS)
-        if not setting.is_smooth:
-            anchors = start.copy()
-            anchors[free] = reached
-            if score < least:
-                best, least = set_layout(state, Layout(anchors, fixed)), score
-                yield (number + 0.5) / _ROUNDS, best
-            reached, score = refresh(setting, reached, rng)
-        if score < least:
-            anchors = start.copy()
-            anchors[free] = reached
-            best, least = set_layout(state, Layout(anchors, fixed)), score
-        if least > before * (1 - _LEAST_GAIN) and number:
-            break
-        yield (number + 1) / _ROUNDS, best
-    yield 1.0, best
-
-
-def _with_fixed(setting: Setting, fixed: FloatArray) -> Setting:
-    """The setting in which anchors count as known."""
-    if not len(fixed):
-        return setting
-    return setting._replace(sample=setting.sample._replace(prior=setting.told(fixed)))
