@@ -1,8 +1,8 @@
-"""A small bank of iterated EKFs: starts from nothing, notices that it is lost, and starts again.
+"""Bank of iterated EKFs that starts without a prior pose, detects divergence and restarts.
 
-One hypothesis leads; the others, its rivals, run beside it until their likelihood ratio decides.
-Rivals come from `locate`, with the mirror poses that it lists, where the prior is vague and where
-the ranges of late contradict the leader. Trials without rivals cost what the iterated EKF does.
+One hypothesis is the leader. The others, its rivals, run in parallel until their likelihood ratio
+decides. `locate` supplies the rivals, mirror poses included, if the prior is vague or if recent
+ranges contradict the leader. Trials without rivals cost the same as the iterated EKF.
 """
 
 from __future__ import annotations
@@ -40,24 +40,24 @@ from rbl_gym.geometry.rotations import error as rotation_error
 from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
-# What a window of epochs forgets with each new one: about three of them count.
+# Forgetting factor per epoch of the fading window: about three epochs count.
 _FORGET = 0.3
-# Squared whitened innovation per link, over the window, above which a leader is doubted: an honest
-# one has 1, within so many standard deviations of it; with a fifth of the ranges wrong, which a
-# robust one bears, it has 2.8.
+# Squared whitened innovation per link, over the window, above which the leader is doubted. A
+# consistent filter has 1, within this many standard deviations. A robust filter with a fifth of
+# the ranges wrong has 2.8 and still works.
 _DEVIATIONS, _MOST_STRAIN = 6.0, 4.0
-# Log of the odds that a filter is lost at a given epoch, before the ranges are looked at.
+# Prior log odds that a filter has diverged at a given epoch.
 _LOST = -10.0
-# Rivals less likely than this against their leader (log odds) have lost.
+# Rivals with log odds against their leader below this are dropped.
 _BEATEN = -12.0
-# Rivals less likely than this against their leader (log odds, 3 sigma) do not widen its belief.
+# Rivals with log odds against their leader below this (3 sigma) do not widen its belief.
 _ALIVE = -4.5
-# A pose has six directions: fewer ranges than that determine none.
+# A pose has six degrees of freedom: fewer ranges do not determine it.
 _FEWEST_LINKS = 6
 
 
 class _Scored(NamedTuple):
-    """A pose after an update, and the cost of the epoch there, prior included."""
+    """A pose after an update, and the cost of the epoch at it, prior included."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -74,8 +74,8 @@ class IteratedEkfBank:
     tags, noise, process, iterations, robust
         As `IteratedEkf`.
     volume
-        Corners (2, 3), metres, of the box where the body's origin may be: it rules out mirror
-        poses, and is where a lost body is looked for. None: anywhere near the anchors.
+        Corners (2, 3), metres, of the box that contains the body's origin. It excludes mirror poses
+        and bounds the search for a lost body. None: anywhere near the anchors.
     """
 
     tags: FloatArray
@@ -105,17 +105,19 @@ class IteratedEkfBank:
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
     ) -> BankState:
-        """State of a prior; from nothing: a covariance as wide as all that may be.
+        """Return the state of a prior.
+
+        For an unknown pose, give a covariance that covers all possible poses.
 
         Raises
         ------
         ValueError
-            As `IteratedEkf.initial`.
+            As in `IteratedEkf.initial`.
         """
         return alone(self._filter.initial(rotation, translation, covariance))
 
     def predict(self, state: BankState, twist: ArrayLike, dt: float) -> BankState:
-        """State after `dt` seconds of the twist (..., 6), of all hypotheses."""
+        """Return the state after `dt` seconds of the twist (..., 6), for all hypotheses."""
         state = plain(state)
         twist, dt = check_array("twist", twist, (6,)), check_number("dt", dt, low=0.0)
         leader = self._filter.predict(leader_of(state), twist, dt)
@@ -137,14 +139,16 @@ class IteratedEkfBank:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> BankState:
-        """State after one epoch of ranges (..., M, N): hypotheses weighed, added, dropped.
+        """Return the state after one epoch of ranges (..., M, N).
 
-        `noise` is the law of this epoch, None: the filter's.
+        Hypotheses are weighted, added and dropped.
+
+        `noise` is the noise model of this epoch; None: that of the filter.
 
         Raises
         ------
         ValueError
-            As `IteratedEkf.update`.
+            As in `IteratedEkf.update`.
         """
         state = plain(state)
         ranges, weights, anchors = self._filter.weighed(ranges, anchors, links, noise, state)
@@ -170,7 +174,7 @@ class IteratedEkfBank:
             strained |= self._is_outside(led.translation, led.covariance)
         vague = self._filter.is_sought(leader_of(prior), *epoch)
         if self._is_line:
-            # The update of the leader has searched; there is nothing else that `locate` knows.
+            # The update of the leader has already searched; `locate` finds nothing more.
             vague = np.zeros_like(vague)
         lost = np.flatnonzero((strained | vague) & (count >= _FEWEST_LINKS))
         if len(lost):
@@ -178,11 +182,11 @@ class IteratedEkfBank:
         return of_batch(self._elect(state), batch)
 
     def belief(self, state: BankState) -> PoseBelief:
-        """The leader's pose with a covariance that covers the rivals alive (copies).
+        """Return the leader's pose with a covariance that covers the live rivals (copies).
 
-        The covariance holds second moments about the leader, of every hypothesis weighed by its
-        probability; of rivals less likely than `_ALIVE` nothing. `probabilities` gives the odds,
-        and the state holds the leader's own covariance.
+        The covariance is the second moment of all hypotheses about the leader, weighted by their
+        probabilities. Rivals with log odds below `_ALIVE` are left out. `probabilities` returns
+        the probabilities; the state holds the leader's own covariance.
         """
         state = plain(state)
         belief = self._filter.belief(leader_of(state))
@@ -198,12 +202,12 @@ class IteratedEkfBank:
         return belief._replace(covariance=whole / (1 + weight.sum(axis=-3)))
 
     def probabilities(self, state: BankState) -> FloatArray:
-        """Probability (..., 1 + K) of the leader and of each rival."""
+        """Return the probabilities (..., 1 + K) of the leader and of each rival."""
         odds = np.exp(np.concatenate([np.zeros_like(state.nis)[..., None], state.log_odds], -1))
         return odds / odds.sum(axis=-1, keepdims=True)
 
     def _bearable(self, links: FloatArray) -> FloatArray:
-        """Sums (...) of so many squared whitened innovations that a leader may have."""
+        """Return the limits (...) of the sum of squared whitened innovations of a leader."""
         most = _MOST_STRAIN * links
         return most if self.robust else np.minimum(most, links + _DEVIATIONS * np.sqrt(2 * links))
 
@@ -213,7 +217,7 @@ class IteratedEkfBank:
         epoch: _Epoch,
         start: tuple[FloatArray, FloatArray] | None = None,
     ) -> _Scored:
-        """The update of trials (B,), with its cost; NaN where it has none."""
+        """Return the update of trials (B,) and its cost, NaN if it has none."""
         start = start or self._filter.start(prior, *epoch)
         return _Scored(
             *update_pose(
@@ -233,7 +237,7 @@ class IteratedEkfBank:
     def _weigh_rivals(
         self, prior: BankState, state: BankState, led: _Scored, epoch: _Epoch
     ) -> BankState:
-        """Rivals after the epoch, their odds by its likelihood; those that have lost are gone."""
+        """Update the rivals and their odds by the epoch, and drop unlikely ones."""
         where = np.isfinite(prior.log_odds).nonzero()
         if not len(where[0]):
             return state
@@ -257,7 +261,7 @@ class IteratedEkfBank:
         rows: np.ndarray,
         vague: BoolArray,
     ) -> BankState:
-        """New rivals of some trials (R,), from their ranges alone."""
+        """Find new rivals of some trials (R,) from their ranges alone."""
         part = epoch.take(rows)
         if self._is_line:
             rotation, translation, known = self._searched(state.rotation[rows], part)
@@ -279,7 +283,7 @@ class IteratedEkfBank:
         if not len(trial):
             return state
         scored = self._scored(before, part.take(trial), (rotation, translation))
-        # Of anchors so far apart that rounding hides what they tell there may be none.
+        # No candidate may have a finite cost if anchors are so far apart that rounding dominates.
         found = np.isfinite(scored.cost)
         if not found.any():
             return state
@@ -295,7 +299,7 @@ class IteratedEkfBank:
         odds[distance(after, PoseState(*(a[trial] for a in leader[:3]))) < SAME] = -np.inf
         if self.volume is not None:
             odds[self._is_outside(after.translation, after.covariance)] = -np.inf
-            # A leader outside its volume is no measure: the best candidate is.
+            # A leader outside the volume is no reference; the best candidate is used instead.
             best = np.full(len(rows), -np.inf)
             np.maximum.at(best, trial, odds)
             out = self._is_outside(leader.translation, leader.covariance) & np.isfinite(best)
@@ -304,7 +308,7 @@ class IteratedEkfBank:
         return with_best(state, rows, np.nonzero(known), known.shape[1], after, odds)
 
     def _candidates(self, epoch: _Epoch) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Poses (R, C, 3, 3), (R, C, 3) that explain an epoch's ranges, and which there are."""
+        """Return poses (R, C, 3, 3), (R, C, 3) that explain the ranges, and which are valid."""
         links = epoch.weights > 0
         noise = LinkNoise(1 / np.sqrt(np.where(links, epoch.weights, 1.0)))
         method = "robust" if self.robust else "ml"
@@ -318,19 +322,19 @@ class IteratedEkfBank:
 
     @functools.cached_property
     def _is_line(self) -> bool:
-        """Whether the tags are in a line: no ranges determine a pose of theirs."""
+        """Return whether the tags are collinear, so that ranges do not determine the pose."""
         return bool(spanned_dimensions(self.tags) < 2)
 
     def _searched(
         self, rotation: FloatArray, epoch: _Epoch
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """As `_candidates`, one each: what the filter finds that knows nothing beforehand."""
+        """Return one candidate each, as `_candidates`, by a filter update with a vague prior."""
         found = self._scored(self._anywhere(rotation, epoch.anchors), epoch)
         known = np.isfinite(found.cost)
         return found.rotation[:, None], found.translation[:, None], known[:, None]
 
     def _anywhere(self, rotation: FloatArray, anchors: FloatArray) -> PoseState:
-        """A prior (K,) that says nothing of the rotation, and of the place what is known."""
+        """Return priors (K,) with unknown rotation and the known bounds of the position."""
         if self.volume is None:
             low, high = anchors.min(axis=-2), anchors.max(axis=-2)
         else:
@@ -341,14 +345,14 @@ class IteratedEkfBank:
         return PoseState(rotation, 0.5 * (low + high), variance[..., None] * np.eye(6))
 
     def _is_outside(self, translation: FloatArray, covariance: FloatArray) -> BoolArray:
-        """Where (...) a place is outside the volume by more than three standard deviations."""
+        """Return whether (...) a position is over three standard deviations outside the volume."""
         low, high = self.volume  # pyright: ignore[reportGeneralTypeIssues, reportOptionalIterable]
         margin = 3 * np.sqrt(np.einsum("...ii->...i", covariance)[..., 3:])
         off = (translation < low - margin) | (translation > high + margin)
         return np.asarray(off.any(axis=-1))
 
     def _elect(self, state: BankState) -> BankState:
-        """The state with the likeliest hypothesis as the leader."""
+        """Return the state with the most likely hypothesis as the leader."""
         log_odds = state.log_odds
         if not np.isfinite(log_odds).any():
             return state
@@ -356,7 +360,7 @@ class IteratedEkfBank:
         if self.volume is not None:
             outside = self._is_outside(state.rival_translation, state.rival_covariance)
             log_odds = np.where(outside, -np.inf, log_odds)
-            # A leader outside the volume yields to any rival inside.
+            # Any rival inside the volume replaces a leader outside.
             against[self._is_outside(state.translation, state.covariance)] = -np.inf
         best = np.argmax(log_odds, axis=-1)
         rows = np.flatnonzero(log_odds[np.arange(len(best)), best] > against)
@@ -366,7 +370,7 @@ class IteratedEkfBank:
         fields = {"log_odds": log_odds.copy(), "nis": state.nis.copy()}
         won = log_odds[rows, slot]
         fields["log_odds"][rows] -= won[:, None]
-        # What was ruled out for its place does not come back.
+        # A hypothesis excluded by the volume does not return.
         fields["log_odds"][rows, slot] = np.where(np.isinf(against[rows]), -np.inf, -won)
         fields["nis"][rows] = state.links[rows]
         for name in PoseState._fields:
@@ -389,7 +393,7 @@ class _Epoch(NamedTuple):
 
 
 def _log_likelihood(before: FloatArray, scored: _Scored) -> FloatArray:
-    """Log evidence (...) of an epoch by Laplace's method, but for what all hypotheses share."""
+    """Return the log evidence (...) of an epoch by Laplace's method, up to a shared constant."""
     determinants = [np.linalg.slogdet(P)[1] for P in (scored.covariance, before)]
     return -scored.cost + 0.5 * (determinants[0] - determinants[1])
 

@@ -1,8 +1,8 @@
-"""A body whose heading nobody knows: several filters side by side, weighed by their likelihood.
+"""Bank of filters for an unknown initial heading, weighted by their likelihood.
 
-Gravity gives roll and pitch at once; the yaw shows in the ranges, of one tag only as it moves. The
-hypotheses start at headings around the circle; each epoch multiplies their weights by its
-likelihood. What cannot be any more is left out, what has become one is merged.
+Gravity gives roll and pitch at once. The ranges give the yaw; with one tag, only once it moves.
+The hypotheses start at headings around the circle. Each epoch multiplies their weights by its
+likelihood. Unlikely hypotheses are dropped, and equal ones are merged.
 """
 
 from __future__ import annotations
@@ -33,20 +33,21 @@ from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.ranging import LinkNoise, NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
-# Hypotheses with less than this share of the weight have lost.
+# Hypotheses with less than this fraction of the weight are dropped.
 _LOST = 1e-8
-# Standard deviation of a heading anywhere around the circle.
+# Standard deviation of a heading uniform on the circle.
 _ANY_RAD = 1.8
-# Nearer to the leader than so many of its standard deviations, squared and over six states, a
-# hypothesis is the same.
+# A hypothesis equals the leader below this squared distance, in the leader's standard deviations
+# and over six states.
 _SAME = 0.1
-# Weight of the middle heading in the mean of all, where these say nothing.
+# Weight of the middle heading in the mean of all, for uniform headings.
 _MIDDLE = 0.05
 
 
 class HeadingState(NamedTuple):
-    """Hypotheses (..., H): fields of `AugmentedState`, logarithms of their weights; and (...) that
-    of the density of all ranges so far, by the hypotheses together.
+    """Hypotheses (..., H): fields of `AugmentedState` and logarithms of their weights.
+
+    `log_evidence` (...) is the log density of all ranges so far under the mixture.
     """
 
     rotation: FloatArray
@@ -59,15 +60,15 @@ class HeadingState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class HeadingBank:
-    """Filters that start at several headings.
+    """Bank of filters that start at several headings.
 
     Parameters
     ----------
     filter
-        What each hypothesis runs.
+        The filter of each hypothesis.
     headings
-        How many, around the circle or, where the prior knows the yaw to better than that, over
-        five of its standard deviations.
+        Number of headings. They cover the circle, or five standard deviations of the prior's yaw
+        if that is less.
     """
 
     filter: AugmentedEkf
@@ -75,7 +76,7 @@ class HeadingBank:
 
     @property
     def reads(self) -> str:
-        """What `predict` is told: as of the filter."""
+        """Inputs that `predict` takes, as those of the filter."""
         return reads(self.filter)
 
     def __post_init__(self) -> None:
@@ -84,22 +85,22 @@ class HeadingBank:
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
     ) -> HeadingState:
-        """State of a prior of the pose; the covariance (..., 6, 6) says how open the yaw is.
+        """Return the state of a prior of the pose; its covariance (..., 6, 6) gives the yaw spread.
 
         Raises
         ------
         ValueError
-            As `IteratedEkf.initial`.
+            As in `IteratedEkf.initial`.
         """
         start = self.filter.initial(rotation, translation, covariance)
         std = np.sqrt(start.covariance[..., 2, 2])[..., None]
         spacing = np.minimum(5 * std, 2 * math.pi) / self.headings
         yaw = spacing * (np.arange(self.headings) - 0.5 * (self.headings - 1))
-        # As wide as the circle, no heading is likelier than another.
+        # If the spread covers the circle, all headings are equally likely.
         log_weights = np.where(std < _ANY_RAD, -0.5 * (yaw / std) ** 2, 0.0)
         turn = rotations.exp(yaw[..., None] * np.array([0.0, 0.0, 1.0]))
         n = start.covariance.shape[-1]
-        # The yaw of a hypothesis is known to its share of the spread; the rest follows.
+        # The yaw of a hypothesis is known to its part of the spread; the rest follows.
         scale = np.ones((*std.shape[:-1], n))
         scale[..., 2] = np.minimum(0.7 * spacing / std, 1.0)[..., 0]
         P = start.covariance * scale[..., :, None] * scale[..., None, :]
@@ -116,14 +117,14 @@ class HeadingBank:
         )  # fmt: skip
 
     def predict(self, state: HeadingState, twist: ArrayLike, dt: Any) -> HeadingState:
-        """State after `dt` seconds, as that of the filter, of all hypotheses.
+        """Return the state of all hypotheses after `dt` seconds.
 
         Parameters
         ----------
         state, dt
-            The state, and seconds.
+            The state, and the time step in seconds.
         twist
-            What the filter reads: a twist (..., 6), or readings (..., S, 6) of a sensor.
+            Input of the filter: a twist (..., 6), or readings (..., S, 6) of a sensor.
         """
         trailing = 1 if self.reads == "twist" else 2
         told = np.asarray(twist, dtype=np.float64)
@@ -143,12 +144,12 @@ class HeadingBank:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> HeadingState:
-        """As that of the filter, of all hypotheses, which are weighed, merged and dropped."""
+        """Update all hypotheses by the filter; weight, merge and drop them."""
         pose = self.filter.pose
         measured, places, mask = check_epoch(ranges, anchors, links, pose.tags)
         variance = epoch_variance(noise, pose.noise, measured, mask)
         std = np.sqrt(np.broadcast_to(variance, measured.shape))
-        # An axis for the hypotheses.
+        # Add an axis for the hypotheses.
         measured, places, std = (a[..., None, :, :] for a in (measured, places, std))
         mask, law = None if mask is None else mask[..., None, :, :], LinkNoise(std)
         before = _filtered(state)
@@ -160,7 +161,7 @@ class HeadingBank:
         weights = state.log_weights + told.log_likelihood
         evidence = state.log_evidence + np.asarray(special.logsumexp(weights, axis=-1))
         if pose.robust == "late":
-            # A late range must not choose a heading by a weight that it has not in the update.
+            # Use the robust weights of the update, so that a late range does not select a heading.
             residual, there = told.residual / std, told.residual != 0
             cost, share = loss_of(residual**2, LATE, residual > 0)
             wider = LinkNoise(std / np.sqrt(share))
@@ -171,11 +172,11 @@ class HeadingBank:
         return _pruned(HeadingState(*after, _normal(weights), evidence))
 
     def belief(self, state: HeadingState) -> PoseBelief:
-        """Mean place and mean rotation of all, with the covariance of all about these."""
+        """Return the mean pose of all hypotheses, with the covariance about it."""
         if state.log_weights.shape[-1] == 1:
             return self.filter.belief(self.leader(state))
         weights = np.exp(state.log_weights)[..., None, None]
-        # Of headings all around the circle the mean is any: a little of the middle one.
+        # The mean of uniform headings is undefined, so the middle heading gets a small weight.
         middle = state.rotation[..., state.rotation.shape[-3] // 2, :, :]
         rotation = rotations.nearest((weights * state.rotation).sum(axis=-3) + _MIDDLE * middle)
         translation = (weights[..., 0] * state.translation).sum(axis=-2)
@@ -185,7 +186,7 @@ class HeadingBank:
         return PoseBelief(rotation, translation, (weights * spread).sum(axis=-3), rotation.copy())
 
     def leader(self, state: HeadingState) -> AugmentedState:
-        """The likeliest hypothesis."""
+        """Return the most likely hypothesis."""
         best = np.argmax(state.log_weights, axis=-1)[..., None]
         return AugmentedState(
             *(
@@ -202,13 +203,13 @@ def _filtered(state: HeadingState) -> AugmentedState:
 
 
 def _normal(log_weights: FloatArray) -> FloatArray:
-    """Weights that add up to 1."""
+    """Return weights that add up to 1."""
     log_weights = log_weights - log_weights.max(axis=-1, keepdims=True)
     return log_weights - np.log(np.exp(log_weights).sum(axis=-1, keepdims=True))
 
 
 def _pruned(state: HeadingState) -> HeadingState:
-    """One body's state without what has lost or has become the leader; a batch keeps its shape."""
+    """Drop unlikely and duplicate hypotheses of one body; a batch keeps its shape."""
     batch = state.log_weights.shape[:-1]
     if math.prod(batch) != 1 or state.log_weights.shape[-1] == 1:
         return state
@@ -217,7 +218,7 @@ def _pruned(state: HeadingState) -> HeadingState:
 
 
 def _kept(state: HeadingState) -> HeadingState:
-    """One body's state (H, ...) without these."""
+    """Return one body's state (H, ...) with only the hypotheses kept."""
     best = int(np.argmax(state.log_weights))
     turn = rotations.error(state.rotation, state.rotation[best])
     gap = np.concatenate([turn, state.translation - state.translation[best]], axis=-1)
@@ -250,26 +251,26 @@ def iekf_imu(
     offset: str | None = None,
     directions: DirectionLaw | None = None,
 ) -> Filter:
-    """The filter ``"iekf-imu"``: pose, velocity and the biases of an inertial sensor.
+    """Return the filter ``"iekf-imu"`` for pose, velocity and the biases of an inertial sensor.
 
     Parameters
     ----------
     tags, noise, iterations, robust, offset
-        As `IteratedEkf`; an offset goes with one heading.
+        As in `IteratedEkf`. `offset` requires one heading.
     process
-        Not used: what moves the body is measured.
+        Not used, because the motion is measured.
     inertial
         As `measurements.inertial.sensor` takes it.
     speed_m_s, gravity_tilt_rad
-        As `InertialEkf`.
+        As in `InertialEkf`.
     bias_std_m, common_std_m
-        Biases of the links that stay: of each, and one that all have in common, metres.
+        Standard deviations of constant biases: one per link, and one common to all links, metres.
     drift_std_m, drift_time_s
-        Biases of the links that drift, and in what time; as `LinkBias`. 0: there are none.
+        Standard deviation and correlation time of drifting link biases, as in `LinkBias`; 0: none.
     headings
-        1, or how many hypotheses of the heading there are at the start.
+        Number of heading hypotheses at the start; 1 for a known heading.
     directions
-        As `AugmentedEkf`.
+        As in `AugmentedEkf`.
     """
     if offset is not None and headings != 1:
         raise ValueError(f"offset goes with headings 1, got {headings!r}")

@@ -1,4 +1,4 @@
-"""The state of a bank of filters: one hypothesis that leads, and its rivals."""
+"""State of a bank of filters: a leading hypothesis and its rivals."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from rbl_gym.estimators.costs.map_problem import PoseState
 from rbl_gym.geometry.rotations import error as rotation_error
 
 RIVALS = 3
-# Squared distance, in the covariance of one of them, below which two hypotheses are the same.
+# Squared Mahalanobis distance below which two hypotheses are the same.
 SAME = 1.0
-# What stands in the slots of rivals that are none.
+# Poses that fill empty slots of rivals.
 EMPTY = PoseState(
     np.broadcast_to(np.eye(3), (RIVALS, 3, 3)),
     np.zeros((RIVALS, 3)),
@@ -28,11 +28,11 @@ class BankState(NamedTuple):
     Attributes
     ----------
     rotation, translation, covariance
-        Of the leader, (..., 3, 3), (..., 3), (..., 6, 6).
+        (..., 3, 3), (..., 3), (..., 6, 6) of the leader.
     rival_rotation, rival_translation, rival_covariance
         (..., K, 3, 3), (..., K, 3), (..., K, 6, 6).
     log_odds
-        (..., K) of each rival against the leader; minus infinity where there is none.
+        (..., K) of each rival against the leader; minus infinity for an empty slot.
     nis, links
         (...): sums over a fading window of squared whitened innovations, and of links.
     """
@@ -53,7 +53,7 @@ _FIELDS = (2, 1, 2, 3, 2, 3, 1, 0, 0)
 
 
 def alone(leader: PoseState) -> BankState:
-    """The state of a leader without rivals."""
+    """Return the state of a leader without rivals."""
     batch = leader.translation.shape[:-1]
     rivals = (np.broadcast_to(a, (*batch, *a.shape)).copy() for a in EMPTY)
     odds = np.full((*batch, RIVALS), -np.inf)
@@ -68,13 +68,16 @@ def with_best(
     found: PoseState,
     odds: FloatArray,
 ) -> BankState:
-    """The state with the likeliest of old and new rivals; `found` (K,) at `place` (R, C)."""
+    """Return the state with the most likely of old and new rivals.
+
+    The new ones are `found` (K,), at `place` of (R, C).
+    """
     new = np.full((len(rows), candidates), -np.inf)
     new[place] = odds
     everyone = np.concatenate([state.log_odds[rows], new], axis=1)
     fields = []
     for name, value in found._asdict().items():
-        # What no candidate fills is the stand-in of an empty slot.
+        # Slots without a candidate keep the filler of an empty slot.
         added = np.repeat(getattr(EMPTY, name)[None, :1], len(rows), axis=0)
         added = np.repeat(added, candidates, axis=1)
         added[place] = value
@@ -85,7 +88,7 @@ def with_best(
     gaps = distance(
         PoseState(*(a[:, :, None] for a in poses)), PoseState(*(a[:, None] for a in poses))
     )
-    # Of those that are the same the likeliest stays.
+    # Of equal hypotheses keep the most likely.
     likelier = np.tri(everyone.shape[1], k=-1, dtype=bool) & np.isfinite(everyone)[:, None]
     everyone[((gaps < SAME) & likelier).any(axis=-1)] = -np.inf
     order = np.argsort(-everyone, axis=1)[:, :RIVALS]
@@ -100,13 +103,13 @@ def with_best(
 def _ordered(
     poses: PoseState, log_odds: FloatArray, order: np.ndarray
 ) -> tuple[PoseState, FloatArray]:
-    """Hypotheses (R, C, ...) and their odds in an order (R, C)."""
+    """Return hypotheses (R, C, ...) and their odds in an order (R, C)."""
     row = np.arange(len(order))[:, None]
     return PoseState(*(a[row, order] for a in poses)), log_odds[row, order]
 
 
 def distance(one: PoseState, other: PoseState) -> FloatArray:
-    """Squared distance (...) of two poses in the wider of their covariances, to first order."""
+    """Return the squared distance (...) of two poses in the wider covariance, to first order."""
     turn = rotation_error(one.rotation, other.rotation)
     gap = np.concatenate([turn, one.translation - other.translation], axis=-1)[..., None]
     return np.minimum(
@@ -115,17 +118,17 @@ def distance(one: PoseState, other: PoseState) -> FloatArray:
 
 
 def leader_of(state: BankState) -> PoseState:
-    """The leading hypothesis."""
+    """Return the leading hypothesis."""
     return PoseState(*state[:3])
 
 
 def rivals_of(state: BankState, where: tuple[np.ndarray, ...]) -> PoseState:
-    """The rivals (L, ...) at an index into trials and slots."""
+    """Return the rivals (L, ...) at an index into trials and slots."""
     return PoseState(*(array[where] for array in state[3:6]))
 
 
 def with_rivals(state: BankState, where: tuple[np.ndarray, ...], rivals: PoseState) -> BankState:
-    """The state with rivals (L, ...) put at an index into trials and slots."""
+    """Return the state with rivals (L, ...) stored at an index into trials and slots."""
     fields = {}
     for name, value in rivals._asdict().items():
         fields[f"rival_{name}"] = getattr(state, f"rival_{name}").copy()
@@ -134,7 +137,7 @@ def with_rivals(state: BankState, where: tuple[np.ndarray, ...], rivals: PoseSta
 
 
 def flat(state: BankState, batch: tuple[int, ...]) -> BankState:
-    """The state with one batch axis (B,), all of its fields broadcast to the batch."""
+    """Return the state with one batch axis (B,), all fields broadcast to the batch."""
     size = math.prod(batch)
     fields = []
     for array, n in zip(state, _FIELDS, strict=True):
@@ -144,11 +147,11 @@ def flat(state: BankState, batch: tuple[int, ...]) -> BankState:
 
 
 def of_batch(state: BankState, batch: tuple[int, ...]) -> BankState:
-    """A flat state with the axes of its batch again."""
+    """Return a flat state reshaped to the axes of its batch."""
     return BankState(*(array.reshape((*batch, *array.shape[1:])) for array in state))
 
 
 def rows_of(array: FloatArray, batch: tuple[int, ...]) -> FloatArray:
-    """An array (..., m, n) of one epoch as (B, m, n)."""
+    """Return an array (..., m, n) of one epoch as (B, m, n)."""
     shape = array.shape[-2:]
     return np.broadcast_to(array, (*batch, *shape)).reshape((math.prod(batch), *shape))

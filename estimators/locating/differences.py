@@ -1,4 +1,4 @@
-"""Where a search for a pose begins when the ranges have an unknown offset in common."""
+"""Starts of a pose search if the ranges share an unknown offset."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from rbl_gym.estimators.costs.losses import loss_of
 from rbl_gym.estimators.costs.map_problem import minimize
 from rbl_gym.estimators.costs.range_cost import RangeCost, squared_residuals
 
-# Places to begin at, on every axis in halves of the anchors' extent; flat ones are as deep as this
-# share of their longest axis.
+# Grid of starts on every axis, in halves of the anchors' extent. Flat anchors get at least this
+# fraction of their longest axis as extent.
 _GRID = np.array(list(itertools.product((-0.8, 0.0, 0.8), repeat=3)))
 _DEPTH = 0.5
 
 
 def places_of_differences(part: RangeCost, net: FloatArray) -> FloatArray:
-    """Three places (K, 3, 3) of the tags' centre that differences of ranges go with.
+    """Return three positions (K, 3, 3) of the tags' centre that agree with range differences.
 
-    The ends of short local solves from a grid of places among the anchors, each with the rotation
-    of a net that fits best there.
+    They are the ends of short local searches from a grid of positions among the anchors. Each
+    starts with the rotation of a net that fits best there.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ def places_of_differences(part: RangeCost, net: FloatArray) -> FloatArray:
 
 
 def _far_apart(places: FloatArray, cost: FloatArray, least: FloatArray) -> FloatArray:
-    """The three cheapest of places (K, P, 3), each at `least` (K,) from those before, if any is."""
+    """Return the three positions of least cost of (K, P, 3), at least `least` (K,) apart if possible."""
     rows, cost = np.arange(len(places)), np.array(cost)
     chosen = []
     for _ in range(3):
         chosen.append(places[rows, np.argmin(cost, axis=-1)])
         gap = np.linalg.norm(places - chosen[-1][:, None], axis=-1)
-        # What is near to one that is chosen comes after all others.
+        # Positions near a chosen one come after all others.
         cost = cost + np.where(gap < least[:, None], 1e30, 0.0)
     return np.stack(chosen, axis=1)

@@ -1,6 +1,6 @@
-"""Localization from a single base station: directions of arrival in, a pose out.
+"""Localization from directions of arrival at a single base station.
 
-`locate_doa` is the door; every method behind it is a function of a flat `DoaEpoch`.
+`locate_doa` is the entry point; every method is a function of a flat `DoaEpoch`.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, no_alte
 from rbl_gym.estimators.locating.swarm import ParticipatorySearch, ParticleSwarm, search_places
 from rbl_gym.measurements import bearing
 
-# Below it squares of lengths lose themselves in rounding.
+# Below this length, squares are lost in rounding.
 _SMALLEST_BODY_M = 1e-50
 HALF_SPACES: dict[str | None, float | None] = {"y>0": 1.0, "y<0": -1.0, None: None}
-# Trials of a block, of Newton's iteration and of methods with many starts for each trial: their
-# arrays stay in the processor's cache.
+# Trials of a block, for Newton's iteration and for methods with many starts per trial. Their
+# arrays fit in the processor's cache.
 _BLOCK, _BLOCK_OF_STARTS = 1024, 64
 
 
 class DoaEpoch(NamedTuple):
-    """Checked arrays of B trials seen from the origin, and what the methods are told besides.
+    """Checked arrays of B trials relative to the base station, and options of the methods.
 
     angles (B, 2, N), weights (B, 2, N) [1/rad^2], tags (B, N, 3); `side`: sign of y or None.
     """
@@ -64,44 +64,45 @@ def locate_doa(
     distance_weight: float | None = None,
     rng: np.random.Generator | None = None,
 ) -> PoseEstimate:
-    """The pose of a body from one epoch of directions of arrival; a thousand are one call.
+    """Estimate the pose of a body from one epoch of directions of arrival; batched.
 
     Parameters
     ----------
     angles
         (..., 2, N) radians: to the x axis, then to the z axis (`rbl_gym.measurements.bearing`).
     tags
-        (..., N, 3), places on the body, metres; three or more, not collinear.
+        (..., N, 3), positions in the body frame, metres; three or more, not collinear.
     method
         ``"ml"``: maximum likelihood, the global optimum. ``"nia"``: Newton's iteration on the
-        places of the tags, then the unit quaternion (the DOA paper's). ``"pso"``, ``"psa"``:
-        its competitors, particle swarm optimisation and the participatory search algorithm over
-        the distances of the tags (`rbl_gym.estimators.locating.swarm`).
+        positions of the tags, then the unit quaternion method (DOA paper). ``"pso"``, ``"psa"``:
+        the paper's competitors, particle swarm optimisation and the participatory search
+        algorithm over the distances of the tags (`rbl_gym.estimators.locating.swarm`).
     noise
-        Law of the angles; of the default 0.1 degrees covariance and alternatives depend.
+        Noise model of the angles, by default 0.1 degrees. Covariance and alternatives depend on
+        it.
     half_space
-        Side of the base station's xz plane that the body (its tags' mean) is known to be on:
-        ``"y>0"``, ``"y<0"``; None: told by the body's handedness, which takes four tags that
-        are not coplanar.
+        Known side of the base station's xz plane on which the mean of the tags lies: ``"y>0"`` or
+        ``"y<0"``. None: found from the handedness of the body, which needs four tags that are not
+        coplanar.
     station
-        Place (..., 3) of the base station; None: the origin.
+        Position (..., 3) of the base station; None: the origin.
     distance_weight
-        Of ``nia``: weight of an error of a distance, radians per metre; None: scale-free.
+        For ``nia``: weight of a distance error, radians per metre; None: scale-free.
     rng
-        Of ``pso`` and ``psa``; None: seed 0.
+        For ``pso`` and ``psa``; None: seed 0.
 
     Returns
     -------
-    A `PoseEstimate`. `cost` is half the sum of squared whitened angles. `alternatives` (of
-    ``ml``) are poses within 3 sigma of the best: mirror images that `half_space` does not rule
-    out and nothing else tells apart (three tags, coplanar tags, y close to 0). NaN where
-    ``nia`` ran away.
+    A `PoseEstimate`. `cost` is half the sum of squared whitened angles. `alternatives` (for
+    ``ml``) are poses within 3 sigma of the best: mirror images that neither `half_space` nor
+    the geometry excludes (three tags, coplanar tags, y close to 0). The pose is NaN if ``nia``
+    diverged.
 
     Raises
     ------
     ValueError
-        On wrong shapes, NaN, angles outside [0, pi], fewer than three tags or collinear ones,
-        an unknown method or half-space.
+        If shapes are wrong, values are NaN, angles are outside [0, pi], there are fewer than three
+        tags or they are collinear, or the method or half-space is unknown.
     """
     check_one_of("method", method, list(METHODS))
     if not isinstance(half_space, str | None) or half_space not in HALF_SPACES:
@@ -158,7 +159,7 @@ def _rows(epoch: DoaEpoch, rows: slice) -> DoaEpoch:
 
 
 def _solve(method: Callable[[DoaEpoch], Fit], epoch: DoaEpoch) -> tuple[np.ndarray, ...]:
-    """The fields of a `PoseEstimate` (alternatives as three, no matrix) of one block of trials."""
+    """Return the fields of a `PoseEstimate` (three for alternatives, no matrix) of one block."""
     found = method(epoch)
     known = are_finite(found.translation, 1) & are_finite(found.rotation, 2)
     cost, information = found.cost, found.information
@@ -193,10 +194,10 @@ def _nia(epoch: DoaEpoch) -> Fit:
 
 
 def fit_of_places(epoch: DoaEpoch, places: Places) -> Fit:
-    """The body laid on the places of its tags, or on their mirror image across y = 0.
+    """Fit the body to the positions of its tags, or to their mirror image across y = 0.
 
-    On the side that is known; else on the one where the body fits better. The covariance is that
-    of maximum likelihood at the pose: noise of the angles is all there is.
+    Use the known side, or else the side with the better fit. The covariance is that of maximum
+    likelihood at the pose, from the noise of the angles alone.
     """
     known = are_finite(places.positions, 2)
     positions = np.where(known[:, None, None], places.positions, epoch.tags)

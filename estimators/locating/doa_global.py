@@ -1,9 +1,9 @@
-"""Maximum likelihood of the pose from directions of arrival, found globally.
+"""Global maximum-likelihood pose from directions of arrival.
 
-Three tags and their directions leave a pose open up to the roots of a quartic (the
+Three tags and their directions determine a pose up to the roots of a quartic (the
 perspective-three-point problem, Grunert 1841; coefficients as in Haralick et al., IJCV 13, 1994).
-The roots of several triples, with every sign of y that the angles leave open, are the starts;
-Levenberg-Marquardt on SO(3) x R^3 ends in the local optima around them.
+The roots of several triples, with every possible sign of y, are the starts. Levenberg-Marquardt on
+SO(3) x R^3 finds the local optima near them.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from rbl_gym.estimators.costs.map_problem import minimize
 from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, cheapest, merge, rivals
 from rbl_gym.measurements import bearing
 
-# Triples of tags that starts are made from: those of largest area.
+# Number of triples of tags, those of largest area, that give starts.
 _TRIPLES = 6
-# Starts on each side of y = 0 that are refined, and those that are refined to the end: many
-# starts lead to one optimum.
+# Starts on each side of y = 0 that are refined, and those refined to convergence: many starts lead
+# to one optimum.
 _REFINED, _FINALISTS = 6, 5
-# A cost so far above the best is not going to be the best.
+# Starts with a cost this far above the best are dropped.
 _HOPEFUL = 50.0
 
 
 def global_search(
     angles: FloatArray, weights: FloatArray, tags: FloatArray, side: float | None
 ) -> tuple[Solution, Alternatives]:
-    """The most likely pose of every trial and others about as likely.
+    """Return the most likely pose of every trial and others about as likely.
 
     Parameters
     ----------
     angles, weights, tags
         (B, 2, K), (B, 2, K), (B, K, 3), K >= 3.
     side
-        Sign of y of the body, None: unknown.
+        Sign of y of the body; None: unknown.
     """
     sides = (1.0, -1.0) if side is None else (side,)
     rotation, translation = starts(angles, tags, side)
@@ -70,7 +70,7 @@ def _cheapest_of_sides(
     sides: tuple[float, ...],
     count: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """The `count` cheapest poses of every trial on each side of y = 0."""
+    """Return the `count` poses of least cost of every trial on each side of y = 0."""
     height = _height(rotation, translation, tags)
     count = min(count, cost.shape[1])
     keep = np.concatenate(
@@ -89,7 +89,7 @@ def _cheapest_of_sides(
 def starts(
     angles: FloatArray, tags: FloatArray, side: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (B, S, 3, 3), (B, S, 3) that three tags at a time leave open."""
+    """Return the poses (B, S, 3, 3), (B, S, 3) that agree with three tags at a time."""
     triples = _triples(tags)
     signs = np.full((1, 3), side or 1.0)
     if side is None:
@@ -105,7 +105,7 @@ def starts(
     places = depths[:, None] * flat[0][..., None]
     poses = [_align(places, flat[1][..., None])]
     if side is None:
-        # Across the plane y = 0 the depths are the same and the triangle is turned over.
+        # The mirror image across y = 0 has the same depths and an inverted triangle.
         places[:, 1] *= -1
         poses.append(_align(places, flat[1][..., None]))
     rotation = [np.moveaxis(Q, (0, 1), (-2, -1)).reshape((batch[0], -1, 3, 3)) for Q, _ in poses]
@@ -114,7 +114,7 @@ def starts(
 
 
 def _triples(tags: FloatArray) -> np.ndarray:
-    """The triples (T, 3) of tags with the largest triangles, on average over the trials."""
+    """Return the triples (T, 3) of tags with the largest triangles, on average over the trials."""
     triples = np.array(list(itertools.combinations(range(tags.shape[1]), 3)))
     some = tags[:: max(1, len(tags) // 16)]
     corner = some[:, triples]
@@ -124,10 +124,10 @@ def _triples(tags: FloatArray) -> np.ndarray:
 
 
 def three_point_depths(rays: FloatArray, body: FloatArray) -> FloatArray:
-    """Distances (3, n, 4) of three tags along unit rays (3, 3, n), body triangles (3, 3, n).
+    """Return distances (3, n, 4) of three tags along unit rays (3, 3, n), body triangles (3, 3, n).
 
-    Tag first, then component. The four roots of Grunert's quartic in v = d3 / d1; where noise
-    made a pair of them complex, its real part stands for both.
+    Axes are tag, then component. There is one distance for each of the four roots of Grunert's
+    quartic in v = d3 / d1. If noise makes a pair of roots complex, its real part replaces both.
     """
     a, b, c = (_square(body[i] - body[j]) for i, j in ((1, 2), (0, 2), (0, 1)))
     cos_a, cos_b, cos_c = (
@@ -154,7 +154,7 @@ def three_point_depths(rays: FloatArray, body: FloatArray) -> FloatArray:
 
 
 def _quartic_roots(coefficients: FloatArray) -> FloatArray:
-    """Real parts (n, 4) of the roots of quartics with coefficients (5, n), highest power first."""
+    """Return real parts (n, 4) of the roots of quartics, coefficients (5, n) highest power first."""
     leading = coefficients[0]
     floor = 1e-12 * np.abs(coefficients).max(axis=0) + 1e-300
     leading = np.where(np.abs(leading) > floor, leading, floor)
@@ -165,7 +165,7 @@ def _quartic_roots(coefficients: FloatArray) -> FloatArray:
 
 
 def _align(places: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pose (3, 3, ...), (3, ...) that lays triangles (3, 3, ...) of a body on places, tag first."""
+    """Return the pose (3, 3, ...), (3, ...) from triangles (3, 3, ...) of body and positions."""
     rotation = np.einsum("ik...,jk...->ij...", _frame(places), _frame(body))
     middle = body.mean(axis=0)
     turned = np.einsum("ij...,j...->i...", rotation, np.broadcast_to(middle, places.shape[1:]))
@@ -173,7 +173,7 @@ def _align(places: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def _frame(triangle: FloatArray) -> FloatArray:
-    """Orthonormal axes (3, 3, ...), as columns, of triangles (3, 3, ...), tag first."""
+    """Return orthonormal axes (3, 3, ...), as columns, of triangles (3, 3, ...), tag first."""
     x = _unit(triangle[1] - triangle[0])
     z = _unit(np.cross(x, triangle[2] - triangle[0], axis=0))
     return np.stack([x, np.cross(z, x, axis=0), z], axis=1)
@@ -188,12 +188,12 @@ def _square(vector: FloatArray) -> FloatArray:
 
 
 def _cost_of_angles(part: DoaCost, rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Half the squared whitened residuals (B, S), without derivatives."""
+    """Return half the squared whitened residuals (B, S), without derivatives."""
     places = part.tags @ np.swapaxes(rotation, -1, -2) + translation[..., None, :]
     residual = bearing.angles(places) - part.angles
     return 0.5 * (part.weights * residual**2).sum(axis=(-2, -1))
 
 
 def _height(rotation: FloatArray, translation: FloatArray, tags: FloatArray) -> FloatArray:
-    """y of the tags' centre at poses (B, S)."""
+    """Return y of the tags' centre at poses (B, S)."""
     return translation[..., 1] + np.einsum("bsj,bj->bs", rotation[..., 1, :], tags.mean(axis=1))

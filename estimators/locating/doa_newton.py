@@ -1,8 +1,8 @@
-"""The DOA paper's method: Newton's iteration on the places of the tags, then a unit quaternion.
+"""Method of the DOA paper: Newton's iteration on the tag positions, then a unit quaternion.
 
-The iteration (NIA) solves for K places in space from their 2 K angles and K (K - 1) / 2 known
-distances, as if they were not on one body; the unit quaternion method fits the body to them.
-Arrays of a batch: angles (B, 2, K), places (B, K, 3); inside, trials come last.
+The iteration (NIA) solves for K positions from their 2 K angles and K (K - 1) / 2 known distances,
+without the constraint of a rigid body. The unit quaternion method then fits the body to them.
+Arrays of a batch are angles (B, 2, K) and places (B, K, 3). Inside, trials are the last axis.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from rbl_gym.estimators.costs.levenberg_marquardt import damped_solution
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import bearing
 
-# Behind the door: places far off make it large.
+# Unchecked, because positions far away make the matrix large.
 _VEE = kernel(rotations.vee)
 
-# Distances are known, angles are noisy: a distance counts as an angle of this many radians for
-# an error of the body's size.
+# Weight of the known distances against the noisy angles: a distance error of the body's size counts
+# as an angle of this many radians.
 DISTANCE_WEIGHT = 10.0
-# The start C has tags on the axes, where the angles have no derivative.
+# Shift of the start C, which has tags on the axes, where the angles have no derivative.
 START_SHIFT = 1e-3
 STEP_TOLERANCE = 1e-8
 MAX_ITERATIONS = 30
-# Farther off than this, in sizes of the body, an iteration has run away; and without an end this
-# far off too. Angles that tell a body at the first are exact to its 1e-6, at the second to 1e-3.
+# An iteration has diverged beyond the first distance, in sizes of the body, or without convergence
+# beyond the second. A body at the first distance needs angles exact to 1e-6, at the second to 1e-3.
 FARTHEST = 1e6
 _FAR = 1e3
-# Below this step, in units of length, the residuals' curvature counts too (Newton proper): noise
-# leaves residuals, and with them Gauss-Newton would go on converging linearly.
+# Below this step, in units of length, the curvature of the residuals is included (full Newton).
+# With residuals from noise, Gauss-Newton converges only linearly.
 _CURVED = 1e-2
 
 
 class Places(NamedTuple):
-    """Places (B, K, 3) of the tags, iterations taken (B,), and whether the last step was small.
+    """Positions (B, K, 3) of the tags, iterations (B,), and whether the last step was small.
 
-    NaN where the iteration ran away: beyond 1e6 sizes of the body, or without an end beyond 1e3.
+    NaN if the iteration diverged: beyond 1e6 sizes of the body, or beyond 1e3 without convergence.
     """
 
     positions: FloatArray
@@ -48,7 +48,7 @@ class Places(NamedTuple):
 
 
 def body_size(tags: FloatArray) -> FloatArray:
-    """Largest distance (...) between two tags of a body (..., K, 3): the unit of length."""
+    """Return the largest distance (...) between two tags of a body (..., K, 3), the unit of length."""
     gap = tags[..., :, None, :] - tags[..., None, :, :]
     return np.sqrt(np.einsum("...i,...i->...", gap, gap).max(axis=(-2, -1)))
 
@@ -56,20 +56,20 @@ def body_size(tags: FloatArray) -> FloatArray:
 def newton_iteration(
     angles: FloatArray, tags: FloatArray, distance_weight: float | None = None
 ) -> Places:
-    """Places of the tags by Newton's iteration (Gauss-Newton), from the tags shifted by 1e-3.
+    """Estimate tag positions by Newton's iteration (Gauss-Newton), from the tags shifted by 1e-3.
 
     Parameters
     ----------
     angles, tags
         (B, 2, K) and (B, K, 3), radians and metres.
     distance_weight
-        Of an error of a distance against one of an angle, radians per metre; None:
-        `DISTANCE_WEIGHT` over the body's size, so that no unit of length matters. The paper's 1
-        is one per whatever unit the tags come in.
+        Weight of a distance error against an angle error, radians per metre. None:
+        `DISTANCE_WEIGHT` over the body's size, so that the unit of length does not matter. The
+        paper's 1 is one radian per unit of the tags.
 
     Notes
     -----
-    Stops where all steps together are shorter than 1e-8 of the unit of length.
+    The iteration stops if the norm of all steps is below 1e-8 of the unit of length.
     """
     unit = body_size(tags) if distance_weight is None else np.ones(len(tags))
     weight = DISTANCE_WEIGHT if distance_weight is None else distance_weight
@@ -88,7 +88,7 @@ def newton_iteration(
         step = _newton_step(
             now, goal, known, pairs, weight, (size < _CURVED * extent).astype(float)
         )
-        # What runs away does not come back.
+        # A diverged iteration does not return.
         gone = ~(np.abs(now + step).max(axis=(0, 1)) < FARTHEST * extent)
         step = np.where(gone, np.nan, step)
         now = now + step
@@ -117,7 +117,7 @@ def _newton_step(
     weight: float,
     curved: FloatArray,
 ) -> FloatArray:
-    """One step (3, K, B) of the places (3, K, B); `curved` (B,): 1 Newton, 0 Gauss-Newton."""
+    """Return one step (3, K, B) of positions (3, K, B); `curved` (B,): 1 Newton, 0 Gauss-Newton."""
     n_tags, trials = x.shape[1:]
     found, J = bearing.linearize(x)
     residual = found - angles
@@ -131,7 +131,7 @@ def _newton_step(
     blocks = (along * (1 - bend)[:, None])[:, :, None] * along[:, None]
     blocks[:, range(3), range(3)] += (weight**2 * bend)[:, None]
     pull = along * (weight * (lengths - distance))[:, None]
-    # A pair pulls its two tags apart: +1 and -1 in its row of the incidence matrix.
+    # Each pair has +1 and -1 in its row of the incidence matrix.
     E = np.zeros((len(pairs), n_tags))
     E[range(len(pairs)), pairs[:, 0]], E[range(len(pairs)), pairs[:, 1]] = 1.0, -1.0
     both = (E[:, :, None] * E[:, None]).reshape(len(pairs), -1)
@@ -146,9 +146,9 @@ def _newton_step(
 
 
 def unit_quaternion(positions: FloatArray, tags: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation (..., 3, 3) and translation (..., 3) of the body nearest to places (..., K, 3).
+    """Return rotation (..., 3, 3) and translation (..., 3) of the body nearest to places (..., K, 3).
 
-    DOA paper, (11)-(14) mended: with ``H = sum_k s_k c_k^T`` (centred) the quaternion maximises
+    DOA paper, (11)-(14), corrected: with ``H = sum_k s_k c_k^T`` (centred) the quaternion maximises
     ``q^T P q``, P the symmetric 4 x 4 matrix of H; ``t = s - R c`` of the means.
     """
     s_mean, c_mean = positions.mean(axis=-2), tags.mean(axis=-2)

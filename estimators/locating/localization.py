@@ -1,6 +1,6 @@
-"""Static localization: one epoch of ranges in, a pose with its covariance out.
+"""Static localization: estimate a pose and its covariance from one epoch of ranges.
 
-`locate` is the door; the methods behind it are in `locators`.
+`locate` is the entry point; its methods are in `locators`.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, no_alte
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.ranging import NoiseLaw
 
-# Of what is not known the cost is not a number: no door here.
+# Unchecked, because the cost of an unknown pose is NaN.
 _DISTANCES = kernel(ranging.distances)
 
 ENTRY_POINT_GROUP = "rbl_gym.locators"
-# Trials of a block: their arrays stay in the processor's cache.
+# Trials of a block: their arrays fit in the processor's cache.
 _BLOCK = 512
 
 
@@ -49,27 +49,27 @@ class PoseEstimate(NamedTuple):
     Attributes
     ----------
     rotation, translation
-        (..., 3, 3), always a proper rotation, and (..., 3) in metres. NaN where the links of
-        a trial do not determine what the method needs.
+        (..., 3, 3), always a proper rotation, and (..., 3) in metres. NaN if the links of
+        a trial are not enough for the method.
     covariance
-        (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``, as
-        the method's own theory has it. Enormous along directions that nothing determines.
+        (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``, by
+        the theory of the method. Very large along directions that the ranges do not determine.
     cost
-        (...), half the sum of squared whitened range residuals at the pose (of `robust`: of
-        the ranges it kept).
+        (...), half the sum of squared whitened range residuals at the pose. For `robust`, only of
+        the inliers.
     converged
-        (...), whether the method ended in a solution of its own problem.
+        (...), whether the method converged to a solution of its own problem.
     rank
-        (...), how many of the 6 directions of the pose the ranges determine. Below 6 the pose
-        is one of many.
+        (...), number of the 6 degrees of freedom that the ranges determine. Below 6 the pose is not
+        unique.
     alternatives
         Other poses that explain the ranges about as well (within 3 sigma of the cost), such as
-        mirror poses; looked for by ``ml`` and ``robust`` where the geometry is poor.
+        mirror poses; searched for by ``ml`` and ``robust`` if the geometry is poor.
     matrix
-        (..., 3, 3), the raw matrix of ``ls``; of all others the rotation.
+        (..., 3, 3), the raw matrix of ``ls``; for all other methods the rotation.
     iterations
-        (...), after how many steps ``nia``, ``pso`` and ``psa`` came to rest; of all others,
-        which do not count them, 0.
+        (...), number of steps until ``nia``, ``pso`` and ``psa`` converged; 0 for all others, which
+        do not count them.
     """
 
     rotation: FloatArray
@@ -94,7 +94,7 @@ def locate(
     retraction: str = "exponential",
     offset: str | None = None,
 ) -> PoseEstimate:
-    """The pose of a body from one epoch of ranges; a thousand problems are one call.
+    """Estimate the pose of a body from one epoch of ranges; batched.
 
     Parameters
     ----------
@@ -103,42 +103,41 @@ def locate(
     anchors, tags
         (..., M, 3) in the world frame and (..., N, 3) in the body frame, metres.
     noise
-        Law of the ranges; variances are taken at the measured ranges.
+        Noise model of the ranges; variances are evaluated at the measured ranges.
     method
         ``"ls"``: least squares on the squared ranges without the constraint (static paper,
         (14)). ``"ls-projected"``: its matrix projected onto SO(3), then the translation
-        (slides). ``"cls"``, or ``"ctls"``, the same: tag by tag, then an orthogonal Procrustes
-        fit (static paper, (17)-(21), Lemmas 1 and 2, Algorithm 1). ``"procrustes"``, or
-        ``"uc-ls"``, the same: weighted orthogonal Procrustes by Newton's method, the optimally
+        (slides). ``"cls"`` (alias ``"ctls"``): tag by tag, then an orthogonal Procrustes
+        fit (static paper, (17)-(21), Lemmas 1 and 2, Algorithm 1). ``"procrustes"`` (alias
+        ``"uc-ls"``): weighted orthogonal Procrustes by Newton's method, the optimally
         constrained least squares (static paper, Remark 2; slides, appendix). ``"ml"``: maximum
-        likelihood of the raw ranges, searched for globally where the geometry is poor.
+        likelihood of the raw ranges, with a global search if the geometry is poor.
         ``"two-step"``: ``cls`` and two Gauss-Newton steps on the raw ranges. ``"robust"``: for
-        ranges of which some are wrong. ``"robust-late"``: for radio ranges, which err late rather
-        than early: weights that fall with the square of the residual, half as large where it is
-        late. Or a name that a package offers by the entry-point group
-        ``rbl_gym.locators``.
+        ranges with outliers. ``"robust-late"``: for radio ranges, whose outliers are mostly late:
+        weights fall with the square of the residual and are halved for late ranges. Or a name from
+        the entry-point group ``rbl_gym.locators`` of another package.
     links
         Mask (..., M, N), True = measured.
     tag_std_m
-        Standard deviation of the tags' places on the body, per axis; marginalised by ``ml``.
+        Standard deviation of the tag positions on the body, per axis; marginalised by ``ml``.
     retraction
-        How Newton's method of ``procrustes`` turns a step into a rotation: ``"exponential"``
-        or ``"cayley"`` (slides). Both end in the same pose.
+        How Newton's method of ``procrustes`` maps a step to a rotation: ``"exponential"`` or
+        ``"cayley"`` (slides). Both converge to the same pose.
     offset
-        Whose ranges have an unknown offset in common: ``"tag"`` (uplink time differences, as
-        ranges to the anchors), ``"anchor"``, or ``"epoch"``, all of them; None: no ranges. They
-        may then have any sign, variances are taken at the distances from the pose, and `rank`
-        says what is left: a tag by itself takes an anchor more, and the squared-range methods
-        five, which take the offset for that of each tag.
+        Which ranges share an unknown offset: those of one ``"tag"`` (uplink time differences, as
+        ranges to the anchors), of one ``"anchor"``, or of the ``"epoch"``, all of them. None: no
+        offset. With an offset, ranges may have any sign, variances are evaluated at the distances
+        from the pose, and `rank` accounts for the offset. Each tag then needs one anchor more. The
+        squared-range methods need five anchors, because they estimate an offset for each tag.
 
     Raises
     ------
     ValueError
-        On wrong shapes, NaN, ranges that are not positive, an unknown method, a retraction
-        other than the exponential for a method that has none, an offset with `tag_std_m` or for a
-        squared-range method one by anchor; and where the
-        anchors or tags cannot give what a squared-range method needs (four anchors not
-        coplanar; tags not collinear, for ``ls`` not coplanar).
+        If shapes are wrong, values are NaN, ranges are not positive, or the method is unknown.
+        If `retraction` is not ``"exponential"`` for a method without one. If `offset` is given
+        with `tag_std_m`, or is ``"anchor"`` for a squared-range method. If the anchors or tags are
+        not enough for a squared-range method (four anchors not coplanar; tags not collinear, for
+        ``ls`` not coplanar).
     """
     fit = _method(method)
     check_one_of("retraction", retraction, list(RETRACTIONS))
@@ -160,7 +159,7 @@ def locate(
     if offset is None:
         epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m)
         return _in_blocks(fit, method, epoch._replace(retraction=retraction), batch)
-    # Variances from the middle of the anchors, then from the pose.
+    # Variances at the centre of the anchors first, then at the pose.
     distance = _DISTANCES(anchors, anchors.mean(axis=-2, keepdims=True))
     epoch, batch = _epoch(ranges, anchors, tags, noise, mask, tag_std_m, distance)
     found = _in_blocks(fit, method, epoch._replace(retraction=retraction, offset=offset), batch)
@@ -193,13 +192,13 @@ def _in_blocks(
 
 
 def joined(blocks: list[tuple[np.ndarray, ...]], batch: tuple[int, ...]) -> list[np.ndarray]:
-    """The fields of all blocks of trials, with the leading axes that the trials had."""
+    """Return the fields of all blocks of trials, with the leading axes of the trials."""
     fields = blocks[0] if len(blocks) == 1 else map(np.concatenate, zip(*blocks, strict=True))
     return [field.reshape((*batch, *field.shape[1:])) for field in fields]
 
 
 def _solve(fit: Callable[[StaticEpoch], Fit], epoch: StaticEpoch) -> tuple[np.ndarray, ...]:
-    """The fields of a `PoseEstimate` (alternatives as three) for one block of trials."""
+    """Return the fields of a `PoseEstimate` (three for alternatives) of one block of trials."""
     found = fit(epoch)
     rotation, translation = found.rotation, found.translation
     known = are_finite(translation, 1) & are_finite(rotation, 2)
@@ -224,7 +223,7 @@ def _solve(fit: Callable[[StaticEpoch], Fit], epoch: StaticEpoch) -> tuple[np.nd
 def _range_cost_of(
     epoch: StaticEpoch, rotation: FloatArray, translation: FloatArray, known: BoolArray
 ) -> FloatArray:
-    """Half the sum of squared whitened range residuals (B,), infinite where no pose is known."""
+    """Return half the sum of squared whitened range residuals (B,); infinite without a pose."""
     turned = epoch.tags @ np.swapaxes(rotation, -1, -2)
     residual = _DISTANCES(epoch.anchors, turned + translation[:, None]) - epoch.ranges
     if epoch.offset is not None:
@@ -234,7 +233,7 @@ def _range_cost_of(
 
 
 def _rank_of_tags(tags: FloatArray) -> np.ndarray:
-    """Rank of the pose where every tag is located: 3 for a point, 5 for a line, else 6."""
+    """Return the rank of the pose if every tag is located: 3 for a point, 5 for a line, else 6."""
     if tags.strides[0] == 0:
         tags = tags[:1]
     gram = np.einsum("bni,bnj->bij", *[tags - tags.mean(axis=1, keepdims=True)] * 2)
@@ -244,7 +243,7 @@ def _rank_of_tags(tags: FloatArray) -> np.ndarray:
 
 
 def _rows(epoch: StaticEpoch, rows: slice) -> StaticEpoch:
-    """Some of the trials."""
+    """Return some of the trials."""
     ranges, anchors, tags, weights, squared_weights = (array[rows] for array in epoch[:5])
     return StaticEpoch(ranges, anchors, tags, weights, squared_weights, *epoch[5:])
 
@@ -258,9 +257,9 @@ def _epoch(
     tag_std_m: float,
     distance: FloatArray | None = None,
 ) -> tuple[StaticEpoch, tuple[int, ...]]:
-    """One flat batch of all leading axes, and the shape it had.
+    """Return one flat batch of all leading axes, and their shape.
 
-    Variances are taken at the ranges, or at a `distance` (..., M, N).
+    Variances are evaluated at the ranges, or at a `distance` (..., M, N).
     """
     told = ranges if distance is None else np.broadcast_to(distance, ranges.shape)
     variance = check_variance(noise.variance(told, mask), mask)
@@ -286,14 +285,14 @@ def _epoch(
     return epoch, batch
 
 
-# Rank of the anchors and of the tags that the squared-range methods stand on.
+# Rank of the anchors and of the tags that the squared-range methods need.
 _NEEDS = {"ls": (3, 3), "ls-projected": (3, 3)} | dict.fromkeys(
     ("cls", "ctls", "procrustes", "uc-ls"), (3, 2)
 )
 
 
 def _check_offset(method: str, offset: str, tag_std_m: float) -> None:
-    """A ValueError where a method cannot take the ranges' offsets."""
+    """Raise ValueError if a method does not support the ranges' offsets."""
     if method not in METHODS:
         raise ValueError(f"offset goes with the methods {', '.join(METHODS)}, got {method!r}")
     if tag_std_m != 0:
@@ -321,7 +320,7 @@ def _check_geometry(method: str, epoch: StaticEpoch) -> None:
 
 
 def methods() -> list[str]:
-    """Names of all methods: ours, and those of installed packages (``rbl_gym.locators``)."""
+    """Return the names of all methods, built in or of installed packages (``rbl_gym.locators``)."""
     return sorted({*METHODS, *(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))})
 
 

@@ -1,4 +1,4 @@
-"""The fixed-interval smoother: the most likely track of a whole log."""
+"""Fixed-interval smoother: estimate the most likely track of a whole log."""
 
 from rbl_gym.estimators.smoothing.equations import Factor, LogState, Rows
 from rbl_gym.estimators.smoothing.knowledge import Level

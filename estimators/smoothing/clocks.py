@@ -1,4 +1,4 @@
-"""Clocks that drift, as the smoother takes them: an offset and a drift of each at every epoch."""
+"""Drifting clocks in the smoother: each clock has an offset and a drift at every epoch."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from rbl_gym.measurements.offsets import Clock
 
 
 def clock_block(law: Clock, shape: tuple[int, int], extra: int) -> BiasBlock:
-    """The offsets of the clocks of (M, N) links as biases; their drifts are the states after.
+    """Return the bias block of the clock offsets of (M, N) links.
 
-    `extra`: how many extra states of an epoch come before.
+    `extra` is the number of extra states of an epoch that precede the offsets. The drifts follow
+    the offsets.
     """
     group = offsets.columns(law.offset, *shape).argmax(axis=-1)
     size = int(group.max()) + 1
@@ -23,9 +24,10 @@ def clock_block(law: Clock, shape: tuple[int, int], extra: int) -> BiasBlock:
 
 
 def first_offsets(gaps: FloatArray, there: BoolArray, offset: str) -> tuple[FloatArray, FloatArray]:
-    """Offsets (..., K, G) of ranges less distances (..., K, M, N), and the first of each (..., G).
+    """Return clock offsets (..., K, G), and the first of each (..., G).
 
-    Where an epoch has none of a clock's ranges, its first.
+    They are medians of `gaps` (..., K, M, N), ranges less distances. An epoch without ranges of a
+    clock gets the first offset of that clock.
     """
     found = offsets.median(gaps, there, offset)
     found = found.reshape((*found.shape[:-2], -1))
@@ -43,7 +45,7 @@ def add_clocks(
     state: LogState,
     times: FloatArray,
 ) -> None:
-    """The prior of the clocks, offsets about a mean (..., G), and how they run on."""
+    """Add the prior of the clocks, with offsets about a mean (..., G), and their motion in time."""
     size, n = block.where.stop - block.where.start, 6 + state.extra.shape[-1]
     offset, drift = (
         slice(block.where.start + k * size, block.where.stop + k * size) for k in range(2)
@@ -53,7 +55,7 @@ def add_clocks(
     equations.add_prior(at[0], o[..., 0, :] - mean, np.asarray(law.std_m))
     equations.add_prior(at[1], d[..., 0, :], np.asarray(law.drift_m_s))
     dt = np.diff(times)[..., None]
-    # The Cholesky factor [[a, 0], [b, c]] of the covariance of offset and drift.
+    # Cholesky factor [[a, 0], [b, c]] of the covariance of offset and drift.
     walk, wander = law.walk_m**2, law.drift_walk_m_s**2
     a = np.sqrt(walk * dt + wander * dt**3 / 3 + LEAST_STD**2)
     b = wander * dt**2 / 2 / a

@@ -1,9 +1,9 @@
-"""What a smoother estimates of a log, and the normal equations of one Gauss-Newton step.
+"""State of a log in the smoother, and the normal equations of one Gauss-Newton step.
 
-The error of an epoch is ``(w, v, extra)``: that of the pose as everywhere, ``Q_hat = exp(w) Q`` and
-``t_hat = t + v``, then estimate less truth of whatever else is estimated per epoch. Constants of
-the log come once. Every factor ties an epoch to itself, to its neighbour and to the constants, so
-that the equations are block-tridiagonal with a border.
+The error of an epoch is ``(w, v, extra)``. The pose error is the usual one, ``Q_hat = exp(w) Q``
+and ``t_hat = t + v``. The extra error is estimate less truth of the other states of the epoch.
+Constants of the log occur once. A factor depends on one epoch, its neighbour and the constants.
+The equations are therefore block-tridiagonal with a border.
 """
 
 from __future__ import annotations
@@ -24,18 +24,16 @@ _EXP, _ERROR, _HAT = kernel(rotations.exp), kernel(rotations.error), kernel(rota
 
 
 class LogState(NamedTuple):
-    """States of the K epochs of a log, and its constants, with leading batch axes.
+    """States of the K epochs of a log and its constants, with leading batch axes.
 
     Attributes
     ----------
     rotation, translation
         (..., K, 3, 3) and (..., K, 3).
     extra
-        (..., K, E): first what the law of motion estimates beside the pose, then the biases that
-        drift.
+        (..., K, E): the extra states of the motion model, then the drifting biases.
     constants
-        (..., C): first those of the law of motion, then those of further factors, then the biases
-        that stay.
+        (..., C): the constants of the motion model, of the other factors, then the constant biases.
     """
 
     rotation: FloatArray
@@ -50,14 +48,15 @@ class Rows(NamedTuple):
     Attributes
     ----------
     residual
-        (..., J, m) in standard deviations: J = K, of every epoch; or J = K - 1, between neighbours.
+        (..., J, m) in standard deviations. J = K for rows of single epochs, K - 1 for rows between
+        neighbours.
     before
-        (..., J, m, n): derivative by the errors of the epoch, or of the earlier neighbour. The
-        first n errors; by the others it is zero.
+        (..., J, m, n): derivative by the first n errors of the epoch, or of the earlier neighbour.
+        The derivative by the other errors is zero.
     after
-        The same by those of the later neighbour; None: rows of an epoch alone.
+        The same for the later neighbour; None for rows of single epochs.
     constants
-        (..., J, m, c): derivative by the factor's own constants; None: there are none.
+        (..., J, m, c): derivative by the factor's own constants; None without constants.
     """
 
     residual: FloatArray
@@ -67,7 +66,7 @@ class Rows(NamedTuple):
 
 
 class Factor(Protocol):
-    """Anything that ties epochs to measurements, to their neighbours and to constants.
+    """A cost term that relates epochs to measurements, to their neighbours and to constants.
 
     Attributes
     ----------
@@ -77,22 +76,22 @@ class Factor(Protocol):
 
     @property
     def constants_std(self) -> FloatArray:
-        """See the class."""
+        """Standard deviations (c,) of the factor's own constants about zero."""
         ...
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
-        """Residuals and derivatives at a state, times (..., K), own constants (..., c)."""
+        """Return residuals and derivatives at a state, times (..., K), own constants (..., c)."""
         ...
 
 
 @dataclass(eq=False)
 class Equations:
-    """Normal equations ``H x = -g`` of a log; `Rows` and the like are added in place.
+    """Normal equations ``H x = -g`` of a log; `Rows` and priors are added in place.
 
     Attributes
     ----------
     diagonal, above
-        Blocks (..., K, n, n) of the epochs, and of each epoch with the next (the last unused).
+        Blocks (..., K, n, n) of the epochs, and of each epoch with the next. The last is unused.
     gradient
         (..., K, n).
     border, corner, corner_gradient
@@ -111,7 +110,7 @@ class Equations:
 
     @classmethod
     def empty(cls, batch: tuple[int, ...], epochs: int, n: int, c: int) -> Equations:
-        """Equations that say nothing, of n errors an epoch and c constants."""
+        """Return equations without information, for n errors per epoch and c constants."""
         return cls(
             np.zeros((*batch, epochs, n, n)), np.zeros((*batch, epochs, n, n)),
             np.zeros((*batch, epochs, n)), np.zeros((*batch, epochs, n, c)),
@@ -119,7 +118,7 @@ class Equations:
         )  # fmt: skip
 
     def add(self, rows: Rows, start: int = 0) -> None:
-        """Half the squares of rows whose own constants begin at `start`."""
+        """Add half the squares of rows whose own constants begin at `start`."""
         r, A, B, C = rows
         J, n = A.shape[-3], A.shape[-1]
         self.cost += 0.5 * np.einsum("...ij,...ij->...", r, r)
@@ -142,21 +141,21 @@ class Equations:
             self.corner_gradient[..., start:end] += times(Ct, r.reshape((*r.shape[:-2], -1)))
 
     def add_prior(self, where: slice, value: FloatArray, std: FloatArray) -> None:
-        """Independent priors about zero of some errors of the first epoch, whose value this is."""
+        """Add independent zero-mean priors of some errors of the first epoch, given their value."""
         at = range(where.start, where.stop)
         self.cost += 0.5 * ((value / std) ** 2).sum(axis=-1)
         self.diagonal[..., 0, at, at] += std**-2.0
         self.gradient[..., 0, where] += value / std**2
 
     def add_constants_prior(self, where: slice, value: FloatArray, std: FloatArray) -> None:
-        """The same of constants."""
+        """Add independent zero-mean priors of constants."""
         at = range(where.start, where.stop)
         self.cost += 0.5 * ((value / std) ** 2).sum(axis=-1)
         self.corner[..., at, at] += std**-2.0
         self.corner_gradient[..., where] += value / std**2
 
     def add_pose_prior(self, state: LogState, prior: PoseState, information: FloatArray) -> None:
-        """A prior (...) of the pose of the first epoch, and its information (..., 6, 6)."""
+        """Add a prior (...) of the pose of the first epoch with information (..., 6, 6)."""
         turn = _ERROR(state.rotation[..., 0, :, :], prior.rotation)
         error, D = pose_error(turn, state.translation[..., 0, :] - prior.translation)
         pull, Dt = times(information, error), np.swapaxes(D, -1, -2)
@@ -165,10 +164,10 @@ class Equations:
         self.gradient[..., 0, :6] += times(Dt, pull)
 
     def step(self, damping: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The step x (..., K, n) and (..., c), and the decrease (...) of cost that it promises.
+        """Return the step (..., K, n) and (..., c), and the predicted decrease (...) of the cost.
 
-        Damping (...) holds every pose back by so much information, 1/rad^2 and 1/m^2. A share of
-        the diagonal, as Marquardt's, would not do: stiff laws of motion make it enormous.
+        Damping (...) adds information to every pose, in 1/rad^2 and 1/m^2. Marquardt's damping
+        by a fraction of the diagonal does not work here: stiff motion models make it far too large.
         """
         n, diagonal = self.gradient.shape[-1], self.diagonal.copy()
         diagonal[..., range(n), range(n)] *= 1 + 1e-14
@@ -186,9 +185,9 @@ class Equations:
         return x, y, decrease - np.einsum("...a,...a->...", self.corner_gradient, y)
 
     def covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of every epoch (..., K, n, n), with the constants (..., K, n, c), of these (..., c, c).
+        """Return covariances (..., K, n, n), (..., K, n, c), (..., c, c) of epochs and constants.
 
-        NaN where the equations are not positive definite.
+        They are NaN if the equations are not positive definite.
         """
         P = inverse_blocks(self.diagonal, self.above)
         if not self.corner.shape[-1]:
@@ -202,10 +201,11 @@ class Equations:
 
 
 def moved(state: LogState, x: FloatArray, y: FloatArray, turning: bool = False) -> LogState:
-    """The state after steps (..., K, n) of the epochs and (..., c) of the constants.
+    """Return the state after steps (..., K, n) of the epochs and (..., c) of the constants.
 
-    `turning`: the first three extra states are a vector that turns with the body, ``W <- exp(w) W
-    + dW``, so that one turn of all epochs changes no turn between them, however large it is.
+    With `turning`, the first three extra states are a vector that rotates with the body,
+    ``W <- exp(w) W + dW``. One rotation of all epochs, however large, then leaves the rotations
+    between them unchanged.
     """
     turn = _EXP(x[..., :3])
     extra = state.extra + x[..., 6:]
@@ -217,7 +217,7 @@ def moved(state: LogState, x: FloatArray, y: FloatArray, turning: bool = False) 
 
 
 def with_turning(rows: Rows, state: LogState) -> Rows:
-    """Rows with derivatives by the steps of `moved` of a turning vector, from those by its error.
+    """Convert derivatives by the error of a rotating vector to derivatives by the steps of `moved`.
 
     The error of the vector is ``dW + w x W``.
     """
@@ -235,5 +235,5 @@ def with_turning(rows: Rows, state: LogState) -> Rows:
 
 
 def times(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Products (..., m) of matrices (..., m, n) and vectors (..., n)."""
+    """Return products (..., m) of matrices (..., m, n) and vectors (..., n)."""
     return (matrix @ vector[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""A body that an inertial sensor carries, as a factor of the smoother."""
+"""Motion measured by an inertial sensor, as a factor of the smoother."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from rbl_gym.motion import navigation
 
 __all__ = ["InertialMotion"]
 
-# Behind the doors: what comes to these was checked, or made here.
+# Inputs of these functions were already checked, or were made here.
 _LOG, _HAT = kernel(rotations.log), kernel(rotations.hat)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 
 
 @dataclass(frozen=True, eq=False)
 class InertialMotion:
-    """A pose moved by the readings of an inertial sensor: `Motion` of a `LogModel`.
+    """Motion of a pose by the readings of an inertial sensor: a `Motion` of a `LogModel`.
 
-    Of every epoch velocity and biases are estimated too, in the order of `motion.navigation`, of
-    the whole log the tilt of gravity, where there may be one.
+    Velocity and sensor biases are estimated at every epoch too, in the order of
+    `motion.navigation`. The tilt of gravity is one constant of the log, if it is not zero.
 
     Parameters
     ----------
     readings, steps
-        (..., K - 1, S, 6) and seconds (..., K - 1, S), of the intervals between epochs. Fewer
-        samples than S in one are filled up with samples of no length.
+        (..., K - 1, S, 6) and seconds (..., K - 1, S), of the intervals between epochs. An interval
+        with fewer than S samples is padded with samples of zero duration.
     sensor
-        Law of the readings.
+        Error model of the readings.
     speed_m_s, gravity_tilt_rad
-        As of the filter ``"iekf-imu"``.
+        As in the filter ``"iekf-imu"``.
     """
 
     readings: ArrayLike
@@ -64,17 +64,17 @@ class InertialMotion:
 
     @property
     def constants_std(self) -> FloatArray:
-        """Standard deviations of the tilt (2,), or none."""
+        """Standard deviations of the tilt, (2,) or (0,)."""
         return np.full(2 * (self.gravity_tilt_rad > 0), self.gravity_tilt_rad)
 
     @functools.cached_property
     def _whitener(self) -> FloatArray:
-        """Inverse Cholesky factors (..., K - 1, 9, 9) of the noise of a preintegration."""
+        """Return inverse Cholesky factors (..., K - 1, 9, 9) of the preintegrated noise."""
         moved = navigation.integrate(self.readings, self.steps, np.zeros(6), self.sensor.numbers)  # pyright: ignore[reportArgumentType]
         return np.linalg.inv(np.linalg.cholesky(moved.covariance + LEAST_STD**2 * np.eye(9)))
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
-        """Rows of what an epoch has beyond what the readings make of the one before, whitened."""
+        """Return whitened rows of each epoch less its prediction from the epoch before."""
         Q, Q_new = state.rotation[..., :-1, :, :], state.rotation[..., 1:, :, :]
         x, x_new = state.extra[..., :-1, :9], state.extra[..., 1:, :9]
         moved = navigation.integrate(self.readings, self.steps, x[..., 3:], self.sensor.numbers)  # pyright: ignore[reportArgumentType]
@@ -87,14 +87,14 @@ class InertialMotion:
         gone, sped = ((Q @ a[..., None])[..., 0] for a in (moved.translation, moved.velocity))
         place = np.diff(state.translation, axis=-2) - x[..., :3] * T - 0.5 * down * T**2 - gone
         speed = x_new[..., :3] - x[..., :3] - down * T - sped
-        # In the frame of the body at the earlier epoch, where the noise is known.
+        # In the body frame at the earlier epoch, in which the noise is known.
         residual = np.concatenate(
             [(back @ a[..., None])[..., 0] for a in (turn, place, speed)], axis=-1
         )
         A, B = (np.zeros((*residual.shape[:-1], 15, 15)) for _ in range(2))
         T = T[..., None]
         outer = back @ np.swapaxes(inner, -1, -2)
-        # The frame turns with the earlier rotation: the residuals' own parts.
+        # The frame rotates with the earlier rotation, which adds these terms.
         A[..., :3, :3] = back @ _HAT(turn) - outer
         A[..., :3, 9:12] = -outer @ Q @ moved.jacobian[..., :3, :3]
         B[..., :3, :3] = back @ inner

@@ -1,4 +1,4 @@
-"""What is known of the body's place at every epoch, as a factor of the smoother."""
+"""Prior knowledge of height and tilt at every epoch, as a factor of the smoother."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ __all__ = ["Level"]
 
 @dataclass(frozen=True)
 class Level:
-    """Soft knowledge of height and tilt: a body that stays about level, at about one height.
+    """Soft constraint on height and tilt, for a body that stays about level at about one height.
 
     Parameters
     ----------
     height_m, height_std_m
-        Height of the body's origin, and the standard deviation about it; None: unknown.
+        Height of the body's origin and its standard deviation; None: unknown.
     tilt_std_rad
         Standard deviation of roll and pitch about level, on each of two axes; None: unknown.
     time_s
-        How long a deviation lasts: epochs closer than this tell of it together what one would.
+        Correlation time of the departure from level and height. Epochs closer together than this
+        carry as much information as one.
 
     Raises
     ------
     ValueError
-        On a deviation that is not positive, or a height without one.
+        If a standard deviation is not positive, or a height has none.
     """
 
     height_m: float | None = None
@@ -50,7 +51,7 @@ class Level:
     constants_std = np.zeros(0)
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
-        """Rows of the height, and of the level parts of the body's upright axis."""
+        """Return rows of the height and of the horizontal components of the body's z axis."""
         upright = state.rotation[..., :, 2]
         residuals, rows = [], []
         if self.height_m is not None and self.height_std_m is not None:
@@ -59,7 +60,7 @@ class Level:
             residuals.append((state.translation[..., 2:] - self.height_m) / self.height_std_m)
             rows.append(A)
         if self.tilt_std_rad is not None:
-            # An error w turns the axis u by w x u.
+            # An error w rotates the axis u by w x u.
             A = np.zeros((*upright.shape[:-1], 2, 6))
             x, y, z = (upright[..., i] / self.tilt_std_rad for i in range(3))
             A[..., 0, 1], A[..., 0, 2] = z, -y
@@ -69,7 +70,7 @@ class Level:
         shape = upright.shape[:-1]
         residuals = residuals or [np.zeros((*shape, 0))]
         rows = rows or [np.zeros((*shape, 0, 6))]
-        # The first epoch counts in full, what comes later by the time that has passed.
+        # The first epoch has full weight; later ones are weighted by the time since the last.
         share = np.ones(times.shape)
         share[..., 1:] = np.minimum(np.diff(times) / self.time_s, 1.0)
         root = np.sqrt(share)[..., None]

@@ -1,4 +1,4 @@
-"""Laws of motion between neighbouring epochs, as factors of the smoother."""
+"""Motion models between neighbouring epochs, as factors of the smoother."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from rbl_gym.motion.unknown_twist import WanderingTwist
 
 __all__ = ["KnownTwist", "Motion", "UnknownTwist"]
 
-# Behind the doors: what comes to these was checked, or made here.
+# Inputs of these functions were already checked, or were made here.
 _EXP, _LOG = kernel(rotations.exp), kernel(rotations.log)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 
 
 class Motion(Factor, Protocol):
-    """The factor between neighbours that says which states an epoch has beside the pose.
+    """A factor between neighbours that also defines the extra states of an epoch.
 
     Attributes
     ----------
     extra_std
-        Standard deviations (e,) about zero of those of the first epoch; e of them are estimated.
+        Standard deviations (e,) about zero of the e extra states at the first epoch.
     turning
-        Whether the first three are a vector that turns with the body, as a turn rate does. The
-        rows do not know of it: their derivatives are by errors, estimate less truth.
+        Whether the first three extra states are a vector that rotates with the body, such as a
+        turn rate. The rows ignore this: their derivatives are by errors, estimate less truth.
     """
 
     @property
     def turning(self) -> bool:
-        """See the class."""
+        """Whether the first three extra states are a vector that rotates with the body."""
         ...
 
     @property
     def extra_std(self) -> FloatArray:
-        """See the class."""
+        """Standard deviations (e,) about zero of the extra states at the first epoch."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class KnownTwist:
-    """A pose moved by a twist that is known up to the noise of the process; or a random walk.
+    """Motion by a known twist plus process noise, or a random walk.
 
     Parameters
     ----------
     process
-        Noise of the motion, as a filter takes it.
+        Process noise, as in a filter.
     twists
-        (..., K - 1, 6), rad/s and m/s, of the intervals between epochs; None: at rest, so that the
-        process makes it a random walk.
+        (..., K - 1, 6), rad/s and m/s, of the intervals between epochs; None: zero, so that the
+        motion is a random walk.
     """
 
     process: ProcessNoise
@@ -72,7 +72,7 @@ class KnownTwist:
     turning = False
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
-        """Rows of ``Jl(W dt)^-1 log(Q' (exp(W dt) Q)^T)`` and ``t' - t - V dt``, whitened."""
+        """Return whitened rows of ``Jl(W dt)^-1 log(Q' (exp(W dt) Q)^T)`` and ``t' - t - V dt``."""
         dt = np.diff(times)[..., None]
         std = np.sqrt(dt * self.process.std() ** 2 + LEAST_STD**2)
         before, after = _neighbours(state)
@@ -94,14 +94,14 @@ class KnownTwist:
 
 @dataclass(frozen=True, eq=False)
 class UnknownTwist:
-    """A pose moved by a twist that wanders by white acceleration, and is estimated with it.
+    """Motion by an unknown twist with white acceleration; the twist is estimated too.
 
     Parameters
     ----------
     law
-        Of the twist.
+        Model of the twist.
     process
-        Noise of the pose beside what the twist does.
+        Process noise of the pose in addition to the twist.
     """
 
     law: WanderingTwist
@@ -115,13 +115,13 @@ class UnknownTwist:
 
     @property
     def extra_std(self) -> FloatArray:
-        """Standard deviations (6,) of the first twist."""
+        """Standard deviations (6,) of the twist at the first epoch."""
         return np.maximum(self.law.prior_std(), LEAST_STD)
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
-        """Rows of the pose, ``log(Q' Q^T) - W dt`` and ``t' - t - V dt``, and of the twist.
+        """Return rows of the pose, ``log(Q' Q^T) - W dt`` and ``t' - t - V dt``, and of the twist.
 
-        They are whitened together: an acceleration that is white over the interval moves both.
+        They are whitened together, because white acceleration over the interval changes both.
         """
         dt = np.diff(times)[..., None]
         before, after = _neighbours(state)
@@ -135,7 +135,7 @@ class UnknownTwist:
         A[..., 3:6, 3:6], B[..., 3:6, 3:6] = -np.eye(3), np.eye(3)
         A[..., :6, 6:] = -dt[..., None] * np.eye(6)
         A[..., 6:, 6:], B[..., 6:, 6:] = -np.eye(6), np.eye(6)
-        # The Cholesky factor [[a, 0], [b, c]] of every axis' covariance of pose and twist.
+        # Cholesky factor [[a, 0], [b, c]] of the covariance of pose and twist, per axis.
         wander = self.law.std() ** 2
         a = np.sqrt(dt * self.process.std() ** 2 + dt**3 / 3 * wander + LEAST_STD**2)
         b = dt**2 / 2 * wander / a
@@ -152,7 +152,7 @@ class UnknownTwist:
 
 
 def _neighbours(state: LogState) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]]:
-    """Rotation, translation and further states of the earlier and the later epochs."""
+    """Return rotation, translation and extra states of the earlier and the later epochs."""
     Q, t, x = state.rotation, state.translation, state.extra
     return (
         (Q[..., :-1, :, :], t[..., :-1, :], x[..., :-1, :]),

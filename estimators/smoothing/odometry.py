@@ -1,4 +1,4 @@
-"""Readings of odometry between neighbouring epochs, as a factor of the smoother."""
+"""Odometry readings between neighbouring epochs, as a factor of the smoother."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rbl_gym.motion import navigation
 
 __all__ = ["OdometryMotion", "padded"]
 
-# Behind the doors: what comes to these was checked, or made here.
+# Inputs of these functions were already checked, or were made here.
 _EXP, _LOG, _HAT = kernel(rotations.exp), kernel(rotations.log), kernel(rotations.hat)
 _LEFT_JACOBIAN = kernel(rotations.left_jacobian)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
@@ -25,22 +25,23 @@ _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 
 @dataclass(frozen=True, eq=False)
 class OdometryMotion:
-    """A pose moved by readings of odometry: `Motion` of a `LogModel`.
+    """Motion of a pose by odometry readings: a `Motion` of a `LogModel`.
 
-    Of the whole log the scales of turn rate and speed and the biases of the turn rates are
-    estimated. Between two epochs the readings are put together; what they do not read moves by a
+    Constants of the log are estimated too: the scales of turn rate and speed, and the biases of
+    the turn rates. The readings between two epochs are integrated. Axes without readings move by a
     random walk.
 
     Parameters
     ----------
     readings, steps
         (..., K - 1, S, 6) and seconds (..., K - 1, S), of the intervals between epochs: turn rate
-        (rad/s), then speed (m/s), in the body frame, NaN where there is none. Fewer readings than
-        S in one are filled up with readings of no length.
+        (rad/s), then speed (m/s), in the body frame, NaN if not measured. An interval with fewer
+        than S readings is padded with readings of zero duration.
     sensor
-        Law of the readings.
+        Error model of the readings.
     unread
-        By how much an axis that is not read moves in 1 s: turns (rad), ways (m).
+        Standard deviation of the motion in 1 s of an axis without readings: rotation (rad),
+        translation (m).
     """
 
     readings: ArrayLike
@@ -68,14 +69,14 @@ class OdometryMotion:
         return np.maximum(self.sensor.calibration_std(), 1e-9)
 
     def linearize(self, state: LogState, times: FloatArray, constants: FloatArray) -> Rows:
-        """Rows of what lies between two poses beyond what the readings tell, whitened."""
+        """Return whitened rows of the motion between two poses less the integrated readings."""
         turn, way, by = _together(self.readings, self.steps, constants)  # pyright: ignore[reportArgumentType]
         Q, Q_new = state.rotation[..., :-1, :, :], state.rotation[..., 1:, :, :]
         back = np.swapaxes(Q, -1, -2)
         error = _LOG(np.swapaxes(turn, -1, -2) @ back @ Q_new)
         moved = _times(back, np.diff(state.translation, axis=-2))
         residual = np.concatenate([error, moved - way], axis=-1)
-        # E = R^T Q^T Q'; an error w' of Q' turns it by (Q R)^T w', one of Q by minus as much.
+        # E = R^T Q^T Q'; an error w' of Q' rotates it by (Q R)^T w', an error of Q by the negative.
         inner = _LEFT_JACOBIAN_INVERSE(error) @ np.swapaxes(Q @ turn, -1, -2)
         A, B = (np.zeros((*residual.shape, 6)) for _ in range(2))
         A[..., :3, :3], B[..., :3, :3] = -inner, inner
@@ -89,7 +90,7 @@ class OdometryMotion:
 
     @functools.cached_property
     def _whitener(self) -> FloatArray:
-        """Inverse Cholesky factors (..., K - 1, 6, 6) of the noise of readings put together."""
+        """Return inverse Cholesky factors (..., K - 1, 6, 6) of the integrated noise."""
         _, way, _ = _together(self.readings, self.steps, np.zeros(5))  # pyright: ignore[reportArgumentType]
         steps = np.asarray(self.steps)[..., None]
         known = np.isfinite(np.asarray(self.readings))
@@ -97,23 +98,24 @@ class OdometryMotion:
         variance = (np.where(known, self.sensor.noise(), unread) ** 2 * steps).sum(axis=-2)
         variance = np.maximum(variance, 1e-12)
         P = variance[..., None] * np.eye(6)
-        # A turn at an unknown moment of the interval moves its end by half of what is left.
+        # A rotation at an unknown time moves the end point by the rotation times the way that
+        # remains.
         lever = -0.5 * _HAT(way)
         P[..., 3:, :3] = lever * variance[..., None, :3]
         P[..., :3, 3:] = np.swapaxes(P[..., 3:, :3], -1, -2)
-        # The mean of squares of such moments is a third.
+        # The mean square of the remaining fraction is a third.
         P[..., 3:, 3:] += 4 / 3 * (P[..., 3:, :3] @ np.swapaxes(lever, -1, -2))
         return np.linalg.inv(np.linalg.cholesky(P))
 
 
 def padded(intervals: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """Readings (J, S, 6) and seconds (J, S) of J intervals, as the laws of motion take them.
+    """Pad readings and seconds of J intervals to arrays (J, S, 6) and (J, S).
 
     Parameters
     ----------
     intervals
-        Readings (S, 6) and seconds (S,) of each; those with fewer than the most are filled up with
-        zeros that last no time.
+        Readings (S, 6) and seconds (S,) of each. Shorter intervals are padded with readings of zero
+        duration.
     """
     most = max((len(steps) for _, steps in intervals), default=0)
     readings, seconds = np.zeros((len(intervals), most, 6)), np.zeros((len(intervals), most))
@@ -125,9 +127,9 @@ def padded(intervals: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArr
 def _together(
     readings: FloatArray, steps: FloatArray, constants: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Turn (..., 3, 3), way (..., 3) in the first frame, and derivatives (..., 6, 5) by constants.
+    """Return rotation (..., 3, 3), way (..., 3) in the first frame, derivatives by constants.
 
-    The derivative of the turn is that of its last frame's error, ``R exp(d)``.
+    The derivatives are (..., 6, 5). That of the rotation refers to the error d in ``R exp(d)``.
     """
     constants = constants[..., None, :]
     scale = 1 + np.repeat(constants[..., :2], 3, axis=-1)
@@ -141,7 +143,7 @@ def _together(
         seen = known[..., s, :]
         twist = np.where(seen, (readings[..., s, :] - none) / scale, 0.0)
         moved = twist * dt
-        # By the constants: the scales, then the biases.
+        # Derivatives by the constants: the scales, then the biases.
         slope = np.zeros((*twist.shape, 5))
         slope[..., :3, 0], slope[..., 3:, 1] = -twist[..., :3], -twist[..., 3:]
         slope[..., range(3), range(2, 5)] = -1.0

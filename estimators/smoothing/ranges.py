@@ -1,4 +1,4 @@
-"""Ranges of a log and the biases of their links, as the smoother takes them."""
+"""Ranges of a log and biases of their links, in the form the smoother uses."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from rbl_gym.measurements.direction_bias import DirectionLaw, direction_bias
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.measurements.offsets import axes_of
 
-# Share of a bias that is new after an interval, at least: two epochs of one time.
+# Least fraction of a bias that is new after an interval, for two epochs at the same time.
 _LEAST_NEW = 1e-12
 
 
 class BiasBlock(NamedTuple):
-    """Biases of one kind: of every link, one that all have in common, offsets of clocks.
+    """Biases of one kind: one per link, one common to all links, or clock offsets.
 
     Attributes
     ----------
     where
-        Their places among the extra states of an epoch, or among the constants.
+        Their slice of the extra states of an epoch, or of the constants.
     of_link
-        Which of them each of the M N links has.
+        Index of the bias of each of the M N links.
     std
-        Metres.
+        Standard deviation, metres.
     time_s
-        Of the drift; None: constants. Infinite: the law is a clock's (`clocks`).
+        Correlation time of the drift. None: constant biases. Infinite: clock offsets (`clocks`).
     """
 
     where: slice
@@ -43,14 +43,14 @@ class BiasBlock(NamedTuple):
 def bias_blocks(
     laws: tuple[LinkBias, ...], links: int, extra: int, constants: int
 ) -> tuple[list[BiasBlock], int, int]:
-    """Where the biases of the laws stand, and how many extra states and constants there are.
+    """Return the block of each law, and the numbers of extra states and constants.
 
     Parameters
     ----------
     laws, links
-        The biases add up; of so many links.
+        Laws of the biases, which add up, and the number of links.
     extra, constants
-        How many come before them.
+        Numbers of extra states and constants that precede them.
     """
     blocks: list[BiasBlock] = []
     for law in laws:
@@ -69,7 +69,7 @@ def bias_blocks(
 
 
 def bias_of(blocks: list[BiasBlock], state: LogState, links: int) -> FloatArray:
-    """Biases (..., K, links) of a state, metres: all kinds together."""
+    """Return the sum (..., K, links) of all biases of a state, metres."""
     total = np.zeros((*state.translation.shape[:-1], links))
     for block in blocks:
         values = state.extra
@@ -83,7 +83,7 @@ def bias_of(blocks: list[BiasBlock], state: LogState, links: int) -> FloatArray:
 def add_biases(
     equations: Equations, blocks: list[BiasBlock], state: LogState, times: FloatArray
 ) -> None:
-    """The priors of the biases, and their drift: Gauss-Markov processes of the same variance."""
+    """Add the priors of the biases and their drift, Gauss-Markov processes of the same variance."""
     for block in blocks:
         where, std = block.where, block.std
         if block.time_s == np.inf:
@@ -107,7 +107,7 @@ def add_biases(
 
 
 class Layout(NamedTuple):
-    """A law of biases by direction, anchors (..., K or 1, M, 3) and tags (N, 3)."""
+    """A model of biases by direction, anchors (..., K or 1, M, 3) and tags (N, 3)."""
 
     law: DirectionLaw
     anchors: FloatArray
@@ -116,24 +116,24 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LogRanges:
-    """The ranges that were measured, at most S of an epoch, side by side.
+    """The measured ranges, packed to at most S per epoch.
 
     Attributes
     ----------
     link
-        (..., K, S), which of the M N links.
+        (..., K, S), index of the link among M N.
     ranges, weights
-        (..., K, S), metres and inverse variances; weight 0 where an epoch has fewer.
+        (..., K, S), metres and inverse variances; weight 0 if an epoch has fewer than S.
     anchors, tags
-        (..., K, S, 3) of each range: world frame, body frame.
+        (..., K, S, 3) of each range, anchors in the world frame and tags in the body frame.
     shape
         (M, N).
     blocks
-        Of the biases.
+        Blocks of the biases.
     offset
-        Whose ranges have an unknown offset in common, new at every epoch; None: nobody's.
+        Which ranges share an unknown offset that is new at every epoch; None: no offset.
     layout
-        A law of biases by direction, and what it is evaluated at; None: there is none.
+        A model of biases by direction, with its anchors and tags; None: no such biases.
     """
 
     link: np.ndarray
@@ -157,12 +157,12 @@ class LogRanges:
         blocks: list[BiasBlock],
         offset: str | None = None,
     ) -> LogRanges:
-        """Of arrays (..., K, M, N), anchors (..., K or 1, M, 3) and tags (N, 3)."""
+        """Pack ranges (..., K, M, N) to anchors (..., K or 1, M, 3) and tags (N, 3)."""
         M, N = ranges.shape[-2:]
         flat = (*ranges.shape[:-2], M * N)
         mask = np.broadcast_to(True if links is None else links, ranges.shape)
         most = max(int(mask.sum(axis=(-2, -1)).max()), 1)
-        # Measured ones first, in their order.
+        # Measured ranges first, in their order.
         link = np.argsort(~mask.reshape(flat), axis=-1, kind="stable")[..., :most]
 
         def pick(array: FloatArray | BoolArray) -> np.ndarray:
@@ -178,9 +178,9 @@ class LogRanges:
     def residual(
         self, state: LogState, loss: FloatArray = SQUARES
     ) -> tuple[FloatArray, FloatArray]:
-        """Prediction less range (..., K, S) [m], and the derivative (..., K, S, 6) of distances.
+        """Return prediction less range (..., K, S) [m], and derivative (..., K, S, 6) by the pose.
 
-        Without the offsets that the loss likes best.
+        The offsets that minimize the loss are removed.
         """
         turned = np.einsum("...ij,...sj->...si", state.rotation, self.tags)
         gap = turned + state.translation[..., None, :] - self.anchors
@@ -214,7 +214,7 @@ class LogRanges:
         return residual, J
 
     def _centred(self, values: FloatArray, weights: FloatArray) -> FloatArray:
-        """Values (..., K, S, n) less the weighted means of those with the same offset."""
+        """Return values (..., K, S, n) less the weighted mean of values with the same offset."""
         if self.offset is None:
             return values
         n_tags = self.shape[1]
@@ -226,9 +226,9 @@ class LogRanges:
         return values - of @ (mean / np.where(total > 0, total, 1.0))
 
     def rows(self, state: LogState, loss: FloatArray) -> tuple[Rows, FloatArray]:
-        """Rows of the ranges, by weights that a loss leaves at the state, and its cost (...).
+        """Return rows of the ranges, weighted by the loss at the state, and the cost (...).
 
-        Derivatives by constants are by all of the log.
+        Derivatives by constants are by all constants of the log.
         """
         residual, J = self.residual(state, loss)
         cost, share = loss_of(self.weights * residual**2, loss, residual < 0)
@@ -247,10 +247,10 @@ class LogRanges:
         return rows, cost.sum(axis=(-2, -1))
 
     def add(self, equations: Equations, state: LogState, loss: FloatArray) -> None:
-        """The cost of the ranges under a loss."""
+        """Add the cost of the ranges under a loss."""
         rows, cost = self.rows(state, loss)
         equations.add(rows)
-        # In place of half the squares: the loss.
+        # The loss replaces half the squares.
         equations.cost += cost - 0.5 * np.einsum("...ks,...ks->...", rows.residual, rows.residual)
 
     def consistency(
@@ -259,9 +259,9 @@ class LogRanges:
         loss: FloatArray,
         covariances: tuple[FloatArray, FloatArray, FloatArray],
     ) -> tuple[FloatArray, FloatArray]:
-        """Squared residuals (..., K) of the epochs in standard deviations, and what to expect.
+        """Return squared whitened residuals (..., K) of the epochs, and their expectation.
 
-        Of a range there is to expect 1 less the share of its variance that the fit explains.
+        The expectation per range is 1 less the fraction of its variance that the fit explains.
         """
         (r, A, _, C), _ = self.rows(state, loss)
         P, crossed, constants = covariances
@@ -276,7 +276,7 @@ class LogRanges:
         return (r**2).sum(axis=-1), free
 
     def spread(self, values: FloatArray) -> FloatArray:
-        """Values (..., K, S) as (..., K, M, N), zero where nothing was measured."""
+        """Return values (..., K, S) as (..., K, M, N), zero where no range was measured."""
         M, N = self.shape
         full = np.zeros((*values.shape[:-1], M * N))
         np.put_along_axis(full, self.link, np.where(self.weights > 0, values, 0.0), axis=-1)

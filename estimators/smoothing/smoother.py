@@ -1,8 +1,9 @@
-"""The smoother: all poses of a log at once, each from all ranges before and after it.
+"""Smoother: estimate all poses of a log together, each from all ranges before and after it.
 
-Maximum a posteriori over the whole log by Gauss-Newton, damped where the cost would rise. The laws
-are those of the filters: `KnownTwist` that of ``"iekf"``, `UnknownTwist` that of ``"iekf-cv"``, and
-biases of links. Where all is linear it is the smoother of Rauch, Tung and Striebel.
+The estimate is the maximum a posteriori of the whole log, found by Gauss-Newton. Steps are damped
+if the cost would rise. The models are those of the filters: `KnownTwist` that of ``"iekf"``,
+`UnknownTwist` that of ``"iekf-cv"``, and biases of links. For a linear model the result equals
+that of the Rauch-Tung-Striebel smoother.
 """
 
 from __future__ import annotations
@@ -51,32 +52,32 @@ from rbl_gym.measurements.offsets import Clock
 
 __all__ = ["LogModel", "RangeLog", "Smoothed", "smooth"]
 
-# Whitened residual at which Huber's loss turns, where a loss that forgets is to be started.
+# Threshold (whitened residual) of the Huber loss that starts the search for non-convex losses.
 _HUBER = 1.5
-# A step is the last one where it promises less decrease of the cost than this, per epoch.
+# Iteration stops if the predicted decrease of the cost per epoch is below this.
 _TOLERANCE, _COARSE = 1e-6, 1e-3
-# Information (1/rad^2, 1/m^2) that holds a pose back, where a step goes too far: a little, much.
+# Damping, information (1/rad^2, 1/m^2) added to a pose after a step too far: least and greatest.
 _SMALL, _MOST_DAMPING = 0.1, 1e12
 
 
 class RangeLog(NamedTuple):
     """Ranges of a log of K epochs, at any spacing; arrays with leading batch axes.
 
-    Ranges that each have a time of their own are epochs of one link.
+    Asynchronous ranges are epochs of one link each.
 
     Attributes
     ----------
     times
-        (..., K), seconds, that do not decrease.
+        (..., K), seconds, not decreasing.
     ranges
         (..., K, M, N), metres.
     anchors
-        (M, 3), or (..., K, M, 3) where they move or differ between logs, metres.
+        (M, 3), or (..., K, M, 3) if they move or differ between logs, metres.
     links
         (..., K, M, N), True where a range was measured; None: all.
     noise
-        Law of these ranges, such as `rbl_gym.ranging.LinkNoise` with a standard deviation for
-        each of (..., K, M, N); None: the model's.
+        Noise model of these ranges, such as `rbl_gym.ranging.LinkNoise` with standard deviations
+        (..., K, M, N); None: that of the `LogModel`.
     """
 
     times: ArrayLike
@@ -88,31 +89,32 @@ class RangeLog(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LogModel:
-    """What a smoother takes for true of a log.
+    """Model that a smoother assumes for a log.
 
     Parameters
     ----------
     tags
         (N, 3), metres, body frame.
     noise
-        Law of the ranges; variances are taken at the measured ranges.
+        Noise model of the ranges; variances are evaluated at the measured ranges.
     motion
         `KnownTwist`, `UnknownTwist`, or any other `Motion`.
     biases
-        Laws of the links' biases, which add up: constant ones are learned from the whole log.
+        Models of the link biases, which add up. Constant biases are estimated from the whole log.
     factors
-        Whatever else is known or measured, for instance `Level`.
+        Other measurements or prior knowledge, for instance `Level`.
     loss
-        Of the ranges' residuals, of `rbl_gym.estimators.costs.range_cost`: squares, or `huber`.
-        One that is not convex is started with Huber's.
+        Loss of the range residuals, from `rbl_gym.estimators.costs.range_cost`: squares, or
+        `huber`. The search with a non-convex loss starts with the Huber loss.
     offset
-        Whose ranges have an unknown offset in common, new at every epoch, as `IteratedEkf`;
-        variances are then taken at the distances from the start.
+        Which ranges share an unknown offset that is new at every epoch, as in `IteratedEkf`.
+        Variances are then evaluated at the distances of the start.
     clock
-        Law of offsets that last, in place of `offset`; their states are eliminated with the rest.
+        Model of clock offsets that persist, in place of `offset`. Their states are eliminated with
+        the others.
     directions
-        What ranges have too much by the direction of the ray, at the poses that are sought; its
-        deviations are taken at the start.
+        Range bias as a function of the direction of the ray, at the estimated poses. Its standard
+        deviations are evaluated at the start.
     """
 
     tags: FloatArray
@@ -141,28 +143,28 @@ class LogModel:
 
 
 class Smoothed(NamedTuple):
-    """The most likely track of a log; arrays with leading batch axes.
+    """Most likely track of a log; arrays with leading batch axes.
 
     Attributes
     ----------
     rotation, translation, covariance
         Poses of the K epochs: (..., K, 3, 3), (..., K, 3), and (..., K, 6, 6) of the error (w, v).
     extra, extra_covariance
-        (..., K, e) and (..., K, e, e): what the motion estimates beside the pose, such as the
-        twist of `UnknownTwist`.
+        (..., K, e) and (..., K, e, e): the extra states of the motion model, such as the twist of
+        `UnknownTwist`.
     biases
-        (..., K, M, N), metres: of all links, constant and drifting ones together.
+        (..., K, M, N), metres: the sum of constant and drifting biases of each link.
     constants, constants_covariance
-        (..., c) and (..., c, c): of the motion, of the factors, then the biases that stay.
+        (..., c) and (..., c, c): constants of the motion, of the factors, then constant biases.
     residuals
-        (..., K, M, N), range less its expectation, metres; 0 where nothing was measured.
+        (..., K, M, N), range less its prediction, metres; 0 where no range was measured.
     squares, freedom
-        (..., K): squared residuals of an epoch in standard deviations, weighed by the loss, and
-        what to expect of them. Their sums over many epochs have the ratio 1 where all is true.
+        (..., K): squared whitened residuals of an epoch, weighted by the loss, and their
+        expectation. The ratio of their sums over many epochs is 1 if the model is correct.
     cost
-        (...), minus the logarithm of the posterior density, up to a constant.
+        (...), negative logarithm of the posterior density, up to a constant.
     converged
-        (...), whether the last step was too short to matter.
+        (...), whether the last step was negligible.
     """
 
     rotation: FloatArray
@@ -187,28 +189,28 @@ def smooth(
     start: Sequence[ArrayLike],
     iterations: int = 50,
 ) -> Smoothed:
-    """The most likely track of a log of ranges, and the covariances of its poses.
+    """Estimate the most likely track of a log of ranges, and the covariances of its poses.
 
     Parameters
     ----------
     log
-        What was measured.
+        The measurements.
     model
-        What is taken for true.
+        The assumed model.
     prior
         Rotation (..., 3, 3), translation (..., 3) and covariance (..., 6, 6) at the first epoch,
         before its ranges.
     start
-        Rotations (..., K, 3, 3) and translations (..., K, 3) where Gauss-Newton begins, for
-        instance a filter's track (`causal_track`). It finds the best track near them.
+        Rotations (..., K, 3, 3) and translations (..., K, 3) from which Gauss-Newton starts, for
+        instance the track of a filter (`causal_track`). The result is a local optimum near them.
     iterations
-        At the most.
+        Maximum number of iterations.
 
     Raises
     ------
     ValueError
-        On shapes that do not fit, NaN, ranges that are not positive, times that decrease, and
-        where log and prior leave a state without any information.
+        If shapes do not match, values are NaN, ranges are not positive, times decrease, or log and
+        prior together do not determine a state.
     """
     iterations = check_count("iterations", iterations)
     problem, state = _checked(log, model, prior, start)
@@ -236,20 +238,20 @@ def smooth(
 
 
 def _of_errors(P: FloatArray, state: LogState) -> FloatArray:
-    """Covariance of errors (..., K, n, n) from that of steps: a vector turns, ``dW + w x W``."""
+    """Return the covariance of errors (..., K, n, n) from that of steps; see `with_turning`."""
     T = np.broadcast_to(np.eye(P.shape[-1]), P.shape).copy()
     T[..., 6:9, :3] = -rotations.hat(state.extra[..., :3])
     return T @ P @ np.swapaxes(T, -1, -2)
 
 
 def _is_convex(loss: FloatArray) -> bool:
-    """Whether a loss has one minimum: squares, or Huber's."""
+    """Return whether a loss is convex: squares, or Huber's."""
     return bool(np.isinf(loss[..., 1:3]).all() and (loss[..., 3:4] == 1).all())
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """All terms of a log: see `smooth`."""
+    """All terms of the cost of a log; see `smooth`."""
 
     times: FloatArray
     ranges: LogRanges
@@ -281,7 +283,7 @@ class _Problem:
         return equations
 
     def _extra_prior(self, state: LogState) -> Rows:
-        """Rows of the first epoch's further states."""
+        """Add the prior of the extra states of the first epoch."""
         std = self.motion.extra_std
         A = np.zeros((*state.extra.shape[:-2], 1, len(std), 6 + len(std)))
         A[..., range(len(std)), range(6, 6 + len(std))] = 1 / std
@@ -293,7 +295,7 @@ class _Problem:
     def minimize(
         self, state: LogState, loss: FloatArray, iterations: int, tolerance: float
     ) -> tuple[LogState, Equations, BoolArray]:
-        """State, equations there, and whether it converged (...), from a start."""
+        """Return the state, its equations, and whether it converged (...), from a start."""
         equations = self.linearize(state, loss)
         damping = np.zeros(equations.cost.shape)
         converged = np.zeros(equations.cost.shape, np.bool_)
@@ -301,7 +303,7 @@ class _Problem:
             x, y, decrease = equations.step(damping)
             new = moved(state, x, y, self.motion.turning)
             cost, equations = equations.cost, self.linearize(new, loss)
-            # What is less than rounding may change: as good as the same.
+            # A difference within rounding counts as equal.
             better = (equations.cost <= cost * (1 + 1e-12)) | (np.abs(decrease) < 1e-8)
             taken = better & ~converged
             if not taken.all():
@@ -309,7 +311,7 @@ class _Problem:
                 new = LogState(*(_where(taken, a, b, axes) for a, b, axes in kept))
                 equations = self.linearize(new, loss)
             state = new
-            # Held back by more, a short step proves nothing.
+            # With strong damping, a short step does not show convergence.
             short = (decrease < tolerance * state.translation.shape[-2]) & (damping <= _SMALL)
             converged = converged | (better & short)
             eased = np.where(damping > 0.1 * _SMALL, 0.3 * damping, 0.0)
@@ -326,7 +328,7 @@ def _where(taken: BoolArray, a: FloatArray, b: FloatArray, axes: int) -> FloatAr
 def _checked(
     log: RangeLog, model: LogModel, prior: Any, start: Sequence[ArrayLike]
 ) -> tuple[_Problem, LogState]:
-    """The problem of arguments that fit, and the state where it starts."""
+    """Check the arguments; return the problem and its initial state."""
     times = check_array("times", log.times, ("K",))
     if (np.diff(times) < 0).any():
         raise ValueError("times must not decrease")

@@ -1,4 +1,4 @@
-"""Where the smoother begins: the track of a filter."""
+"""Initial tracks for the smoother, from a filter."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ def causal_track(
     prior: Sequence[ArrayLike],
     twists: ArrayLike | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Rotations (..., K, 3, 3) and translations (..., K, 3) that a filter believes, epoch by epoch.
+    """Return rotations (..., K, 3, 3) and translations (..., K, 3) estimated by a filter.
 
     Parameters
     ----------
     filter
-        Of `rbl_gym.estimators.make`.
+        A filter from `rbl_gym.estimators.make`.
     log
-        Its times are those of all trials, (K,).
+        The log; its times (K,) are common to all trials.
     prior
         Rotation (..., 3, 3), translation (..., 3), covariance (..., 6, 6) at the first epoch.
     twists
-        (..., K - 1, 6) of the intervals; None: at rest.
+        (..., K - 1, 6) of the intervals; None: zero.
 
     Raises
     ------
     ValueError
-        As the filter.
+        If the filter raises it.
     """
     times = check_array("times", log.times, ("K",))
     if times.ndim != 1:
@@ -62,7 +62,7 @@ def causal_track(
 
 
 def _law_at(noise: Any, k: int) -> Any:
-    """The law of one epoch, of one for all of them."""
+    """Return the noise model of one epoch from that of all epochs."""
     if isinstance(noise, LinkNoise) and noise.std_m.ndim > 2:
         return LinkNoise(noise.std_m[..., k, :, :])
     return noise
