@@ -1,7 +1,7 @@
-"""Estimators: arrays in, beliefs out; they know no environment.
+"""Estimators of poses: functions from arrays to beliefs, independent of the environments.
 
-``make(name, tags=..., noise=..., process=...)`` gives a filter; swapping one for another is a
-change of name.
+``make(name, tags=..., noise=..., process=...)`` returns a filter. Another name gives
+another filter with the same interface.
 """
 
 from importlib import import_module
@@ -39,7 +39,7 @@ from rbl_gym.estimators.networks.orientations import chordal_optimum, orientatio
 from rbl_gym.estimators.networks.triangle import TriangleFrames, triangle_frames
 from rbl_gym.estimators.smoothing.smoother import smooth
 
-# A filter is known by the `register` at the end of its own module; no list names the modules.
+# Every module registers its filters by `register` at its end; there is no central list.
 for _module in walk_packages(__path__, f"{__name__}."):
     import_module(_module.name)
 

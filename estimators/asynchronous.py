@@ -1,9 +1,9 @@
-"""Ranges one at a time, each with a time of its own, some of them late.
+"""Asynchronous ranges: one at a time, each with its own time, possibly out of order.
 
-Radios measure one link after another, and a range may arrive after later ones. `Asynchronous`
-puts any filter of `rbl_gym.estimators.Filter` on such a stream: it moves the state to the time of
-every range, and takes it back within a short window when a range comes out of order, so that the
-result is that of the ordered stream, to the last bit.
+Radios measure one link after another, and a range may arrive after later ones. `Asynchronous` runs
+any filter of `rbl_gym.estimators.Filter` on such a stream. It predicts the state to the time of
+every range. If a range arrives out of order within a short window, it goes back and repeats the
+later updates. The result equals that of the ordered stream to the last bit.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ class TimedRange(NamedTuple):
     time
         Seconds.
     anchor, tag
-        Indices.
+        Indices of the link.
     range
         (...), metres.
     twist
-        (..., 6) of the interval before; None: the filter estimates it.
+        (..., 6) of the preceding interval; None: the filter estimates it.
     noise
-        Law of the range; None: the filter's.
+        Noise model of the range; None: that of the filter.
     anchors
-        (..., M, 3) at its time; None: where they stand.
+        (..., M, 3) at its time; None: fixed anchors.
     """
 
     time: float
@@ -56,14 +56,14 @@ class Checkpoint(NamedTuple):
 
 
 class Stream(NamedTuple):
-    """What a stream of ranges has come to.
+    """State of a stream of ranges.
 
     Attributes
     ----------
     checkpoints
-        In the order of their times: the last one before the window, and all inside it.
+        In order of time: the last one before the window, and all inside it.
     refused
-        How many ranges came too late for the window, and were left out.
+        Number of ranges left out because they came too late for the window.
     """
 
     checkpoints: tuple[Checkpoint, ...]
@@ -77,18 +77,18 @@ class Stream(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Asynchronous:
-    """A filter on ranges that come one at a time, also out of order; pure functions.
+    """Filter for ranges that arrive one at a time, possibly out of order; pure functions.
 
     Parameters
     ----------
     filter
         Any filter.
     anchors
-        (M, 3), metres; where they move, the places of those that no range tells.
+        (M, 3), metres. If anchors move, these positions hold for ranges without `anchors`.
     n_tags
-        Of the body.
+        Number of tags on the body.
     window_s
-        How late a range may be, against the newest one, and still count.
+        Greatest delay of a range behind the newest one, seconds.
 
     Example
     -------
@@ -111,10 +111,10 @@ class Asynchronous:
         check_number("window_s", self.window_s, low=0.0)
 
     def start(self, state: Any, time: float) -> Stream:
-        """A stream from a state of the filter at a time (s).
+        """Return a stream from a state of the filter at a time (s).
 
-        One range does not determine a pose: a body of which nothing is known starts from the
-        filter's state after a first epoch of all links.
+        One range does not determine a pose. If the pose is unknown, start from the filter's
+        state after a first epoch of all links.
         """
         return Stream((Checkpoint(check_number("time", time), state, None),), 0)
 
@@ -131,27 +131,28 @@ class Asynchronous:
         std_m: float | None = None,
         anchors: ArrayLike | None = None,
     ) -> Stream:
-        """The stream with one more range (metres; (...) of many bodies with the same times).
+        """Return the stream with one more range, metres, (...) for bodies with the same times.
 
-        One that lies before the start, or before the newest by more than the window, is left out
-        and counted as refused.
+        A range before the start, or before the newest by more than the window, is left out and
+        counted in `refused`.
 
         Parameters
         ----------
         twist
-            (..., 6) of the interval that ends at this range: at rest, a random walk, unless it is
-            told; None for a filter that estimates it.
+            (..., 6) of the interval that ends at this range. By default zero, a random walk; None
+            for a filter that estimates it.
         noise
-            Law of this range, for instance ``LinkNoise([[0.05]])``; None: the filter's.
+            Noise model of this range, for instance ``LinkNoise([[0.05]])``; None: the filter's.
         std_m
-            Standard deviation of this range, metres, in place of a law.
+            Standard deviation of this range, metres, in place of `noise`.
         anchors
-            (..., M, 3), all anchors at this time, where they move; None: where they stand.
+            (..., M, 3), all anchors at this time, if they move; None: fixed anchors.
 
         Raises
         ------
         ValueError
-            On an index out of range, a range, a deviation, a twist or anchors that cannot be.
+            If an index is out of range, or the range, standard deviation, twist or anchors are
+            invalid.
         """
         time = check_number("time", time)
         anchor = check_count("anchor", anchor, least=0, most=len(self.anchors) - 1)
@@ -179,7 +180,7 @@ class Asynchronous:
         later = [point.measured for point in stream.checkpoints[len(kept) :]]
         for each in (measured, *later):
             kept.append(self._advanced(kept[-1], each))  # pyright: ignore[reportArgumentType]
-        # The last one at or before the window's edge is what a range at the edge starts from.
+        # A range at the window's edge starts from the last checkpoint at or before the edge.
         first = max(
             k for k, point in enumerate(kept) if k == 0 or point.time < newest - self.window_s
         )
@@ -192,7 +193,7 @@ class Asynchronous:
         ranges[..., measured.anchor, measured.tag] = measured.range
         links = np.zeros(shape, np.bool_)
         links[measured.anchor, measured.tag] = True
-        # A filter of an older interface takes no law, and needs none where no range has one.
+        # A filter of an older interface has no argument `noise`; pass it only if a range has one.
         law = {} if measured.noise is None else {"noise": measured.noise}
         anchors = self.anchors if measured.anchors is None else measured.anchors
         state = self.filter.update(state, ranges, anchors, links, **law)
@@ -206,7 +207,7 @@ class Asynchronous:
     def state(
         self, stream: Stream, time: float | None = None, twist: ArrayLike | None = (0.0,) * 6
     ) -> Any:
-        """The filter's state at a time (s) not before the newest range; None: at that one."""
+        """Return the filter's state at a time (s) not before the newest range; None: at it."""
         newest = stream.checkpoints[-1]
         if time is None:
             return newest.state
@@ -220,5 +221,5 @@ class Asynchronous:
     def belief(
         self, stream: Stream, time: float | None = None, twist: ArrayLike | None = (0.0,) * 6
     ) -> PoseBelief:
-        """The belief over the pose at a time, as `state`."""
+        """Return the belief over the pose at a time, as `state`."""
         return self.filter.belief(self.state(stream, time, twist))

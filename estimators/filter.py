@@ -1,4 +1,4 @@
-"""What an estimator is: the belief it returns, the interface of a filter, the registry of names."""
+"""Interface of estimators: the belief, the filter protocol, and the registry of names."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ class PoseBelief(NamedTuple):
     covariance
         (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``.
     matrix
-        (..., 3, 3), the raw estimate of the rotation: of KF and ET-KF not orthogonal, of all
-        others the rotation itself.
+        (..., 3, 3), the raw estimate of the rotation. It is not orthogonal for KF and ET-KF, and
+        equals `rotation` for all others.
     """
 
     rotation: FloatArray
@@ -42,20 +42,20 @@ class PoseBelief(NamedTuple):
 
 
 class Filter(Protocol):
-    """The interface of a filter: pure functions on a state that is a NamedTuple of arrays.
+    """Interface of a filter: pure functions on a state that is a NamedTuple of arrays.
 
-    Every array may have leading batch axes; the state is never changed in place.
+    Every array may have leading batch axes; the state is never modified in place.
     """
 
     def initial(self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike) -> Any:
-        """State of a prior: pose (..., 3, 3), (..., 3) and its covariance (..., 6, 6)."""
+        """Return the state of a prior: pose (..., 3, 3), (..., 3) and covariance (..., 6, 6)."""
         ...
 
     def predict(self, state: Any, twist: ArrayLike, dt: float) -> Any:
-        """State after `dt` seconds of the twist (..., 6).
+        """Return the state after `dt` seconds of the twist (..., 6).
 
         A filter with the attribute ``reads = "inertial"`` takes the readings (..., S, 6) of an
-        inertial sensor in that time in place of it.
+        inertial sensor during that time in place of the twist.
         """
         ...
 
@@ -67,15 +67,15 @@ class Filter(Protocol):
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> Any:
-        """State after the ranges (..., M, N) to anchors (..., M, 3).
+        """Return the state after the ranges (..., M, N) to anchors (..., M, 3).
 
-        `links` (..., M, N) is True where measured; None: all. `noise` is the law of this epoch;
-        None: the law that the filter was made with.
+        `links` (..., M, N) is True where measured; None: all. `noise` is the noise model of this
+        epoch; None: that of the filter.
         """
         ...
 
     def belief(self, state: Any) -> PoseBelief:
-        """What the state says about the pose."""
+        """Return the belief of the state over the pose."""
         ...
 
 
@@ -83,7 +83,7 @@ _FACTORIES: dict[str, Callable[..., Filter]] = {}
 
 
 def register(name: str, factory: Callable[..., Filter]) -> None:
-    """Put a filter under a name; `factory` takes tags, noise, process and its own options.
+    """Register a filter; `factory` takes tags, noise, process and its own options.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def register(name: str, factory: Callable[..., Filter]) -> None:
 
 
 def names() -> list[str]:
-    """Names of all filters: ours, and those of installed packages (group ``rbl_gym.filters``)."""
+    """Return the names of all filters, built in or of installed packages (``rbl_gym.filters``)."""
     return sorted({*_FACTORIES, *(entry.name for entry in entry_points(group=ENTRY_POINT_GROUP))})
 
 
@@ -109,28 +109,29 @@ def make(
     process: ProcessNoise,
     **options: Any,
 ) -> Filter:
-    """A filter by its name.
+    """Make a filter by its name.
 
     Parameters
     ----------
     name
         ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
-        ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; one that a package offers by the
-        entry-point group ``rbl_gym.filters``; or ``"package.module:factory"``, which is imported.
+        ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; a name from the
+        entry-point group ``rbl_gym.filters`` of another package; or ``"package.module:factory"``,
+        which is imported.
     tags
-        (N, 3), places on the body, metres, body frame.
+        (N, 3), positions in the body frame, metres.
     noise
-        Law of the ranges (`rbl_gym.ranging`); with ``measurement="doa"`` (of ``"iekf"``) that of
-        the angles (`rbl_gym.measurements.bearing.AngleNoise`).
+        Noise model of the ranges (`rbl_gym.ranging`); with ``measurement="doa"`` (of ``"iekf"``)
+        that of the angles (`rbl_gym.measurements.bearing.AngleNoise`).
     process
-        Noise of the motion.
+        Process noise of the motion.
     **options
-        Of that filter; see its class.
+        Options of that filter; see its class.
 
     Raises
     ------
     ValueError
-        On an unknown name or option, or an argument out of its range.
+        If the name or an option is unknown, or an argument is out of range.
     """
     factory = factory_of(name)
     tags = check_array("tags", tags, ("N", 3))
@@ -151,7 +152,7 @@ def make(
 
 
 def factory_of(name: str) -> Callable[..., Filter]:
-    """What makes the filters of a name: registered, of an entry point, or to be imported."""
+    """Return the factory of a name: registered, of an entry point, or imported."""
     if isinstance(name, str) and name in _FACTORIES:
         return _FACTORIES[name]
     found = [entry for entry in entry_points(group=ENTRY_POINT_GROUP) if entry.name == name]
@@ -173,16 +174,16 @@ def factory_of(name: str) -> Callable[..., Filter]:
 
 
 def check_takes_noise(name: str, filter: Filter, why: str) -> None:
-    """A ValueError that names a filter whose `update` has no argument `noise`.
+    """Raise ValueError if the `update` of a filter has no argument `noise`.
 
     Parameters
     ----------
     name
-        Of the filter, for the message.
+        Name of the filter, for the message.
     filter
         The filter.
     why
-        What has a law of its own for each epoch, for the message.
+        What has a noise model for each epoch, for the message.
     """
     parameters = inspect.signature(filter.update).parameters
     if "noise" in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
@@ -194,11 +195,11 @@ def check_takes_noise(name: str, filter: Filter, why: str) -> None:
 
 
 def reads(filter: Filter) -> str:
-    """What the `predict` of a filter is told: ``"twist"``, ``"inertial"`` or ``"odometry"``."""
+    """Return the input of a filter's `predict`: ``"twist"``, ``"inertial"`` or ``"odometry"``."""
     return getattr(filter, "reads", "twist")
 
 
 def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of symmetric positive definite matrices (..., n, n), symmetric to the last bit."""
+    """Invert symmetric positive definite matrices (..., n, n), symmetric to the last bit."""
     result = np.linalg.inv(matrix)
     return 0.5 * (result + np.swapaxes(result, -1, -2))

@@ -1,13 +1,13 @@
-"""How well a filter foretold an epoch: innovations, their covariance, NIS and likelihood.
+"""Innovations of a filter at an epoch, with their covariance, NIS and likelihood.
 
-With x the pose and the further states that bias the ranges, e and dx by how much an update moved
-them, and H, S the derivatives of the ranges by them at the pose after it, the innovation is
+Let x be the other states that bias the ranges. Let e and dx be the changes of the pose and of x by
+the update, and H, S the derivatives of the ranges by them at the pose after it. The innovation is
 
     v = r - h(after) + H e + S dx,   cov(v) = [H S] P [H S]^T + R,
 
-P the covariance before the update. To first order v is the range less the one foretold. Taken
-about the pose after the update, it holds for a filter that starts from nothing as well, and its
-normalised square is twice the cost that an iterated EKF has minimised.
+with P the covariance before the update. To first order v is the range less its prediction.
+Linearization at the pose after the update also works for a filter with an unknown initial pose. The
+normalised square of v is twice the cost that an iterated EKF has minimised.
 """
 
 from __future__ import annotations
@@ -26,37 +26,37 @@ from rbl_gym.measurements import offsets
 from rbl_gym.measurements.direction_bias import direction_bias
 from rbl_gym.measurements.ranging import NoiseLaw
 
-# Standard deviations of a range beyond which it contradicts the pose after the update: it is
-# refused, as by the robust filters.
+# Ranges with residuals beyond this many standard deviations, at the pose after the update, are
+# rejected, as in the robust filters.
 GATE = 4.0
-# What the likelihood supposes of refused ranges: this share of all, at any of 10 m (1/m). Without
-# such a constant the deviation that refuses everything would be the likeliest.
+# Density (1/m) of rejected ranges in the likelihood: this fraction of all, uniform over 10 m.
+# Without it, the most likely standard deviation would be one that rejects everything.
 OUTLIER_SHARE, OUTLIER_DENSITY = 0.05, 0.1
 LOG_USED = np.log((1 - OUTLIER_SHARE) / np.sqrt(2 * np.pi))
 LOG_REFUSED = np.log(OUTLIER_SHARE * OUTLIER_DENSITY)
 
 
 class Innovations(NamedTuple):
-    """What an epoch's ranges say to a filter, with leading axes.
+    """Innovations of an epoch's ranges, with leading axes.
 
     Attributes
     ----------
     innovation, std
-        (..., M, N), metres: the range less the one foretold, and the standard deviation that the
-        filter expected of that; 0 where there is no link.
+        (..., M, N), metres: the range less its prediction, and the standard deviation that the
+        filter predicts for it; 0 without a link.
     residual
         (..., M, N), metres: the range less that of the state after the update; 0 without a link.
     used
-        (..., M, N): the links measured, but for the refused, whose residual is beyond `GATE`
-        standard deviations of a range.
+        (..., M, N): the measured links without those rejected because their residual is beyond
+        `GATE` standard deviations of a range.
     nis
-        Normalised innovation squared (...) of the ranges used, of mean `dof` where the filter is
-        honest; inf where a state is not finite.
+        Normalised innovation squared (...) of the ranges used. Its mean is `dof` if the filter is
+        consistent. It is inf if a state is not finite.
     dof
-        How many ranges (...) were used.
+        Number (...) of ranges used.
     log_likelihood
-        Natural logarithm (...) of the density of the ranges: Gaussian of those used, constant of
-        those refused.
+        Natural logarithm (...) of the density of the ranges: Gaussian for those used, constant for
+        those rejected.
     """
 
     innovation: FloatArray
@@ -78,29 +78,29 @@ def innovations(
     noise: NoiseLaw,
     links: ArrayLike | None = None,
 ) -> Innovations:
-    """Innovations of an update, seen from the pose after it.
+    """Return the innovations of an update, linearized at the pose after it.
 
     Parameters
     ----------
     filter
-        Any filter. One whose states bias the ranges has a method ``biases_of(state, anchors)``: the
-        states besides the pose (..., K), the covariance (..., 6 + K, 6 + K) of the pose's error
-        and theirs, and by how much (M N, K) each of them lengthens every range. One whose ranges
-        have an offset in common has an attribute ``offset``; NIS and likelihood are then those of
-        what the offsets leave, and so are the residuals.
+        Any filter. A filter whose states bias the ranges has a method ``biases_of(state,
+        anchors)``. It returns the states besides the pose (..., K), the covariance (..., 6 + K,
+        6 + K) of the errors of pose and states, and the derivative (M N, K) of the ranges by the
+        states. A filter whose ranges share an unknown offset has an attribute ``offset``. NIS,
+        likelihood and residuals are then those with the offsets removed.
     before, after
-        Its states, as `predict` and as `update` gave them.
+        Its states, as returned by `predict` and by `update`.
     ranges, anchors, links
-        As `update` was told.
+        As passed to `update`.
     tags
-        Places on the body (N, 3).
+        Positions (N, 3) in the body frame.
     noise
-        Law of the epoch.
+        Noise model of the epoch.
 
     Raises
     ------
     ValueError
-        As `update`.
+        As in `update`.
     """
     offset = getattr(filter, "offset", None)
     if offset is None:
@@ -128,7 +128,7 @@ def innovations(
     H = np.concatenate([H, np.broadcast_to(S, (*H.shape[:-1], S.shape[-1]))], axis=-1)
     v = residual + (H @ moved[..., None])[..., 0]
     used: BoolArray = np.asarray(links & (residual**2 <= GATE**2 * variance))
-    # A = R^-1/2 H of what was used: cov(v) = R^1/2 (I + A P A^T) R^1/2.
+    # A = R^-1/2 H of the ranges used: cov(v) = R^1/2 (I + A P A^T) R^1/2.
     scale = np.where(links, 1 / np.sqrt(variance), 0.0)
     A = H * scale[..., None]
     own = ((A @ P) * A).sum(axis=-1)
@@ -170,13 +170,13 @@ def innovations(
 def _divided(
     B: FloatArray, A: FloatArray, P: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """``(I + A P A^T)^-1 B``, sign and logarithm of the determinant, in the smaller size."""
+    """Return ``(I + A P A^T)^-1 B``, sign and logarithm of the determinant, in the smaller size."""
     rows, states = A.shape[-2:]
     transposed = np.swapaxes(A, -1, -2)
     if rows <= states:
         S = np.eye(rows) + A @ P @ transposed
         return np.linalg.solve(S, B), *np.linalg.slogdet(S)
-    # By Woodbury's identity.
+    # Woodbury's identity.
     S = np.eye(states) + P @ (transposed @ A)
     return B - A @ np.linalg.solve(S, P @ (transposed @ B)), *np.linalg.slogdet(S)
 
@@ -184,9 +184,9 @@ def _divided(
 def _states(
     filter: Filter, state: Any, anchors: FloatArray, tags: FloatArray
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray]:
-    """Pose, further states x, covariance P of both, and what x adds to the ranges (M N, K)."""
+    """Return pose, other states x, covariance P of both, derivative (M N, K) of ranges by x."""
     if hasattr(filter, "leader"):
-        # Of several hypotheses, what the likeliest has foretold.
+        # Of several hypotheses, use the prediction of the most likely.
         filter, state = filter.filter, filter.leader(state)  # pyright: ignore[reportAttributeAccessIssue]
     own = getattr(filter, "biases_of", None)
     if own is not None:

@@ -1,4 +1,4 @@
-"""Checks of what comes into a filter: priors, and epochs of ranges with their links."""
+"""Checks of the inputs of a filter: priors, and epochs of ranges with their links."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from rbl_gym.motion.kinematics import ProcessNoise
 State = TypeVar("State", bound=tuple[Any, ...])
 _FLOAT64 = np.dtype(np.float64)
 
-# Variance of an entry of a uniformly random rotation: a prior as wide as this says nothing.
+# Variance of an entry of a uniformly random rotation: the variance of an uninformative prior.
 VAGUE_ENTRY_VARIANCE = 1 / 3
 
 
 def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
-    """A symmetric positive definite covariance of one of the sizes, or a ValueError."""
+    """Return a symmetric positive definite covariance of one of the sizes, or raise ValueError."""
     covariance = check_array("covariance", covariance, ("n", "n"))
     if covariance.shape[-1] not in sizes or covariance.shape[-2] != covariance.shape[-1]:
         wanted = " or ".join(f"(..., {n}, {n})" for n in sizes)
@@ -50,14 +50,15 @@ def check_epoch(
     tags: FloatArray,
     signed: bool = False,
 ) -> tuple[FloatArray, FloatArray, BoolArray | None]:
-    """One epoch as (ranges, anchors, links): links None where all measured, else 0 behind False.
+    """Return an epoch as (ranges, anchors, links); links are None if all were measured.
 
-    `signed`: ranges may be zero and negative, as with an offset.
+    Ranges behind a False link become 0. With `signed`, ranges may be zero and negative, as with an
+    offset.
 
     Raises
     ------
     ValueError
-        On shapes that do not fit, NaN or inf behind a True link, a range that is not positive.
+        If shapes do not match, or a range behind a True link is NaN, infinite or not positive.
     """
     if (
         links is None
@@ -66,7 +67,7 @@ def check_epoch(
         and np.vdot(anchors, anchors) < HUGE  # pyright: ignore[reportCallIssue, reportArgumentType]
         and are_positive(ranges)  # pyright: ignore[reportArgumentType]
     ):
-        # The quick way of one body; what is wrong goes the long one, which names it.
+        # Fast path for one body. Invalid input takes the slow path, which names the error.
         return ranges, anchors, None  # pyright: ignore[reportReturnType]
     anchors = check_array("anchors", anchors, ("M", 3))
     shape = (anchors.shape[-2], tags.shape[-2])
@@ -90,7 +91,7 @@ def check_epoch(
 
 
 class OffsetEpoch(NamedTuple):
-    """An epoch of ranges with offsets: ranges (..., M, N) less their groups' means, and links."""
+    """An epoch of ranges with offsets: ranges (..., M, N) less the group means, and links."""
 
     ranges: FloatArray
     anchors: FloatArray
@@ -104,10 +105,10 @@ def check_offset_epoch(
     tags: FloatArray,
     offset: str,
 ) -> OffsetEpoch:
-    """`check_epoch` of ranges with an unknown offset in common, by the name of its kind.
+    """Check an epoch of ranges with an unknown common offset of a kind, as `check_epoch`.
 
-    The size of the offset leaves with the means. A link that shares its offset with no other says
-    nothing, and counts as none.
+    Subtracting the means removes the offsets. A link that shares its offset with no other carries
+    no information, and counts as missing.
     """
     ranges, anchors, mask = check_epoch(ranges, anchors, links, tags, signed=True)
     there = offsets.paired(np.broadcast_to(True if mask is None else mask, ranges.shape), offset)
@@ -116,13 +117,13 @@ def check_offset_epoch(
 
 
 def is_plain_epoch(ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int, ...]) -> bool:
-    """Whether these are arrays of float64 for the tags of one body, of trials (*batch) each.
+    """Return whether these are float64 arrays for the tags of one body and trials (*batch).
 
-    Ranges (*batch, M, N), anchors (*batch, M, 3), tags (N, 3); their values are not looked at.
+    Ranges (*batch, M, N), anchors (*batch, M, 3), tags (N, 3); their values are not checked.
     """
     return (
         type(ranges) is type(anchors) is np.ndarray
-        # Not by identity: what was pickled has a type of its own.
+        # Not by identity, because pickled arrays have their own dtype object.
         and ranges.dtype == anchors.dtype == _FLOAT64
         and anchors.ndim == len(batch) + 2
         and tags.ndim == 2
@@ -135,14 +136,14 @@ def is_plain_epoch(ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int
 
 @functools.lru_cache(64)
 def all_links(n_anchors: int, n_tags: int) -> FloatArray:
-    """Ones (M, N), not to be written to."""
+    """Return read-only ones (M, N)."""
     ones = np.ones((n_anchors, n_tags))
     ones.flags.writeable = False
     return ones
 
 
 def check_batches(**batches: tuple[int, ...]) -> None:
-    """A ValueError where the leading axes of arguments, given by their names, do not broadcast."""
+    """Raise ValueError if the leading axes of the named arguments do not broadcast."""
     if not any(batches.values()):
         return
     try:
@@ -155,7 +156,7 @@ def check_batches(**batches: tuple[int, ...]) -> None:
 
 
 def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
-    """A ValueError on NaN, inf, or a range that is not positive behind a True link."""
+    """Raise ValueError if a range behind a True link is NaN, infinite or not positive."""
     if links is None and are_positive(ranges):
         return
     check_finite("ranges", ranges)
@@ -166,7 +167,7 @@ def check_ranges(ranges: FloatArray, links: BoolArray | None = None) -> None:
 
 
 def are_positive(values: FloatArray) -> bool:
-    """Whether all are positive and finite: NaN fails both comparisons."""
+    """Return whether all values are positive and finite; NaN fails both comparisons."""
     positive = np.count_nonzero(values > 0) == values.size
     return positive and bool(np.vdot(values, values) < HUGE or values.max() < HUGE)
 
@@ -178,14 +179,15 @@ def epoch_variance(
     links: BoolArray | None,
     squared: bool = False,
 ) -> FloatArray:
-    """Variances of an epoch's ranges by its law, None: by the filter's `own`; checked.
+    """Return the checked variances of an epoch's ranges.
 
-    `squared`: of the squared ranges. 1 where no link uses them.
+    They come from the noise model of the epoch; None: from the filter's `own`. With `squared` they
+    are those of the squared ranges. Variances that no link uses are 1.
 
     Raises
     ------
     ValueError
-        If what is given is no law of ranges, or does not fit these.
+        If the argument is not a noise model of ranges, or does not match these ranges.
     """
     law = law_of(noise, own)
     try:
@@ -198,18 +200,18 @@ def epoch_variance(
 
 
 def check_variance(variance: FloatArray, links: BoolArray | None) -> FloatArray:
-    """The variances, 1 where no link uses them, or a ValueError if one is not positive."""
+    """Return the variances, 1 if no link uses them, or raise ValueError if not positive."""
     if links is not None:
         used = links if variance.shape[-1] == links.shape[-1] else links.any(-1, keepdims=True)
         variance = np.where(used, variance, 1.0)
-    # False of NaN too.
+    # NaN also gives False.
     if np.count_nonzero(variance > 0) < variance.size:
         raise ValueError(f"noise must have positive variance at the ranges, got {variance.min()}")
     return variance
 
 
 def plain(state: State) -> State:
-    """A state with its arrays in C order: results must not depend on how they lie in memory."""
+    """Return a state with arrays in C order, so that results do not depend on memory layout."""
     for field in state:
         if type(field) is not np.ndarray or not field.flags.c_contiguous:
             return type(state)(*(np.asarray(field, order="C") for field in state))
@@ -217,12 +219,12 @@ def plain(state: State) -> State:
 
 
 def law_of(noise: NoiseLaw | None, own: NoiseLaw) -> NoiseLaw:
-    """The law of an epoch: the filter's own where None is given, else checked.
+    """Return the checked noise model of an epoch; None gives that of the filter.
 
     Raises
     ------
     ValueError
-        If what is given is no law of ranges.
+        If the argument is not a noise model of ranges.
     """
     if noise is None:
         return own
@@ -236,18 +238,18 @@ def law_of(noise: NoiseLaw | None, own: NoiseLaw) -> NoiseLaw:
 
 
 def spanned_dimensions(points: FloatArray) -> np.ndarray:
-    """Dimensions (...) that points (..., N, 3) span: 0 a point, 1 a line, 2 a plane, 3 space."""
+    """Return the dimension (...) of points (..., N, 3): 0 point, 1 line, 2 plane, 3 space."""
     return matrix_rank(points - points.mean(axis=-2, keepdims=True))
 
 
 def matrix_rank(rows: FloatArray) -> np.ndarray:
-    """Rank (...) of matrices (..., m, n): singular values above 1e-9 of the largest."""
+    """Return the rank (...) of matrices (..., m, n): singular values above 1e-9 of the largest."""
     values = np.linalg.svd(rows, compute_uv=False)
     return (values > 1e-9 * np.maximum(values[..., :1], 1e-300)).sum(axis=-1)
 
 
 def check_one_process(process: ProcessNoise) -> ProcessNoise:
-    """The noise of a motion, or a ValueError where each trial has its own."""
+    """Return the process noise, or raise ValueError if each trial has its own."""
     if np.ndim(process.std()) > 1:
         raise ValueError(
             f"process must be that of all trials, as only 'iekf' takes leading axes, got "

@@ -1,9 +1,9 @@
-"""Soft knowledge of height and tilt in a filter: a body that stays level, at about one height.
+"""Soft constraint on height and tilt in a filter, for a body that stays about level.
 
-Its height and tilt are stationary: Gaussian about what is known, with that standard deviation S.
-By what a prediction adds to their variance, D, they have moved within it: that is what an
-observation of standard deviation ``S sqrt(1 + S^2 / D)`` says. It leaves a variance of S^2 as it
-is, however often it comes, and after a long time it is the knowledge itself.
+Height and tilt are stationary Gaussian processes about their known values, with standard deviation
+S. If a prediction adds the variance D, the update is an observation of the known value with
+standard deviation ``S sqrt(1 + S^2 / D)``. Repeated updates leave a variance of S^2 unchanged.
+After a long time the observation has the standard deviation S itself.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from rbl_gym.geometry import rotations
 
 
 def hold_level(before: Any, predicted: Any, level: Level) -> Any:
-    """The predicted state of a filter, with what is known of height and tilt.
+    """Return the predicted state of a filter, updated by the known height and tilt.
 
-    The prior of the filter has to know of it as well: standard deviations of the height and of
-    the tilt no larger than these.
+    The prior of the filter must include this knowledge: its standard deviations of height and tilt
+    must not be larger than those of `level`.
 
     Parameters
     ----------
     before, predicted
-        States before and after a prediction: of the iterated EKFs, NamedTuples with `rotation`,
-        `translation`, `covariance` (..., n, n) of (w, v) and further states, and those in `extra`.
+        States before and after a prediction, of the iterated EKFs: NamedTuples with `rotation`,
+        `translation`, `covariance` (..., n, n) of (w, v) and other states, and these in `extra`.
     level
-        What is known.
+        Known height and tilt.
 
     Returns
     -------
-    A state as `predicted`.
+    A state of the type of `predicted`.
 
     Raises
     ------
     ValueError
-        On states of other filters.
+        If the states are of another filter.
 
     Examples
     --------
@@ -66,7 +66,7 @@ def hold_level(before: Any, predicted: Any, level: Level) -> Any:
         added = np.maximum(added, 0.0)
         information = added / (std**2 * (std**2 + added))
         crossed = (P @ h[..., None])[..., 0]
-        # The rows are linear in the step that the rows before them made.
+        # Later rows are linearized about the step of the rows before them.
         left = value - (h * step).sum(axis=-1)
         gain = crossed * (information / (1 + information * _variance(P, h)))[..., None]
         step = step + gain * left[..., None]
@@ -85,14 +85,14 @@ def hold_level(before: Any, predicted: Any, level: Level) -> Any:
 def _known(
     Q: FloatArray, t: FloatArray, level: Level
 ) -> list[tuple[FloatArray, FloatArray, float]]:
-    """Rows (..., 6) by the pose error, what is missing (...) to what is known, deviations."""
+    """Return rows (..., 6) by the pose error, residuals (...) and standard deviations."""
     known: list[tuple[FloatArray, FloatArray, float]] = []
     if level.height_m is not None and level.height_std_m is not None:
         row = np.zeros((*t.shape[:-1], 6))
         row[..., 5] = 1.0
         known.append((row, level.height_m - t[..., 2], level.height_std_m))
     if level.tilt_std_rad is not None:
-        # An error w turns the upright axis u by w x u; level it is (0, 0, 1).
+        # An error w rotates the body's z axis u by w x u; for a level body u is (0, 0, 1).
         x, y, z = np.moveaxis(Q[..., :, 2], -1, 0)
         for place, parts in ((0, (0 * z, z, -y)), (1, (-z, 0 * z, x))):
             row = np.zeros((*t.shape[:-1], 6))

@@ -1,4 +1,4 @@
-"""Filters of the pose and further states by their names."""
+"""Named filters of the pose and other states."""
 
 from __future__ import annotations
 
@@ -35,16 +35,17 @@ def iekf_cv(
     frame: str = "world",
     offset: str | None = None,
 ) -> AugmentedEkf:
-    """The filter ``"iekf-cv"``: pose and twist of a body without odometry (12 error states).
+    """Return the filter ``"iekf-cv"`` for pose and twist without odometry (12 error states).
 
     Parameters
     ----------
     tags, noise, process, iterations, robust, offset
-        As `IteratedEkf`; `process` moves the pose beyond what the twist does.
+        As in `IteratedEkf`; `process` is pose noise in addition to the twist.
     turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration
-        As `WanderingTwist`.
+        As in `WanderingTwist`.
     gyro_std_rad_s, speed_std_m_s, frame
-        As `TwistSensor`: what `predict` is told is then a reading. Both None: it is ignored.
+        As in `TwistSensor`; the twist passed to `predict` is then a measurement. Both None: it is
+        ignored.
     """
     law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
     sensor = TwistSensor(gyro_std_rad_s, speed_std_m_s, frame)
@@ -65,17 +66,17 @@ def iekf_bias(
     offset: str | None = None,
     directions: DirectionLaw | None = None,
 ) -> AugmentedEkf:
-    """The filter ``"iekf-bias"``: the pose, and a bias of every link that it learns on the way.
+    """Return the filter ``"iekf-bias"`` for the pose and a bias of every link.
 
     Parameters
     ----------
     tags, noise, process, iterations, robust, offset
-        As `IteratedEkf`; `noise` is what remains of a range beside its bias.
+        As in `IteratedEkf`; `noise` excludes the bias.
     bias_std_m, bias_time_s, common_std_m
-        As `LinkBias`. A short time marginalises errors that are correlated rather than learning
-        them.
+        As in `LinkBias`. With a short time, correlated errors are marginalised rather than
+        estimated.
     directions
-        As `AugmentedEkf`.
+        As in `AugmentedEkf`.
     """
     pose = IteratedEkf(tags, noise, process, iterations, robust, offset)
     law = LinkBias(bias_std_m, bias_time_s, common_std_m)
@@ -102,35 +103,35 @@ def iekf_log(
     headings: int = 1,
     directions: DirectionLaw | None = None,
 ) -> Filter:
-    """The filter ``"iekf-log"``: a log of raw ranges of which nothing else is known.
+    """Return the filter ``"iekf-log"`` for a log of raw ranges without other knowledge.
 
-    Pose and twist, and of every link two biases: one that stays, of cables and antennas, and one
-    that moves with the body. The defaults were chosen on logs of a planar robot, a hand-held rig,
-    a wheeled robot and two robots that range to each other, so as to do well on all of them.
+    It estimates pose, twist and two biases of every link: a constant one, of cables and antennas,
+    and one that changes as the body moves. The defaults were chosen to work well on all of these
+    logs: a planar robot, a hand-held rig, a wheeled robot, and two robots that range to each other.
 
     Parameters
     ----------
     tags, noise, process, iterations, offset
-        As `IteratedEkf`; `noise` is what remains of a range beside its biases, and `process` moves
-        the pose beyond what the twist does.
+        As in `IteratedEkf`; `noise` excludes the biases, and `process` is pose noise in addition to
+        the twist.
     robust
-        As `IteratedEkf`; real ranges err late.
+        As in `IteratedEkf`; outliers of real ranges are late.
     turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration
-        As `WanderingTwist`.
+        As in `WanderingTwist`.
     constant_std_m, constant_common_m
-        Standard deviations of the biases that stay: of each link, and of what all have in common.
+        Standard deviations of the constant biases: one per link, and one common to all links.
     drift_std_m, drift_time_s
-        Of the biases that move: standard deviation of each link's, and how long it lasts.
+        Standard deviation and correlation time of the changing bias of each link.
     clock
-        Law of offsets that last, in place of `offset`, as of ``"iekf"``; with one heading and
-        no odometry.
+        Model of clock offsets that persist, in place of `offset`, as in ``"iekf"``. It requires one
+        heading and no odometry.
     odometry
-        Law of the odometry that `predict` is then told, an `OdometrySensor` or its fields; the
-        twist is that of the body's axes. None: there is none.
+        Error model of the odometry passed to `predict`, an `OdometrySensor` or its fields. The
+        twist is in the body frame. None: no odometry.
     headings
-        1, or how many hypotheses of the heading there are at the start, as of `iekf-imu`.
+        Number of heading hypotheses at the start, as in `iekf_imu`; 1 for a known heading.
     directions
-        As `AugmentedEkf`.
+        As in `AugmentedEkf`.
     """
     law = WanderingTwist(turn_rate_rad_s, speed_m_s, turn_acceleration, acceleration)  # pyright: ignore[reportArgumentType]
     stays = LinkBias(constant_std_m, None, constant_common_m)

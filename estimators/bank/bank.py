@@ -1,8 +1,8 @@
 """Bank of iterated EKFs that starts without a prior pose, detects divergence and restarts.
 
-One hypothesis is the leader. The others, its rivals, run in parallel until their likelihood ratio
-decides. `locate` supplies the rivals, mirror poses included, if the prior is vague or if recent
-ranges contradict the leader. Trials without rivals cost the same as the iterated EKF.
+One hypothesis is the leader. Its rivals run in parallel until their likelihood ratio decides.
+`locate` supplies rivals, mirror poses included, if the prior is vague or if recent ranges
+contradict the leader. Trials without rivals cost the same as the iterated EKF.
 """
 
 from __future__ import annotations
@@ -141,9 +141,8 @@ class IteratedEkfBank:
     ) -> BankState:
         """Return the state after one epoch of ranges (..., M, N).
 
-        Hypotheses are weighted, added and dropped.
-
-        `noise` is the noise model of this epoch; None: that of the filter.
+        Hypotheses are weighted, added and dropped. `noise` is the noise model of this epoch; None:
+        that of the filter.
 
         Raises
         ------

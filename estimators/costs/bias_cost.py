@@ -1,9 +1,9 @@
-"""The update of a pose whose ranges carry biases: these are eliminated, then follow from it.
+"""Pose update from ranges with biases: eliminate the biases, then recover them from the pose.
 
-With x the states besides the pose and e the pose's error in the chart of the prior, the prior
-says ``x = x0 + G e + N(0, C)``, ``G = P_xp P_pp^-1``; the ranges are ``d(pose) + S x + noise``,
-S summing the biases of every link. Given the pose, ``nu = r - d - S (x0 + G e)`` has covariance
-``S C S^T + R``: a dense weight on the ranges, constant over the iterations.
+Let x be the states besides the pose, and e the pose error in the chart of the prior. The prior is
+``x = x0 + G e + N(0, C)``, ``G = P_xp P_pp^-1``. The ranges are ``d(pose) + S x + noise``, where S
+sums the biases of every link. Given the pose, ``nu = r - d - S (x0 + G e)`` has covariance
+``S C S^T + R``. Its inverse is a dense weight on the ranges, constant over the iterations.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets
 
-# Behind the doors: what comes to these was checked, or made here.
+# Called without input checks: the inputs were checked before, or made here.
 _ERROR = kernel(rotations.error)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
-# Weights that change by no more than this between two poses are those of both.
+# Weights that change by no more than this between two poses count as equal.
 _SAME_SHARE = 0.01
 
 
 class AugmentedState(NamedTuple):
-    """Pose, further states, and the covariance of all errors, with leading batch axes.
+    """Pose, extra states, and the covariance of all errors, with leading batch axes.
 
     Attributes
     ----------
     rotation, translation
         (..., 3, 3) and (..., 3).
     extra
-        (..., K): the twist (6) where it is unknown, then the biases of the M N links, by anchors,
-        of one law after the other (none before the first ranges have said how many anchors).
+        (..., K): the twist (6) if it is unknown, then the biases of the M N links, by anchors, of
+        one bias model after the other. There are no biases before the first ranges, which fix M.
     covariance
         (..., 6 + K, 6 + K) of ``(w, v)`` and the extra states, estimate less truth.
     """
@@ -59,27 +59,27 @@ class AugmentedState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BiasProblem:
-    """Maximum a posteriori pose of one epoch whose ranges carry biases; leading batch axes.
+    """Maximum a posteriori pose of one epoch of ranges with biases; leading batch axes.
 
     Attributes
     ----------
     rotation, translation
-        The prior's.
+        Pose of the prior.
     information
-        (..., 6, 6), inverse of the prior's covariance of the pose.
+        (..., 6, 6), inverse of the prior covariance of the pose.
     extra, gain, spread
         x0 (..., K), G (..., K, 6), C (..., K, K).
     sums
-        S (..., L, K): of which extra states every link is biased, and by how much.
+        S (..., L, K): derivative of the ranges by the extra states.
     ranges, variance, links
-        (..., L), metres, and which of the L = M N links were measured.
+        (..., L), metres, m^2, and which of the L = M N links were measured.
     anchors, tags
         (..., M, 3), (N, 3).
     weight
-        (..., L, L), inverse covariance of nu; zero where a link is missing. Where ranges have
-        offsets in common, less what these take of it.
+        (..., L, L), inverse covariance of nu; zero for missing links. Common offsets are projected
+        out.
     offset
-        Their kind, as of `measurements.offsets`; None: there are none.
+        Kind of the offsets, as in `measurements.offsets`; None: no offsets.
     """
 
     rotation: FloatArray
@@ -100,7 +100,7 @@ class BiasProblem:
     def innovation(
         self, rotation: FloatArray, translation: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """nu (..., L), H = -dnu (..., L, 6), e (..., 6), and e's derivative D (..., 6, 6)."""
+        """Return nu (..., L), H = -dnu (..., L, 6), e (..., 6), and D = de (..., 6, 6)."""
         turn = _ERROR(rotation, self.rotation)
         e = np.concatenate([turn, translation - self.translation], axis=-1)
         D = np.zeros((*turn.shape[:-1], 6, 6))
@@ -114,21 +114,21 @@ class BiasProblem:
 
     @functools.cached_property
     def _unbiased(self) -> FloatArray:
-        """The ranges less the biases expected at the prior's pose."""
+        """Return the ranges less the biases expected at the prior pose."""
         return self.ranges - _times(self.sums, self.extra)
 
     @functools.cached_property
     def _slope(self) -> FloatArray:
-        """By how much the expected biases (..., L, 6) change with the pose."""
+        """Return the derivative (..., L, 6) of the expected biases by the pose."""
         return self.sums @ self.gain
 
     @functools.cached_property
     def _own(self) -> FloatArray:
-        """Covariance (..., L, L) of the biases given the pose."""
+        """Return the covariance (..., L, L) of the biases given the pose."""
         return self.sums @ self.spread @ np.swapaxes(self.sums, -1, -2)
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
+        """Return cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
         nu, H, e, D = self.innovation(rotation, translation)
         Wnu, pull = _times(self.weight, nu), _times(self.information, e)
         cost = 0.5 * np.einsum("...i,...i->...", nu, Wnu)
@@ -139,7 +139,7 @@ class BiasProblem:
         return Linearization(cost, gradient, hessian)
 
     def weighed(self, share: FloatArray) -> BiasProblem:
-        """The problem with its `weight`, each link of it worth a `share` (..., L) of its own."""
+        """Return the problem with its `weight`, where each link keeps a `share` (..., L)."""
         S = self._own
         n = S.shape[-1]
         own = np.diagonal(S, axis1=-2, axis2=-1)
@@ -147,7 +147,7 @@ class BiasProblem:
         both = self.links[..., None] & self.links[..., None, :]
         weight = np.where(both, inverse(np.where(both, S, np.eye(n))), 0.0)
         if self.offset is not None:
-            # W - W U (U^T W U)^-1 U^T W: U says which links have each offset.
+            # W - W U (U^T W U)^-1 U^T W: U maps offsets to links.
             U = offsets.columns(self.offset, self.anchors.shape[-2], self.tags.shape[-2])
             taken = weight @ U
             total = U.T @ taken
@@ -163,7 +163,7 @@ class BiasProblem:
         loss: FloatArray,
         P: FloatArray | None = None,
     ) -> FloatArray:
-        """Weights (..., L) by a loss of the innovations at a pose of covariance P (None: 0)."""
+        """Return weights (..., L) by a loss of the innovations at a pose of covariance P or 0."""
         nu, H, _, _ = self.innovation(rotation, translation)
         if self.offset is not None:
             grid = (*nu.shape[:-1], self.anchors.shape[-2], self.tags.shape[-2])
@@ -192,23 +192,23 @@ def update_augmented(
     loss: FloatArray,
     n_twist: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The most likely pose of an epoch near a start, and what follows for the other states.
+    """Return the most likely pose of an epoch near a start, and the other states given it.
 
     Parameters
     ----------
     rotation, translation, extra, covariance
-        The prior, as of `AugmentedState`.
+        The prior, as in `AugmentedState`.
     ranges, weights, anchors, tags
-        As of `RangeCost`; the variances are those of a range beside its bias.
+        As in `RangeCost`; the variances exclude the biases.
     start_rotation, start_translation, start_covariance
-        Where Gauss-Newton starts, and how well that pose is known: the weights of the loss are
-        taken there, and once more at the pose found from them.
+        Start of Gauss-Newton, and its covariance. The weights of the loss are evaluated there, and
+        once more at the resulting pose.
     iterations
-        Of Gauss-Newton, at the most.
+        Maximum number of Gauss-Newton iterations.
     loss
-        (5,), of the innovations whitened by all that is not known.
+        (5,), of the innovations whitened by their full covariance.
     n_twist
-        How many of the extra states are no biases.
+        Number of extra states that are not biases.
 
     Returns
     -------
@@ -239,10 +239,10 @@ def update_any(
     offset: str | None,
     sums: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """`update_augmented` of ranges that may have an `offset` in common.
+    """Run `update_augmented` on ranges that may share an unknown `offset`.
 
-    `sums` (..., M N, K): by how much each extra state lengthens every range, where they are no
-    biases of links one by one.
+    `sums` (..., M N, K) is the derivative of the ranges by the extra states, if these are not
+    biases of single links.
     """
     n_links = ranges.shape[-2] * ranges.shape[-1]
     if sums is None:
@@ -276,7 +276,7 @@ def update_any(
 
 
 def sums_of(n_twist: int, n_laws: int, links: int) -> FloatArray:
-    """S (links, K): the biases of a link add up, whatever else the extra states hold."""
+    """Return S (links, K), which adds up the biases of each link."""
     return np.concatenate([np.zeros((links, n_twist)), *[np.eye(links)] * n_laws], axis=1)
 
 
@@ -288,7 +288,7 @@ def _problem(
     anchors: FloatArray,
     tags: FloatArray,
 ) -> BiasProblem:
-    """The problem of ranges and their weights (..., M, N), for a state of the same batch."""
+    """Return the problem of ranges and weights (..., M, N), for a state of the same batch."""
     ranges, weights = (a.reshape((*a.shape[:-2], -1)) for a in (ranges, weights))
     links = weights > 0
     P = state.covariance
@@ -302,7 +302,7 @@ def _problem(
 
 
 def _chosen(where: BoolArray, first: Solution, second: Solution) -> Solution:
-    """The first solution of some trials (...), the second of the others."""
+    """Return the first solution for some trials (...), the second for the others."""
     at = Linearization(
         np.where(where, first.at.cost, second.at.cost),
         np.where(where[..., None], first.at.gradient, second.at.gradient),
@@ -319,10 +319,10 @@ def _chosen(where: BoolArray, first: Solution, second: Solution) -> Solution:
 def _solved(
     problem: BiasProblem, found: Solution, heard: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The fields of the state at the pose found; `heard` (..., N): which tags had any link."""
+    """Return the fields of the state at the solution; `heard` (..., N): tags with any link."""
     rotation, translation = found.rotation, found.translation
     nu, H, e, D = problem.innovation(rotation, translation)
-    # Of the extra states: what the ranges tell given the pose, then what the pose tells.
+    # Covariance of the extra states: given the pose, then from the pose.
     gain = problem.spread @ np.swapaxes(problem.sums, -1, -2) @ problem.weight
     slope = problem.gain @ D - gain @ H
     pose = kept_wide(

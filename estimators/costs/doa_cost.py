@@ -1,6 +1,7 @@
-"""The cost of directions of arrival at a pose, and sums of costs; batched.
+"""Cost of directions of arrival at a pose, and sums of costs; batched.
 
-What `range_cost.RangeCost` is to ranges. Angles and ranges of one epoch are a sum of the two.
+`DoaCost` is the counterpart of `range_cost.RangeCost`. The cost of an epoch with angles and ranges
+is the sum of the two.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ class DoaCost:
     Parameters
     ----------
     angles, weights
-        (..., 2, N): radians, inverse variances [1/rad^2]; weight 0 where nothing was measured.
+        (..., 2, N): radians, inverse variances [1/rad^2]; weight 0 without a measurement.
     tags
         (..., N, 3), metres.
     station
         (..., 3), the base station, metres.
     loss
-        Of the squared whitened residuals, (..., 5), as of `losses.loss_of`.
+        Loss of the squared whitened residuals, (..., 5), as in `losses.loss_of`.
     """
 
     angles: FloatArray
@@ -48,12 +49,12 @@ class DoaCost:
         return np.broadcast_shapes(*arrays, self.station.shape[:-1], self.loss.shape[:-1])
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
+        """Return cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
         turned = self.tags @ np.swapaxes(rotation, -1, -2)
         places = turned + (translation - self.station)[..., None, :]
         residual = np.where(self.weights > 0, bearing.angles(places) - self.angles, 0.0)
         cost, share = loss_of(self.weights * residual**2, self.loss)
-        # The angles' derivative by the places, times that of the places by the pose.
+        # Chain rule: derivative of angles by positions, times derivative of positions by the pose.
         J = (
             bearing.jacobian(places)[..., None, :]
             @ bounds.tag_jacobian(rotation, self.tags)[..., None, :, :, :]
@@ -68,11 +69,11 @@ class DoaCost:
         )
 
     def with_loss(self, loss: FloatArray) -> DoaCost:
-        """The cost by another loss."""
+        """Return the cost with another loss."""
         return dataclasses.replace(self, loss=loss)
 
     def each(self, function: Callable[[FloatArray, int], FloatArray]) -> DoaCost:
-        """The cost with a function of (array, number of trailing axes) applied to its arrays."""
+        """Apply a function of (array, number of trailing axes) to the arrays of the cost."""
         return dataclasses.replace(
             self,
             angles=function(self.angles, 2),
@@ -85,7 +86,7 @@ class DoaCost:
 
 @dataclass(frozen=True, eq=False)
 class SumCost:
-    """Several costs of one pose together, such as angles and ranges of one epoch."""
+    """Sum of costs of one pose, such as angles and ranges of one epoch."""
 
     parts: tuple[DoaCost | RangeCost, ...]
 
@@ -95,14 +96,14 @@ class SumCost:
         return np.broadcast_shapes(*(part.batch for part in self.parts))
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """The sum of the parts."""
+        """Return the sum of the parts."""
         at = [part(rotation, translation) for part in self.parts]
         return Linearization._make(sum(fields[1:], fields[0]) for fields in zip(*at, strict=True))
 
     def with_loss(self, loss: FloatArray) -> SumCost:
-        """The sum of the parts by another loss."""
+        """Return the sum of the parts with another loss."""
         return SumCost(tuple(dataclasses.replace(part, loss=loss) for part in self.parts))
 
     def each(self, function: Callable[[FloatArray, int], FloatArray]) -> SumCost:
-        """The sum of the parts with a function applied to their arrays."""
+        """Return the sum of the parts with a function applied to their arrays."""
         return SumCost(tuple(part.each(function) for part in self.parts))

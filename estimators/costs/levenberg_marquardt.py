@@ -1,4 +1,4 @@
-"""Gauss-Newton with damping for poses: one loop for every estimator on SO(3) x R^3, batched."""
+"""Damped Gauss-Newton on SO(3) x R^3, batched; every estimator of poses uses this loop."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.geometry import rotations
 
-# Behind the door: what comes to it was made here.
+# Called without input checks: the input was made here.
 _EXP = kernel(rotations.exp)
 
-# No step is longer (rad, m) on any axis.
+# Largest step (rad, m) on any axis.
 _LONGEST = 1e12
 
 
@@ -43,20 +43,20 @@ def minimize_pose(
 ) -> Solution:
     """Minimise a sum of squares over poses, ``Q <- exp(w) Q``, ``t <- t + v``.
 
-    Plain Gauss-Newton while the cost falls; where it would rise the step is refused and the
-    damping grows tenfold (Marquardt's scaling).
+    This is plain Gauss-Newton while the cost falls. If a step would raise the cost, it is rejected
+    and the damping grows tenfold (Marquardt's scaling).
 
     Parameters
     ----------
     linearize
         The problem: pose to `Linearization`.
     rotation, translation
-        The starts, (..., 3, 3) and (..., 3).
+        Starts, (..., 3, 3) and (..., 3).
     iterations
-        At the most; a trial stands still once it has converged.
+        Maximum number of iterations; a converged trial no longer changes.
     tolerance
-        On the length of the step in standard deviations, the Hessian taken as information.
-        The step is still taken, and near the minimum leaves its square behind.
+        Tolerance on the length of the step in standard deviations, with the Hessian as information.
+        The last step is still taken; near the minimum the remaining error is of second order.
     """
     at = linearize(rotation, translation)
     batch = at.cost.shape
@@ -66,13 +66,13 @@ def minimize_pose(
     converged = np.zeros(batch, bool)
     for _ in range(iterations):
         step = -damped_solution(at.hessian, at.gradient, damping)
-        # Where next to nothing is determined a step may be too long for its own square.
+        # With almost no information, the square of a step may overflow.
         step = np.clip(step, -_LONGEST, _LONGEST)
         turned, moved = _EXP(step[..., :3]) @ rotation, translation + step[..., 3:]
         new = linearize(turned, moved)
-        # Damping shortens the step by about 1 + damping: a short step alone proves nothing.
+        # Damping shortens the step by about 1 + damping, so a short step does not show convergence.
         decrease = -np.einsum("...i,...i->...", at.gradient, step) * (1 + damping)
-        # A step of 1e-4 standard deviations changes the cost by less than rounding may.
+        # A step of 1e-4 standard deviations changes the cost by less than rounding can.
         better = (new.cost <= at.cost * (1 + 1e-12)) | (decrease < 1e-8)
         taken = better & ~converged
         rotation = np.where(taken[..., None, None], turned, rotation)
@@ -91,9 +91,9 @@ def minimize_pose(
 
 
 def damped_solution(A: FloatArray, b: FloatArray, damping: FloatArray) -> FloatArray:
-    """Solution (..., n) of ``(A + damping diag(A)) x = b``, A (..., n, n) positive semidefinite.
+    """Solve ``(A + damping diag(A)) x = b`` for x (..., n), A (..., n, n) positive semidefinite.
 
-    A diagonal that is not zero is raised by 1e-14 of itself: singular matrices solve too.
+    Nonzero diagonal entries grow by 1e-14 of themselves, so that singular matrices solve too.
     """
     diagonal = np.einsum("...ii->...i", A)
     raised = (damping[..., None] + 1e-14) * diagonal + 1e-300

@@ -1,4 +1,4 @@
-"""Losses of whitened residuals: squares, Huber's, and those that bound the pull of wrong ranges."""
+"""Losses of whitened residuals: squares, Huber, and losses that bound the effect of outliers."""
 
 from __future__ import annotations
 
@@ -7,43 +7,43 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import BoolArray, FloatArray
 
-# A loss is five numbers (..., 5): threshold, cutoff and scale, infinite where they are not used,
-# the power by which weights fall beyond the threshold, and what is left of the weight of a range
-# that is late.
+# A loss is five numbers (..., 5). Threshold, cutoff and scale are infinite if not used. The others
+# are the power by which weights fall beyond the threshold, and the factor on the weight of a late
+# range.
 SQUARES = np.array([np.inf, np.inf, np.inf, 1.0, 1.0])
 
 
 def huber(threshold: float) -> FloatArray:
-    """Huber's loss: squares up to `threshold` standard deviations, straight lines beyond."""
+    """Return Huber's loss: quadratic up to `threshold` standard deviations, linear beyond."""
     return np.array([threshold, np.inf, np.inf, 1.0, 1.0])
 
 
 def redescending(threshold: float, late: float = 0.5) -> FloatArray:
-    """Weights ``min(1, (h / |x|)^2)``, h the threshold, and of late ranges `late` times as much.
+    """Return the loss of weights ``min(1, (h / |x|)^2)``, h the threshold, times `late` if late.
 
-    Radio ranges err late, by reflections and obstacles, far more than early. The pull of a range
-    falls with its residual x: the cost is ``x^2 / 2`` up to h, ``h^2 (1/2 + log(|x| / h))``
-    beyond.
+    Radio ranges are late, by reflections and obstacles, far more often than early. The influence of
+    a range falls with its residual x. The cost is ``x^2 / 2`` up to h, and
+    ``h^2 (1/2 + log(|x| / h))`` beyond.
     """
     return np.array([threshold, np.inf, np.inf, 2.0, late])
 
 
 def cut_huber(threshold: float, cutoff: ArrayLike) -> FloatArray:
-    """Huber's loss up to `cutoff` (...) standard deviations, constant beyond: that is out."""
+    """Return Huber's loss up to `cutoff` (...) standard deviations, constant (weight 0) beyond."""
     return _stacked(huber(threshold), 1, cutoff)
 
 
 def geman_mcclure(scale: ArrayLike) -> FloatArray:
-    """Geman and McClure's loss, bounded: what is many `scale` (...) away hardly counts at all."""
+    """Return the bounded Geman-McClure loss; residuals far beyond `scale` (...) hardly count."""
     return _stacked(SQUARES, 2, scale)
 
 
-# Of radio ranges: chosen on several public logs, whose figures hardly change from 0.8 to 1.
+# For radio ranges: chosen on several public logs, whose errors hardly change from 0.8 to 1.
 LATE = redescending(1.0, late=0.5)
 
 
 def _stacked(loss: FloatArray, place: int, values: ArrayLike) -> FloatArray:
-    """A loss (..., 5) with values (...) at a place."""
+    """Return a loss (..., 5) with values (...) at one index."""
     values = np.asarray(values, dtype=np.float64)
     result = np.broadcast_to(loss, (*values.shape, len(loss))).copy()
     result[..., place] = values
@@ -53,7 +53,7 @@ def _stacked(loss: FloatArray, place: int, values: ArrayLike) -> FloatArray:
 def loss_of(
     squared: FloatArray, loss: FloatArray, late: BoolArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Cost of squared whitened residuals (..., M, N), and the share of their weight that is left.
+    """Return the cost of squared whitened residuals (..., M, N), and their weights in [0, 1].
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def loss_of(
         (..., 5), from `huber`, `cut_huber`, `geman_mcclure`, `redescending`, or `SQUARES`.
         Huber's is ``x^2 / 2`` up to its threshold k, and ``k |x| - k^2 / 2`` beyond.
     late
-        (..., M, N), which ranges are longer than expected; None: the loss does not ask.
+        (..., M, N), which ranges are longer than expected; None: not used by the loss.
     """
     threshold, cutoff, scale, power, of_late = (loss[..., i, None, None] for i in range(5))
     held = np.minimum(squared, cutoff**2)

@@ -1,6 +1,6 @@
-"""The most likely pose of an epoch: the cost of what was measured, and a prior.
+"""Most likely pose of an epoch: the cost of the measurements, and a prior.
 
-`minimize` is the one way to it: where all that was measured are ranges, a kernel runs.
+`minimize` is the entry point. It runs a kernel if the measurements are ranges only.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets
 
-# Behind the doors: what comes to these was checked, or made here.
+# Called without input checks: the inputs were checked before, or made here.
 _ERROR = kernel(rotations.error)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 
@@ -32,14 +32,14 @@ class PoseState(NamedTuple):
 
 
 class Cost(Protocol):
-    """What was measured: callable on poses, and its arrays can be picked from."""
+    """Cost of measurements: callable on poses, with arrays that can be indexed."""
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """Cost, gradient and Gauss-Newton Hessian at poses."""
+        """Return cost, gradient and Gauss-Newton Hessian at poses."""
         ...
 
     def each(self, function: Callable[[FloatArray, int], FloatArray]) -> Cost:
-        """The cost with a function of (array, number of trailing axes) applied to its arrays."""
+        """Apply a function of (array, number of trailing axes) to the arrays of the cost."""
         ...
 
 
@@ -48,7 +48,8 @@ class MapProblem:
     """Maximum a posteriori pose of one epoch; arrays with leading batch axes.
 
     `data` is the cost of the measurements (`RangeCost`, `doa_cost.DoaCost`, or a sum of costs).
-    Cost: that of the measurements plus half the prior's Mahalanobis distance, residual
+    The cost is that of the measurements plus half the squared Mahalanobis distance to the prior,
+    with residual
     ``(log(Q Q_pred^T), t - t_pred)``.
     """
 
@@ -57,7 +58,7 @@ class MapProblem:
     data: Cost
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """Cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
+        """Return cost, gradient and Gauss-Newton Hessian by the pose error (w, v)."""
         of_data = self.data(rotation, translation)
         turn = _ERROR(rotation, self.prior.rotation)
         shift = translation - self.prior.translation
@@ -71,7 +72,7 @@ class MapProblem:
         )
 
     def take(self, batch: tuple[int, ...], where: Index) -> MapProblem:
-        """The trials (K, 1) at an index into the batch, with an axis of 1 for starts."""
+        """Return the trials (K, 1) at an index into the batch, with an axis of 1 for starts."""
 
         def some(array: FloatArray, trailing: int) -> FloatArray:
             return pick(array, batch, where, trailing)[:, None]
@@ -84,7 +85,7 @@ class MapProblem:
 
 
 def pose_error(turn: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The error (..., 6) of a pose, and its derivative ``blkdiag(Jl^-1, I)`` by (w, v)."""
+    """Return the error (..., 6) of a pose, and its derivative ``blkdiag(Jl^-1, I)`` by (w, v)."""
     shape = np.broadcast_shapes(turn.shape, shift.shape)
     error = np.concatenate([np.broadcast_to(turn, shape), np.broadcast_to(shift, shape)], axis=-1)
     D = np.zeros((*shape[:-1], 6, 6))
@@ -94,7 +95,7 @@ def pose_error(turn: FloatArray, shift: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def map_problem(state: PoseState, data: Cost) -> MapProblem:
-    """The problem of an update: a prior and the cost of what was measured."""
+    """Return the problem of an update from a prior and the cost of the measurements."""
     return MapProblem(state, positive_inverse(state.covariance), data)
 
 
@@ -105,7 +106,7 @@ def minimize(
     iterations: int,
     tolerance: float = 1e-6,
 ) -> Solution:
-    """`minimize_pose` of a problem, by its kernel where all that was measured are ranges."""
+    """Run `minimize_pose` on a problem, or a kernel if the measurements are ranges only."""
     prior, information, data = _NO_PRIOR, _NOTHING, problem
     if isinstance(problem, MapProblem):
         prior, information, data = problem.prior, problem.prior_information, problem.data
@@ -139,13 +140,13 @@ def minimize_ranges(
     iterations: int,
     tolerance: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-    """The most likely pose near a start: ranges, and a prior of some information (..., 6, 6).
+    """Return the most likely pose near a start, from ranges and a prior of information (..., 6, 6).
 
-    `offset` is the kind of the ranges' offsets, as kernels have it (`offsets.code_of`).
+    `offset` is the code of the kind of range offsets (`offsets.code_of`).
 
     Returns
     -------
-    Rotation, translation, cost, gradient, Hessian, and whether it converged: see `Solution`.
+    Rotation, translation, cost, gradient, Hessian, and whether it converged; see `Solution`.
     """
     prior, kind = PoseState(rotation, translation, information), offsets.name_of(offset)
     problem = MapProblem(
@@ -157,10 +158,10 @@ def minimize_ranges(
 
 
 def positive_inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of symmetric positive definite matrices (..., n, n); NaN where one is not.
+    """Invert symmetric positive definite matrices (..., n, n); NaN for others.
 
-    The units of its rows do not matter: of a matrix with a unit diagonal the smallest eigenvalue
-    decides.
+    The units of the rows do not matter: the test uses the smallest eigenvalue of the matrix scaled
+    to unit diagonal.
     """
     n = matrix.shape[-1]
     diagonal = np.einsum("...ii->...i", matrix)

@@ -1,7 +1,7 @@
-"""The cost of raw ranges at a pose, its gradient and Gauss-Newton Hessian; batched.
+"""Cost of raw ranges at a pose, with gradient and Gauss-Newton Hessian; batched.
 
-Everything an estimator on raw ranges minimises is built of this: maximum likelihood is this
-cost alone, the iterated EKF adds a prior, robust estimation changes the loss.
+All estimators on raw ranges minimise this cost. Maximum likelihood is the cost alone, the iterated
+EKF adds a prior, and robust estimation changes the loss.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from rbl_gym.estimators.costs.levenberg_marquardt import Linearization
 from rbl_gym.estimators.costs.losses import SQUARES, loss_of
 from rbl_gym.measurements import offsets, ranging
 
-# Behind the doors: what comes to these was checked, or made here.
+# Called without input checks: the inputs were checked before, or made here.
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
-# Trials of a batch: a mask (...), or one array (K,) of positions for every axis of the batch.
+# Trials of a batch: a mask (...), or one index array (K,) for every axis of the batch.
 Index = BoolArray | tuple[np.ndarray, ...]
 
-# Steps to the offset that a loss other than squares likes best.
+# Iterations to the offset of least cost, for losses other than squares.
 _STEPS = 20
 
 
@@ -35,18 +35,18 @@ class RangeCost:
     Parameters
     ----------
     ranges, weights
-        (..., M, N): metres, inverse variances [1/m^2]; weight 0 where a link is missing.
+        (..., M, N): metres, inverse variances [1/m^2]; weight 0 for missing links.
     anchors, tags
         (..., M, 3) and (..., N, 3), metres.
     loss
-        Of the squared whitened residuals, (..., 5), as of `losses.loss_of`.
+        Loss of the squared whitened residuals, (..., 5), as in `losses.loss_of`.
     tag_variance, tag_unit
-        Variance [m^2] of every tag's place on the body, per axis, marginalised to first order
-        about unit vectors (..., M, N, 3) from anchors to tags: it ties the ranges of a tag to
-        each other. Least squares only.
+        Variance [m^2] of every tag position on the body, per axis, marginalised to first order
+        about unit vectors (..., M, N, 3) from anchors to tags. It correlates the ranges of a tag.
+        Least squares only.
     offset
-        Whose ranges have an unknown offset in common (`measurements.offsets`); it takes the value
-        of least cost at every pose. Ranges may then have any sign.
+        Which ranges share an unknown offset (`measurements.offsets`). At every pose the offset has
+        the value of least cost. Ranges may then have any sign.
     """
 
     ranges: FloatArray
@@ -65,7 +65,7 @@ class RangeCost:
         return np.broadcast_shapes(*(a.shape[:-2] for a in arrays), self.loss.shape[:-1])
 
     def __call__(self, rotation: FloatArray, translation: FloatArray) -> Linearization:
-        """Cost, gradient ``J W (d - r)`` and Gauss-Newton Hessian ``J W J^T`` by the pose error."""
+        """Return cost, gradient ``J W (d - r)``, Gauss-Newton Hessian ``J W J^T`` by (w, v)."""
         distance, J = bounds.range_jacobian(self.anchors, self.tags, rotation, translation)
         residual = self.residuals(distance)
         cost, share = loss_of(self.weights * residual**2, self.loss, residual < 0)
@@ -87,7 +87,7 @@ class RangeCost:
         return self._with_tag_noise(at, J, residual, self.tag_unit)
 
     def residuals(self, distance: FloatArray) -> FloatArray:
-        """Distances (..., M, N) less ranges, the likeliest offsets taken out; 0 without a link."""
+        """Return distances (..., M, N) less ranges and best offsets; 0 without a link."""
         residual = np.where(self.weights > 0, distance - self.ranges, 0.0)
         if self.offset is None:
             return residual
@@ -95,7 +95,7 @@ class RangeCost:
         return np.where(self.weights > 0, residual - found, 0.0)
 
     def offsets(self) -> np.ndarray | int:
-        """How many unknown offsets (...) the ranges have."""
+        """Return the number (...) of unknown offsets of the ranges."""
         if self.offset is None:
             return 0
         groups = (self.weights > 0).any(axis=offsets.axes_of(self.offset), keepdims=True)
@@ -104,7 +104,7 @@ class RangeCost:
     def _with_tag_noise(
         self, at: Linearization, J: FloatArray, residual: FloatArray, unit: FloatArray
     ) -> Linearization:
-        """The linearization with the tags' places marginalised, J (..., 6, M N) of the ranges.
+        """Return the linearization with tag positions marginalised, J (..., 6, M N) of the ranges.
 
         The covariance of a tag's ranges is ``diag(1 / w) + s^2 U U^T``; its inverse by Woodbury.
         """
@@ -122,12 +122,12 @@ class RangeCost:
         )
 
     def rows(self, where: np.ndarray) -> RangeCost:
-        """The trials (K, 1) at an index (K,) into one batch axis, with an axis of 1 for starts."""
+        """Return trials (K, 1) at an index (K,) of one batch axis, with an axis of 1 for starts."""
         size = self.ranges.shape[:1]
         return self.each(lambda array, n: pick(array, size, (where,), n)[:, None])
 
     def each(self, function: Callable[[FloatArray, int], FloatArray]) -> RangeCost:
-        """The cost with a function of (array, number of trailing axes) applied to its arrays."""
+        """Apply a function of (array, number of trailing axes) to the arrays of the cost."""
         return dataclasses.replace(
             self,
             ranges=function(self.ranges, 2),
@@ -140,7 +140,7 @@ class RangeCost:
 
 
 def squared_residuals(cost: RangeCost, rotation: FloatArray, translation: FloatArray) -> FloatArray:
-    """Squared whitened residuals (..., M, N) of a cost's ranges at a pose."""
+    """Return squared whitened residuals (..., M, N) of a cost's ranges at a pose."""
     distance = _DISTANCES(cost.anchors, _TAG_POSITIONS(rotation, translation, cost.tags))
     return cost.weights * cost.residuals(distance) ** 2
 
@@ -148,9 +148,10 @@ def squared_residuals(cost: RangeCost, rotation: FloatArray, translation: FloatA
 def offset_of(
     residual: FloatArray, weights: FloatArray, loss: FloatArray, offset: str
 ) -> FloatArray:
-    """The offsets of least cost: weighted means, of another loss than squares from the median on.
+    """Return the offsets of least cost.
 
-    Of a bounded loss that is the minimum nearest to the median.
+    For squares they are weighted means. For other losses the iteration starts at the median; for a
+    bounded loss it finds the minimum nearest to the median.
     """
     if np.isinf(loss[..., :3]).all() and (loss[..., 4] == 1).all():
         return offsets.common(residual, weights, offset)
@@ -164,5 +165,5 @@ def offset_of(
 
 
 def pick(array: FloatArray, batch: tuple[int, ...], where: Index, trailing: int) -> FloatArray:
-    """The entries (K, ...) at an index, or of a mask, into an array that broadcasts to a batch."""
+    """Return entries (K, ...) at an index or mask of an array that broadcasts to a batch."""
     return np.broadcast_to(array, (*batch, *array.shape[array.ndim - trailing :]))[where]

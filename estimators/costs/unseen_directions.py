@@ -1,10 +1,11 @@
-"""What an update leaves of a prior about directions that its epoch cannot see.
+"""Covariance of an update along directions that its epoch does not observe.
 
-Ranges to tags in a line say nothing of the body's roll about that line, and the line turns with the
-body. The update carries the prior's information to the new pose by ``Jl^-1(log(Q Q_-^T))``, the
-derivative of its residual, halfway between the old line and the new one: each update then takes a
-little of what the prior knows of other directions for knowledge of the roll, and after many of them
-the roll is believed to be known. Carried along with the body, the wide direction stays on the line.
+Ranges to collinear tags do not determine the body's roll about their line, and the line rotates
+with the body. The update moves the prior's information to the new pose by ``Jl^-1(log(Q Q_-^T))``,
+the derivative of its residual. This is halfway between the old line and the new one. Each update
+then turns a little information about other directions into information about the roll. After many
+updates the filter would be overconfident in the roll. Here the information is rotated with the
+body, so that the uncertain direction stays on the line.
 """
 
 from __future__ import annotations
@@ -17,15 +18,16 @@ from rbl_gym.checks import BoolArray, FloatArray, kernel
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.geometry import rotations
 
-# Tags this thin beside their length (squared) are as good as in a line: to them the two ways of
-# carrying the prior differ by more than the ranges tell, to others by nothing that matters.
+# Tags with a smaller ratio of squared width to squared length count as collinear. For these the
+# difference of the two ways to move the prior exceeds the information of the ranges; for others it
+# is negligible.
 _THIN = 0.01
 _HAT, _LOG = kernel(rotations.hat), kernel(rotations.log)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 
 
 def kept_wide(prior: Any, posterior: Any, heard: BoolArray | np.bool_, tags: FloatArray) -> Any:
-    """The posterior pose with the covariance that leaves unseen directions as wide as they were.
+    """Return the posterior with a covariance that keeps unobserved directions as wide as before.
 
     Parameters
     ----------
@@ -55,7 +57,7 @@ def kept_wide(prior: Any, posterior: Any, heard: BoolArray | np.bool_, tags: Flo
     D = np.zeros_like(P1)
     D[:, :3, :3] = _LEFT_JACOBIAN_INVERSE(_LOG(np.swapaxes(back, -1, -2)))
     D[:, 3:, 3:] = np.eye(3)
-    # With the body: an error about the tags' centre is the same in the body's frame.
+    # An error about the tags' centre keeps its value in the body frame.
     T = np.zeros_like(P1)
     T[:, :3, :3], T[:, 3:, 3:] = back, np.eye(3)
     T[:, 3:, :3] = arms[0] @ back - arms[1]
@@ -66,13 +68,13 @@ def kept_wide(prior: Any, posterior: Any, heard: BoolArray | np.bool_, tags: Flo
 
 
 def _line(heard: BoolArray | np.bool_, tags: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Where (...) the tags that were heard are about in a line, and their centre (..., 3)."""
+    """Return whether (...) the tags with links are nearly collinear, and their centre (..., 3)."""
     heard = np.asarray(heard)
     share = heard / np.maximum(heard.sum(axis=-1, keepdims=True), 1)
     centre = (share[..., None, :] @ tags)[..., 0, :]
     about = (tags - centre[..., None, :]) * heard[..., None]
     gram = np.swapaxes(about, -1, -2) @ about
     trace = np.einsum("...ii->...", gram)
-    # The sum of products of two eigenvalues, over the square of their sum.
+    # Sum of products of pairs of eigenvalues, over the square of their sum.
     pairs = 0.5 * (trace**2 - np.einsum("...ij,...ij->...", gram, gram))
     return np.asarray(heard.any(axis=-1) & (pairs <= _THIN * trace**2)), centre

@@ -57,7 +57,7 @@ def places_of_differences(part: RangeCost, net: FloatArray) -> FloatArray:
 
 
 def _far_apart(places: FloatArray, cost: FloatArray, least: FloatArray) -> FloatArray:
-    """Return the three positions of least cost of (K, P, 3), at least `least` (K,) apart if possible."""
+    """Return the best three of positions (K, P, 3), at least `least` (K,) apart if possible."""
     rows, cost = np.arange(len(places)), np.array(cost)
     chosen = []
     for _ in range(3):

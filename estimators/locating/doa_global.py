@@ -154,7 +154,7 @@ def three_point_depths(rays: FloatArray, body: FloatArray) -> FloatArray:
 
 
 def _quartic_roots(coefficients: FloatArray) -> FloatArray:
-    """Return real parts (n, 4) of the roots of quartics, coefficients (5, n) highest power first."""
+    """Return real parts (n, 4) of the roots of quartics (5, n), highest power first."""
     leading = coefficients[0]
     floor = 1e-12 * np.abs(coefficients).max(axis=0) + 1e-300
     leading = np.where(np.abs(leading) > floor, leading, floor)

@@ -17,7 +17,7 @@ from rbl_gym.estimators.costs.levenberg_marquardt import damped_solution
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import bearing
 
-# Unchecked, because positions far away make the matrix large.
+# Called without input checks, because positions far away make the matrix large.
 _VEE = kernel(rotations.vee)
 
 # Weight of the known distances against the noisy angles: a distance error of the body's size counts
@@ -48,7 +48,7 @@ class Places(NamedTuple):
 
 
 def body_size(tags: FloatArray) -> FloatArray:
-    """Return the largest distance (...) between two tags of a body (..., K, 3), the unit of length."""
+    """Return the largest distance (...) between tags (..., K, 3) of a body, the unit of length."""
     gap = tags[..., :, None, :] - tags[..., None, :, :]
     return np.sqrt(np.einsum("...i,...i->...", gap, gap).max(axis=(-2, -1)))
 
@@ -146,7 +146,7 @@ def _newton_step(
 
 
 def unit_quaternion(positions: FloatArray, tags: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rotation (..., 3, 3) and translation (..., 3) of the body nearest to places (..., K, 3).
+    """Fit rotation (..., 3, 3) and translation (..., 3) of a body to positions (..., K, 3).
 
     DOA paper, (11)-(14), corrected: with ``H = sum_k s_k c_k^T`` (centred) the quaternion maximises
     ``q^T P q``, P the symmetric 4 x 4 matrix of H; ``t = s - R c`` of the means.

@@ -35,7 +35,7 @@ from rbl_gym.estimators.locating.maximum_likelihood import Alternatives, no_alte
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.ranging import NoiseLaw
 
-# Unchecked, because the cost of an unknown pose is NaN.
+# Called without input checks, because an unknown pose is NaN.
 _DISTANCES = kernel(ranging.distances)
 
 ENTRY_POINT_GROUP = "rbl_gym.locators"

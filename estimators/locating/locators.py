@@ -1,4 +1,4 @@
-"""The methods of `locate`: functions of a flat `StaticEpoch` that return a `Fit`."""
+"""Methods of `locate`: functions of a flat `StaticEpoch` that return a `Fit`."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from rbl_gym.estimators.locating.robust_location import robust, robust_late
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
-# Determinant from which a matrix of a unit diagonal has no eigenvalue below 1e-12.
+# A matrix with unit diagonal and at least this determinant has no eigenvalue below 1e-12.
 _REGULAR = 1e-12 * 6**5
 
 
 class StaticEpoch(NamedTuple):
     """Checked arrays of B trials: ranges (B, M, N), anchors (B, M, 3), tags (B, N, 3).
 
-    `weights` (B, M, N) are inverse variances of the ranges, 0 where a link is missing;
-    `squared_weights` those of the squared ranges, (B, M, 1) where common to the tags;
-    `tag_std_m` that of the tags' places; `retraction` that of Newton's method in ``procrustes``;
-    `offset` whose ranges have an unknown one in common.
+    `weights` (B, M, N) are inverse variances of the ranges, 0 for missing links. `squared_weights`
+    are those of the squared ranges, (B, M, 1) if common to the tags. `tag_std_m` is the standard
+    deviation of the tag positions, `retraction` that of Newton's method in ``procrustes``, and
+    `offset` the kind of unknown range offset.
     """
 
     ranges: FloatArray
@@ -50,13 +50,13 @@ class StaticEpoch(NamedTuple):
 
     @property
     def stat(self) -> Statistic:
-        """The statistic of the squared ranges."""
+        """Return the statistic of the squared ranges."""
         offset = self.offset is not None
         return statistic(self.ranges, self.anchors, self.tags, self.squared_weights, pseudo=offset)
 
 
 class Fit(NamedTuple):
-    """What a method returns, (B, ...): pose, covariance, convergence; what else it knows itself."""
+    """Result of a method, (B, ...): pose, covariance, convergence and optional fields."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -190,13 +190,13 @@ def _nearest(matrix: FloatArray) -> FloatArray:
 
 
 def _propagated(T: FloatArray, stat: Statistic) -> FloatArray:
-    """``T I^-1 T^T`` with the information of the 12 linear states."""
+    """Return ``T I^-1 T^T`` with the information of the 12 linear states."""
     info, _ = information(stat)
     return bounds.symmetric(T @ np.linalg.solve(least_squares.loaded(info), np.swapaxes(T, -1, -2)))
 
 
 def covariance_of(hessian: FloatArray) -> FloatArray:
-    """Inverse of information (..., 6, 6); what nothing determines gets 1e12 of the rest."""
+    """Invert information (..., 6, 6); undetermined directions get 1e12 of the rest."""
     inverse, regular = regular_inverse(hessian, _REGULAR)
     if not regular.all():
         inverse[~regular] = _wide_covariance(hessian[~regular])
@@ -204,7 +204,7 @@ def covariance_of(hessian: FloatArray) -> FloatArray:
 
 
 def _wide_covariance(hessian: FloatArray) -> FloatArray:
-    """`covariance_of` by eigenvalues, none below 1e-12 of a matrix with a unit diagonal."""
+    """Return `covariance_of` by eigenvalues, at least 1e-12 for a matrix with unit diagonal."""
     scale = np.sqrt(np.maximum(np.diagonal(hessian, axis1=-2, axis2=-1), 0.0))
     largest = scale.max(axis=-1, keepdims=True)
     scale = np.where(scale > 1e-9 * largest, scale, np.where(largest > 0, largest, 1.0))

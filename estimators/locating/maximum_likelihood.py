@@ -1,6 +1,6 @@
-"""Maximum likelihood of the pose on raw ranges, and its search for other minima.
+"""Maximum-likelihood pose from raw ranges, with a search for other minima.
 
-Problems are flat here: one batch axis B, arrays (B, M, N), (B, M, 3), (B, N, 3).
+Problems here are flat: one batch axis B, arrays (B, M, N), (B, M, 3), (B, N, 3).
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
 
-# Behind the door: what comes to it was checked, or made here.
+# Called without input checks: the inputs were checked before, or made here.
 _TAG_POSITIONS = kernel(ranging.tag_positions)
 
-# A cost this many standard deviations above its chi-square mean calls for a global search.
+# A cost this many standard deviations above its chi-square mean starts a global search.
 _SUSPICIOUS = 5.0
-# So does a rotation that the ranges leave this uncertain (rad): there may be other minima.
+# So does a rotation with this standard deviation (rad): there may be other minima.
 _UNCERTAIN_RAD = 0.2
 # So do fewer anchors than this, and anchors this flat.
 _FEW_ANCHORS, _FLAT = 5, 0.05
-# A search starts from so many rotations at each place, the cheapest of the net, and follows so
-# many of the minima that it comes near.
+# Numbers of rotations at each position, the best of the net, from which a search starts, and of
+# approximate minima that it refines.
 _STARTS, _MINIMA = 5, 8
-# Poses whose tags are closer than these shares of the body's size are the same: on the way to a
-# minimum, and at it.
+# Poses whose tags are closer than these fractions of the body's size are the same: before
+# convergence, and after it.
 _NEAR, _SAME = 2e-2, 1e-3
 # Poses within 3 sigma of the best cost are alternatives to it.
 _RIVAL_COST = 4.5
@@ -46,7 +46,7 @@ _MAX_ALTERNATIVES = 3
 class Alternatives(NamedTuple):
     """Other poses that explain the ranges about as well, best first.
 
-    rotation (..., K, 3, 3), translation (..., K, 3), cost (..., K); infinite where there is none.
+    rotation (..., K, 3, 3), translation (..., K, 3), cost (..., K); infinite for none.
     """
 
     rotation: FloatArray
@@ -55,7 +55,7 @@ class Alternatives(NamedTuple):
 
 
 def no_alternatives(size: int) -> Alternatives:
-    """`size` trials without any."""
+    """Return empty alternatives for `size` trials."""
     return Alternatives(
         np.tile(np.eye(3), (size, _MAX_ALTERNATIVES, 1, 1)),
         np.zeros((size, _MAX_ALTERNATIVES, 3)),
@@ -66,7 +66,7 @@ def no_alternatives(size: int) -> Alternatives:
 def maximum_likelihood(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray, tag_std_m: float = 0.0
 ) -> tuple[Solution, Alternatives]:
-    """The most likely pose, searched for globally where the first solution is in doubt.
+    """Return the most likely pose, with a global search if the first solution is in doubt.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def maximum_likelihood(
     rotation, translation
         Starts (B, 3, 3), (B, 3); rows that are not finite are started globally.
     tag_std_m
-        Standard deviation of the tags' places on the body, marginalised.
+        Standard deviation of the tag positions on the body, marginalised.
     """
     weights = cost.weights / (1 + tag_std_m**2 * cost.weights)
     if cost.offset is not None:
@@ -90,7 +90,7 @@ def maximum_likelihood(
 
 
 def _with_tag_noise(cost: RangeCost, solution: Solution, tag_std_m: float) -> Solution:
-    """The solution with uncertain tag places marginalised about it (twice, as they move it)."""
+    """Marginalise uncertain tag positions about the solution (twice, because it moves)."""
     if tag_std_m == 0:
         return solution
     for _ in range(2):
@@ -102,13 +102,13 @@ def _with_tag_noise(cost: RangeCost, solution: Solution, tag_std_m: float) -> So
 
 
 def linear_start(cost: RangeCost) -> tuple[FloatArray, FloatArray]:
-    """`points_start` of a cost; where the offsets leave no linear solution, NaN."""
+    """Return `points_start` of a cost; NaN if the offsets leave no linear solution."""
     if cost.offset is None:
         return points_start(cost.ranges, cost.weights, cost.anchors, cost.tags)
     if cost.offset == "anchor":
         batch = cost.batch
         return np.full((*batch, 3, 3), np.nan), np.full((*batch, 3), np.nan)
-    # The distances, which say how squares are to be weighed, are not known yet.
+    # The distances, which the weights of squared ranges need, are not known yet.
     stat = statistic(cost.ranges, cost.anchors, cost.tags, cost.weights, pseudo=True)
     return points_fit(stat)
 
@@ -117,7 +117,7 @@ def linear_start(cost: RangeCost) -> tuple[FloatArray, FloatArray]:
 def points_start(
     ranges: FloatArray, weights: FloatArray, anchors: FloatArray, tags: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """A pose (..., 3, 3), (..., 3) from squared ranges: `points_fit`; NaN where there is none."""
+    """Return a pose (..., 3, 3), (..., 3) from squared ranges by `points_fit`; NaN if none."""
     # To first order var(r^2) = 4 r^2 var(r).
     ranges = np.where(weights > 0, ranges, 1.0)
     squared = weights / (4 * ranges**2)
@@ -135,18 +135,18 @@ def most_likely_pose(
     net: FloatArray,
     room: FloatArray,
 ) -> tuple[Any, ...]:
-    """`maximum_likelihood` as arrays.
+    """Return `maximum_likelihood` as plain arrays, for the kernel.
 
     Parameters
     ----------
     ranges, weights, anchors, tags
         As of `RangeCost`.
     rotation, translation
-        Starts, NaN where there are none.
+        Starts; NaN for none.
     net
         Rotations (S, 3, 3) to search from.
     room
-        (K, 6), for as many alternatives; its values are not looked at.
+        (K, 6), for K alternatives; its values are not used.
 
     Returns
     -------
@@ -178,17 +178,17 @@ def _most_likely_pose(
 
 
 def chunks(where: BoolArray) -> list[np.ndarray]:
-    """The mask as indices, in parts: the starts of a search multiply the memory."""
+    """Split a mask into parts as indices, because the starts of a search multiply the memory."""
     index = np.flatnonzero(where)
     return [index[k : k + 128] for k in range(0, len(index), 128)]
 
 
 def in_doubt(cost: RangeCost, at: Linearization) -> BoolArray:
-    """Whether a solution may not be the global one: poor geometry, or a cost too high."""
+    """Return whether a solution may not be global: poor geometry, or too high a cost."""
     free = (cost.weights > 0).sum(axis=(-2, -1)) - 6 - cost.offsets()
     excess = 2 * at.cost - free
     high = excess > _SUSPICIOUS * np.sqrt(2 * np.maximum(free, 1))
-    # The root of the covariance's trace: at most sqrt(3) times the largest standard deviation.
+    # Square root of the covariance's trace: at most sqrt(3) times the largest standard deviation.
     trace = np.einsum("...ii->...", positive_inverse(at.hessian)[..., :3, :3])
     spread = cost.anchors - cost.anchors.mean(axis=-2, keepdims=True)
     squares = np.linalg.eigvalsh(np.swapaxes(spread, -1, -2) @ spread)
@@ -200,20 +200,20 @@ def in_doubt(cost: RangeCost, at: Linearization) -> BoolArray:
 def search(
     part: RangeCost, first: tuple[FloatArray, FloatArray], usable: BoolArray, net: FloatArray
 ) -> tuple[Solution, Alternatives]:
-    """The best of many local solves, and its rivals.
+    """Return the best of many local searches, and its rivals.
 
     Parameters
     ----------
     part
         Trials (K, 1, ...).
     first, usable
-        Solutions (K, 3, 3), (K, 3) that are known already, and which of them count.
+        Known solutions (K, 3, 3), (K, 3), and which of them are valid.
     net
         Rotations (S, 3, 3) to start from.
     """
     fine = local_minima(part, first, usable, net)
     best = cheapest(fine)
-    # Where many poses are nearly as good the way along the valley is long.
+    # In a flat valley of many nearly equal poses, convergence is slow.
     polished = minimize(part, best.rotation[:, None], best.translation[:, None], 100)
     return cheapest(polished), rivals(part.tags, fine)
 
@@ -225,10 +225,10 @@ def local_minima(
     net: FloatArray,
     starts: int = _STARTS,
 ) -> Solution:
-    """Distinct minima (K, 8), cheapest first; an infinite cost where there are fewer.
+    """Return distinct minima (K, 8), least cost first; infinite cost for unused slots.
 
-    The first solution, and so many `starts` at each of three places: the cheapest rotations of
-    the net. Arguments as `search`.
+    Starts are the first solution and, at each of three positions, the best `starts` rotations of
+    the net. Other arguments as in `search`.
     """
     rotation, translation = _starts(part, net, starts)
     rotation = np.concatenate([rotation, first[0][:, None]], axis=1)
@@ -240,7 +240,7 @@ def local_minima(
     coarse = _rows(coarse, order)
     cost = np.take_along_axis(cost, order, axis=-1)
     distinct = _first_of_each(part.tags, coarse, cost < np.inf, _NEAR)
-    # The distinct ones first, in their order.
+    # Distinct minima first, in their order.
     keep = np.argsort(~distinct, axis=-1, kind="stable")[:, :_MINIMA]
     kept = _rows(coarse, keep)
     fine = minimize(part, kept.rotation, kept.translation, 25)
@@ -251,7 +251,7 @@ def local_minima(
 
 
 def _starts(part: RangeCost, net: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """The cheapest poses (K, 3 count) of a net's rotations at each of three places."""
+    """Return the best poses (K, 3 count), `count` rotations of a net at each of three positions."""
     if part.offset is None:
         places = candidate_places(part.ranges[:, 0], part.weights[:, 0], part.anchors[:, 0])
     else:
@@ -268,10 +268,10 @@ def _starts(part: RangeCost, net: FloatArray, count: int) -> tuple[FloatArray, F
 
 
 def candidate_places(ranges: FloatArray, weights: FloatArray, anchors: FloatArray) -> FloatArray:
-    """Candidate places (K, 3, 3) of the tags' centre: linear, and on both sides of the plane.
+    """Return positions (K, 3, 3) of the tags' centre: linear, and on both sides of the plane.
 
-    From the mean squared range of every anchor; the plane is that of least spread of the
-    anchors, across which the linear solution knows little or nothing.
+    They come from the mean squared range of every anchor. The plane is the best fit to the
+    anchors; the linear solution determines little or nothing across it.
     """
     measured = weights > 0
     count = np.maximum(measured.sum(axis=-1), 1)
@@ -288,12 +288,12 @@ def candidate_places(ranges: FloatArray, weights: FloatArray, anchors: FloatArra
     known = values > 1e-9 * values[:, 2:]
     along = np.where(known, along / np.where(known, values, 1.0), 0.0)
     flat = along * [0, 1, 1]
-    # What is left of the squared ranges in the plane is the squared height over it.
+    # The remainder of the squared ranges in the plane is the squared height over it.
     in_plane = (axes @ flat[..., None])[..., 0]
     gaps = np.sum((anchors - mean[:, None] - in_plane[:, None]) ** 2, axis=-1)
     height = np.sqrt(np.maximum((((squared - gaps) * seen).sum(axis=-1) / total[:, 0]), 0.0))
     normal = axes[..., 0] * height[:, None]
-    # Which side comes first must not depend on the sign of an eigenvector.
+    # The order of the sides must not depend on the sign of an eigenvector.
     largest = np.take_along_axis(normal, np.abs(normal).argmax(axis=-1)[:, None], axis=-1)
     normal = np.where(largest < 0, -normal, normal)
     linear = (axes @ along[..., None])[..., 0]
@@ -301,10 +301,10 @@ def candidate_places(ranges: FloatArray, weights: FloatArray, anchors: FloatArra
 
 
 def _first_of_each(tags: FloatArray, poses: Solution, there: BoolArray, share: float) -> BoolArray:
-    """Which poses (K, S) are not the same as one before them that is counted itself.
+    """Return which poses (K, S) differ from all kept poses before them.
 
-    Tags (K, 1, N, 3); those of two poses that are the same are closer than a `share` of the
-    body's size. Only poses that are `there` count.
+    Two poses are the same if their tags (K, 1, N, 3) are closer than a `share` of the body's size.
+    Only poses marked in `there` count.
     """
     positions = _TAG_POSITIONS(poses.rotation, poses.translation, tags)
     gap = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1).max(axis=-1)
@@ -317,7 +317,7 @@ def _first_of_each(tags: FloatArray, poses: Solution, there: BoolArray, share: f
 
 
 def _rows(poses: Solution, order: np.ndarray) -> Solution:
-    """Poses (K, S) in the order (K, n) of each trial."""
+    """Return poses (K, S) in the order (K, n) of each trial."""
     rows = np.arange(len(order))[:, None]
     at = Linearization(*(field[rows, order] for field in poses.at))
     return Solution(
@@ -329,15 +329,15 @@ def _rows(poses: Solution, order: np.ndarray) -> Solution:
 
 
 def cheapest(solutions: Solution) -> Solution:
-    """The cheapest of the starts (K, S) of every trial."""
+    """Return the solution of least cost among the starts (K, S) of every trial."""
     best = _rows(solutions, np.argmin(solutions.at.cost, axis=-1)[:, None])
     at = Linearization(*(field[:, 0] for field in best.at))
     return Solution(best.rotation[:, 0], best.translation[:, 0], at, best.converged[:, 0])
 
 
 def rivals(tags: FloatArray, solutions: Solution) -> Alternatives:
-    """Distinct minima (K, S) that are about as cheap as the best; tags (K, 1, N, 3)."""
-    # Stable: of exact mirror images `cheapest` takes the first too.
+    """Return distinct minima (K, S) about as likely as the best; tags (K, 1, N, 3)."""
+    # Stable sort, because `cheapest` also takes the first of exact mirror images.
     order = np.argsort(solutions.at.cost, axis=-1, kind="stable")
     sorted_ = _rows(solutions, order)
     cost = sorted_.at.cost
@@ -356,7 +356,7 @@ def rivals(tags: FloatArray, solutions: Solution) -> Alternatives:
 
 
 def merge(solution: Solution, found: Solution, where: np.ndarray) -> Solution:
-    """`solution` with the trials at an index replaced by `found`."""
+    """Return `solution` with the trials at an index replaced by `found`."""
 
     def put(old: Any, new: Any) -> Any:
         result = np.array(old)

@@ -1,4 +1,4 @@
-"""Location of a body from ranges of which some are wrong; flat problems, batch axis (B,)."""
+"""Robust localization from ranges with outliers; flat problems, batch axis (B,)."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from rbl_gym.estimators.locating.maximum_likelihood import (
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 
 _HUBER = 1.5
-# Standard deviations to which Geman and McClure's loss is narrowed.
+# Final scale of the Geman-McClure loss, in standard deviations.
 _NARROWEST = 3.0
-# A robust fit that fewer of its ranges agree with is searched for again.
+# A robust fit with a smaller fraction of inliers is searched for again.
 _TRUSTED_INLIERS = 0.65
 
 
 def robust(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray
 ) -> tuple[Solution, Alternatives]:
-    """Pose from ranges of which some are wrong: Huber, Geman-McClure, a refit on the inliers.
+    """Return the pose from ranges with outliers: Huber, Geman-McClure, a refit on inliers.
 
-    Geman and McClure's loss is narrowed step by step (graduated non-convexity), so that the
-    start need not be near. Where few ranges agree with the outcome, many starts are tried and
-    the one with the least bounded loss is kept. Ranges beyond 4 standard deviations of that fit
-    are left out of the maximum-likelihood refit.
+    The scale of the Geman-McClure loss decreases step by step (graduated non-convexity), so that
+    the start need not be near. If few ranges agree with the result, many starts are tried and the
+    one with the least bounded loss is kept. Ranges beyond 4 standard deviations of that fit are
+    left out of the maximum-likelihood refit.
     """
     rotation, translation = _stand_ins(rotation, translation, cost.anchors)
     easy = dataclasses.replace(cost, loss=huber(_HUBER))
@@ -53,7 +53,7 @@ def robust(
         usable = np.ones(len(rows), bool)
         minima = local_minima(part, first, usable, ROTATION_NET, starts=len(ROTATION_NET))[:2]
         starts = zip(minima, _without_pairs_of_anchors(part), strict=True)
-        # From the median residual on: a wide loss would lead them all to the same wrong place.
+        # Start at the median residual: a wide loss would lead all starts to the same wrong pose.
         narrowed = _narrow(part, *(np.concatenate(pair, axis=1) for pair in starts), widest=0.5)
         solution = merge(solution, cheapest(narrowed), rows)
     weights = np.where(_inliers(cost, solution), cost.weights, 0.0)
@@ -64,7 +64,7 @@ def robust(
 def robust_late(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray
 ) -> tuple[Solution, Alternatives]:
-    """Pose from ranges that err late rather than early: `robust`, then the redescending loss."""
+    """Return the pose from ranges with late outliers: `robust`, then the redescending loss."""
     found, alternatives = robust(cost, rotation, translation)
     late = dataclasses.replace(cost, loss=LATE)
     better = minimize(late, found.rotation, found.translation, iterations=20)
@@ -74,7 +74,7 @@ def robust_late(
 def _stand_ins(
     rotation: FloatArray, translation: FloatArray, anchors: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses with the identity among the anchors where they are not finite."""
+    """Replace poses that are not finite by the identity at the anchors' centre."""
     known = are_finite(translation, 1) & are_finite(rotation, 2)
     return (
         np.where(known[..., None, None], rotation, np.eye(3)),
@@ -83,8 +83,8 @@ def _stand_ins(
 
 
 def _inliers(cost: RangeCost, solution: Solution) -> BoolArray:
-    """Links (..., M, N) within 4 standard deviations of a solution."""
-    # Squares would give an offset that wrong ranges have moved.
+    """Return links (..., M, N) within 4 standard deviations of a solution."""
+    # Least squares would give an offset biased by outliers.
     cost = dataclasses.replace(cost, loss=geman_mcclure(_NARROWEST))
     squared = squared_residuals(cost, solution.rotation, solution.translation)
     return (squared < 16.0) & (cost.weights > 0)
@@ -93,7 +93,7 @@ def _inliers(cost: RangeCost, solution: Solution) -> BoolArray:
 def _narrow(
     cost: RangeCost, rotation: FloatArray, translation: FloatArray, widest: float
 ) -> Solution:
-    """Geman-McClure from the quantile `widest` of the residuals to 3 standard deviations."""
+    """Minimise Geman-McClure, from the quantile `widest` of residuals to 3 standard deviations."""
     residuals = np.sqrt(squared_residuals(cost, rotation, translation))
     scale = np.maximum(np.quantile(residuals, widest, axis=(-2, -1)), _NARROWEST)
     while True:
@@ -106,9 +106,9 @@ def _narrow(
 
 
 def _without_pairs_of_anchors(part: RangeCost) -> tuple[FloatArray, FloatArray]:
-    """Linear solutions (K, S, ...) with two anchors left out: one of them has no bad anchor.
+    """Return linear solutions (K, S, ...), each without two anchors, so that one has no bad anchor.
 
-    All pairs among the first 10 anchors; with fewer than 6 anchors nothing can be left out.
+    These are all pairs among the first 10 anchors. With fewer than 6 anchors none is left out.
     """
     n_anchors = part.anchors.shape[-2]
     if n_anchors < 6 or part.offset is not None:
@@ -118,5 +118,5 @@ def _without_pairs_of_anchors(part: RangeCost) -> tuple[FloatArray, FloatArray]:
     kept[np.arange(len(pairs))[:, None], pairs, 0] = False
     squared = part.weights / (4 * np.where(part.weights > 0, part.ranges, 1.0) ** 2)
     found = points_fit(statistic(part.ranges, part.anchors, part.tags, squared * kept))
-    # The anchors that are left may lie in a plane: then there is no linear solution.
+    # If the remaining anchors are coplanar, there is no linear solution.
     return _stand_ins(*found, part.anchors)

@@ -1,4 +1,4 @@
-"""A coarse net over SO(3) to start local searches from."""
+"""Coarse net over SO(3) from which local searches start."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rbl_gym.geometry import rotations
 
 
 def _octahedral_group() -> FloatArray:
-    """The 24 rotations of the cube: no rotation is farther than 62.8 degrees from one of them."""
+    """Return the 24 rotations of the cube; every rotation is within 62.8 degrees of one."""
     quarter = [rotations.exp(0.5 * np.pi * axis) for axis in np.eye(3)]
     group = [np.eye(3)]
     for element in group:

@@ -1,11 +1,11 @@
-"""The DOA paper's competitors: heuristic searches over the distances of the tags.
+"""Competitors of the DOA paper: heuristic searches over the distances of the tags.
 
-With the directions known, K distances from the base station say where K tags are; what is
-searched for is the K distances whose places are as far from each other as the tags are on the
-body. The paper names the two searches and gives neither objective nor parameters. Ours minimise
-``sum_ij (|d_i u_i - d_j u_j| - |c_i - c_j|)^2``; the y of all tags has one sign. What else was
-assumed stands in the two classes. Population, steps, reach and the share of new individuals were
-tuned once for the share of poses near the truth.
+With known directions, K distances from the base station determine the positions of K tags. The
+searches find K distances for which the distances between tags match those on the body. The paper
+names the two searches but gives neither objective nor parameters. Ours minimise ``sum_ij (|d_i u_i
+- d_j u_j| - |c_i - c_j|)^2``; the y of all tags has one sign. The two classes list the other
+assumptions. Population, steps, reach and the fraction of new individuals were tuned once for the
+fraction of poses near the truth.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from rbl_gym.measurements import bearing
 
 # Objective (B, P) of normalised distances (K, B, P).
 Objective = Callable[[FloatArray], FloatArray]
-# A search counts as converged where its best distances moved less than this (units of the body's
-# size) over the last quarter of its steps.
+# A search has converged if its best distances moved less than this (units of the body's size) over
+# the last quarter of its steps.
 _STILL = 1e-3
-_SMALLEST_RAD = 1e-4  # angle between directions that tells a distance
+_SMALLEST_RAD = 1e-4  # least angle between directions that bounds a distance
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ParticleSwarm:
     def search(
         self, objective: Objective, shape: tuple[int, int], rng: np.random.Generator
     ) -> Iterator[FloatArray]:
-        """The best distances (K, B) after each step, in units of `reach`."""
+        """Return the best distances (K, B) after each step, in units of `reach`."""
         x = rng.random((*shape, self.size))
         velocity = np.zeros_like(x)
         best, best_cost = x.copy(), objective(x)
@@ -63,14 +63,14 @@ class ParticleSwarm:
 
 @dataclass(frozen=True)
 class ParticipatorySearch:
-    """Participatory search algorithm (Liu and Gomide, Evolving Intelligence 10, 2017), as sketched.
+    """Participatory search algorithm (Liu and Gomide, Evolving Intelligence 10, 2017), as outlined.
 
-    A pool of individuals on [0, 1]^K; compatibility of two is one minus their mean absolute
-    difference. At every step, of each individual s and a random other one s': p_s is the one more
-    compatible with the best; ``p_r = s + alpha rho^(1-a) (s' - s)`` recombines them by the
-    participatory learning rule, rho their compatibility; ``p_m = best + rho^(1-a) (p_s - p_r)``
-    mutates, rho that of p_s and p_r; p_m stays where it is better than s. The worst tenth then
-    gives way to new random individuals.
+    The pool consists of individuals on [0, 1]^K. The compatibility of two is one minus their mean
+    absolute difference. Each step pairs every individual s with a random other one s'. Of the two,
+    p_s is the one more compatible with the best. ``p_r = s + alpha rho^(1-a) (s' - s)`` recombines
+    them by the participatory learning rule, with rho their compatibility. ``p_m = best + rho^(1-a)
+    (p_s - p_r)`` mutates, with rho that of p_s and p_r. p_m replaces s if it is better. New random
+    individuals then replace the worst tenth.
 
     Assumed: 400 individuals, 200 steps, alpha = 0.5 (learning rate), a = 0 (no arousal),
     distances up to the largest that the directions allow, and the new tenth.
@@ -86,7 +86,7 @@ class ParticipatorySearch:
     def search(
         self, objective: Objective, shape: tuple[int, int], rng: np.random.Generator
     ) -> Iterator[FloatArray]:
-        """The best distances (K, B) after each step, in units of `reach`."""
+        """Return the best distances (K, B) after each step, in units of `reach`."""
         x = rng.random((*shape, self.size))
         cost = objective(x)
         power = 1 - self.arousal
@@ -115,16 +115,17 @@ def search_places(
     angle_std_rad: FloatArray,
     rng: np.random.Generator,
 ) -> Places:
-    """Places (B, K, 3) of the tags, y >= 0, by a search, and the step it came to rest at.
+    """Search for tag positions (B, K, 3), y >= 0; return them and the step of convergence.
 
     Parameters
     ----------
     search
-        Which.
+        The search.
     angles, tags, angle_std_rad
-        (B, 2, K), (B, K, 3) and (B,): directions, the body, the noise of the angles.
+        (B, 2, K), (B, K, 3) and (B,): directions, tags in the body frame, standard deviation of
+        the angles.
     rng
-        Source of all that is drawn.
+        Random generator.
     """
     unit = body_size(tags)
     rays = bearing.directions(angles)
@@ -158,10 +159,10 @@ def search_places(
 def _farthest(
     pairs: np.ndarray, lengths: FloatArray, cosines: FloatArray, std_rad: FloatArray
 ) -> FloatArray:
-    """Largest distance (K, B) of every tag: ``d_i sin(i, j) <= |c_i - c_j|``, law of sines.
+    """Return the largest distance (K, B) of every tag by ``d_i sin(i, j) <= |c_i - c_j|``.
 
-    The angle between two directions is taken 3 standard deviations smaller than measured. Beyond a
-    right angle ``d_i <= |c_i - c_j|``.
+    This is the law of sines. The angle between two directions is reduced by 3 standard deviations.
+    Beyond a right angle the bound is ``d_i <= |c_i - c_j|``.
     """
     between = np.arccos(np.clip(cosines, -1, 1)) - 3 * np.sqrt(2) * std_rad
     most = lengths / np.sin(np.clip(between, _SMALLEST_RAD, np.pi / 2))
@@ -172,7 +173,7 @@ def _farthest(
 
 
 def _at(x: FloatArray, index: np.ndarray) -> FloatArray:
-    """The individuals (K, B) at an index (B,) into (K, B, P)."""
+    """Return the individuals (K, B) at an index (B,) into (K, B, P)."""
     return np.take_along_axis(x, index[None, :, None], axis=-1)[..., 0]
 
 

@@ -19,7 +19,7 @@ from rbl_gym.motion.unknown_twist import WanderingTwist
 
 __all__ = ["KnownTwist", "Motion", "UnknownTwist"]
 
-# Inputs of these functions were already checked, or were made here.
+# Called without input checks: the inputs were checked before, or made here.
 _EXP, _LOG = kernel(rotations.exp), kernel(rotations.log)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
 

@@ -17,7 +17,7 @@ from rbl_gym.motion import navigation
 
 __all__ = ["OdometryMotion", "padded"]
 
-# Inputs of these functions were already checked, or were made here.
+# Called without input checks: the inputs were checked before, or made here.
 _EXP, _LOG, _HAT = kernel(rotations.exp), kernel(rotations.log), kernel(rotations.hat)
 _LEFT_JACOBIAN = kernel(rotations.left_jacobian)
 _LEFT_JACOBIAN_INVERSE = kernel(rotations.left_jacobian_inverse)
