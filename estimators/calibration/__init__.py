@@ -1,4 +1,4 @@
-"""Calibration from logs: biases of links, lever arms, clocks; batch least squares on arrays."""
+"""Calibration from logs by batch least squares: link biases, lever arms, clocks, surveys."""
 
 from rbl_gym.estimators.calibration.clock import Clock, find_clock
 from rbl_gym.estimators.calibration.link_equations import KnownPath, LinkModel

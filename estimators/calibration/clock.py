@@ -1,7 +1,7 @@
-"""The clock of a path against that of ranges, by the changes of the ranges.
+"""Time offset between a path and ranges, from the changes of the ranges.
 
-A range that changes tells when the body moved, whatever its bias. Changes over a fraction of a
-second are free of what lasts longer: biases, slow multipath, lever arms that are a little off.
+The change of a range shows when the body moved, whatever the bias. Changes over a fraction of a
+second do not depend on slower errors: biases, slow multipath, small errors of lever arms.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from rbl_gym.estimators.calibration import robust
 
 __all__ = ["Clock", "find_clock"]
 
-# Changes are over one of these many seconds, or from a range of a link to the next, up to so many
-# times it. Longer ones tell more of a clock, and shorter ones are freer of what lasts.
+# Changes are over one of these intervals (s), or between successive ranges of a link, up to this
+# multiple of it. Longer ones carry more information, shorter ones contain less of slow errors.
 _LAGS_S, _LONGEST = (0.2, 0.4, 0.8), 3.0
 _SEARCH_STEP_S, _FEWEST, _BLOCK_S = 0.1, 30, 2.0
-# Half-width of the difference that gives rates (s).
+# Half-width of the finite difference for rates (s).
 _HALF_S = 0.02
 _LEAST_M = 1e-4
 
@@ -29,7 +29,7 @@ Places = Callable[[float], tuple[FloatArray, BoolArray]]
 
 
 class Clock(NamedTuple):
-    """Seconds by which a path's stamps are ahead of the ranges', and the standard deviation."""
+    """Seconds by which the path's time stamps are ahead of the ranges', with standard deviation."""
 
     offset_s: float
     std_s: float
@@ -42,25 +42,25 @@ def find_clock(
     distances: Places,
     search_s: float,
 ) -> Clock | None:
-    """The shift in time at which distances along a path change as the ranges do.
+    """Estimate the time shift at which distances along a path change as the ranges do.
 
     Parameters
     ----------
     times
         (K,) seconds of the ranges.
     ranges, links
-        (K, M, N) metres, and where there is a range.
+        (K, M, N) metres, and a mask of the measured ranges.
     distances
-        Of a shift: distances (K, M, N) at ``times + shift`` along the path, and where they are
-        known (K,).
+        Function of a shift. It returns distances (K, M, N) at ``times + shift`` along the path, and
+        a mask (K,) of epochs with known distances.
     search_s
         Shifts up to this are tried, in both directions.
 
     Returns
     -------
     Clock
-        What has stamp t of the ranges has ``t + offset_s`` on the path. None where too few ranges
-        change to tell.
+        An event at time t of the ranges is at ``t + offset_s`` on the path. None if too few ranges
+        change to estimate it.
     """
     K = len(times)
     flat, used = ranges.reshape(K, -1), links.reshape(K, -1)
@@ -83,25 +83,25 @@ def find_clock(
 
 
 class _Changes(NamedTuple):
-    """How P ranges change, and how distances do at a shift."""
+    """Changes of P ranges, and a function of the predicted changes at a shift."""
 
     times: FloatArray  # (P,)
     change: FloatArray  # (P,) metres
     foretold: Callable[[float], tuple[FloatArray, BoolArray]]
 
     def left(self, shift: float) -> tuple[FloatArray, BoolArray]:
-        """What is left of the changes at a shift, and where that is known."""
+        """Return the residual changes at a shift, and a mask of the known ones."""
         foretold, known = self.foretold(shift)
         return self.change - foretold, known
 
     def spread(self, shift: float) -> float:
-        """Robust standard deviation of what is left."""
+        """Return the robust standard deviation of the residual changes."""
         e, known = self.left(shift)
         return float(robust.spread(e, known, _LEAST_M)) if known.sum() >= _FEWEST else np.inf
 
 
 def _refined(changes: _Changes, start: float) -> Clock | None:
-    """The shift near `start` that leaves least, and its standard deviation."""
+    """Return the shift near `start` with the least residuals, and its standard deviation."""
     std = changes.spread(start)
 
     def cost(shift: float) -> float:
@@ -117,7 +117,7 @@ def _refined(changes: _Changes, start: float) -> Clock | None:
     rate = changes.left(offset - _HALF_S)[0] - changes.left(offset + _HALF_S)[0]
     rate = (rate / (2 * _HALF_S * std))[known]
     z = (e / std)[known]
-    # Changes overlap, and errors last: scores are summed over stretches of time first.
+    # Changes overlap and errors are correlated, so scores are summed over blocks of time first.
     block = np.unique((changes.times[known] // _BLOCK_S).astype(int), return_inverse=True)[1]
     score = np.bincount(block, z * robust.share_of(z) * rate)
     information = float((rate**2).sum())
@@ -129,7 +129,7 @@ def _refined(changes: _Changes, start: float) -> Clock | None:
 def _changes(
     times: FloatArray, links: BoolArray, ranges: FloatArray, distances: Places, lag_s: float
 ) -> _Changes | None:
-    """Changes of the ranges (K, L) of each link over a lag; None where there are too few."""
+    """Return the changes of the ranges (K, L) of each link over a lag; None if too few."""
     found = []
     for link in range(links.shape[1]):
         at = np.flatnonzero(links[:, link])

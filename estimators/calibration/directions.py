@@ -1,9 +1,9 @@
-"""Bias and deviation of ranges as functions of the direction in which a ray leaves the body.
+"""Bias and standard deviation of ranges as functions of the ray's direction in the body frame.
 
-Bodies block their own radios: a ray that leaves through the body is late, and varies more. Bias
-and logarithm of the deviation are a few harmonics of the bearing of the ray at each end, one law
-for all antennas; the bearing counts from where the antenna points away from its body's origin, or
-from the x axis. Evaluated at the pose that is estimated, it is part of the measurement model.
+Bodies block their own radios: a ray through the body is late and has more noise. Bias and logarithm
+of the standard deviation are a few harmonics of the ray's bearing at each end. One model holds for
+all antennas. The bearing is relative to the direction of the antenna from its body's origin, or to
+the x axis. The model is evaluated at the estimated pose, as part of the measurement model.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
     "locate_by_directions",
 ]
 
-# Scales of the coefficients that the ridge refers to: metres of bias, logarithm of the deviation.
+# Scales of the coefficients for the ridge: metres of bias, logarithm of the standard deviation.
 _BIAS_M, _LOG = 0.2, 1.0
 _LEAST_STD_M = 0.01
 _HEADINGS, _ITERATIONS = 12, 30
@@ -37,17 +37,17 @@ _STEP = 1e-5
 
 @dataclass(frozen=True)
 class DirectionBasis:
-    """What bias and deviation are functions of.
+    """Harmonics that model bias and standard deviation.
 
     Parameters
     ----------
     harmonics
-        Of the bearing at each end; 0: constants alone.
+        Number of harmonics of the bearing at each end; 0: constants alone.
     zero
-        Bearings count from ``"antenna"``, its direction from the body's origin, or ``"body"``, the
-        x axis.
+        Zero of the bearings: ``"antenna"``, its direction from the body's origin, or ``"body"``,
+        the x axis.
     ends
-        ``"both"`` ends, or the ``"tags"`` alone: of anchors that hang on walls.
+        ``"both"`` ends, or the ``"tags"`` alone, for anchors on walls.
     """
 
     harmonics: int = 1
@@ -61,10 +61,10 @@ class DirectionBasis:
 
 
 class DirectionModel(NamedTuple):
-    """Coefficients (F,) of the bias, metres, and of the logarithm of the deviation.
+    """Coefficients (F,) of the bias, metres, and of the logarithm of the standard deviation.
 
-    The first is the constant; then cosine and sine of each harmonic at the anchors' end, if it
-    counts, and at the tags' end.
+    The first is the constant. Cosine and sine of each harmonic follow, at the anchors' end, if
+    included, then at the tags' end.
     """
 
     basis: DirectionBasis
@@ -82,28 +82,28 @@ def fit_directions(
     basis: DirectionBasis = DirectionBasis(),
     ridge: float = 0.05,
 ) -> DirectionModel:
-    """Bias and deviation by ranges at known poses: maximum likelihood with a ridge.
+    """Estimate bias and standard deviation from ranges at known poses, with a ridge penalty.
 
-    Errors are Gaussian on the early side and Cauchy on the late side.
+    The estimate is maximum likelihood. Early errors are Gaussian, late errors Cauchy.
 
     Parameters
     ----------
     ranges, links
-        (K, M, N) metres, and where there is a range.
+        (K, M, N) metres, and a mask of the measured ranges.
     anchors, tags
         (M, 3) and (N, 3), each in the frame of its own body.
     rotation, translation
         (K, 3, 3) and (K, 3): the pose of the tags' body in the anchors' frame.
     basis
-        Harmonics.
+        The harmonics.
     ridge
-        Weight of a range that draws each harmonic to zero, over that of a range of the log; the
-        constants are free.
+        Weight of the penalty on each harmonic, relative to that of one range of the log. The
+        constants have no penalty.
 
     Raises
     ------
     ValueError
-        Without a range.
+        If there is no range.
     """
     ranges = check_array("ranges", ranges, ("K", "M", "N"))
     mask = np.asarray(links, dtype=bool) & (ranges > 0)
@@ -141,7 +141,7 @@ def _fitted(e: FloatArray, F: FloatArray, basis: DirectionBasis, ridge: float) -
 
 
 def _late_loss(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Loss and its derivative: squares for early residuals, Cauchy's for late ones."""
+    """Return the loss and its derivative: squares for early residuals, Cauchy for late ones."""
     late = z > 0
     tail = 1 + 0.5 * z * z
     return np.where(late, np.log(tail), 0.5 * z * z), np.where(late, z / tail, z)
@@ -159,31 +159,30 @@ def choose_basis(
     ridge: float = 0.05,
     parts: int = 4,
 ) -> tuple[DirectionBasis, FloatArray]:
-    """The simplest basis that places epochs left out about as well as the best one does.
+    """Choose the simplest basis that locates held-out epochs about as well as the best basis.
 
     Parameters
     ----------
     ranges, links, anchors, tags, rotation, translation, ridge
-        As of `fit_directions`.
+        As in `fit_directions`.
     candidates
-        Bases that are tried, the simplest first.
+        Candidate bases, the simplest first.
     level
-        As of `locate_by_directions`.
+        As in `locate_by_directions`.
     parts
-        The log is cut into so many stretches of time; each is left out once.
+        Number of intervals of time into which the log is split; each is held out once.
 
     Returns
     -------
     basis
-        The first candidate that falls short of the best by no more than one standard error of the
-        difference.
+        The first candidate within one standard error of the difference to the best.
     errors
-        (candidates, parts) mean horizontal error of the epochs left out, metres.
+        (candidates, parts) mean horizontal error of the held-out epochs, metres.
 
     Notes
     -----
-    Cross-validation with the rule of one standard error (Hastie, Tibshirani, Friedman, "The
-    Elements of Statistical Learning", 7.10). Add errors of several logs to choose by all of them.
+    Cross-validation with the one-standard-error rule (Hastie, Tibshirani, Friedman, "The
+    Elements of Statistical Learning", 7.10). To choose by several logs, add their errors.
     """
     arrays = map(np.asarray, (ranges, links, rotation, translation))
     r, there, Q, t = arrays
@@ -210,14 +209,14 @@ def direction_model_at(
     anchors: ArrayLike,
     tags: ArrayLike,
 ) -> tuple[FloatArray, FloatArray]:
-    """Bias and deviation (..., M, N) of the ranges at poses, metres.
+    """Return bias and standard deviation (..., M, N) of the ranges at poses, metres.
 
     Parameters
     ----------
     model
-        Of `fit_directions`.
+        Result of `fit_directions`.
     rotation, translation
-        (..., 3, 3) and (..., 3): the tags' body in the anchors' frame.
+        (..., 3, 3) and (..., 3): pose of the tags' body in the anchors' frame.
     anchors, tags
         (M, 3) and (N, 3), each in the frame of its own body.
     """
@@ -230,7 +229,7 @@ def direction_model_at(
 def _rays(
     rotation: FloatArray, translation: FloatArray, anchors: FloatArray, tags: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors (..., M, N, 3) from anchors to tags, and distances (..., M, N)."""
+    """Return unit vectors (..., M, N, 3) from anchors to tags, and distances (..., M, N)."""
     places = tags @ np.swapaxes(rotation, -1, -2) + translation[..., None, :]
     apart = places[..., None, :, :] - anchors[:, None]
     d = np.maximum(np.linalg.norm(apart, axis=-1), 1e-9)
@@ -244,7 +243,7 @@ def _features(
     anchors: FloatArray,
     tags: FloatArray,
 ) -> FloatArray:
-    """What the coefficients multiply (..., M, N, F)."""
+    """Return the basis functions (..., M, N, F) of the coefficients."""
     back = -np.einsum("...mni,...ij->...mnj", u, rotation)
     ends = [(u, anchors[:, None]), (back, tags)] if basis.ends == "both" else [(back, tags)]
     columns = [np.ones(u.shape[:-1])]
@@ -258,7 +257,7 @@ def _features(
 
 
 class _Told(NamedTuple):
-    """What is known of height and tilt."""
+    """Known height and tilt."""
 
     height_m: float
     height_std_m: float
@@ -280,27 +279,28 @@ def locate_by_directions(
     model: DirectionModel,
     level: Level,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Most likely pose of every epoch by itself, of a body about level at about one height.
+    """Estimate the most likely pose of each epoch separately, for a body that stays about level.
 
-    Bias and deviation are those of the rays at the pose. The search starts from twelve headings.
+    The height is about constant. Bias and standard deviation are those of the rays at the pose. The
+    search starts from twelve headings.
 
     Parameters
     ----------
     ranges, links
-        (K, M, N) metres, and where there is a range.
+        (K, M, N) metres, and a mask of the measured ranges.
     anchors, tags
         (M, 3) and (N, 3), each in the frame of its own body.
     model
-        Of `fit_directions`.
+        Result of `fit_directions`.
     level
-        Height and tilt as they are known in the anchors' frame.
+        Known height and tilt in the anchors' frame.
 
     Returns
     -------
     rotation, translation
         (K, 3, 3) and (K, 3).
     cost
-        (K,) negative log-likelihood, less its constant.
+        (K,) negative log-likelihood, up to a constant.
     """
     ranges = check_array("ranges", ranges, ("K", "M", "N"))
     mask = np.asarray(links, dtype=bool) & (ranges > 0)
@@ -334,7 +334,7 @@ def locate_by_directions(
 def _starts(
     ranges: FloatArray, mask: BoolArray, anchors: FloatArray, height: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (H, K, ...): towards where ranges are short, at the mean range, turned every way."""
+    """Return poses (H, K, ...) towards the short ranges, at the mean range, with H headings."""
     K = len(ranges)
     seen = mask.sum(axis=2)
     mean = (ranges * mask).sum(axis=2) / np.maximum(seen, 1)
@@ -373,7 +373,7 @@ def _step(
     model: DirectionModel, level: _Told, rotation: FloatArray, translation: FloatArray,
     now: _Found, damping: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Steps (H, K, 6) of the pose error."""
+    """Return steps (H, K, 6) of the pose error."""
     u, _ = _rays(rotation, translation, anchors, tags)
     arms = tags @ np.swapaxes(rotation, -1, -2)
     J = np.concatenate([np.cross(arms[..., None, :, :], u), u], axis=-1)

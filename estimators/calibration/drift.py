@@ -1,9 +1,9 @@
-"""Errors of links that last: white noise and a slow part, found in residuals and whitened.
+"""Correlated errors of links: estimate white noise and a slow part from residuals, and whiten them.
 
-Multipath moves as the body does: errors of one link are alike for a while. They are taken as the
-sum of white noise and a first-order Gauss-Markov process. The scalar Kalman filter of that process
-whitens residuals and the columns of a Jacobian alike, which makes least squares the maximum
-likelihood of the correlated errors.
+Multipath changes as the body moves, so errors of one link are correlated for some time. The model
+is the sum of white noise and a first-order Gauss-Markov process. The scalar Kalman filter of that
+process whitens both residuals and the columns of a Jacobian. Least squares is then maximum
+likelihood under the correlated errors.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import numpy as np
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators.calibration import robust
 
-# Longest lag that is looked at, in epochs; fewest pairs of residuals of a lag.
+# Longest lag, in epochs; least number of pairs of residuals at a lag.
 _LONGEST, _FEWEST = 3000, 30
-# Correlations below these are none.
+# Correlations below these count as zero.
 _NONE, _END = 0.1, 0.05
-# Time between epochs of more than so many of the usual ends a stretch.
+# A gap longer than this multiple of the usual interval ends a stretch.
 _GAP = 20.0
 _MOST_SHARE = 0.98
 
 
 class Drift(NamedTuple):
-    """The slow part of the errors: its share of the variance, and for how many seconds it lasts."""
+    """The slow part of the errors: its fraction of the variance, and its correlation time (s)."""
 
     share: float
     time_s: float
@@ -36,7 +36,7 @@ NO_DRIFT = Drift(0.0, 1.0)
 
 
 def stretches(times: FloatArray) -> list[slice]:
-    """Epochs (K,) without gaps or steps back in time between them."""
+    """Split epochs (K,) into slices without gaps or backward steps in time."""
     step = np.diff(times)
     forward = step[step > 0]
     usual = float(np.median(forward)) if len(forward) else 1.0
@@ -46,7 +46,7 @@ def stretches(times: FloatArray) -> list[slice]:
 
 
 def find_drift(z: FloatArray, used: BoolArray, times: FloatArray) -> Drift:
-    """The slow part of whitened residuals z (K, L), by their autocorrelation over all links."""
+    """Estimate the slow part of whitened residuals z (K, L) by autocorrelation over all links."""
     parts = stretches(times)
     lags = min(max(part.stop - part.start for part in parts), _LONGEST)
     psi = np.where(used, z * robust.share_of(z), 0.0)
@@ -66,7 +66,7 @@ def find_drift(z: FloatArray, used: BoolArray, times: FloatArray) -> Drift:
     near = rho[: max(3, int((rho > _END).argmin()))]
     if near.mean() < max(_NONE, float(noise[: len(near)].mean())):
         return NO_DRIFT
-    # To the first lag without correlation, and as far again.
+    # Use lags up to twice the first lag without correlation.
     end = 2 * (int(np.argmax(rho < _END)) if (rho < _END).any() else len(rho)) + 2
     rho, lag_s, weight = rho[:end], lag_s[:end], 1 / (1 + np.arange(end))[: len(rho[:end])]
     best, found = np.inf, NO_DRIFT
@@ -80,19 +80,19 @@ def find_drift(z: FloatArray, used: BoolArray, times: FloatArray) -> Drift:
 
 
 def _lagged(a: FloatArray) -> FloatArray:
-    """Sums over columns of products (K,) of a (K, L) with itself, lag by lag."""
+    """Return the autocorrelation sums (K,) of the columns of (K, L), lag by lag."""
     K = len(a)
     spectrum = np.fft.rfft(a, 1 << (2 * K - 1).bit_length(), axis=0)
     return np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=1))[:K]
 
 
 class Whitener:
-    """The scalar Kalman filters of the slow parts of L links, epoch after epoch, in pieces.
+    """Scalar Kalman filters of the slow parts of L links, run in successive blocks of epochs.
 
     Parameters
     ----------
     std
-        (L,) standard deviations of the errors, white and slow together.
+        (L,) standard deviations of the errors, white and slow parts together.
     drift
         The slow part.
     times
@@ -109,9 +109,9 @@ class Whitener:
         self._epoch = 0
 
     def whitened(self, columns: FloatArray, used: BoolArray, share: FloatArray) -> FloatArray:
-        """The next columns (k, L, C) with white errors of variance 1; 0 where not `used` (k, L).
+        """Return the next columns (k, L, C) with white unit-variance errors; 0 if not `used` (k, L).
 
-        `share` (k, L) of its weight that each range keeps.
+        `share` (k, L) is the fraction of its weight that each range keeps.
         """
         if not self._slow.any():
             return columns * np.sqrt(used * share / self._white)[..., None]

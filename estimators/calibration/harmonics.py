@@ -1,8 +1,8 @@
-"""Harmonics of bias and deviation by the direction of the ray, from residuals of a known path.
+"""Harmonics of bias and standard deviation by ray direction, from residuals along a known path.
 
-The residuals of links are regressed on cosines and sines of the bearing at each end; how many
-harmonics there are, and whether each node has its own, is chosen by how well stretches of time
-are foretold that were left out. Constants and slopes of the links are taken off first.
+The residuals of links are regressed on cosines and sines of the bearing at each end. The number of
+harmonics, and whether each node has its own, are chosen by the prediction of held-out intervals of
+time. Constants and slopes of the links are subtracted first.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ from rbl_gym.measurements.direction_bias import DirectionLaw
 
 __all__ = ["Candidate", "FoundDirections", "candidates_of", "fit_harmonics"]
 
-# Standard deviations that coefficients are thought to have: metres, logarithm of the deviation.
+# Prior standard deviations of coefficients: metres, logarithm of the standard deviation.
 _BIAS_M, _LOG = 0.05, 0.3
-# The mean of log|z| of a Gaussian, and its variance.
+# Mean and variance of log|z| for a standard Gaussian.
 _MEAN_LOG, _VARIANCE_LOG = -0.635, 1.2337
 _PARTS, _ROWS, _CELLS = 8, 60_000, 8_000_000
 _LEAST = 0.1
 
 
 class Candidate(NamedTuple):
-    """Harmonics at an end or both; ``shared``: one law for all antennas of a body, whose bearings
-    count from where the antenna points away from its body's origin.
+    """Harmonics at one end or both.
+
+    ``shared``: one model for all antennas of a body. Bearings are then relative to the direction of
+    the antenna from its body's origin.
     """
 
     harmonics: int
@@ -39,7 +41,7 @@ class Candidate(NamedTuple):
 
 
 def candidates_of(most: int = 4, ends: str = "tags") -> list[Candidate]:
-    """What is tried, the simplest first: none; shared by the antennas; each node by itself."""
+    """Return the candidates, the simplest first: none, shared by the antennas, one per node."""
     check_count("most", most, least=0, most=8)
     check_one_of("ends", ends, ("tags", "both"))
     kinds = itertools.product((True, False), range(1, most + 1))
@@ -52,15 +54,15 @@ class FoundDirections(NamedTuple):
     Attributes
     ----------
     law
-        Of all anchors and tags.
+        Model of all anchors and tags.
     bias, deviation
-        The candidates that were taken.
+        The chosen candidates.
     gain
-        Share of the variance of the residuals left out that the biases explain.
+        Fraction of the variance of held-out residuals that the biases explain.
     spread_m
         Root mean square of the tags' coefficients of the largest harmonic beyond the first, or of
-        the first where there is no other, metres: how large a first harmonic may be that looks
-        like a shift of the tags.
+        the first if there is no other, metres. It estimates the size of a first harmonic, which is
+        indistinguishable from a shift of the tags.
     """
 
     law: DirectionLaw
@@ -80,24 +82,24 @@ def fit_harmonics(
     lasting: float = 1.0,
     first: int = 1,
 ) -> FoundDirections:
-    """Bias and deviation by direction of the residuals of links.
+    """Estimate bias and standard deviation by direction from the residuals of links.
 
     Parameters
     ----------
     residuals, links
-        (K, M, N) metres, and where there is a range.
+        (K, M, N) metres, and a mask of the measured ranges.
     anchors, tags
         (M, 3) or (K, M, 3), and (N, 3) in the path's body frame.
     path
-        Of the body, at the epochs.
+        Path of the body, at the epochs.
     candidates
-        The simplest first; the first one that foretells the stretches left out as well as the
-        best one does, to one standard error, is taken.
+        The simplest first. The first one that predicts held-out intervals as well as the best one,
+        within one standard error, is chosen.
     lasting
-        For how many epochs an error of a link lasts.
+        Correlation length of a link's errors, in epochs.
     first
-        The first harmonic of the tags that is fitted: 2 where the tags' places are estimated by
-        themselves, which is the same as the first.
+        First harmonic of the tags to fit. Use 2 if the tag positions are estimated too, because
+        these are equivalent to the first harmonic.
     """
     rows = _Rows.of(residuals, links, anchors, tags, path, candidates)
     y = residuals[rows.epoch, rows.anchor, rows.tag]
@@ -120,7 +122,7 @@ def fit_harmonics(
 
 
 class _Rows(NamedTuple):
-    """Ranges that are looked at: what they are of, and the harmonics of their bearings."""
+    """Selected ranges: their indices, and the harmonics of their bearings."""
 
     epoch: np.ndarray  # (n,)
     anchor: np.ndarray
@@ -138,7 +140,7 @@ class _Rows(NamedTuple):
     ) -> _Rows:  # fmt: skip
         K, M, N = residuals.shape
         most = max(candidate.harmonics for candidate in candidates)
-        # Whole epochs, evenly spread: every link has its share.
+        # Whole epochs, evenly spaced, so that every link is represented.
         heard = np.flatnonzero(links.any(axis=(1, 2)))
         rows = max(min(_ROWS, _CELLS // max(2 * most * (M + N), 1)), 1)
         heard = heard[:: -(-int(links.sum()) // rows)]
@@ -165,7 +167,7 @@ class _Rows(NamedTuple):
         )  # fmt: skip
 
     def columns(self, candidate: Candidate, first: int) -> FloatArray:
-        """From a candidate's coefficients to those of the features (F, c)."""
+        """Return the matrix (F, c) from a candidate's coefficients to those of the features."""
         M, N = self.nodes
         most = self.features.shape[1] // (2 * (M + N)) if M + N else 0
         found = []
@@ -189,14 +191,14 @@ class _Rows(NamedTuple):
         )
 
     def by_node(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of the features as (M, 2 H) and (N, 2 H)."""
+        """Return the coefficients of the features as (M, 2 H) and (N, 2 H)."""
         M, N = self.nodes
         whole = coefficients.reshape(-1, M + N, 2).transpose(1, 0, 2).reshape(M + N, -1)
         return whole[:M], whole[M:]
 
 
 def _trimmed(bias: FloatArray, log_std: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Without the harmonics behind the last one that is not zero."""
+    """Drop the harmonics after the last nonzero one."""
     some = np.flatnonzero((bias != 0).any(axis=0) | (log_std != 0).any(axis=0))
     width = 2 * (some[-1] // 2 + 1) if len(some) else 0
     return bias[:, :width], log_std[:, :width]
@@ -206,7 +208,7 @@ def _chosen(
     rows: _Rows, y: FloatArray, weight: FloatArray, candidates: Sequence[Candidate],
     lasting: float, prior: float, first: int,
 ) -> tuple[FloatArray, Candidate, float]:  # fmt: skip
-    """Coefficients of the features, the candidate taken, and the share that it explains."""
+    """Return coefficients of the features, the chosen candidate, and its explained fraction."""
     X, y = _without_links(rows, weight, y)
     parts = [
         (X[at].T @ (weight[at, None] * X[at]), X[at].T @ (weight[at] * y[at]),
@@ -240,7 +242,7 @@ def _chosen(
 
 
 def _without_links(rows: _Rows, weight: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Features and values less what a constant and a slope of every link explain."""
+    """Remove a constant and a slope of every link from features and values."""
     both = np.concatenate([rows.features, y[:, None]], axis=1)
     link = rows.anchor * rows.nodes[1] + rows.tag
     order = np.argsort(link, kind="stable")

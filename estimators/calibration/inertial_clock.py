@@ -1,9 +1,9 @@
-"""The clock of an inertial sensor, by the accelerations of the path that ranges tell.
+"""Clock offset of an inertial sensor, from the accelerations of a path estimated from ranges.
 
-The gyroscope turns the specific forces of some seconds into one frame, gravity levels it, and its
-heading is free. What forces and accelerations of the path have between 0.1 and 2 s must agree, at
-the right offset, in every such window. The path needs no rotation for that; once one is found, it
-says where the tags are.
+In windows of some seconds, the gyroscope rotates the specific forces to one frame. Gravity levels
+this frame; its heading is unknown. At the right offset, forces and accelerations of the path agree
+in every window, in the band between 0.1 and 2 s. This needs no rotations along the path. Rotations
+found at the offset then give the positions of the tags.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from rbl_gym.geometry import rotations
 
 __all__ = ["InertialClock", "TaggedRanges", "inertial_clock"]
 
-# Seconds: of the grid, of both ends of the band, of a window of forces and between their starts.
+# Seconds: step of the grid, both ends of the band, length of a window and spacing of windows.
 _STEP_S, _FAST_S, _WINDOW_S, _HOP_S = 0.02, 0.12, 10.0, 2.5
-# The slow end of the band: at first, where peaks must not be missed, then, where errors of the
-# ranges that change slowly must not move them.
+# Slow end of the band: first, to find all peaks; then, so that slow errors of the ranges do not
+# move them.
 _SLOW_S, _REFINED_S = 2.0, 0.5
-# Seconds in which the noise of such a band is renewed, for each of the two horizontal axes.
+# Correlation time (s) of the noise in such a band, for each of the two horizontal axes.
 _RENEWED_S = np.sqrt(np.pi) * _FAST_S
-# What differs by less from the best is the same peak.
+# Offsets that differ from the best by less belong to the same peak.
 _PEAK_S = 0.25
-# A correlation below this is chance, and so is a log-likelihood that is higher by less than this.
+# Correlations and gains of log-likelihood below these count as chance.
 _LEAST, _GAIN = 0.3, 4.0
 _LONGEST_GAP_S = 0.1
-# How often the tags' places are found anew.
+# Number of times the tag positions are estimated anew.
 _ROUNDS = 5
 
 
 class TaggedRanges(NamedTuple):
-    """Ranges in the order of time: (K,) seconds, metres, their deviations; (K, 3) anchors and, in
-    the body frame, tags; (K,) which link each is of, from 0.
+    """Ranges in order of time.  (K,) seconds, metres, standard deviations; (K, 3) anchors, and tags
+    in the body frame; (K,) index of the link, from 0.
     """
 
     times: FloatArray
@@ -51,16 +51,16 @@ class TaggedRanges(NamedTuple):
 
 
 class InertialClock(NamedTuple):
-    """How far the clock of an inertial sensor is ahead of that of ranges.
+    """Time by which the clock of an inertial sensor is ahead of that of ranges.
 
     Attributes
     ----------
     offset_s, std_s
         The offset and its standard deviation, seconds.
     correlation
-        Of the accelerations there.
+        Correlation of the accelerations at the offset.
     rival_s, gain
-        The best offset elsewhere, and by how much the log-likelihood is higher than there.
+        The best offset of another peak, and the gain in log-likelihood over it.
     """
 
     offset_s: float
@@ -71,8 +71,10 @@ class InertialClock(NamedTuple):
 
 
 class _Window(NamedTuple):
-    """Some seconds of readings: step of the grid where it begins, forces (n, 3) in a level frame
-    (of the band), the body's rotations there (S, 3, 3) and their times (S,).
+    """Some seconds of readings.
+
+    First step of the grid, band-passed forces (n, 3) in a level frame, rotations (S, 3, 3) of the
+    body in it and their times (S,).
     """
 
     start: int
@@ -89,23 +91,23 @@ def inertial_clock(
     near_s: float = 0.0,
     search_s: float = 10.0,
 ) -> InertialClock:
-    """The offset at which readings of an inertial sensor fit the path of the tags.
+    """Estimate the offset at which readings of an inertial sensor fit the path of the tags.
 
     Parameters
     ----------
     told
-        Ranges, of one recording.
+        Ranges of one recording.
     times, readings
         (S,) on the sensor's clock; (S, 6), rad/s and m/s^2, in the axes of the body.
     start
-        About where the tags are at first (3,).
+        Approximate position (3,) of the tags at the start.
     near_s, search_s
-        Offsets up to `search_s` from `near_s` are tried.
+        Centre and half-width of the search for the offset, seconds.
 
     Raises
     ------
     ValueError
-        If the two have too little in common, do not agree anywhere, or as well at another offset.
+        If the overlap is too short, no offset fits, or another offset fits as well.
     """
     times, readings = check_array("times", times, ("S",)), check_array("readings", readings, (6,))
     search_s = check_number("search_s", search_s, low=0.0)
@@ -138,7 +140,7 @@ def inertial_clock(
 
 
 def _band(values: FloatArray, slow_s: float) -> FloatArray:
-    """What of values (n, 3) changes within the band."""
+    """Return the band-pass filtered values (n, 3)."""
     fast = scipy.ndimage.gaussian_filter1d(values, _FAST_S / _STEP_S, axis=0)
     return fast - scipy.ndimage.gaussian_filter1d(fast, slow_s / _STEP_S, axis=0)
 
@@ -146,7 +148,7 @@ def _band(values: FloatArray, slow_s: float) -> FloatArray:
 def _windows(
     times: FloatArray, readings: FloatArray, first_s: float, slow_s: float
 ) -> list[_Window]:
-    """Windows of readings on a grid that goes through `first_s`."""
+    """Return windows of readings on a grid through `first_s`."""
     found: list[_Window] = []
     elapsed = np.diff(times, prepend=times[0])
     edge, size = int(2 * _FAST_S / _STEP_S), int(_WINDOW_S / _STEP_S)
@@ -165,7 +167,7 @@ def _windows(
             turn[k] = turn[k - 1] @ steps[k]
         force = (turn @ readings[part, 3:, None])[..., 0]
         up = force.mean(axis=0)
-        # Roll and pitch of that frame, by the mean force in it; its yaw is as good as any.
+        # Roll and pitch of the frame come from its mean force; its yaw is arbitrary.
         across = np.cross(up, [0.0, 0.0, 1.0])
         angle = np.arctan2(np.linalg.norm(across), up[2])
         axis = across / max(float(np.linalg.norm(across)), 1e-12)
@@ -178,7 +180,7 @@ def _windows(
 
 
 def _agreement(moved: FloatArray, window: _Window) -> tuple[np.ndarray, FloatArray]:
-    """Of a window at every place of the path: products across, complex by its yaw, and upwards."""
+    """Correlate a window with the path at every shift: horizontal (complex) and vertical."""
     across = [a[:, 0] + 1j * a[:, 1] for a in (moved, window.force)]
     return (
         np.correlate(across[0], across[1], "valid"),
@@ -187,7 +189,7 @@ def _agreement(moved: FloatArray, window: _Window) -> tuple[np.ndarray, FloatArr
 
 
 class _Scores(NamedTuple):
-    """Correlations (L,) at offsets (L,), and how many seconds of windows tell them."""
+    """Correlations (L,) at offsets (L,), and the total seconds of windows used for each."""
 
     offsets: FloatArray
     score: FloatArray
@@ -202,7 +204,7 @@ def _scores(moved: FloatArray, windows: Sequence[_Window]) -> _Scores:
     shared, ours, theirs, seconds = np.zeros((4, len(offsets)))
     power = np.concatenate([[0.0], np.cumsum((moved**2).sum(axis=1))])
     for window in windows:
-        # At place i of the path the sensor is ahead by start - i steps.
+        # At index i of the path the sensor is ahead by start - i steps.
         where = window.start - places - low
         across, up = _agreement(moved, window)
         shared[where] += np.abs(across) + up
@@ -213,7 +215,7 @@ def _scores(moved: FloatArray, windows: Sequence[_Window]) -> _Scores:
 
 
 def _sought(scores: _Scores, near_s: float, search_s: float) -> tuple[int, int, float]:
-    """The best place, that of its rival, and the gain; or a ValueError that says why not."""
+    """Return the best index, its rival, and the gain, or raise ValueError with the reason."""
     offsets, score, seconds = scores
     tried = (seconds >= 0.5 * seconds.max()) & (np.abs(offsets - near_s) <= search_s + 1e-9)
     if not tried.any():
@@ -246,7 +248,7 @@ def _sought(scores: _Scores, near_s: float, search_s: float) -> tuple[int, int, 
 
 
 def _peak(moved: FloatArray, scores: _Scores, near_s: float) -> tuple[float, float]:
-    """The best offset about one, and its standard deviation."""
+    """Return the best offset near one, and its standard deviation."""
     offsets, score, seconds = scores
     best = int(np.argmax(np.where(np.abs(offsets - near_s) <= _PEAK_S, score, -1.0)))
     before, top, after = score[np.clip([best - 1, best, best + 1], 0, len(score) - 1)]
@@ -259,7 +261,7 @@ def _peak(moved: FloatArray, scores: _Scores, near_s: float) -> tuple[float, flo
 def _arms(
     moved: FloatArray, windows: Sequence[_Window], offset_s: float, told: TaggedRanges
 ) -> FloatArray:
-    """Arms (K, 3) of the tags in the world, by the nearest window's rotations and its yaw."""
+    """Return arms (K, 3) of the tags in the world, from rotations and yaw of the nearest window."""
     centres = np.array([window.times.mean() for window in windows])
     nearest = np.abs(told.times[:, None] + offset_s - centres).argmin(axis=1)
     arms = np.empty_like(told.tags)

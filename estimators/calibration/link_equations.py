@@ -1,4 +1,4 @@
-"""Robust least squares of links and tags along a known path: the equations."""
+"""Equations of robust least squares for links and tags along a known path."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from rbl_gym.geometry import rotations
 
 __all__ = ["KnownPath", "LinkModel"]
 
-# What is thought of the parameters before any range: standard deviations about zero or the table.
+# Prior standard deviations of the parameters, about zero or the table.
 BIAS_M, SLOPE, ARM_M, TURN_RAD = 2.0, 0.1, 0.5, 1.0
 _LEAST_STD_M = 1e-4
 _ITERATIONS, _ROUNDS, _CONVERGED = 10, 3, 0.03
-# Rows whose Jacobian is in memory at one time.
+# Number of rows of the Jacobian in memory at one time.
 _ROWS = 200_000
 
 
 class KnownPath(NamedTuple):
     """Poses of the body at K epochs.
 
-    Times (K,) in seconds, which may step back from one run to the next, rotation (K, 3, 3) and
-    translation (K, 3), metres.
+    Times (K,) in seconds, rotation (K, 3, 3) and translation (K, 3), metres. Times may step back
+    from one run to the next.
     """
 
     times: FloatArray
@@ -37,20 +37,20 @@ class KnownPath(NamedTuple):
 
 @dataclass(frozen=True)
 class LinkModel:
-    """What is estimated.
+    """Parameters to estimate.
 
     Parameters
     ----------
     biases
-        ``"link"``: one of every link. ``"node"``: one of every anchor and every tag, which add up
-        (antenna delays), the mean of the tags' being zero. ``"common"``: one of all links.
+        ``"link"``: one per link. ``"node"``: one per anchor and per tag, which add up (antenna
+        delays); the mean over the tags is zero. ``"common"``: one for all links.
     slopes
-        One of every link; with ``"node"`` and ``"common"`` one of all.
+        One per link; with ``"node"`` and ``"common"`` one for all links.
     tags
-        ``"held"``: where the table has them. ``"turned"``: the table as a whole is turned and
-        shifted. ``"free"``: each by itself.
+        ``"held"``: fixed as in the table. ``"turned"``: the whole table is rotated and shifted.
+        ``"free"``: each tag separately.
     planar
-        Tags keep their heights and the table turns about z only.
+        Tags keep their heights and the table rotates about z only.
     """
 
     biases: str = "link"
@@ -64,7 +64,7 @@ class LinkModel:
 
 
 class Problem(NamedTuple):
-    """What is fitted: measurements, path, model, and the parameters' design and prior."""
+    """Least-squares problem: measurements, path, model, and the parameters' design and prior."""
 
     ranges: FloatArray  # (K, M, N)
     links: BoolArray
@@ -79,7 +79,7 @@ class Problem(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Parameters as found, what they leave, and how well they are known."""
+    """Estimated parameters, residuals and covariance."""
 
     parameters: FloatArray  # (P,)
     rotation: FloatArray  # (3, 3) of the table
@@ -98,7 +98,7 @@ def problem_of(
     model: LinkModel,
     rotation: ArrayLike | None,
 ) -> Problem:
-    """The problem, its arguments checked."""
+    """Return the problem of checked arguments."""
     ranges = check_array("ranges", ranges, ("K", "M", "N"))
     tags = check_array("tags", tags, ("N", 3))
     K, M, N = ranges.shape
@@ -130,7 +130,7 @@ def problem_of(
 
 
 def _link_design(M: int, N: int, model: LinkModel) -> tuple[FloatArray, FloatArray]:
-    """From the parameters of links to biases (M N), then slopes (M N); and their priors."""
+    """Return the design from link parameters to biases (M N), then slopes (M N), and priors."""
     L = M * N
     if model.biases == "link":
         bias = np.eye(L)
@@ -150,12 +150,12 @@ def _link_design(M: int, N: int, model: LinkModel) -> tuple[FloatArray, FloatArr
 
 
 def sum_zero(n: int) -> FloatArray:
-    """Orthonormal basis (n, n - 1) of what sums to zero."""
+    """Return an orthonormal basis (n, n - 1) of vectors with zero sum."""
     return np.linalg.svd(np.ones((1, n)))[2][1:].T
 
 
 def _geometry_prior(N: int, model: LinkModel) -> FloatArray:
-    """Standard deviations of the tags' parameters."""
+    """Return prior standard deviations of the tags' parameters."""
     arms: dict[str, list[float]] = {
         "held": [],
         "turned": [TURN_RAD, ARM_M, ARM_M] if model.planar else [TURN_RAD] * 3 + [ARM_M] * 3,
@@ -165,14 +165,14 @@ def _geometry_prior(N: int, model: LinkModel) -> FloatArray:
 
 
 def axes_of(model: LinkModel) -> tuple[list[int], list[int]]:
-    """Axes that the table turns about, and along which tags move."""
+    """Return the axes of rotation of the table, and the axes along which tags move."""
     return ([2], [0, 1]) if model.planar else ([0, 1, 2], [0, 1, 2])
 
 
 def placed(
     problem: Problem, parameters: FloatArray, rotation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Tags (N, 3) in the path's frame, and their derivative (N, 3, G)."""
+    """Return tags (N, 3) in the body frame of the path, and their derivative (N, 3, G)."""
     model, table = problem.model, problem.tags
     turn_axes, move_axes = axes_of(model)
     N = len(table)
@@ -195,7 +195,7 @@ def placed(
 
 
 def directions(anchors: FloatArray, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors (K, M, N, 3) from anchors to tags, and distances (K, M, N)."""
+    """Return unit vectors (K, M, N, 3) from anchors to tags, and distances (K, M, N)."""
     apart = places[:, None] - anchors[:, :, None]
     d = np.maximum(np.linalg.norm(apart, axis=-1), 1e-9)
     return apart / d[..., None], d
@@ -204,7 +204,7 @@ def directions(anchors: FloatArray, places: FloatArray) -> tuple[FloatArray, Flo
 def _residual_of(
     problem: Problem, parameters: FloatArray, rotation: FloatArray, jacobian: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals and distances (K, M, N), derivative (K, M, N, G) of the ranges by geometry."""
+    """Return residuals and distances (K, M, N), derivative (K, M, N, G) by the geometry."""
     K, M, N = problem.ranges.shape
     L = M * N
     of_links = problem.design[: 2 * L] @ parameters
@@ -221,7 +221,7 @@ def _residual_of(
 
 
 def carried_tags(path: KnownPath, tags: FloatArray) -> FloatArray:
-    """Places (K, N, 3) in the world of tags (N, 3) of the body."""
+    """Return world positions (K, N, 3) of tags (N, 3) in the body frame."""
     return tags @ np.swapaxes(path.rotation, -1, -2) + path.translation[:, None]
 
 
@@ -232,10 +232,10 @@ def _normal(
     errors: tuple[FloatArray, Drift],
     share: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Gram matrices (M N, C, C) of the whitened columns, and whitened residuals (K, M N).
+    """Return Gram matrices (M N, C, C) of whitened columns, and whitened residuals (K, M N).
 
-    Columns are of bias, slope and geometry, and the residual last. `errors` are standard
-    deviations (M N,) and the slow part; `share` (K, M N) is what each range keeps of its weight.
+    Columns are bias, slope, geometry and the residual. `errors` are standard deviations (M N,) and
+    the slow part. `share` (K, M N) is the fraction of its weight that each range keeps.
     """
     K, M, N = problem.ranges.shape
     L = M * N
@@ -263,7 +263,7 @@ def _normal(
 
 
 def _gathered(problem: Problem, grams: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information (P, P) and gradient (P,) of the parameters, without the prior."""
+    """Return information (P, P) and gradient (P,) of the parameters, without the prior."""
     L = len(grams)
     G = grams.shape[-1] - 3
     H, g, at = np.zeros((2 * L + G, 2 * L + G)), np.zeros(2 * L + G), np.arange(L)
@@ -280,7 +280,7 @@ def _gathered(problem: Problem, grams: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def solve(problem: Problem) -> Fit:
-    """Gauss-Newton with iterated weights; the slow part of the errors found in between."""
+    """Run Gauss-Newton with iterated weights; estimate the slow part of the errors in between."""
     K, L = len(problem.ranges), problem.links[0].size
     used = problem.links.reshape(K, L)
     parameters, rotation = np.zeros(len(problem.prior)), problem.rotation
@@ -299,7 +299,7 @@ def solve(problem: Problem) -> Fit:
             step = covariance @ (g - prior @ _from_table(problem, parameters, rotation))
             parameters, rotation = _moved(problem, parameters, rotation, step)
             white = white / np.sqrt(share)
-            # Weights follow the spread of the whitened residuals.
+            # Weights depend on the spread of the whitened residuals.
             std = np.maximum(std * robust.spread(white, used, 1e-3), _LEAST_STD_M)
             if np.abs(step / np.sqrt(np.diag(covariance))).max() < _CONVERGED:
                 break
@@ -323,7 +323,7 @@ def solve(problem: Problem) -> Fit:
 
 
 def _first_biases(problem: Problem, rotation: FloatArray) -> FloatArray:
-    """Parameters of the links by medians; slopes are zero."""
+    """Return initial parameters of the links by medians, with zero slopes."""
     zero = np.zeros(len(problem.prior))
     M, N = problem.ranges.shape[1:]
     residual = np.where(problem.links, _residual_of(problem, zero, rotation, False)[0], np.nan)
@@ -335,7 +335,7 @@ def _first_biases(problem: Problem, rotation: FloatArray) -> FloatArray:
 
 
 def _from_table(problem: Problem, parameters: FloatArray, rotation: FloatArray) -> FloatArray:
-    """How far the parameters are from where the prior has its middle."""
+    """Return the parameters less the mean of their prior."""
     away = parameters.copy()
     if problem.model.tags == "turned":
         axes = axes_of(problem.model)[0]

@@ -298,7 +298,8 @@ def _is_positive(S: sp.csc_matrix) -> bool:
 def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matrix:
     """Hermitian matrix with ``-links`` at (i, j), their conjugates at (j, i), and the sums of
     their sizes on the diagonal: the graph Laplacian of weights, the connection Laplacian of
-    ``e^{-iy}``."""
+    ``e^{-iy}``.
+    """
     i, j = edges.T
     nodes = np.arange(n_nodes)
     degree = np.bincount(edges.ravel(), np.repeat(np.abs(links), 2), n_nodes)
