@@ -109,7 +109,7 @@ class Whitener:
         self._epoch = 0
 
     def whitened(self, columns: FloatArray, used: BoolArray, share: FloatArray) -> FloatArray:
-        """Return the next columns (k, L, C) with white unit-variance errors; 0 if not `used` (k, L).
+        """Whiten the next columns (k, L, C) to unit-variance errors; 0 if not `used` (k, L).
 
         `share` (k, L) is the fraction of its weight that each range keeps.
         """

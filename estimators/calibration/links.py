@@ -1,10 +1,10 @@
-"""Biases of links, lever arms by the ranges of a body whose path is known.
+"""Calibration of link biases and lever arms from ranges along a known path.
 
 The range of anchor m and tag n at epoch k is
 
     r = (1 + s_mn) |Q_k c_n + p_k - a_m| + b_mn + noise,
 
-where Q_k, p_k is the path and c_n the place of the tag in its body frame.
+where Q_k, p_k is the path and c_n the position of the tag in its body frame.
 """
 
 from __future__ import annotations
@@ -33,30 +33,30 @@ __all__ = ["LinkFit", "fit_links", "spread_of_residuals"]
 
 
 class LinkFit(NamedTuple):
-    """Links and tags as the ranges tell them; standard deviations beside each.
+    """Estimated links and tags, with standard deviations.
 
     Attributes
     ----------
     bias_m, bias_std_m, slope, slope_std
         (M, N): ``range = (1 + slope) distance + bias``.
     noise_std_m
-        (M, N) robust standard deviation of what is left; late ranges hardly count.
+        (M, N) robust standard deviation of the residuals; late ranges hardly count.
     drift
-        What of it is slow: the share of the variance, and for how many seconds it lasts.
+        Slow part of the residuals: its fraction of the variance, and its correlation time (s).
     node_delay_m, node_delay_std_m
-        (M + N,) of the anchors, then of the tags; None but for ``biases="node"``.
+        (M + N,) of the anchors, then of the tags; None unless ``biases="node"``.
     rotation, rotation_std_rad
-        (3, 3) what turns the table into the body frame of the path, and (3,) about its axes.
+        (3, 3) from the table to the body frame of the path, and (3,) about the axes of that frame.
     shift_m, shift_std_m
-        (3,): ``tags = rotation @ table + shift`` where the table is turned as a whole.
+        (3,): ``tags = rotation @ table + shift`` if the table is rotated as a whole.
     tags, tags_std_m
         (N, 3) in the body frame of the path.
     residuals
-        (K, M, N) metres, 0 where there is no range.
+        (K, M, N) metres, 0 without a range.
     counts
-        (M, N) ranges of each link.
+        (M, N) number of ranges of each link.
     covariance
-        Of all parameters: biases and slopes as the model has them, tags.
+        Covariance of all parameters: biases and slopes in the form of the model, then tags.
     """
 
     bias_m: FloatArray
@@ -81,18 +81,18 @@ class LinkFit(NamedTuple):
 def spread_of_residuals(
     ranges: FloatArray, links: BoolArray, anchors: FloatArray, places: FloatArray
 ) -> float:
-    """Robust spread of ranges about distances, with a bias of every link taken off.
+    """Return the robust spread of ranges about distances, without a bias of every link.
 
-    What coarse starts are compared by: the median absolute deviation, metres.
+    It is the median absolute deviation, metres, and serves to compare coarse starts.
 
     Parameters
     ----------
     ranges, links
-        (K, M, N) metres, and where there is a range.
+        (K, M, N) metres, and a mask of the measured ranges.
     anchors
-        (M, 3), or (K, M, 3) where they move.
+        (M, 3), or (K, M, 3) if they move.
     places
-        Tags (K, N, 3) in the world.
+        Tags (K, N, 3) in the world frame.
     """
     d = directions(np.broadcast_to(anchors, (len(ranges), *anchors.shape[-2:])), places)[1]
     left = np.where(links, ranges - d, np.nan)
@@ -110,33 +110,34 @@ def fit_links(
     model: LinkModel = LinkModel(),  # noqa: B008 (frozen)
     rotation: ArrayLike | None = None,
 ) -> LinkFit:
-    """Biases and slopes of links, and tags, by robust least squares.
+    """Estimate biases and slopes of links, and tags, by robust least squares.
 
     Parameters
     ----------
     ranges, links
-        (K, M, N) metres, and where there is a range; None: where it is positive.
+        (K, M, N) metres, and a mask of the measured ranges; None: all positive ranges.
     anchors
-        (M, 3), or (K, M, 3) where they move.
+        (M, 3), or (K, M, 3) if they move.
     tags
-        (N, 3), the table.
+        (N, 3), the table of nominal positions.
     path
-        Of the body, at the epochs.
+        Path of the body, at the epochs.
     model
-        What is estimated.
+        Parameters to estimate.
     rotation
-        (3, 3) where the search for the turn of the table starts; default the identity.
+        (3, 3) start of the search for the rotation of the table; default the identity.
 
     Raises
     ------
     ValueError
-        On shapes that do not fit together, or no range at all.
+        If shapes do not match, or there is no range.
 
     Notes
     -----
     Gauss-Newton with iterated weights (`robust.share_of`); every link has its own spread. Errors of
-    a link are white noise and a slow part, which is found in the residuals and whitened (`drift`):
-    standard deviations stay honest for biases that move slowly with the pose.
+    a link are white noise and a slow part. The slow part is estimated from the residuals and
+    whitened (`drift`). Standard deviations then remain consistent for biases that change slowly
+    with the pose.
     """
     problem = problem_of(ranges, links, anchors, tags, path, model, rotation)
     fit = solve(problem)
@@ -174,5 +175,5 @@ def _result(problem: Problem, fit: Fit) -> LinkFit:
 
 
 def _std_of(rows: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Standard deviations of ``rows @ parameters``."""
+    """Return the standard deviations of ``rows @ parameters``."""
     return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, covariance, rows), 0.0))

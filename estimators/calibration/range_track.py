@@ -1,4 +1,4 @@
-"""The path of a point by ranges alone: a spline of the whole log, for what needs no rotation."""
+"""Path of a point from ranges alone, as a spline over the whole log, without rotation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rbl_gym.estimators.costs.losses import LATE, huber, loss_of
 __all__ = ["range_track"]
 
 _KNOT_S, _ACCELERATION = 0.2, 2.0
-# Deviations of the biases of a link, and of what all have in common (m).
+# Standard deviations of the bias of a link, and of the common bias (m).
 _LINK_M, _COMMON_M = 0.1, 0.2
 _ITERATIONS, _CONVERGED_M = 25, 2e-3
 _HUBER = 1.5
@@ -30,30 +30,31 @@ def range_track(
     start: ArrayLike | scipy.interpolate.BSpline,
     links: ArrayLike | None = None,
 ) -> scipy.interpolate.BSpline:
-    """A cubic spline of positions that ranges fit best, robustly, with biases that stay.
+    """Estimate a cubic spline of positions robustly from ranges with constant biases.
 
-    Between knots 0.2 s apart the acceleration is held to zero by 2 m/s^2.
+    Knots are 0.2 s apart. The acceleration between them has a zero-mean prior with standard
+    deviation 2 m/s^2.
 
     Parameters
     ----------
     times, ranges, std
-        (K,) of each range: seconds that do not decrease, metres, standard deviation.
+        (K,) of each range: seconds, not decreasing; metres; standard deviation, metres.
     anchors
-        (K, 3): where each was measured from.
+        (K, 3): anchor of each range.
     start
-        Where the search begins (3,); or what it found with other anchors.
+        Start of the search (3,), or the spline found with other anchors.
     links
-        Which link each is of, (K,) integers from 0; None: all of one.
+        Index of the link of each range, (K,) integers from 0; None: one link.
 
     Returns
     -------
     BSpline
-        Of seconds, with values (..., 3).
+        Function of time (s), with values (..., 3), metres.
 
     Raises
     ------
     ValueError
-        On arrays that do not fit together.
+        If shapes do not match.
     """
     times, ranges, std = (
         check_array(name, value, ("K",))
@@ -66,7 +67,7 @@ def range_track(
     count = int(np.ceil(length / _KNOT_S))
     knots = times[0] + length / count * np.arange(-3, count + 4)
     inside = np.clip(times, knots[3], np.nextafter(knots[-4], -np.inf))
-    # Their types are not told by scipy's stubs.
+    # scipy's stubs lack these types.
     basis: Any = scipy.interpolate.BSpline.design_matrix(inside, knots, 3).tocsr()
     m = basis.shape[1]
     bend = sparse.eye(m - 2, m) - 2 * sparse.eye(m - 2, m, k=1) + sparse.eye(m - 2, m, k=2)
@@ -87,7 +88,7 @@ def range_track(
             away = basis @ x[: 3 * m].reshape(3, m).T - anchors
             distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
             error = (ranges - distance - x[3 * m :][link]) / std
-            # As epochs of one range each.
+            # Epochs of one range each.
             share = loss_of(error[:, None, None] ** 2, loss, error[:, None, None] > 0)[1]
             weight = share[:, 0, 0] / std
             columns = [basis.multiply(a[:, None]) for a in (away / distance[:, None]).T]

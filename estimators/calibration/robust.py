@@ -1,4 +1,4 @@
-"""Residuals of links: how much each counts and how wide they are."""
+"""Robust weights and spread of the residuals of links."""
 
 from __future__ import annotations
 
@@ -6,27 +6,28 @@ import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 
-# Residuals of more than so many standard deviations count less, and less the further they are.
+# Threshold (standard deviations) beyond which the weights of residuals fall.
 _THRESHOLD = 2.0
 # Median absolute deviation of a standard Gaussian.
 _MAD = 0.6744897501960817
-# Fewest residuals that tell a spread of their own.
+# Least number of residuals for a separate spread.
 _FEWEST = 10
 
 
 def share_of(z: FloatArray) -> FloatArray:
-    """Share of its weight that a residual of z standard deviations keeps: ``min(1, (h / z)^2)``.
+    """Return the weight ``min(1, (h / z)^2)`` of a residual of z standard deviations.
 
-    Beyond h = 2 the pull of a residual falls as 1/z, so that late ranges hardly move the fit.
-    The loss is symmetric: a Gaussian's mean stays where it is.
+    Beyond h = 2 the influence of a residual falls as 1/z, so that late ranges hardly change the
+    fit. The loss is symmetric, so the mean of a Gaussian remains unbiased.
     """
     return np.minimum(1.0, (_THRESHOLD / np.maximum(np.abs(z), 1e-9)) ** 2)
 
 
 def spread(residual: FloatArray, used: BoolArray, least: float) -> FloatArray:
-    """Robust standard deviation (...) of residuals (K, ...) by their median absolute deviation.
+    """Return robust standard deviations (...) of residuals (K, ...).
 
-    Columns with fewer than ten residuals get that of all together; none is below `least`.
+    They come from the median absolute deviation. Columns with fewer than ten residuals get that of
+    all columns together. None is below `least`.
     """
     held = np.where(used, np.abs(residual), np.nan)
     if not used.any():
@@ -38,10 +39,10 @@ def spread(residual: FloatArray, used: BoolArray, least: float) -> FloatArray:
 
 
 def variance_factor(z: FloatArray, used: BoolArray) -> FloatArray:
-    """Variance (...) of the estimate of a mean by residuals z (K, ...), in units of sigma^2 / K.
+    """Return the variance (...) of a mean estimated from z (K, ...), in units of sigma^2 / K.
 
-    ``mean(psi^2) / mean(psi')^2`` of the M-estimator (Huber, "Robust Statistics", 1981); 1 for a
-    Gaussian but for the little that the loss gives away.
+    It is ``mean(psi^2) / mean(psi')^2`` of the M-estimator (Huber, "Robust Statistics", 1981). For
+    a Gaussian it is slightly above 1.
     """
     count = np.maximum(used.sum(axis=0), 1)
     psi = np.where(used, z * share_of(z), 0.0)
@@ -52,6 +53,6 @@ def variance_factor(z: FloatArray, used: BoolArray) -> FloatArray:
 
 
 def loss_of(z: FloatArray) -> FloatArray:
-    """The loss whose weights `share_of` gives: ``z^2 / 2``, then ``h^2 (1/2 + log(z / h))``."""
+    """Return the loss with the weights `share_of`: ``z^2 / 2``, then ``h^2 (1/2 + log(z / h))``."""
     z, h = np.abs(z), _THRESHOLD
     return np.where(z <= h, 0.5 * z**2, h**2 * (0.5 + np.log(np.maximum(z, h) / h)))

@@ -1,8 +1,8 @@
-"""Anchors surveyed by the ranges of a moving body, and of anchors to each other; without truth.
+"""Anchor survey from ranges of a moving body and ranges between anchors, without ground truth.
 
-Poses of all epochs, anchors and biases are adjusted together, robustly. Poses are independent of
-each other given the rest: each is eliminated from the normal equations by itself (the Schur
-complement over poses), and what is solved is as large as the anchors and biases are many.
+Poses of all epochs, anchors and biases are adjusted jointly and robustly. Given the rest, poses are
+independent of each other. Each is eliminated separately from the normal equations (Schur complement
+over poses). The remaining system has only the unknowns of anchors and biases.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ __all__ = ["Survey", "SurveyModel", "SurveyState", "adjust"]
 
 _ITERATIONS, _CONVERGED_M = 100, 1e-5
 _LEAST_STD_M = 1e-4
-# Weight of what fixes the free frame, over the largest weight of the anchors.
+# Weight of the constraints on a free frame, relative to the largest weight of the anchors.
 _FIXED = 10.0
-# Numbers of a piece of the Jacobian that are in memory at one time.
+# Number of Jacobian entries in memory at one time.
 _PIECE = 20_000_000
 
 
 @dataclass(frozen=True)
 class SurveyModel:
-    """What is known before.
+    """Prior knowledge of a survey.
 
     Parameters
     ----------
     bias_m, bias_std_m
-        The bias that all ranges have in common, metres, and its standard deviation.
+        Common bias of all ranges, metres, and its standard deviation.
     link_std_m
-        Standard deviation of what each link has beside that; 0: nothing.
+        Standard deviation of the additional bias of each link, metres; 0: none.
     planar
-        Anchors keep their heights; the body its height, roll and pitch.
+        Anchors keep their heights, and the body its height, roll and pitch.
     """
 
     bias_m: float = 0.0
@@ -53,7 +53,7 @@ class SurveyModel:
 
 
 class SurveyState(NamedTuple):
-    """Anchors (M, 3), poses (K, 3, 3) and (K, 3), common bias, biases of links (M, N) beside it."""
+    """Anchors (M, 3), poses (K, 3, 3) and (K, 3), common bias, additional link biases (M, N)."""
 
     anchors: FloatArray
     rotation: FloatArray
@@ -63,26 +63,26 @@ class SurveyState(NamedTuple):
 
 
 class Survey(NamedTuple):
-    """Anchors as the ranges tell them.
+    """Result of a survey.
 
     Attributes
     ----------
     state
         Anchors, poses, biases.
     std_m
-        (M, 3) of the anchors; 0 where they are held. In the frame of the anchors' own centre and
-        mean turn where that is free.
+        (M, 3) of the anchors; 0 for fixed ones. A free frame is that of the anchors' own centre
+        and mean rotation.
     covariance
         (3 M + 1, 3 M + 1) of the anchors and the common bias.
     bias_std_m
-        Of the common bias.
+        Standard deviation of the common bias.
     scale_std, scale_bias_correlation
         Relative standard deviation of the size of the layout, and its correlation with the common
-        bias: the two trade off.
+        bias.
     noise_std_m
         Robust standard deviation of a range.
     residuals
-        (K, M, N) metres, 0 where there is no range.
+        (K, M, N) metres, 0 without a range.
     """
 
     state: SurveyState
@@ -115,25 +115,25 @@ def adjust(
     pairs: ArrayLike | None = None,
     lasting: float = 1.0,
 ) -> Survey:
-    """Adjust anchors, poses and biases together, from a start.
+    """Adjust anchors, poses and biases jointly, from a start.
 
     Parameters
     ----------
     ranges, links
-        (K, M, N) metres, and where there is a range. K may be 0 with `pairs`.
+        (K, M, N) metres, and a mask of the measured ranges. K may be 0 with `pairs`.
     tags
-        (N, 3) of the body.
+        (N, 3), body frame.
     start
-        Where the search starts (`survey_start`).
+        Start of the search (`survey_start`).
     model
-        Biases, and whether everything lies in a plane.
+        Biases, and whether the problem is planar.
     known
-        (M,) anchors that stay where they start; default none. What these leave free of the frame is
-        held by the start: the anchors' mean shift and turn from there are zero.
+        (M,) mask of anchors fixed at the start; default none. Degrees of freedom of the frame that
+        these leave free are fixed by zero mean shift and rotation of the anchors from the start.
     pairs
-        (M, M) ranges between anchors, metres, 0 where there is none; both directions are averaged.
+        (M, M) ranges between anchors, metres, 0 for none; both directions are averaged.
     lasting
-        For how many epochs an error lasts: so many ranges count as one.
+        Correlation length of the errors in epochs: this many ranges count as one.
 
     Raises
     ------
@@ -142,7 +142,7 @@ def adjust(
 
     Notes
     -----
-    Levenberg-Marquardt with iterated weights. A body with one tag has a place and no rotation.
+    Levenberg-Marquardt with iterated weights. A body with one tag has a position and no rotation.
     Triggs et al., "Bundle adjustment: a modern synthesis", 2000, is the method, for cameras.
     """
     ranges = (
@@ -161,7 +161,7 @@ def adjust(
 
 
 def _counts(problem: _Problem) -> tuple[int, int]:
-    """How many ranges there are, and how many unknowns they tell."""
+    """Return the number of ranges and the number of unknowns they determine."""
     axes = 2 if problem.model.planar else 3
     per_epoch = problem.links.sum(axis=(1, 2))
     poses = _pose_axes(problem) * int((per_epoch > 0).sum())
@@ -179,7 +179,7 @@ def _check_count(problem: _Problem) -> None:
 
 
 def _pose_axes(problem: _Problem) -> int:
-    """Unknowns of a pose: turns that the tags tell, and shifts."""
+    """Return the unknowns of a pose: rotations observable by the tags, and shifts."""
     turns = 0 if len(problem.tags) == 1 else 1 if problem.model.planar else 3
     return turns + (2 if problem.model.planar else 3)
 
@@ -187,7 +187,7 @@ def _pose_axes(problem: _Problem) -> int:
 def _linearized(
     problem: _Problem, state: SurveyState, part: slice
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (k, L), derivatives of the ranges by poses (k, L, P) and by the rest (k, L, A)."""
+    """Return residuals (k, L), derivatives by poses (k, L, P) and by the rest (k, L, A)."""
     axes = [0, 1] if problem.model.planar else [0, 1, 2]
     turned = np.einsum("kij,nj->kni", state.rotation[part], problem.tags)
     apart = (turned + state.translation[part, None])[:, None] - state.anchors[:, None]
@@ -212,7 +212,7 @@ def _linearized(
 
 
 def _pair_rows(problem: _Problem, state: SurveyState) -> tuple[FloatArray, FloatArray]:
-    """Residuals of ranges between anchors, and their derivatives by anchors and biases."""
+    """Return residuals of ranges between anchors, and derivatives by anchors and biases."""
     axes = [0, 1] if problem.model.planar else [0, 1, 2]
     i, j = np.nonzero(problem.pairs)
     M, D, A = len(state.anchors), len(axes), 0
@@ -228,7 +228,7 @@ def _pair_rows(problem: _Problem, state: SurveyState) -> tuple[FloatArray, Float
 
 
 def _residuals(problem: _Problem, state: SurveyState) -> FloatArray:
-    """Residuals of all ranges and pairs, one row: those that there are."""
+    """Return the residuals of all measured ranges and pairs, in one row."""
     turned = np.einsum("kij,nj->kni", state.rotation, problem.tags)
     apart = (turned + state.translation[:, None])[:, None] - state.anchors[:, None]
     e = problem.ranges - np.linalg.norm(apart, axis=-1) - state.bias_m - state.link_m
@@ -236,7 +236,7 @@ def _residuals(problem: _Problem, state: SurveyState) -> FloatArray:
 
 
 def _prior(problem: _Problem, state: SurveyState) -> tuple[FloatArray, FloatArray]:
-    """Information (A, A) and gradient (A,) of what is known before, in 1/m^2."""
+    """Return information (A, A) and gradient (A,) of the prior, in 1/m^2."""
     model, M = problem.model, len(state.anchors)
     D = 2 if model.planar else 3
     link = np.full(state.link_m.size, max(model.link_std_m, 1e-6) ** -2.0)
@@ -247,7 +247,7 @@ def _prior(problem: _Problem, state: SurveyState) -> tuple[FloatArray, FloatArra
 
 
 def _frame(problem: _Problem, anchors: FloatArray) -> FloatArray:
-    """Orthonormal motions (M D, g) of all anchors that the ranges leave free."""
+    """Return orthonormal motions (M D, g) of all anchors that the ranges do not determine."""
     D = 2 if problem.model.planar else 3
     centred = anchors - anchors.mean(axis=0)
     shifts = np.tile(np.eye(D), (len(anchors), 1))
@@ -267,7 +267,7 @@ def _frame(problem: _Problem, anchors: FloatArray) -> FloatArray:
 def _reduced(
     problem: _Problem, state: SurveyState, std: float, damping: float
 ) -> tuple[FloatArray, FloatArray, list[tuple[FloatArray, FloatArray, FloatArray]]]:
-    """The normal equations of anchors and biases, and of each piece what gives its poses."""
+    """Return the normal equations of anchors and biases, and back-substitution data per block."""
     K, L = len(problem.ranges), state.link_m.size
     H, g = _prior(problem, state)
     pieces = []
@@ -362,7 +362,7 @@ def _moved(
 def _result(problem: _Problem, state: SurveyState, std: float) -> Survey:
     M, D = len(state.anchors), 2 if problem.model.planar else 3
     told, unknown = _counts(problem)
-    # Residuals are smaller than errors, the more so the more unknowns follow them.
+    # Residuals are smaller than errors; the ratio depends on the number of unknowns.
     std *= np.sqrt(told / max(told - unknown, 1))
     H, _, _ = _reduced(problem, state, std, 0.0)
     cov = np.linalg.inv(H)

@@ -1,4 +1,4 @@
-"""Where a survey of anchors starts: poses from rough anchors, or anchors from nothing."""
+"""Starts of an anchor survey: poses from approximate anchors, or anchors from ranges alone."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def start_from_anchors(
     planar: bool = False,
     height_m: float = 0.0,
 ) -> SurveyState:
-    """Poses by rough anchors: each tag by squared ranges, the body by its tags.
+    """Estimate poses from approximate anchors: tags from squared ranges, the body from its tags.
 
     Parameters
     ----------
     ranges, links
-        (K, M, N) metres, and where there is a range.
+        (K, M, N) metres, and a mask of the measured ranges.
     anchors, tags
         (M, 3) and (N, 3), metres.
     bias_m
-        That is taken off the ranges.
+        Bias to subtract from the ranges.
     planar, height_m
-        The body is level, its origin at this height.
+        Whether the body is level, and the height of its origin.
     """
     points = _multilaterated(ranges - bias_m, links, anchors, planar)
     K, N = points.shape[:2]
@@ -59,11 +59,11 @@ def start_from_anchors(
 def _multilaterated(
     ranges: FloatArray, links: BoolArray, anchors: FloatArray, planar: bool
 ) -> FloatArray:
-    """Places (K, N, 3) of tags by linear least squares of squared ranges; NaN where too few."""
+    """Return tags (K, N, 3) by linear least squares of squared ranges; NaN if too few."""
     D = 2 if planar else 3
     centre = anchors.mean(axis=0)
     A = (anchors - centre)[:, :D]
-    # r^2 - |a|^2 = -2 a s + c, with c = |s|^2 and what the heights add.
+    # r^2 - |a|^2 = -2 a s + c, with c = |s|^2 plus terms of the heights.
     columns = np.concatenate([-2 * A, np.ones((len(A), 1))], axis=1)
     y = ranges**2 - (A**2).sum(axis=1)[:, None]
     w = links / np.maximum(ranges, 0.1) ** 2
@@ -71,7 +71,7 @@ def _multilaterated(
     g = np.einsum("kmn,mi,kmn->kni", w, columns, y)
     enough = links.sum(axis=1) > D
     H = np.where(enough[..., None, None], H, np.eye(D + 1))
-    # Anchors in a line or a plane: the rest is left at the centre.
+    # With collinear or coplanar anchors, undetermined coordinates remain at the centre.
     H = H + 1e-9 * np.trace(H, axis1=-2, axis2=-1)[..., None, None] * np.eye(D + 1)
     s = np.linalg.solve(H, g[..., None])[..., :D, 0]
     points = np.full((*s.shape[:2], 3), centre)
@@ -83,25 +83,26 @@ def _multilaterated(
 def anchors_from_points(
     ranges: FloatArray, links: BoolArray, bias_m: float = 0.0, planar: bool = False
 ) -> FloatArray | None:
-    """Anchors (M, 3) by ranges (P, M) to points of which nothing is known.
+    """Estimate anchors (M, 3) from ranges (P, M) to unknown points.
 
-    The matrix of squared distances, rows and columns centred, has the rank of space. Its factors
-    are anchors and points but for an affine map, which the anchors' own squares tell linearly.
+    The matrix of squared distances, with rows and columns centred, has the dimension of space as
+    rank. Its factors are anchors and points up to an affine map, which follows linearly from the
+    anchors' squared norms.
 
     Parameters
     ----------
     ranges, links
-        (P, M) metres, and where there is a range. Points that miss an anchor are left out.
+        (P, M) metres, and a mask of the measured ranges. Points that miss an anchor are left out.
     bias_m
-        That is taken off the ranges.
+        Bias to subtract from the ranges.
     planar
-        Anchors at one height, and points at another.
+        Whether anchors are at one height, and points at another.
 
     Returns
     -------
     anchors
-        About their centre, turned anyhow, maybe a mirror image; height 0 where `planar`. None where
-        it does not come out: fewer than 6 anchors (10 in space), or ranges too noisy.
+        Relative to their centre, with arbitrary rotation and possibly mirrored; height 0 if
+        `planar`. None without a solution: fewer than 6 anchors (10 in space), or ranges too noisy.
 
     Notes
     -----
@@ -135,14 +136,15 @@ def anchors_from_points(
 
 
 def anchors_from_pairs(pairs: FloatArray, bias_m: float = 0.0, planar: bool = False) -> FloatArray:
-    """Anchors (M, 3) by the ranges between them: classical scaling; maybe a mirror image.
+    """Estimate anchors (M, 3) from the ranges between them by classical multidimensional scaling.
 
-    Pairs (M, M) without a range (0) get the shortest way over others.
+    The result may be a mirror image. Pairs (M, M) without a range (0) get the shortest path over
+    other anchors.
 
     Raises
     ------
     ValueError
-        If the anchors fall apart into groups without ranges between them.
+        If there are groups of anchors without ranges between them.
     """
     from scipy.sparse.csgraph import shortest_path
 

@@ -1,4 +1,4 @@
-"""How an inertial sensor sits on a body, by turn rates: rotation and gyroscope bias."""
+"""Mount of an inertial sensor on a body from turn rates: rotation and gyroscope bias."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ _ROUNDS, _LEAST_RAD_S = 20, 1e-6
 
 
 class SensorTurn(NamedTuple):
-    """How a gyroscope sits on a body: ``w_body = rotation @ (w_sensor - bias)``.
+    """Mount of a gyroscope on a body: ``w_body = rotation @ (w_sensor - bias)``.
 
     Attributes
     ----------
     rotation, rotation_std_rad
-        (3, 3), and (3,) of its error about the body's axes; infinite where the turns do not tell.
+        (3, 3), and (3,) of its error about the body's axes; infinite if not observable.
     bias, bias_std
         (3,) of the gyroscope, in its own axes, rad/s.
     noise_std_rad_s
-        Robust standard deviation of what is left, an axis.
+        Robust standard deviation of the residuals per axis.
     """
 
     rotation: FloatArray
@@ -37,23 +37,23 @@ class SensorTurn(NamedTuple):
 
 
 def align_turn_rates(sensor: ArrayLike, body: ArrayLike) -> SensorTurn:
-    """The rotation and the bias that take turn rates of a sensor to those of its body.
+    """Estimate the rotation and bias that map turn rates of a sensor to those of its body.
 
-    Robust least squares; the rotation of each round is Wahba's.
+    The method is robust least squares. Each iteration solves Wahba's problem for the rotation.
 
     Parameters
     ----------
     sensor
         Turn rates (K, 3) of the gyroscope, in its axes, rad/s.
     body
-        Turn rates (K, 3) of the body at the same times, in its own axes, rad/s: of a truth, or of
-        the track of a filter. Clocks that differ are found first (`rbl_gym.recordings.time_offset`
-        of the lengths of both).
+        Turn rates (K, 3) of the body at the same times, in its own axes, rad/s: from ground
+        truth, or from the track of a filter. Estimate a clock offset first, by
+        `rbl_gym.recordings.time_offset` of the norms of both.
 
     Raises
     ------
     ValueError
-        On arrays that do not fit together, fewer than 10 rates, or turns about one axis only.
+        If shapes do not match, there are fewer than 10 rates, or all turns are about one axis.
     """
     sensor, body = check_array("sensor", sensor, ("K", 3)), check_array("body", body, ("K", 3))
     if sensor.ndim != 2 or sensor.shape != body.shape or len(sensor) < 10:
@@ -75,10 +75,11 @@ def align_turn_rates(sensor: ArrayLike, body: ArrayLike) -> SensorTurn:
         left = body - (sensor - bias) @ R.T
         std = float(robust.spread(left.reshape(-1, 1), everything.reshape(-1, 1), _LEAST_RAD_S)[0])
         w = robust.share_of(np.linalg.norm(left, axis=1) / (np.sqrt(3) * std))
-    # The error of the rotation by the turns about their mean: [w]x of the rates.
+    # Information on the rotation error from the rates about their mean, [w]x.
     rates = (sensor - np.average(sensor, axis=0, weights=w)) @ R.T
     H = np.einsum("k,kij,kil->jl", w, rotations.hat(rates), rotations.hat(rates))
-    # Rates of one gyroscope that are smoothed alike stand for fewer: the errors' autocorrelation.
+    # Smoothed rates are correlated, so the effective number follows from the errors'
+    # autocorrelation.
     lasting = _lasting(np.asarray(left / std))
     turn = np.linalg.inv(H) * std**2 * lasting
     of_bias = std**2 * lasting / w.sum() * np.eye(3)
@@ -88,7 +89,7 @@ def align_turn_rates(sensor: ArrayLike, body: ArrayLike) -> SensorTurn:
 
 
 def _lasting(z: FloatArray) -> float:
-    """For how many rates an error lasts: one plus twice the sum of its first correlations."""
+    """Return the correlation length of errors: one plus twice the sum of the first correlations."""
     z = z * robust.share_of(z)
     total, power = 1.0, float((z**2).sum())
     for lag in range(1, len(z) // 4):
