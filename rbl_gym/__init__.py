@@ -80,8 +80,8 @@ def _register_environments() -> None:
             "rbl_gym.wrappers.tasks:MobileAnchorsVectorEnv",
         ),
         "RBL/AnchorSelection-v0": (
-            "rbl_gym.wrappers.tasks:AnchorSelectionEnv",
-            "rbl_gym.wrappers.tasks:AnchorSelectionVectorEnv",
+            "rbl_gym.wrappers.selection:AnchorSelectionEnv",
+            "rbl_gym.wrappers.selection:AnchorSelectionVectorEnv",
         ),
         "RBL/SharedAnchors-v0": (
             "rbl_gym.wrappers.shared_anchors:SharedAnchorsEnv",

@@ -11,7 +11,8 @@ import pytest
 
 from rbl_gym import bounds, motion
 from rbl_gym.wrappers import controllers
-from rbl_gym.wrappers.tasks import AnchorSelectionVectorEnv, MobileAnchorsVectorEnv
+from rbl_gym.wrappers.selection import AnchorSelectionVectorEnv
+from rbl_gym.wrappers.tasks import MobileAnchorsVectorEnv
 from tests.helpers import share_by_hand
 
 

@@ -368,7 +368,10 @@ def test_environment_that_hides_its_measurements_is_named():
         ({"filter": "et-kf", "options": {"threshold": -1}}, "threshold"),
         ({"reward": "bound"}, "reward must be one of 'belief', 'error', .*, got 'bound'"),
         ({"reward": None}, "reward must be one of 'belief', 'error', .*, got None"),
-        ({"observation": "image"}, "observation must be one of 'dict', 'flat', got 'image'"),
+        (
+            {"observation": "image"},
+            "observation must be one of 'dict', 'flat', 'tokens', .* got 'image'",
+        ),
     ],
     ids=str,
 )

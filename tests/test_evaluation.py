@@ -18,7 +18,8 @@ from rbl_gym.placement import Context, layouts, search
 from rbl_gym.studies.learning import evaluation, policies, training, transfer
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
 from rbl_gym.studies.progress import silent
-from rbl_gym.wrappers.tasks import AnchorSelectionEnv, MobileAnchorsEnv
+from rbl_gym.wrappers.selection import AnchorSelectionEnv
+from rbl_gym.wrappers.tasks import MobileAnchorsEnv
 from tests.helpers import Told, needs
 from tests.test_policies import random_policy
 

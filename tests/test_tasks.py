@@ -17,12 +17,8 @@ from rbl_gym import bounds, estimators, motion
 from rbl_gym.measurements.ranging import LinkNoise
 from rbl_gym.worlds import scenes, simulation
 from rbl_gym.wrappers import controllers
-from rbl_gym.wrappers.tasks import (
-    AnchorSelectionEnv,
-    AnchorSelectionVectorEnv,
-    MobileAnchorsEnv,
-    MobileAnchorsVectorEnv,
-)
+from rbl_gym.wrappers.selection import AnchorSelectionEnv, AnchorSelectionVectorEnv
+from rbl_gym.wrappers.tasks import MobileAnchorsEnv, MobileAnchorsVectorEnv
 from tests.helpers import assert_same, score_by_hand, share_by_hand
 from tests.side_by_side import (
     actions_of,
@@ -543,7 +539,7 @@ def test_other_scenes_give_finite_observations(kind, scene):
         (0, {"scene": {"name": "auv_craft", "colour": 1}}, "scene has no field 'colour'"),
         (0, {"sort_craft": "no"}, "sort_craft must be True or False, got 'no'"),
         (0, {"render_mode": "human"}, "render_mode must be None"),
-        (1, {"mode": "all"}, "mode must be one of 'top-k', 'priced', got 'all'"),
+        (1, {"mode": "all"}, "mode must be one of 'top-k', 'priced', 'subset', got 'all'"),
         (1, {"k": 0}, "k must be an int from 1 to 12, got 0"),
         (1, {"k": 13}, "k must be an int from 1 to 12, got 13"),
         (1, {"k": 2.0}, "k must be an int from 1 to 12, got 2.0"),

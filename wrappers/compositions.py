@@ -11,6 +11,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -21,9 +22,11 @@ from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.wrappers.estimate import scene_of
+from rbl_gym.wrappers.observations import Seen, Viewer, ViewLike, viewer_of
 
 
-class _Task(StatedLength):
+class Task(StatedLength):
     """What scalar and vector tasks share. Arrays have leading axes (B,) in the vector form.
 
     A subclass fills in `_command` and `_show`, and `_price` where actions cost something.
@@ -44,6 +47,8 @@ class _Task(StatedLength):
     scene: Scene
     family: SceneFamily | None = None
     seen: dict[str, np.ndarray] | None = None
+    # What shows the belief; None: the task's own view of it.
+    _viewer: Viewer | None = None
 
     @property
     def episode_steps(self) -> int:
@@ -58,9 +63,7 @@ class _Task(StatedLength):
     @property
     def belief(self) -> PoseBelief:
         """The filter's belief now."""
-        told = self._told()
-        rotation = told["belief_rotation"]
-        return PoseBelief(rotation, told["belief_translation"], told["belief_covariance"], rotation)
+        return _belief_of(self._told())
 
     @property
     def anchors(self) -> FloatArray:
@@ -89,9 +92,32 @@ class _Task(StatedLength):
         """The policy's view of an observation of `inner`, made in a `Scene` or `StackedScenes`."""
         raise NotImplementedError
 
-    def _shown(self) -> np.ndarray:
-        """The policy's view now."""
-        return self._show(self._told(), self.world)
+    def _look_by(self, observation: ViewLike, hides_obstacles: bool = False) -> None:
+        """How the policy sees the belief; ``"flat"``: as the task has it."""
+        if isinstance(observation, str) and observation == "flat":
+            return
+        self._viewer = viewer_of(observation)
+        self._viewer.hides_obstacles = hides_obstacles
+
+    def _space_of(self, own: spaces.Space[Any], inner: Any) -> spaces.Space[Any]:
+        """The space of what the policy sees of one world, `own` if the task's own view."""
+        if self._viewer is None:
+            return own
+        below = getattr(inner, "single_observation_space", inner.observation_space)
+        return self._viewer.space_of(inner, scene_of(inner), below)
+
+    def _view_of(self, observation: dict[str, np.ndarray], world: Any) -> Any:
+        """What the policy sees of an observation of `inner`; the caller's."""
+        if self._viewer is None:
+            return self._show(observation, world)
+        shown = self._viewer(Seen(observation, _belief_of(observation), world))
+        if isinstance(shown, dict):
+            return {key: np.array(field) for key, field in shown.items()}
+        return shown
+
+    def _shown(self) -> Any:
+        """What the policy sees now."""
+        return self._view_of(self._told(), self.world)
 
     @property
     def world(self) -> Any:
@@ -104,24 +130,30 @@ class _Task(StatedLength):
         return 0.0
 
 
-class TaskEnv(_Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+def _belief_of(told: dict[str, np.ndarray]) -> PoseBelief:
+    rotation = told["belief_rotation"]
+    return PoseBelief(rotation, told["belief_translation"], told["belief_covariance"], rotation)
+
+
+class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One world of a task."""
 
     metadata: dict[str, Any] = TrackingEnv.metadata
 
     def _compose(self, inner: gym.Env[Any, Any]) -> None:
         self.inner, self.render_mode = inner, inner.render_mode
+        self.observation_space = self._space_of(self.observation_space, inner)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode; `options` must be empty."""
         self.seen, info = self.inner.reset(seed=seed, options=options)
         world = self.inner.unwrapped
         self._np_random, self._np_random_seed = world.np_random, world.np_random_seed
         return self._shown(), info
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step of the world and of its filter."""
         self.seen, reward, *ended, info = self.inner.step(self._command(action))
         return self._shown(), float(reward - self._price(info)), *ended, info
@@ -131,25 +163,24 @@ class TaskEnv(_Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVa
         self.inner.close()
 
 
-class VectorTaskEnv(_Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
+class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """`num_envs` worlds of a task; seeding and autoreset as `BatchEnv`."""
 
     def _compose(self, inner: VectorEnv[Any, Any, Any]) -> None:
         self.inner, self.num_envs = inner, inner.num_envs
         self.metadata, self.render_mode = inner.metadata, inner.render_mode
+        self.single_observation_space = self._space_of(self.single_observation_space, inner)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
         self.seen, info = self.inner.reset(seed=seed, options=options)
         return self._shown(), info
 
-    def step(
-        self, actions: Any
-    ) -> tuple[np.ndarray, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
         """One step of every world and of its filter."""
         world = self.world
         self.seen, reward, *ended, info = self.inner.step(self._command(actions))
@@ -158,7 +189,7 @@ class VectorTaskEnv(_Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportI
             final = info["_final_obs"]
             for i in np.flatnonzero(final):
                 scene = world if isinstance(world, Scene) else world.scenes[i]
-                info["final_obs"][i] = self._show(info["final_obs"][i], scene)
+                info["final_obs"][i] = self._view_of(info["final_obs"][i], scene)
             price = np.where(final, self._price(info["final_info"]), price)
         return self._shown(), reward - price, *ended, info
 

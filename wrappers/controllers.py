@@ -14,7 +14,8 @@ import numpy as np
 from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
 from rbl_gym.motion.kinematics import propagate
-from rbl_gym.wrappers.tasks import AnchorSelectionVectorEnv, MobileAnchorsVectorEnv
+from rbl_gym.wrappers.selection import AnchorSelectionVectorEnv
+from rbl_gym.wrappers.tasks import MobileAnchorsVectorEnv
 
 __all__ = [
     "MOBILE", "SELECTION", "greedy_blind", "greedy_with_map", "nearest", "orbit",

@@ -8,11 +8,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
 from rbl_gym import estimators, metrics, rendering
-from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import check_takes_noise, factory_of, reads
 from rbl_gym.measurements.bearing import AngleNoise
@@ -20,11 +19,10 @@ from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise
 from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.worlds.stacked import StackedScenes
+from rbl_gym.wrappers.observations import Seen, ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
-OBSERVATIONS = ("dict", "flat")
-# A flat observation is of order one; what is far outside says no more than that.
-_FLAT_LIMIT = 10.0
+FilterLike = str | Mapping[str, Any]
 
 
 class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -45,7 +43,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     env
         The environment.
     filter
-        Name of a filter (`rbl_gym.estimators.names`).
+        Name of a filter (`rbl_gym.estimators.names`); or a dict of its `name` and options, as
+        ``{"name": "iekf", "robust": True}``.
     options
         Its options, a JSON-able dict, for instance ``{"robust": True}``.
     reward
@@ -55,7 +54,8 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     observation
         ``"dict"``: the environment's, with `belief_rotation` (3, 3), `belief_translation`
         (3,), `belief_covariance` (6, 6) added. ``"flat"``: one float32 vector for a policy, see
-        `flat_observation`.
+        `observations.flat`. ``"tokens"``: a token for each anchor, tag and obstacle, see
+        `observations.tokens`. Or a function of one's own: `observations.viewer_of`.
 
     Info
     ----
@@ -78,10 +78,10 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        filter: str = "iekf",
+        filter: FilterLike = "iekf",
         options: Mapping[str, Any] | None = None,
         reward: RewardLike = "belief",
-        observation: str = "dict",
+        observation: ViewLike = "dict",
     ) -> None:
         RecordConstructorArgs.__init__(
             self, filter=filter, options=options, reward=reward, observation=observation
@@ -89,17 +89,17 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         self._scene = scene_of(env)
         self._reward = reward_of(reward)
-        self._kind = check_one_of("observation", observation, OBSERVATIONS)
+        self._viewer = viewer_of(observation)
         self._tags = self._scene.body
         self._rendered = getattr(env.unwrapped, "film", None) is not None
-        self._named = filter, options
+        self._named = named_filter(filter, options)
         self._family = family_of(env)
         if self._family is not None:
             # Options that a scene of the family refuses are refused now.
             self._scene = next((s for s in self._family.corners if s.obstacles), self._scene)
-        self._filter = make_filter(env, self._scene, filter, options)
+        self._filter = make_filter(env, self._scene, *self._named)
         self._state: Any = None
-        self.observation_space = observation_space(self._kind, env.observation_space, self._scene)
+        self.observation_space = self._viewer.space_of(env, self._scene, env.observation_space)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -146,7 +146,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return info, figures
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:
-        return present(self._kind, observation, belief, self._scene)
+        return self._viewer(Seen(observation, belief, self._scene))
 
 
 def scene_of(env: Any) -> Scene:
@@ -191,6 +191,21 @@ def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
         if name in told:
             told[bound] = told.pop(name)
     return told
+
+
+def named_filter(
+    filter: FilterLike, options: Mapping[str, Any] | None
+) -> tuple[str, Mapping[str, Any] | None]:
+    """Name and options of a filter that is given by its name, or by a dict of both."""
+    if not isinstance(filter, Mapping):
+        return filter, options
+    if options is not None:
+        raise ValueError(f"options must be in the dict of the filter, got {options!r:.80} besides")
+    told = dict(filter)
+    name = told.pop("name", None)
+    if not isinstance(name, str):
+        raise ValueError(f"filter must be a name, or a dict with a name, got {filter!r:.80}")
+    return name, told
 
 
 def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
@@ -283,77 +298,3 @@ def _variance(
     if "quality" in observation:
         variance = variance / np.where(links, observation["quality"][..., None], 1.0)
     return np.where(links, variance, 1.0)
-
-
-def present(
-    kind: str, observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: Scene
-) -> Any:
-    """The observation with the belief: a dict, or flat for a policy."""
-    if kind == "flat":
-        return flat_observation(observation, belief, scene)
-    return {
-        **observation,
-        "belief_rotation": belief.rotation,
-        "belief_translation": belief.translation,
-        "belief_covariance": belief.covariance,
-    }
-
-
-def observation_space(kind: str, inner: spaces.Space[Any], scene: Scene) -> spaces.Space[Any]:
-    """The space of `present`, from that of one raw environment which the filter can read."""
-    keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
-    needed = {"angles", "station"} if "angles" in keys else {"ranges", "links", "anchors"}
-    if not isinstance(inner, spaces.Dict) or not {*needed, "twist"} <= keys:
-        raise ValueError(
-            "env must observe ranges, links, anchors and twist, or angles, station and twist, its "
-            f"space is {inner}"
-        )
-    if kind == "flat":
-        m = scene.n_anchors if "station" in keys else inner["anchors"].shape[0]  # pyright: ignore[reportOptionalSubscript]
-        size = 21 + (5 if "anchor_mask" in keys else 4) * m
-        return spaces.Box(-_FLAT_LIMIT, _FLAT_LIMIT, (size,), np.float32)
-    # Beliefs have no bound of their own; these are finite and never met.
-    return spaces.Dict(
-        {
-            **inner.spaces,
-            "belief_rotation": spaces.Box(-1.001, 1.001, (3, 3), np.float64),
-            "belief_translation": spaces.Box(-1e9, 1e9, (3,), np.float64),
-            "belief_covariance": spaces.Box(-1e18, 1e18, (6, 6), np.float64),
-        }
-    )
-
-
-def flat_observation(
-    observation: Mapping[str, np.ndarray], belief: PoseBelief, scene: Scene
-) -> np.ndarray:
-    """Belief and anchors as one float32 vector (..., 21 + 4 M), relative and of order one.
-
-    Of a family of scenes (..., 21 + 5 M): the mask of the anchors is the end of it.
-
-    In order: estimated position scaled to the scene's volume (3); twist over pi/10 a step and
-    over the speed (6); log standard deviations of the pose error (6); the first two columns
-    of the estimated rotation (6); anchors relative to the estimate over the scene's extent (3
-    M); log of their distances over that extent (M). Cut to +-10.
-    """
-    middle, half, extent, rates = scene.scales
-    std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
-    station = "station" in observation
-    anchors = observation["station"][..., None, :] if station else observation["anchors"]
-    relative = anchors - belief.translation[..., None, :]
-    distance = metrics.length(relative)
-    batch = belief.translation.shape[:-1]
-    far = np.log(np.maximum(distance / extent[..., None], 1e-6))
-    masks = [observation["anchor_mask"]] if "anchor_mask" in observation else []
-    for mask in masks:
-        relative, far = relative * mask[..., None], far * mask
-    parts = [
-        (belief.translation - middle) / half,
-        observation["twist"] / rates,
-        np.log(np.maximum(std, 1e-12)),
-        np.swapaxes(belief.rotation, -1, -2)[..., :2, :].reshape(*batch, 6),
-        (relative / extent[..., None, None]).reshape(*batch, -1),
-        far,
-        *masks,
-    ]
-    flat = np.concatenate(parts, axis=-1)
-    return np.clip(flat, -_FLAT_LIMIT, _FLAT_LIMIT).astype(np.float32)

@@ -17,7 +17,7 @@ from rbl_gym.envs.placement_family import PlacementFamilyEnv, PlacementFamilyVec
 from rbl_gym.estimators import Filter
 from rbl_gym.estimators.filter import check_takes_noise, reads
 from rbl_gym.placement import Context, PlacementTask
-from rbl_gym.wrappers.estimate import make_filter
+from rbl_gym.wrappers.estimate import FilterLike, make_filter, named_filter
 from rbl_gym.wrappers.filter_tracks import check_determined, track_error
 
 REWARDS = ("bound", "filter")
@@ -38,8 +38,9 @@ def filter_of(env: Any, task: PlacementTask, name: str, options: Any) -> Filter:
 class _Judge:
     """How well a named filter tracks with complete layouts, in one task or in a family of them."""
 
-    def __init__(self, env: Any, name: str, options: Mapping[str, Any] | None) -> None:
-        self._env, self._named = env, (name, options)
+    def __init__(self, env: Any, name: FilterLike, options: Mapping[str, Any] | None) -> None:
+        self._env, self._named = env, named_filter(name, options)
+        name, options = self._named
         tasks = _tasks_of(env)
         family = getattr(env.unwrapped, "family", None)
         self._one = filter_of(env, tasks[0], name, options) if family is None else None
@@ -115,7 +116,7 @@ class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def __init__(
         self,
         env: gym.Env[Any, Any],
-        filter: str = "iekf",
+        filter: FilterLike = "iekf",
         options: Mapping[str, Any] | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(self, filter=filter, options=options)
@@ -146,7 +147,7 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        filter: str = "iekf",
+        filter: FilterLike = "iekf",
         options: Mapping[str, Any] | None = None,
     ) -> None:
         RecordConstructorArgs.__init__(self, filter=filter, options=options)
@@ -201,7 +202,7 @@ def _errors(task: PlacementTask, filter: Filter, info: Mapping[str, np.ndarray])
 def anchor_placement(
     *,
     reward: str = "bound",
-    filter: str = "iekf",
+    filter: FilterLike = "iekf",
     options: Mapping[str, Any] | None = None,
     **arguments: Any,
 ) -> gym.Env[Any, Any]:
@@ -229,7 +230,7 @@ def anchor_placement(
 def anchor_placement_vector(
     *,
     reward: str = "bound",
-    filter: str = "iekf",
+    filter: FilterLike = "iekf",
     options: Mapping[str, Any] | None = None,
     **arguments: Any,
 ) -> VectorEnv[Any, Any, Any]:

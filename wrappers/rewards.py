@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import math
 from collections.abc import Callable, Mapping
@@ -15,6 +14,7 @@ from rbl_gym.checks import FloatArray, all_finite, check_number
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.metrics import Figures
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.wrappers.observations import imported
 
 __all__ = ["REWARDS", "Outcome", "reward_of"]
 
@@ -114,14 +114,7 @@ def reward_of(reward: RewardLike) -> Reward:
     if isinstance(reward, str) and reward in REWARDS and reward != "requirement":
         return REWARDS[reward]
     if isinstance(reward, str) and ":" in reward:
-        module, _, name = reward.partition(":")
-        try:
-            found = getattr(importlib.import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ValueError(f"reward {reward!r:.80} cannot be imported: {error}") from error
-        if not callable(found):
-            raise ValueError(f"reward {reward!r:.80} must be callable, got {found!r:.80}")
-        return found
+        return imported("reward", reward)
     if isinstance(reward, str) and reward == "requirement":
         raise ValueError(
             "reward 'requirement' needs limits: "

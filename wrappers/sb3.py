@@ -114,7 +114,10 @@ class Sb3VecEnv(VecEnv):
     def env_method(
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        """Refused: the worlds have no methods of their own."""
+        """``action_masks`` of each world; anything else is refused, the worlds have no methods."""
+        if method_name == "action_masks":
+            masks = self.envs.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
+            return [masks[i] for i in self._get_indices(indices)]
         raise NotImplementedError("the worlds of a native vector environment share methods")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:

@@ -25,12 +25,13 @@ from rbl_gym.envs.batch import (
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily
-from rbl_gym.wrappers.estimate import OBSERVATIONS
+from rbl_gym.wrappers.estimate import FilterLike
+from rbl_gym.wrappers.observations import ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import RewardLike
 from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
 # What the bodies of a world have in common, and what they must agree in.
-_SHARED = ("anchors",)
+_SHARED = ("anchors", "anchor_mask")
 _ALIKE = ("n_anchors", "anchors", "anchor_region", "anchor_speed_m_s", "dt", "steps")
 # How the rewards of the bodies become one.
 COMBINATIONS = {"mean": np.mean, "worst": np.min, "sum": np.sum}
@@ -61,11 +62,11 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         num_envs: int = 1,
         scene: str | Mapping[str, Any] = "auv_buoys",
         bodies: Sequence[Mapping[str, Any]] = ({}, {}),
-        filter: str = "iekf",
+        filter: FilterLike = "iekf",
         options: Mapping[str, Any] | None = None,
         reward: RewardLike = "belief",
         combine: str = "mean",
-        observation: str = "dict",
+        observation: ViewLike = "dict",
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
@@ -73,12 +74,12 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         num_envs = check_count("num_envs", num_envs, most=MOST_ENVS)
         family = family_of_bodies(scene, bodies)
         self._combine = COMBINATIONS[check_one_of("combine", combine, list(COMBINATIONS))]
-        self._observed = check_one_of("observation", observation, OBSERVATIONS)
         self.n_bodies = k = len(family.members)
         rows = _Bodies(
             num_envs * k, reward="none", render_mode=render_mode,
             max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode, scenes=family,
         )  # fmt: skip
+        self._kind = viewer_of(observation).kind
         self.inner = VectorEstimatePose(rows, filter, options, reward, observation)
         self.num_envs, self.render_mode, self.metadata = num_envs, render_mode, rows.metadata
         self.single_action_space = rows.single_action_space
@@ -92,10 +93,18 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
                 {
                     key: space if key in _SHARED else batch_space(space, self.n_bodies)
                     for key, space in one.items()
-                    if key != "anchor_mask"
+                    if key not in self._left_out
                 }
             )
-        return spaces.Box(-10.0, 10.0, (self.n_bodies * one.shape[0],), np.float32)
+        each = batch_space(one, self.n_bodies)
+        if len(one.shape) != 1 or not isinstance(each, spaces.Box):
+            return each
+        return spaces.Box(each.low.ravel(), each.high.ravel(), dtype=one.dtype)
+
+    @property
+    def _left_out(self) -> tuple[str, ...]:
+        """Masks that are all ones: there is one number of anchors, and tokens alone tell it."""
+        return ("anchor_mask",) if self._kind == "dict" else ()
 
     @property
     def episode_steps(self) -> int:
@@ -138,11 +147,11 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
     def _grouped(self, observation: Any) -> Any:
         """Observations (B K, ...) as those of B worlds."""
         if not isinstance(observation, dict):
-            return observation.reshape(self.num_envs, -1)
+            return observation.reshape(self.observation_space.shape)
         return {
             key: field[:: self.n_bodies] if key in _SHARED else self._split(field)
             for key, field in observation.items()
-            if key != "anchor_mask"
+            if key not in self._left_out
         }
 
     def _split(self, field: np.ndarray) -> np.ndarray:
@@ -173,10 +182,10 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
                 final[world] = {
                     key: group[0][key] if key in _SHARED else np.stack([one[key] for one in group])
                     for key in group[0]
-                    if key != "anchor_mask"
+                    if key not in self._left_out
                 }
             else:
-                final[world] = np.concatenate(list(group))
+                final[world] = np.stack(list(group)).reshape(self.single_observation_space.shape)
         return final
 
     def render(self) -> Any:
@@ -208,7 +217,9 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
     `ranges`, `links`, `twist`, `quality`, `belief_rotation`, `belief_translation`,
     `belief_covariance`; besides `tags` (K, N, 3), metres, body frame, and `tag_mask` (K, N), 1
     for the tags that a body has. `anchors` (M, 3) are those of all.
-    ``"flat"``: the flat observations of the bodies one after the other, float32.
+    ``"flat"``: the flat observations of the bodies one after the other, float32. ``"tokens"``, and
+    a function of one's own: as `EstimatePose`, with an axis of K bodies before the others; vectors
+    stand one after the other.
 
     ## Reward
     Each body has the `reward` of `EstimatePose`; ``combine="mean"``, ``"worst"`` or ``"sum"`` over
@@ -256,11 +267,11 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
         self,
         scene: str | Mapping[str, Any] = "auv_buoys",
         bodies: Sequence[Mapping[str, Any]] = ({}, {}),
-        filter: str = "iekf",
+        filter: FilterLike = "iekf",
         options: Mapping[str, Any] | None = None,
         reward: RewardLike = "belief",
         combine: str = "mean",
-        observation: str = "dict",
+        observation: ViewLike = "dict",
         render_mode: str | None = None,
     ) -> None:
         self.render_mode = render_mode

@@ -10,6 +10,12 @@ import numpy as np
 from rbl_gym.worlds import scenes
 from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.worlds.scene import Scene
+from rbl_gym.wrappers.estimate import FilterLike, check_options_of, named_filter
+
+# An observation is of order one; what is far outside says no more than that.
+LIMIT = 10.0
+# Iterations of the iterated EKF; two are as good as four here, and faster.
+_ITERATIONS = 2
 
 
 def world_of(scene: Any, **defaults: Any) -> Scene:
@@ -44,3 +50,17 @@ class Usual:
         self.variance = np.max([np.diagonal(one.prior_covariance) for one in worlds], axis=0)
         speeds = [(one.speed_m_s, float(np.abs(one.twist[3:]).max())) for one in worlds]
         self.speed = max(np.max(speeds), 1e-3)
+
+
+def filter_of_task(
+    filter: FilterLike, options: Mapping[str, Any] | None
+) -> tuple[FilterLike, Mapping[str, Any] | None]:
+    """Filter and options, the tasks' own where none are given."""
+    name, told = named_filter(filter, options)
+    usual = {"iterations": _ITERATIONS} if isinstance(name, str) and name == "iekf" else {}
+    return name, {**usual, **check_options_of(told)}
+
+
+def worlds_of(batch: tuple[int, ...]) -> tuple[np.ndarray, ...]:
+    """Indices that stand before those (B, M) of each world's anchors."""
+    return tuple(np.arange(n)[:, None] for n in batch)

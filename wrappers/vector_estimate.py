@@ -11,22 +11,22 @@ from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import batch_space
 
 from rbl_gym import metrics, rendering
-from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, PoseBelief
 from rbl_gym.estimators.filter import reads
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import (
-    OBSERVATIONS,
+    FilterLike,
     family_of,
     make_filter,
     measured_of,
-    observation_space,
-    present,
+    named_filter,
     scene_of,
     unpadded,
     update,
     with_bound,
 )
+from rbl_gym.wrappers.observations import Seen, ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
 
@@ -52,27 +52,27 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def __init__(
         self,
         env: VectorEnv[Any, Any, Any],
-        filter: str = "iekf",
+        filter: FilterLike = "iekf",
         options: Mapping[str, Any] | None = None,
         reward: RewardLike = "belief",
-        observation: str = "dict",
+        observation: ViewLike = "dict",
     ) -> None:
         RecordConstructorArgs.__init__(
             self, filter=filter, options=options, reward=reward, observation=observation
         )
         VectorWrapper.__init__(self, env)
         self._scene: Any = scene_of(env)
-        self._named = filter, options
+        self._named = named_filter(filter, options)
         self._varied = family_of(env) is not None
         if self._varied:
             self._scene = env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
         self._reward = reward_of(reward)
-        self._kind = check_one_of("observation", observation, OBSERVATIONS)
-        self._stacks = self._varied and _takes_stacks(env, self._scene, filter, options)
+        self._viewer = viewer_of(observation)
+        self._stacks = self._varied and _takes_stacks(env, self._scene, *self._named)
         self._parts = self._parted()
         self._state: Any = None
         self._belief: PoseBelief | None = None
-        single = observation_space(self._kind, env.single_observation_space, self._scene)
+        single = self._viewer.space_of(env, scene_of(env), env.single_observation_space)
         self.single_observation_space = single
         self.observation_space = batch_space(single, env.num_envs)
 
@@ -193,7 +193,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         for i in np.flatnonzero(last):
             belief = PoseBelief(*(field[i].copy() for field in self._belief))
             scene = self._scene.scenes[i] if self._varied else self._scene
-            info["final_obs"][i] = present(self._kind, info["final_obs"][i], belief, scene)
+            info["final_obs"][i] = self._viewer(Seen(info["final_obs"][i], belief, scene))
         for name, value in figures._asdict().items():
             info["final_info"][name] = np.where(last, value, 0.0)
             info["final_info"][f"_{name}"] = last.copy()
@@ -206,7 +206,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         assert self._belief is not None
         rendering.tell(self.env, rendering.Pose(*self._belief[:3]))
         belief = PoseBelief(*(field.copy() for field in self._belief))
-        return present(self._kind, observation, belief, self._scene)
+        return self._viewer(Seen(observation, belief, self._scene))
 
 
 def _reached(

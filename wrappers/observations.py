@@ -1,0 +1,367 @@
+"""What `EstimatePose` shows: a dict, a flat vector, tokens, or a view of one's own."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+
+from rbl_gym import metrics
+from rbl_gym.checks import FloatArray, all_finite
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.worlds.scene import Scene
+
+__all__ = ["OBSERVATIONS", "Seen", "flat", "tokens", "viewer_of"]
+
+OBSERVATIONS = ("dict", "flat", "tokens")
+# Observations of policies are of order one; what is far outside says no more than that.
+_LIMIT = 10.0
+# Beliefs and views of one's own have no bounds; these are finite and never met.
+_FAR = 1e9
+# Entries of the tokens.
+_BODY, _ANCHOR, _TAG, _BOX = 26, 6, 4, 6
+
+
+class Seen(NamedTuple):
+    """An epoch as a view sees it. In a vector environment every array has a leading axis (B,).
+
+    Attributes
+    ----------
+    observation
+        The environment's: `ranges`, `links`, `anchors`, `twist` and so on; of drawn worlds padded,
+        with `anchor_mask`, `tag_mask` and `tags`.
+    belief
+        The belief after the epoch.
+    scene
+        The world: a `Scene`, of many drawn ones a `StackedScenes` with the same attributes.
+    """
+
+    observation: Mapping[str, np.ndarray]
+    belief: PoseBelief
+    scene: Any
+
+
+View = Callable[[Seen], Any]
+ViewLike = str | View
+
+
+# --- named views ------------------------------------------------------------------------------
+
+
+def flat(seen: Seen) -> np.ndarray:
+    """Belief and anchors as one float32 vector (..., 21 + 4 M), relative and of order one.
+
+    Of drawn worlds (..., 21 + 5 M): the mask of the anchors is the end of it.
+
+    In order: estimated position scaled to the scene's volume (3); twist over pi/10 a step and
+    over the speed (6); log standard deviations of the pose error (6); the first two columns
+    of the estimated rotation (6); anchors relative to the estimate over the scene's extent (3
+    M); log of their distances over that extent (M). Cut to +-10.
+    """
+    relative, far = _anchors(seen)
+    masks = [seen.observation["anchor_mask"]] if "anchor_mask" in seen.observation else []
+    for mask in masks:
+        relative, far = relative * mask[..., None], far * mask
+    parts = [*_body(seen), relative.reshape(*far.shape[:-1], -1), far, *masks]
+    return _cut(np.concatenate(parts, axis=-1))
+
+
+def tokens(seen: Seen, n_boxes: int = 0) -> dict[str, np.ndarray]:
+    """A token for the body, and one for each anchor, tag and obstacle, with masks; float32.
+
+    Made for policies with attention: what is padded has a token of zeros and a mask of 0. All
+    entries are relative, of order one and cut to +-10.
+
+    - `body` (..., 26): the first 21 entries of `flat`; half sizes of the volume over the scene's
+      extent (3); decimal logarithms over 4 of that extent in metres and of the body's radius over
+      it.
+    - `anchor_tokens` (..., M, 6): place relative to the estimate over the extent (3); log of the
+      distance over it; share of the tags that were measured; `quality`, 1 where there is none.
+      With the memory of `SelectAnchors` two more: what the last choice told (1: it saw the body,
+      -1: it did not, 0: never chosen) and ``exp(-steps since then / 10)``.
+    - `tag_tokens` (..., N, 4): place on the body, turned as the belief is, over the body's radius
+      (3); share of the anchors that measured it.
+    - `obstacle_tokens` (..., K, 6), where the scenes have obstacles: centre relative to the
+      estimate, and half size, over the extent.
+    - `anchor_mask` (..., M), `tag_mask` (..., N), `obstacle_mask` (..., K), int8.
+
+    Parameters
+    ----------
+    seen
+        The epoch.
+    n_boxes
+        The most obstacles of a scene; 0: none are shown.
+    """
+    told, belief, scene = seen
+    batch, extent = belief.translation.shape[:-1], scene.scales.extent
+    half = scene.scales.half / extent[..., None]
+    tags = told.get("tags", scene.body)
+    tags = np.broadcast_to(tags, (*batch, *tags.shape[-2:]))
+    tag_mask = told.get("tag_mask", np.ones(tags.shape[:-1], np.int8))
+    relative, far = _anchors(seen)
+    anchor_mask = told.get("anchor_mask", np.ones(far.shape, np.int8))
+    links = told["links"] if "links" in told else np.ones((*far.shape, tags.shape[-2]))
+    counts = tag_mask.sum(axis=-1)[..., None], anchor_mask.sum(axis=-1)[..., None]
+    radius = metrics.length(tags).max(axis=-1)
+    sizes = np.stack([extent + 0 * radius, radius / extent], axis=-1)
+    of_anchors = [
+        relative,
+        far[..., None],
+        (links.sum(axis=-1) / counts[0])[..., None],
+        np.asarray(told.get("quality", np.ones(far.shape)))[..., None],
+    ]
+    if "known" in told:
+        heard = np.exp(-told["age"] / 10)
+        of_anchors += [np.where(heard > 0, 2 * told["known"] - 1, 0.0)[..., None], heard[..., None]]
+    turned = tags @ np.swapaxes(belief.rotation, -1, -2) / radius[..., None, None]
+    of_tags = [turned, (links.sum(axis=-2) / counts[1])[..., None]]
+    shown = {
+        "body": [*_body(seen), np.broadcast_to(half, (*batch, 3)), np.log10(sizes) / 4],
+        "anchor_tokens": of_anchors,
+        "tag_tokens": of_tags,
+    }
+    masks = {"anchor_tokens": anchor_mask, "tag_tokens": tag_mask}
+    if n_boxes:
+        boxes, mask = _boxes(scene, n_boxes, batch)
+        size = extent[..., None, None]
+        middle = (boxes[..., :3] - belief.translation[..., None, :]) / size
+        shown["obstacle_tokens"] = [middle, boxes[..., 3:] / size]
+        masks["obstacle_tokens"] = mask
+    result = {name: _cut(np.concatenate(parts, axis=-1)) for name, parts in shown.items()}
+    for name, mask in masks.items():
+        result[name] *= mask[..., None]
+        result[name.replace("_tokens", "_mask")] = np.array(mask, np.int8)
+    return result
+
+
+def _body(seen: Seen) -> list[FloatArray]:
+    """Place, twist, log standard deviations, two columns of the rotation: 21 entries."""
+    told, belief, scene = seen
+    middle, half, _, rates = scene.scales
+    std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
+    columns = np.swapaxes(belief.rotation, -1, -2)[..., :2, :]
+    return [
+        (belief.translation - middle) / half,
+        told["twist"] / rates,
+        np.log(np.maximum(std, 1e-12)),
+        columns.reshape(*belief.translation.shape[:-1], 6),
+    ]
+
+
+def _anchors(seen: Seen) -> tuple[FloatArray, FloatArray]:
+    """Anchors relative to the estimate (..., M, 3), and the logs of their distances (..., M)."""
+    told, belief, scene = seen
+    extent = scene.scales.extent
+    anchors = told["station"][..., None, :] if "station" in told else told["anchors"]
+    relative = anchors - belief.translation[..., None, :]
+    far = np.log(np.maximum(metrics.length(relative) / extent[..., None], 1e-6))
+    return relative / extent[..., None, None], far
+
+
+def _boxes(scene: Any, n_boxes: int, batch: tuple[int, ...]) -> tuple[FloatArray, np.ndarray]:
+    """The obstacles (..., K, 6) of the scenes, and their mask (..., K)."""
+    own = scene.obstruction.boxes
+    boxes = np.zeros((*batch, n_boxes, 6))
+    boxes[..., : own.shape[-2], :] = own
+    return boxes, (boxes[..., 3] > 0).astype(np.int8)
+
+
+def _cut(entries: FloatArray) -> np.ndarray:
+    return np.clip(entries, -_LIMIT, _LIMIT).astype(np.float32)
+
+
+# --- views of an environment ------------------------------------------------------------------
+
+
+def viewer_of(observation: ViewLike) -> Viewer:
+    """What shows an epoch as the argument `observation` says.
+
+    Parameters
+    ----------
+    observation
+        A name of `OBSERVATIONS`. Or ``"module:function"``, or a function of a `Seen`, which
+        returns an array, or a dict of arrays, with the leading axes of the belief. Its space is its
+        attribute `space` (a Gymnasium space, of one world), and without one is found by calling it
+        once: boxes of the shapes and types that it returns.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, a path that cannot be imported, anything else.
+    """
+    if callable(observation):
+        return Viewer("own", observation)
+    if isinstance(observation, str) and observation in OBSERVATIONS:
+        return Viewer(observation)
+    if isinstance(observation, str) and ":" in observation:
+        return Viewer("own", imported("observation", observation))
+    raise ValueError(
+        f"observation must be one of {', '.join(map(repr, OBSERVATIONS))}, 'module:function' or a "
+        f"function, got {observation!r:.80}"
+    )
+
+
+def imported(name: str, path: str) -> Callable[..., Any]:
+    """The function of ``"module:function"``, or a ValueError that calls the argument by `name`."""
+    module, _, attribute = path.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{name} {path!r:.80} cannot be imported: {error}") from error
+    if not callable(found):
+        raise ValueError(f"{name} {path!r:.80} must be callable, got {found!r:.80}")
+    return found
+
+
+@dataclass
+class Viewer:
+    """Shows the epochs of an environment; `space_of` is asked first.
+
+    Attributes
+    ----------
+    kind
+        A name of `OBSERVATIONS`, or ``"own"``.
+    function
+        The view of one's own.
+    hides_obstacles
+        Whether tokens have no obstacles.
+    """
+
+    kind: str
+    function: View | None = None
+    hides_obstacles: bool = False
+    n_boxes: int = 0
+    space: spaces.Space[Any] | None = None
+
+    def space_of(self, env: Any, scene: Any, inner: spaces.Space[Any]) -> spaces.Space[Any]:
+        """The space of what is shown of one world of `env`, whose own space is `inner`."""
+        keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
+        needed = {"angles", "station"} if "angles" in keys else {"ranges", "links", "anchors"}
+        if not isinstance(inner, spaces.Dict) or not {*needed, "twist"} <= keys:
+            raise ValueError(
+                "env must observe ranges, links, anchors and twist, or angles, station and twist, "
+                f"its space is {inner}"
+            )
+        m, n = 1, len(scene.body[0] if scene.body.ndim > 2 else scene.body)
+        if "ranges" in keys:
+            m, n = inner["ranges"].shape or (m, n)
+        if self.kind == "tokens":
+            family = getattr(env.unwrapped, "family", None)
+            most = len(scene.obstacles) if family is None else family.n_boxes
+            self.n_boxes = 0 if self.hides_obstacles else most
+            self.space = _space_of_tokens(m, n, self.n_boxes, "known" in keys)
+        elif self.kind == "flat":
+            size = 21 + (5 if "anchor_mask" in keys else 4) * m
+            self.space = spaces.Box(-_LIMIT, _LIMIT, (size,), np.float32)
+        elif self.kind == "dict":
+            self.space = spaces.Dict({**inner.spaces, **_BELIEF})
+        else:
+            self.space = self._own_space(env, inner)
+        return self.space
+
+    def __call__(self, seen: Seen) -> Any:
+        """What is shown of an epoch, of the caller."""
+        if self.kind == "flat":
+            return flat(seen)
+        if self.kind == "tokens":
+            return tokens(seen, self.n_boxes)
+        if self.kind == "own":
+            return self._own(seen)
+        told, belief = seen.observation, seen.belief
+        return {
+            **told,
+            "belief_rotation": belief.rotation,
+            "belief_translation": belief.translation,
+            "belief_covariance": belief.covariance,
+        }
+
+    def _own_space(self, env: Any, inner: spaces.Dict) -> spaces.Space[Any]:
+        assert self.function is not None
+        declared = getattr(self.function, "space", None)
+        if isinstance(declared, spaces.Space):
+            return declared
+        with np.errstate(all="ignore"):
+            shown = self.function(_example(env, inner))
+        if isinstance(shown, Mapping):
+            return spaces.Dict({key: _box_like(value) for key, value in shown.items()})
+        return _box_like(shown)
+
+    def _own(self, seen: Seen) -> Any:
+        assert self.function is not None
+        shown, batch = self.function(seen), seen.belief.translation.shape[:-1]
+        if not isinstance(self.space, spaces.Dict):
+            return _fitted("observation", shown, batch, self.space)
+        if not isinstance(shown, Mapping) or set(shown) != set(self.space):
+            raise ValueError(
+                f"observation must return a dict with {', '.join(self.space)}, got {shown!r:.80}"
+            )
+        return {
+            key: _fitted(f"observation[{key!r}]", shown[key], batch, space)
+            for key, space in self.space.items()
+        }
+
+
+_BELIEF: dict[str, spaces.Space[Any]] = {
+    "belief_rotation": spaces.Box(-1.001, 1.001, (3, 3), np.float64),
+    "belief_translation": spaces.Box(-_FAR, _FAR, (3,), np.float64),
+    "belief_covariance": spaces.Box(-(_FAR**2), _FAR**2, (6, 6), np.float64),
+}
+
+
+def _space_of_tokens(m: int, n: int, k: int, memory: bool) -> spaces.Dict:
+    shapes = {
+        "body": (_BODY,),
+        "anchor_tokens": (m, _ANCHOR + 2 * memory),
+        "tag_tokens": (n, _TAG),
+        **({"obstacle_tokens": (k, _BOX)} if k else {}),
+    }
+    masks = {
+        name.replace("_tokens", "_mask"): spaces.MultiBinary(shape[0])
+        for name, shape in shapes.items()
+        if name != "body"
+    }
+    boxes = {name: spaces.Box(-_LIMIT, _LIMIT, s, np.float32) for name, s in shapes.items()}
+    return spaces.Dict({**boxes, **masks})
+
+
+def _example(env: Any, inner: spaces.Dict) -> Seen:
+    """The first epoch of a copy of the environment, of one world."""
+    world = copy.deepcopy(env.unwrapped)
+    observation, info = world.reset(seed=0)
+    scene = world.scene
+    if hasattr(world, "num_envs"):
+        observation = {key: field[0] for key, field in observation.items()}
+        info = {key: field[0] for key, field in info.items()}
+        stack = getattr(world, "world", scene)
+        scene = stack if isinstance(stack, Scene) else stack.scenes[0]
+    nothing = {key: np.zeros(space.shape or (), space.dtype) for key, space in inner.items()}
+    rotation = info["prior_rotation"]
+    belief = PoseBelief(rotation, info["prior_translation"], info["prior_covariance"], rotation)
+    return Seen({**nothing, **observation}, belief, scene)
+
+
+def _box_like(value: Any) -> spaces.Box:
+    """A box for arrays as this one: numbers with a point become float32."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiub":
+        raise ValueError(f"observation must return numbers, got {value!r:.80}")
+    if array.dtype.kind == "f":
+        return spaces.Box(-_FAR, _FAR, array.shape, np.float32)
+    info = np.iinfo(np.int8 if array.dtype.kind == "b" else array.dtype)
+    return spaces.Box(info.min, info.max, array.shape, info.dtype.type)
+
+
+def _fitted(name: str, value: Any, batch: tuple[int, ...], space: Any) -> np.ndarray:
+    """A copy of what a view returned, in the type of its space; or a ValueError."""
+    array = np.array(value)
+    shape = (*batch, *space.shape)
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
+    if array.dtype.kind not in "fiub" or not all_finite(array.astype(np.float64)):
+        raise ValueError(f"{name} must hold finite numbers, got {value!r:.80}")
+    return array.astype(space.dtype)

@@ -1,0 +1,264 @@
+"""RBL/AnchorSelection-v0: which anchors range now, with a filter in the loop."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+
+from rbl_gym.checks import BoolArray, check_count, check_number, check_one_of
+from rbl_gym.envs.batch import check_actions
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
+from rbl_gym.worlds.scene import Scene
+from rbl_gym.wrappers import views
+from rbl_gym.wrappers.compositions import Task, TaskEnv, VectorTaskEnv
+from rbl_gym.wrappers.estimate import EstimatePose, FilterLike
+from rbl_gym.wrappers.observations import ViewLike
+from rbl_gym.wrappers.rewards import RewardLike
+from rbl_gym.wrappers.select_anchors import SelectAnchors, VectorSelectAnchors
+from rbl_gym.wrappers.task_worlds import (
+    LIMIT,
+    Usual,
+    family_of_task,
+    filter_of_task,
+    made_of,
+    world_of,
+    worlds_of,
+)
+from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
+
+SELECTIONS = ("top-k", "priced", "subset")
+# More than a policy can tell apart.
+_MOST_SUBSETS = 10_000
+
+
+class _AnchorSelection(Task):
+    """Choices and their price: what scalar and vector forms share."""
+
+    def _configure(self, mode: str, k: int, price: float, scene: Any, scenes: Any) -> None:
+        found = family_of_task(scenes, scene, "hall", steps=50)
+        worlds = (world_of(scene, steps=50),) if found is None else found.corners
+        self.family, self.scene = found, worlds[0]
+        self._most = (found or self.scene).n_anchors
+        self.mode = check_one_of("mode", mode, SELECTIONS)
+        self.k = check_count("k", k, most=min(one.n_anchors for one in worlds))
+        self._subsets = _subsets(self._most, self.k) if mode == "subset" else None
+        self.price = check_number("price", price, low=0.0)
+        self._limits = np.full(18, LIMIT)
+        self._usual = Usual(*worlds)
+        corners = np.array([one.volume.bounds() for one in worlds])
+        low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+        self._centre = 0.5 * (low + high)
+        # In a volume without height, deviations count by what the prior leaves open.
+        prior = max(one.initial_translation_m for one in worlds)
+        self._half = np.maximum(0.5 * (high - low), prior)
+        self._extent_m = max(float(one.scales.extent) for one in worlds)
+
+    def _spaces(self) -> tuple[spaces.Box, spaces.Space[Any]]:
+        m = self._most
+        size = 18 if self.family is None else 21 + 6 * m
+        action: spaces.Space[Any] = spaces.Box(-1.0, 1.0, (m,), np.float32)
+        if self._subsets is not None:
+            action = spaces.Discrete(len(self._subsets))
+        elif self.mode == "priced":
+            action = spaces.MultiBinary(m)
+        return spaces.Box(-LIMIT, LIMIT, (size,), np.float32), action
+
+    @property
+    def _remembers(self) -> bool:
+        """Whether the observation has what the anchors told last."""
+        return self.family is not None or self._viewer is not None
+
+    def _choice(self, action: np.ndarray) -> np.ndarray:
+        """Which anchors (..., M) an action chooses, int8; ties go to the lower number."""
+        there = None if self.family is None else self._told()["anchor_mask"]
+        if self._subsets is not None:
+            chosen = self._subsets[action]
+            return chosen if there is None else chosen & there
+        if self.mode == "priced":
+            return action if there is None else action & there
+        if there is not None:
+            action = np.where(there, action, -np.inf)
+        best = (-action).argsort(axis=-1, kind="stable")[..., : self.k]
+        chosen = np.zeros(action.shape, dtype=np.int8)
+        chosen[(*worlds_of(action.shape[:-1]), best)] = 1
+        return chosen
+
+    def action_masks(self) -> BoolArray:
+        """Which actions choose only anchors that there are, as sb3-contrib's ``MaskablePPO`` asks.
+
+        ``mode="subset"``: (..., n), of each action. ``"priced"``: (..., 2 M), of each anchor
+        whether it may be left out (always) and whether it may be chosen.
+
+        Raises
+        ------
+        ValueError
+            With ``mode="top-k"``, whose actions are scores.
+        """
+        if self.mode == "top-k":
+            raise ValueError("mode must be 'subset' or 'priced' for action masks, got 'top-k'")
+        told = self._told()
+        there = np.ones(told["links"].shape[:-1], dtype=np.bool_)
+        if self.family is not None:
+            there = told["anchor_mask"].astype(np.bool_)
+        if self._subsets is not None:
+            return ~(~there[..., None, :] & self._subsets.astype(np.bool_)).any(axis=-1)
+        both = np.stack([np.ones_like(there), there], axis=-1)
+        return both.reshape(*there.shape[:-1], -1)
+
+    def _price(self, info: dict[str, Any]) -> Any:
+        return self.price * info["chosen"].sum(axis=-1) if self.mode == "priced" else 0.0
+
+    def _show(self, observation: Mapping[str, np.ndarray], world: Any) -> np.ndarray:
+        middle, half = self._centre, self._half
+        if self.family is not None:
+            middle, half, *_ = world.scales
+        flat = views.anchor_selection(
+            observation["belief_translation"], observation["belief_rotation"],
+            observation["belief_covariance"], observation["twist"], self._usual.variance,
+            self._usual.speed, middle, half, self._limits,
+        )  # fmt: skip
+        if self.family is not None:
+            flat = views.padded_selection(flat, observation, half, self._extent_m)
+        return flat.astype(np.float32)
+
+
+class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
+    """`num_envs` independent `AnchorSelectionEnv`; seeding and autoreset as `BatchEnv`."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        mode: str = "top-k",
+        k: int = 3,
+        price: float = 0.05,
+        scene: str | Mapping[str, Any] | Scene = "hall",
+        filter: FilterLike = "iekf",
+        options: Mapping[str, Any] | None = None,
+        reward: RewardLike = "belief",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        scenes: Any = None,
+        observation: ViewLike = "flat",
+    ) -> None:
+        self._configure(mode, k, price, scene, scenes)
+        self._look_by(observation, hides_obstacles=True)
+        self.single_observation_space, self.single_action_space = self._spaces()
+        envs = TrackingVectorEnv(
+            num_envs, **made_of(self), render_mode=render_mode,
+            max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode,
+        )  # fmt: skip
+        selected = VectorSelectAnchors(envs, self._remembers)
+        self._compose(VectorEstimatePose(selected, *filter_of_task(filter, options), reward))
+
+    def _command(self, action: Any) -> np.ndarray:
+        self._told()
+        space = self.single_action_space
+        return self._choice(check_actions("actions", action, space, self.num_envs))
+
+
+class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
+    """Twelve anchors on the walls of a hall, racks between: which ones range to the body now?
+
+    ## Description
+    A body with six tags drives through a hall. At every step the policy chooses anchors, the
+    body moves, the chosen anchors measure, and a filter updates. Racks block sight: a
+    range without it carries 2 % of the information. The receiver learns a link's quality with
+    the range; the policy does not see the racks and has to learn where they are.
+
+    ## Action space
+    ``mode="top-k"``: ``Box(-1, 1, (12,))``, scores; the `k` highest are chosen.
+    ``"priced"``: ``MultiBinary(12)``, any number, each at its `price`.
+    ``"subset"``: ``Discrete(220)``, one of the subsets of `k` anchors, in lexical order.
+    `action_masks()` of the last two says which actions choose only anchors that there are; an
+    action that chooses others too chooses the rest.
+
+    ## Observation space
+    ``Box(-10, 10, (18,), float32)``: estimated place (scaled to the hall's volume), commanded
+    velocity (over the speed), log standard deviations of the pose error over the prior's (6),
+    first two columns of the estimated rotation (6).
+
+    ## Reward
+    ``-log b`` of the belief after every step, or another `reward`; ``"priced"``: minus `price` for
+    each anchor.
+
+    ## Episode end
+    Truncates after 50 steps of 0.2 s.
+
+    ## Info
+    `chosen` (12); that of `EstimatePose`: `score_m`, real errors `rotation_error_rad`,
+    `position_error_m`, `tag_error_m`, `nees`; and that of `RBL/Tracking-v0`: `epoch`, the true
+    `rotation` and `translation`, `nlos`.
+
+    ## Rendering
+    ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
+
+    ## Arguments
+    ```python
+    import gymnasium as gym
+
+    env = gym.make("rbl_gym:RBL/AnchorSelection-v0", k=3)
+    env = gym.make("rbl_gym:RBL/AnchorSelection-v0", mode="priced", price=0.05)
+    env = gym.make("rbl_gym:RBL/AnchorSelection-v0", filter="uc-kf", k=6)
+    ```
+    `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`.
+
+    `scenes`: a family of such in its place, see `RBL/Tracking-v0`. M is then the largest number of
+    anchors; those that a drawn scene does not have cannot be chosen. The observation has 21 + 6 M
+    entries: those above, the place scaled to the volume of the drawn scene; half sizes of that
+    volume (3) and the anchors relative to the estimate (3 M), both over the extent of the largest
+    scene; and M each: what the last choice of an anchor told (1: it saw the body, -1: it did not,
+    0: never chosen), ``exp(-steps since then / 10)``, and 1 if there is such an anchor.
+
+    `filter`, `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options`
+    say else. `observation`: ``"flat"`` is the above; the others are those of `EstimatePose`,
+    with the memory of `SelectAnchors`; tokens show no racks.
+
+    ## Version history
+    * v0: first version.
+    """
+
+    def __init__(
+        self,
+        mode: str = "top-k",
+        k: int = 3,
+        price: float = 0.05,
+        scene: str | Mapping[str, Any] | Scene = "hall",
+        filter: FilterLike = "iekf",
+        options: Mapping[str, Any] | None = None,
+        reward: RewardLike = "belief",
+        render_mode: str | None = None,
+        scenes: Any = None,
+        observation: ViewLike = "flat",
+    ) -> None:
+        self._configure(mode, k, price, scene, scenes)
+        self._look_by(observation, hides_obstacles=True)
+        self.observation_space, self.action_space = self._spaces()
+        world = TrackingEnv(**made_of(self), render_mode=render_mode)
+        env = SelectAnchors(world, self._remembers)
+        self._compose(EstimatePose(env, *filter_of_task(filter, options), reward))
+
+    def _command(self, action: Any) -> np.ndarray:
+        self._told()
+        return self._choice(check_actions("action", action, self.action_space))
+
+
+def _subsets(m: int, k: int) -> np.ndarray:
+    """The subsets of k of M anchors, (n, M), int8."""
+    count = math.comb(m, k)
+    if count > _MOST_SUBSETS:
+        raise ValueError(
+            f"mode 'subset' must have at most {_MOST_SUBSETS} subsets, {k} of {m} anchors have "
+            f"{count}"
+        )
+    found = np.zeros((count, m), np.int8)
+    for row, chosen in zip(found, itertools.combinations(range(m), k), strict=True):
+        row[list(chosen)] = 1
+    return found
