@@ -18,7 +18,7 @@ from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
-from rbl_gym.wrappers.observations import Seen, flat, tokens
+from rbl_gym.wrappers.observations import OBSERVATIONS, Seen, flat, tokens, viewer_of
 from tests.helpers import assert_same
 from tests.side_by_side import assert_steps_alike, of_its_spec
 
@@ -221,6 +221,11 @@ def test_spaces_are_declared_or_found():
     env = EstimatePose(TrackingEnv("hall"), observation=declared)
     assert env.observation_space is declared.space  # pyright: ignore[reportFunctionMemberAccess]
     assert env.reset(seed=1)[0].dtype == np.float64
+
+
+def test_names_and_paths():
+    assert [viewer_of(name).kind for name in OBSERVATIONS] == list(OBSERVATIONS)
+    assert viewer_of(PATH).function is nearest
 
 
 def test_looking_for_the_space_changes_no_episode():
