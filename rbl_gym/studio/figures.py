@@ -14,7 +14,7 @@ from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studies.placing.judging import Judged
 from rbl_gym.studies.placing.requirements import share_within
 from rbl_gym.studio.state import State
-from rbl_gym.studio.world import World
+from rbl_gym.studio.world import Knobs, World
 
 # Links at the places of all zones while an anchor is dragged, about.
 _FEW = 1200
@@ -118,25 +118,34 @@ def usual_scores(world: World, n_anchors: int) -> dict[str, float]:
 
 
 class Others:
-    """Layouts beside the one that is shown: the usual ones, and the designed ones by number."""
+    """Layouts beside the one that is shown: the usual ones, and designed ones.
+
+    Attributes
+    ----------
+    designed
+        Layouts by the knobs for which they were designed, and by their number of anchors.
+    """
 
     def __init__(self) -> None:
-        self.designed: dict[int, FloatArray] = {}
-        self._usual: dict[str, float] = {}
+        self.designed: dict[tuple[Knobs, int], FloatArray] = {}
         self._of: tuple[World | None, int] = None, 0
+        self._usual: dict[str, float] = {}
+        self._scored: tuple[World | None, FloatArray | None, float] = None, None, 0.0
 
     def search_usual(self, world: World, count: int) -> None:
         """Score the usual layouts of so many anchors, unless that is done."""
-        if self._of[0] is not world or self._of[1] != count:
+        if self._of != (world, count):
             self._usual, self._of = usual_scores(world, count), (world, count)
 
     def scores(self, world: World, count: int) -> dict[str, float | None]:
         """b by names; None while the first design is searched; the usual ones where known."""
-        designed = self.designed.get(count)
+        same = [found for (_, number), found in self.designed.items() if number == count]
+        designed = self.designed.get((world.knobs, count), same[0] if same else None)
         found: dict[str, float | None] = {}
         if designed is not None:
-            found["designed"] = world.score(designed)
+            if self._scored[0] is not world or self._scored[1] is not designed:
+                self._scored = world, designed, world.score(designed)
+            found["designed"] = self._scored[2]
         elif not self.designed:
             found["designed"] = None
-        known = self._of[0] is world and self._of[1] == count
-        return found | (self._usual if known else {})
+        return found | (self._usual if self._of == (world, count) else {})

@@ -26,6 +26,8 @@ from rbl_gym.studies.placing.layout_export import write_layout
 from rbl_gym.studio.state import State, open_state
 from rbl_gym.studio.world import knobs_of, noise_field
 
+# Writes a report of a problem and a layout (M, 3) to a path.
+Report = Callable[[Problem, FloatArray, str], None]
 # The first line of a scene file of the studio: only such files are written over.
 HEAD = "Written by rbl-gym studio."
 _AUTOSAVE = "-autosave"
@@ -93,10 +95,12 @@ def last_session(state: State, folder: Path) -> FloatArray | None:
     return None if np.array_equal(anchors, state.anchors) else anchors
 
 
-def report_path(folder: Path, name: str) -> Path:
-    """Where the report of that name goes: NAME.pdf. Arguments and errors as `save`."""
+def save_report(state: State, report: Report, folder: Path, name: str) -> Path:
+    """Write NAME.pdf, the report of a state. Arguments and errors as `save`."""
     stem = owned(folder, name)
-    return stem.with_name(f"{stem.name}.pdf")
+    path = stem.with_name(f"{stem.name}.pdf")
+    replace(path, lambda draft: report(state.problem, state.anchors, str(draft)))
+    return path
 
 
 def owned(folder: Path, name: str) -> Path:

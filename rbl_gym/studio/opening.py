@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from rbl_gym.checks import FloatArray, check_count
 from rbl_gym.placement.building import Problem
 from rbl_gym.studio import files, serving
-from rbl_gym.studio.place import PlacePage, Report
+from rbl_gym.studio.place import PlacePage
 from rbl_gym.studio.state import open_state
 
 __all__ = ["Options", "Studio", "show"]
@@ -38,7 +38,7 @@ class Options(NamedTuple):
     folder: str | Path = "."
     seed: int = 0
     browser: bool = True
-    report: Report | None = None
+    report: files.Report | None = None
 
 
 class Studio:
@@ -61,6 +61,10 @@ class Studio:
         host = self.server.get_host()
         host = "127.0.0.1" if host in ("0.0.0.0", "::") else host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
+
+    def _repr_html_(self) -> str:
+        """The page within a notebook."""
+        return f'<iframe src="{self.url}" width="100%" height="650" frameborder="0"></iframe>'
 
     def wait(self) -> None:
         """Serve until interrupted (Ctrl-C), then stop."""
@@ -112,7 +116,11 @@ def show(
     tables = files.tables_of(what) if tables is None else tables
     server = serving.open_server(options.host, options.port)
     folder = Path(options.folder).resolve()
-    page = PlacePage(server, start, tables, folder, options.report, options.seed)
+    try:
+        page = PlacePage(server, start, tables, folder, options.report, options.seed)
+    except BaseException:
+        serving.stop_server(server)
+        raise
     studio = Studio(server, page)
     if options.browser:
         webbrowser.open(studio.url)

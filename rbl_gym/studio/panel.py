@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import html
+import math
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -15,9 +17,11 @@ from rbl_gym.studio.state import State
 
 PLANES = {"Floor plan (x, y)": 1, "Section (x, z)": 2}
 _NOBODY = "none"
+# So many values that a user asked for are remembered of an input.
+_MOST_ASKED = 64
 _CSS = (
     "font-family:inherit;font-size:12.5px;line-height:1.4;color:#212529;"
-    "font-variant-numeric:tabular-nums;padding:0 10px"
+    "font-variant-numeric:tabular-nums;padding:0 12px 0 10px"
 )
 
 
@@ -62,7 +66,8 @@ class Panel:
         What is called, by name: ``undo``, ``redo``, ``add``, ``add_best``, ``remove``, ``fix``,
         ``optimise``, ``stop``, ``design``, ``reset_knobs``, ``restore`` without
         arguments; ``select`` with an index or None;
-        ``cut`` and ``knobs`` with keywords; ``save`` and ``report`` with a name.
+        ``cut`` and ``knobs`` with keywords; ``save`` and ``report`` with a name,
+        ``load`` with a file's name and its bytes.
     has_report
         Whether there is a button for the report.
     """
@@ -76,13 +81,13 @@ class Panel:
         has_report: bool = False,
     ) -> None:
         self._gui, self._actions = gui, actions
-        self._filling = False
+        self._asked: dict[int, deque[Any]] = {}
         self._headline = gui.add_html("")
         self._optimise = self._button("Optimise from here", "optimise", icon="trending-down")
         self._optimise.hint = "Move all free anchors, step by step, as long as the error falls"
         self._stop = self._button("Stop", "stop", icon="player-stop", color="gray")
         self._progress = gui.add_progress_bar(0.0, visible=False)
-        self._group("Undo", {"Undo": "undo", "Redo": "redo"})
+        self._group("History", {"Undo": "undo", "Redo": "redo"})
         self._status = gui.add_html("")
         with gui.add_folder("Anchors"):
             self._selected = gui.add_dropdown("Selected", (_NOBODY,))
@@ -116,33 +121,60 @@ class Panel:
             self._name = gui.add_text("Name", name)
             save = gui.add_button("Scene and list", icon="device-floppy")
             save.hint = "NAME.toml for rbl-gym place and studio, NAME.csv to mount by"
-            save.on_click(lambda _: self._call("save", self._name.value))
+            save.on_click(lambda _: actions["save"](self._name.value))
             if has_report:
                 report = gui.add_button("Report (PDF)", icon="file-text")
-                report.on_click(lambda _: self._call("report", self._name.value))
+                report.on_click(lambda _: actions["report"](self._name.value))
             self._restore = self._button("Restore the last session", "restore", color="gray")
             self._restore.visible = False
+            lists = gui.add_upload_button("Load a list (CSV)", icon="upload", mime_type=".csv")
+            lists.on_upload(lambda _: actions["load"](lists.value.name, lists.value.content))
+        for action, key in (("undo", "Z"), ("redo", "Y")):
+            command = gui.add_command(action.capitalize(), hotkey=key, modifier="cmd/ctrl")
+            command.on_trigger(lambda _, action=action: self._actions[action]())
         self._listen()
 
     def _button(self, label: str, action: str, **style: Any) -> Any:
         button = self._gui.add_button(label, **style)
-        button.on_click(lambda _: self._call(action))
+        button.on_click(lambda _: self._actions[action]())
         return button
 
     def _group(self, label: str, labels: Mapping[str, str]) -> Any:
         group = self._gui.add_button_group(label, tuple(labels))
-        group.on_click(lambda _: self._call(labels[group.value]))
+        group.on_click(lambda _: self._actions[labels[group.value]]())
         return group
 
     def _listen(self) -> None:
-        self._selected.on_update(lambda _: self._call("select", self._selection()))
-        self._quantity.on_update(
-            lambda _: self._call("cut", quantity=self._quantities[self._quantity.value])
+        self._input(self._selected, lambda: self._actions["select"](self._selection()))
+        self._input(
+            self._quantity,
+            lambda: self._actions["cut"](quantity=self._quantities[self._quantity.value]),
         )
-        self._plane.on_update(lambda _: self._call("cut", up=PLANES[self._plane.value]))
-        self._at.on_update(lambda _: self._call("cut", share=self._share()))
+        self._input(self._plane, lambda: self._actions["cut"](up=PLANES[self._plane.value]))
+        self._input(self._at, lambda: self._actions["cut"](share=self._share()))
         for name, handle in self._knobs().items():
-            handle.on_update(lambda _, n=name, h=handle: self._call("knobs", **{n: h.value}))
+            self._input(handle, lambda n=name, h=handle: self._actions["knobs"](**{n: h.value}))
+
+    def _input(self, handle: Any, call: Callable[[], None]) -> None:
+        """Call when a user changes an input, not when `show` does."""
+        asked = self._asked[id(handle)] = deque(maxlen=_MOST_ASKED)
+
+        def changed(event: Any) -> None:
+            if event.client is not None:
+                asked.append(handle.value)
+                call()
+
+        handle.on_update(changed)
+
+    def _fill(self, handle: Any, value: Any) -> None:
+        """Show a value in an input, unless it is what a user asked for.
+
+        While a slider is moved the state comes some values behind: it must not be moved back.
+        """
+        asked = self._asked[id(handle)]
+        if not any(_same(value, one) for one in (handle.value, *asked)):
+            asked.clear()
+            handle.value = value
 
     def _share(self) -> float:
         low, high = float(self._at.min), float(self._at.max)
@@ -160,11 +192,6 @@ class Panel:
         text = str(self._selected.value)
         return None if text == _NOBODY else int(text.split()[0]) - 1
 
-    def _call(self, action: str, *values: Any, **named: Any) -> None:
-        # What the server itself fills in is no wish of a user.
-        if not self._filling:
-            self._actions[action](*values, **named)
-
     # --- what it shows ---------------------------------------------------------------------
 
     def offer_restore(self, visible: bool) -> None:
@@ -174,51 +201,56 @@ class Panel:
     def show(self, shown: Shown) -> None:
         """Show all of it."""
         state, selected = shown.state, shown.selected
-        self._filling = True
-        try:
-            _set(self._headline, headline(shown), "content")
-            _set(self._legend, legend(shown.map), "content")
-            _set(self._status, status(shown), "content")
-            running = shown.progress is not None
-            for handle in (self._stop, self._progress):
-                _set(handle, running, "visible")
-            _set(self._optimise, not running, "visible")
-            _set(self._progress, 100.0 * (shown.progress or 0.0))
-            names = [_NOBODY, *(_anchor_name(state, k) for k in range(len(state.anchors)))]
-            _set(self._selected, tuple(names), "options")
-            _set(self._selected, names[0 if selected is None else selected + 1])
-            _set(self._one, selected is not None, "visible")
-            _set(self._quantity, QUANTITIES[state.slice.quantity].name)
-            _set(self._plane, next(k for k, up in PLANES.items() if up == state.slice.up))
-            self._show_at(state)
-            for name, handle in self._knobs().items():
-                _set(handle, getattr(state.world.knobs, name))
-        finally:
-            self._filling = False
+        _set(self._headline, "content", headline(shown))
+        _set(self._legend, "content", legend(shown.map))
+        _set(self._status, "content", status(shown))
+        running = shown.progress is not None
+        for handle in (self._stop, self._progress):
+            _set(handle, "visible", running)
+        _set(self._optimise, "visible", not running)
+        _set(self._progress, "value", 100.0 * (shown.progress or 0.0))
+        names = [_NOBODY, *(_anchor_name(state, k) for k in range(len(state.anchors)))]
+        if _set(self._selected, "options", tuple(names)):
+            self._asked[id(self._selected)].clear()
+        self._fill(self._selected, names[0 if selected is None else selected + 1])
+        _set(self._one, "visible", selected is not None)
+        self._fill(self._quantity, QUANTITIES[state.slice.quantity].name)
+        self._fill(self._plane, next(k for k, up in PLANES.items() if up == state.slice.up))
+        self._show_at(state)
+        for name, handle in self._knobs().items():
+            self._fill(handle, getattr(state.world.knobs, name))
 
     def _show_at(self, state: State) -> None:
         """Where the slice is, in metres along the axis that it cuts."""
         axis = 3 - state.slice.up
         low, high = (float(corner[axis]) for corner in state.world.base.corners())
-        _set(self._at, high > low, "visible")
+        _set(self._at, "visible", high > low)
         if high > low:
-            step = (high - low) / 100
-            _set(self._at, f"At {'xyz'[axis]} (m)", "label")
-            for name, value in (("min", low), ("max", high), ("step", step)):
-                _set(self._at, value, name)
-            _set(self._at, round(low + state.slice.share * (high - low), 6))
+            if _set(self._at, "label", f"At {'xyz'[axis]} (m)"):
+                self._asked[id(self._at)].clear()
+            for name, value in (("min", low), ("max", high), ("step", (high - low) / 100)):
+                _set(self._at, name, value)
+            self._fill(self._at, round(low + state.slice.share * (high - low), 6))
 
 
-def _set(handle: Any, value: Any, name: str = "value") -> None:
-    """What is as it should be is not sent."""
-    if getattr(handle, name) != value:
-        setattr(handle, name, value)
+def _set(handle: Any, name: str, value: Any) -> bool:
+    """Set a property, and whether it was another: what is as it should be is not sent."""
+    if getattr(handle, name) == value:
+        return False
+    setattr(handle, name, value)
+    return True
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, str) or isinstance(other, str):
+        return one == other
+    return math.isclose(one, other, rel_tol=1e-5, abs_tol=1e-6)
 
 
 def _range(value: float, most: float) -> tuple[float, float, float]:
     """Least, most and step of a slider that has `value` on it."""
-    step = 10.0 ** np.floor(np.log10(max(value, 1e-9))) / 20
-    return float(step), float(np.ceil(most / step) * step), float(step)
+    step = 10.0 ** int(np.floor(np.log10(max(value, 1e-9)))) / 20
+    return step, round(round(most / step) * step, 9), step
 
 
 def _anchor_name(state: State, index: int) -> str:
@@ -238,16 +270,16 @@ def headline(shown: Shown) -> str:
     body = figures.body
     seen = int((body.seen >= SEEN).sum())
     parts = [
-        f'<div style="{_CSS}">',
+        f'<div style="{_CSS};padding-bottom:8px">',
         '<div style="display:flex;align-items:baseline;gap:8px">'
         f'<b style="font-size:26px;line-height:1.25">{length(figures.score_m)}</b>'
-        f'<span style="color:#495057">error of a tag, {count} anchors</span></div>',
+        f'<span style="color:#495057">tag error b, {count} anchors</span></div>',
         *(_zone(zone) for zone in figures.zones),
         _row(
             "#fcc419",
             "At the body",
-            f"{length(body.position_m)}, {body.heading_deg:.1f}° heading; {seen} of "
-            f"{count} anchors in sight",
+            f"{length(body.position_m)}, {body.heading_deg:.1f}°; "
+            f"{seen} of {count} anchors in sight",
         ),
         _bars(figures.score_m, shown.others),
         "</div>",
@@ -264,7 +296,7 @@ def _zone(zone: ZoneFigures) -> str:
         )
     figures = (
         f"{length(zone.position_m)} horizontal, {length(zone.height_m)} height, "
-        f"{zone.heading_deg:.1f}° heading"
+        f"{zone.heading_deg:.1f}°"
     )
     return _row(colour, zone.name, figures, share)
 

@@ -7,6 +7,7 @@ import functools
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import FloatArray
-from rbl_gym.placement import scene_files
-from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing import design
+from rbl_gym.studies.placing.layout_files import parse_layout
 from rbl_gym.studio import files, maps, searches, state
 from rbl_gym.studio.display import Display
 from rbl_gym.studio.figures import Others, body_figures, figures
@@ -25,8 +25,6 @@ from rbl_gym.studio.rays import on_plane, under_pointer
 from rbl_gym.studio.state import Layout, State
 from rbl_gym.studio.worker import Worker
 from rbl_gym.studio.world import knobs_of
-
-Report = Callable[[Problem, FloatArray, str], None]
 
 
 class PlacePage:
@@ -54,7 +52,7 @@ class PlacePage:
         start: State,
         tables: Mapping[str, Any],
         folder: Path,
-        report: Report | None = None,
+        report: files.Report | None = None,
         seed: int = 0,
     ) -> None:
         self._tables, self._folder = tables, folder
@@ -62,8 +60,9 @@ class PlacePage:
         self.state = start
         self.figures = figures(start)
         self.map = maps.slice_map(start)
-        self.seconds: list[float] = []
-        self._before_drag: State | None = None
+        self.seconds: deque[float] = deque(maxlen=256)
+        # The anchor that is held, and the state before that.
+        self._held: tuple[int, State] | None = None
         self._selected: int | None = None
         self._status = "Drag an anchor. Click one to select it."
         self._progress: float | None = None
@@ -89,6 +88,7 @@ class PlacePage:
             "save": self.save,
             "report": self.write_report,
             "restore": self._restore,
+            "load": self.load,
         }
         self._display = Display(server, start, actions, report is not None)
         self._display.panel.offer_restore(self._autosave_found is not None)
@@ -133,7 +133,8 @@ class PlacePage:
         def task() -> None:
             self.state = state.cut(self.state, **fields)
             self._show_coarse()
-            self._refine()
+            if self._progress is None:
+                self._refine()
 
         self._worker.post(task, "slice")
 
@@ -154,6 +155,7 @@ class PlacePage:
 
         def task() -> None:
             self.state = state.turn_knobs(self.state, **knobs)
+            self._end_work()
             self._show_coarse()
             self._refine()
 
@@ -163,7 +165,8 @@ class PlacePage:
         """Improve the layout from where it is, a step at a time; any change ends it."""
 
         def task() -> None:
-            self._status = "Optimising ..."
+            self._progress, self._status = 0.0, "Optimising ..."
+            self._show()
             self._worker.when_idle(self._improve(self.state))
 
         self._worker.post(task)
@@ -172,7 +175,8 @@ class PlacePage:
         """End what runs; what was found stays."""
 
         def task() -> None:
-            self._progress, self._status = None, "Stopped."
+            self._end_work()
+            self._status = "Stopped."
             self._show()
             self._refine()
 
@@ -182,13 +186,14 @@ class PlacePage:
         """Put the designed layout of as many anchors in place; it is searched if need be."""
 
         def task() -> None:
-            found = self._others.designed.get(len(self.state.anchors))
-            if found is None or self.state.fixed.any():
-                self._status = "Searching the best layout from scratch ..."
-                self._show()
-                threading.Thread(target=self._search, args=(self.state, True), daemon=True).start()
+            now = self.state
+            found = self._others.designed.get((now.world.knobs, len(now.anchors)))
+            if found is not None and not now.fixed.any():
+                self._edit(lambda at: state.set_layout(at, Layout(found, at.fixed)))
                 return
-            self._edit(lambda now: state.set_layout(now, Layout(found, now.fixed)))
+            self._status = "Searching the best layout from scratch ..."
+            self._show()
+            threading.Thread(target=self._search, args=(now, True), daemon=True).start()
 
         self._worker.post(task)
 
@@ -201,11 +206,32 @@ class PlacePage:
 
         self._worker.post(task)
 
+    def load(self, name: str, content: bytes) -> None:
+        """Put the anchors of a list (CSV) in place."""
+
+        def task() -> None:
+            places = parse_layout(name, content).positions
+            loaded = state.open_state(self.state.world.base, places).layout
+            self._edit(lambda now: state.set_layout(now, loaded))
+            self._status = f"{len(places)} anchors of {name}."
+
+        self._worker.post(task)
+
     def write_report(self, name: str) -> None:
         """Write the report into the folder; it takes a while, beside everything else."""
-        now = self.state
-        threading.Thread(target=self._write_report, args=(now, name), daemon=True).start()
-        self._note("Writing the report ...")
+        now, report = self.state, self._report
+        assert report is not None  # else there is no button
+
+        def task() -> None:
+            try:
+                path = files.save_report(now, report, self._folder, name)
+            except Exception as error:
+                self._worker.post(functools.partial(self._failed, error))
+            else:
+                self._worker.post(lambda: self._say("Saved", path.name, "teal"))
+
+        self._worker.post(lambda: self._say("Report", f"{name}.pdf is being made", "gray"))
+        threading.Thread(target=task, daemon=True).start()
 
     def settle(self, timeout: float = 60.0) -> bool:
         """Wait until all that was asked for is shown; whether that was so in time."""
@@ -221,7 +247,8 @@ class PlacePage:
     def _edit(self, change: Callable[[State], State]) -> None:
         before = self.state
         self.state = change(before)
-        self._progress = None
+        self._held = None
+        self._end_work()
         if self._selected is not None and self._selected >= len(self.state.anchors):
             self._selected = None
         self._status = "Nothing to change." if self.state is before else ""
@@ -251,45 +278,52 @@ class PlacePage:
     def _drag(
         self, index: int, phase: str, camera: FloatArray, point: FloatArray, asked: float
     ) -> None:
-        if phase == "start":
-            self._before_drag, self._selected, self._progress = self.state, index, None
-            self._worker.when_idle(None)
-        start = self._before_drag
-        if start is None or index >= len(start.anchors):
+        if phase == "start" and self._held is None:
+            self._held, self._selected = (index, self.state), index
+            self._end_work()
+        if self._held is None or self._held[0] != index:
             return
-        if start.fixed[index]:
-            if phase == "end":
-                self._before_drag = None
-                self._say("Fixed", f"Anchor {index + 1} is fixed: release it first.", "orange")
-            return
-        place = under_pointer(self.state.world, camera, point, self.state.anchors[index])
-        moved = state.move(start, index, place)
-        # Over an obstacle it stays where it was last.
-        if moved is not start:
-            self.state = dataclasses.replace(moved, slice=self.state.slice, body=self.state.body)
+        start = self._held[1]
         if phase == "end":
-            self._before_drag, self._status = None, ""
+            self._held, self._status = None, ""
+            if start.fixed[index]:
+                self._say("Fixed", f"Anchor {index + 1} is fixed: release it first.", "orange")
+        if not start.fixed[index]:
+            place = under_pointer(self.state.world, camera, point, self.state.anchors[index])
+            moved = state.move(start, index, place)
+            # Over an obstacle it stays where it was last.
+            if moved is not start:
+                self._adopt(moved)
+            self._show_coarse()
+            self.seconds.append(time.perf_counter() - asked)
+        if phase == "end":
             self._refine()
-        self._show_coarse()
-        self.seconds.append(time.perf_counter() - asked)
+
+    def _adopt(self, other: State) -> None:
+        """Take the layout of another state, and its past."""
+        fields = {name: getattr(other, name) for name in ("layout", "past", "future")}
+        self.state = dataclasses.replace(self.state, **fields)
 
     def _improve(self, start: State) -> Iterator[None]:
         before = start.score
-        self._progress = 0.0
-        self._show()
         for done, better in searches.optimise(start, self._seed):
-            self.state, self._progress = better, done
+            self._adopt(better)
+            self._progress = done
             self._show_coarse()
             yield
-        self._progress = None
         gain = 100 * (1 - self.state.score / before)
-        self._status = (
-            f"Optimised: b is {gain:.1f} % smaller."
-            if gain > 0.05
-            else ("Optimised: no step from here helps.")
-        )
+        self._end_work()
+        self._status = "No step from here helps."
+        if gain >= 0.05:
+            self._status = f"Optimised: b is {gain:.1f} % smaller."
         self._show()
         yield from self._refined()
+
+    def _end_work(self) -> None:
+        """Leave an optimisation where it is."""
+        if self._progress is not None:
+            self._progress, self._status = None, ""
+        self._worker.when_idle(None)
 
     # --- showing ----------------------------------------------------------------------------
 
@@ -302,86 +336,56 @@ class PlacePage:
         self._worker.when_idle(self._refined())
 
     def _refined(self) -> Iterator[None]:
-        now = self.state
-        self.figures = figures(now)
+        self.figures = figures(self.state)
         self._show()
         yield
-        self.map = maps.slice_map(now, maps.REFINED)
+        self.map = maps.slice_map(self.state, maps.REFINED)
         self._show()
         yield
-        self._others.search_usual(now.world, len(now.anchors))
+        self._others.search_usual(self.state.world, len(self.state.anchors))
         self._show()
         yield
         self._autosave()
 
     def _show(self) -> None:
-        self._display.show(
-            Shown(
-                self.state,
-                self.figures,
-                self.map,
-                self._others.scores(self.state.world, len(self.state.anchors)),
-                self._selected,
-                self._progress,
-                self._status,
-            )
-        )
+        now = self.state
+        others = self._others.scores(now.world, len(now.anchors))
+        marks = self._selected, self._progress, self._status
+        self._display.show(Shown(now, self.figures, self.map, others, *marks))
 
     # --- beside the worker ------------------------------------------------------------------
 
     def _search(self, now: State, apply: bool = False) -> None:
+        """Design a layout: around the fixed anchors and in place of this one, or to compare."""
+        world, count = now.world, len(now.anchors)
+        problem = now.problem if apply else world.problem.with_anchors(count)
         try:
-            problem = (
-                now.problem
-                if apply
-                else scene_files.with_anchors(now.world.problem, len(now.anchors))
-            )
             found = design.design_layout(problem, self._seed).anchors
         except Exception as error:
             self._worker.post(functools.partial(self._failed, error))
             return
 
         def task() -> None:
-            count = len(problem.fixed)
-            self._others.designed[len(found)] = found
+            if not apply or not now.fixed.any():
+                self._others.designed[world.knobs, count] = found
             if apply:
-                stays = np.arange(len(found)) < count
+                stays = np.arange(count) < len(problem.fixed)
                 self._edit(lambda at: state.set_layout(at, Layout(found, stays)))
             else:
                 self._show()
 
         self._worker.post(task)
 
-    def _write_report(self, now: State, name: str) -> None:
-        assert self._report is not None
-        try:
-            path = files.report_path(self._folder, name)
-            files.replace(
-                path,
-                lambda p: self._report(now.problem, now.anchors, str(p)),  # type: ignore
-            )
-        except Exception as error:
-            self._worker.post(functools.partial(self._failed, error))
-            return
-        self._worker.post(lambda: self._say("Saved", path.name, "teal"))
-
     def _restore(self) -> None:
         anchors = self._autosave_found
         if anchors is not None:
-            stays = np.zeros(len(anchors), bool)
-            self.edit(lambda now: state.set_layout(now, Layout(anchors, stays)))
+            restored = Layout(anchors, np.zeros(len(anchors), bool))
+            self.edit(lambda now: state.set_layout(now, restored))
             self._display.panel.offer_restore(False)
 
     def _autosave(self) -> None:
         if self.state.past or self.state.future:
             files.autosave(self.state, self._tables, self._folder)
-
-    def _note(self, text: str) -> None:
-        def task() -> None:
-            self._status = text
-            self._show()
-
-        self._worker.post(task)
 
     def _say(self, title: str, text: str, colour: str) -> None:
         self._status = f"{title}: {text}"
@@ -391,5 +395,5 @@ class PlacePage:
     def _failed(self, error: Exception) -> None:
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
             traceback.print_exception(error)
-        self._progress = None
+        self._end_work()
         self._say("Not done", str(error) or type(error).__name__, "red")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -12,9 +14,15 @@ from rbl_gym.geometry.polygons import ears
 from rbl_gym.geometry.regions import Walls
 from rbl_gym.placement.building import Problem
 
+# Width of the panel, pixels.
+PANEL = 310
 INK = (52, 58, 64)
 WALL, FLOOR, GRID, RACK = (206, 212, 218), (241, 243, 245), (222, 226, 230), (173, 181, 189)
-_FOV_RAD = 0.75
+# Where the camera stands, its vertical field of view, and how much of the window is filled.
+_TOWARDS = np.array([-0.25, -1.0, 0.85])
+_FOV_RAD, _FILLED = 0.7, 0.92
+# What reaches above this share of the height is a wall, and seen through.
+_TALL = 0.8
 
 
 def corners(problem: Problem) -> tuple[FloatArray, FloatArray]:
@@ -38,19 +46,46 @@ def extent_of(problem: Problem) -> float:
 
 
 def set_camera(server: Any, problem: Problem) -> None:
-    """A view from the south and above, in which all of it can be seen."""
-    low, high = corners(problem)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    away = np.array([-0.25, -1.0, 0.85])
-    away /= np.linalg.norm(away)
-    reach = max(half[0], 1.6 * half[1], 1.6 * half[2])
+    """A view from the south and above in which all of it is seen, for every browser that comes."""
     camera = server.initial_camera
     camera.fov = _FOV_RAD
-    camera.near, camera.far = reach / 200, reach * 60
-    # The panel covers the right side.
-    middle = middle + np.array([0.22 * reach, 0.0, -0.1 * reach])
-    camera.look_at = middle
-    camera.position = middle + 1.45 * reach / np.tan(0.5 * _FOV_RAD) * away
+    reach = extent_of(problem)
+    camera.near, camera.far = reach / 500, reach * 50
+    camera.look_at, camera.position = view_of(problem, 1.2)
+
+    @server.on_client_connect
+    async def _(client: Any) -> None:
+        view = client.camera
+        # What the panel leaves of the window.
+        aspect = max(view.image_width - PANEL, 0.4 * view.image_width) / view.image_height
+        look_at, position = view_of(problem, aspect)
+        # The place takes the point that is looked at with it.
+        client.camera.position = position
+        client.camera.look_at = look_at
+
+
+def view_of(problem: Problem, aspect: float) -> tuple[FloatArray, FloatArray]:
+    """Where a camera looks and stands, (3,) each, to see all of a problem in a window.
+
+    Parameters
+    ----------
+    problem
+        What is seen.
+    aspect
+        Width of the window over its height.
+    """
+    low, high = corners(problem)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    forward = -_TOWARDS / np.linalg.norm(_TOWARDS)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(right, forward), forward])
+    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+    across, up, ahead = axes @ (signs * half).T
+    limit = math.tan(0.5 * _FOV_RAD)
+    # How far away each corner comes to the edge of the window.
+    needed = np.maximum(np.abs(across) / aspect, np.abs(up)) / (_FILLED * limit) - ahead
+    return middle, middle - needed.max() * forward
 
 
 # --- what stands still -----------------------------------------------------------------------
@@ -87,11 +122,14 @@ def draw_room(server: Any, problem: Problem) -> None:
             )  # fmt: skip
     else:
         lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), (173, 181, 189), 1)
-    solids = obstacle_mesh(problem)
-    if solids is not None:
-        scene.add_mesh_simple(
-            "/room/obstacles", *solids, color=RACK, opacity=0.8, flat_shading=True, side="double"
-        )
+    tall = low[2] + _TALL * (high - low)[2]
+    for name, opacity, which in (("racks", 0.85, False), ("walls-within", 0.3, True)):
+        solids = [solid for solid in solids_of(problem) if (solid[2] > tall) == which]
+        if solids:
+            scene.add_mesh_simple(
+                f"/room/{name}", *mesh_of(solids), color=RACK, opacity=opacity,
+                flat_shading=True, side="double",
+            )  # fmt: skip
 
 
 def lines(scene: Any, name: str, segments: FloatArray, colour: Any, width: float) -> Any:
@@ -148,16 +186,21 @@ def _mount_faces(mounts: Mounts) -> tuple[FloatArray, np.ndarray]:
     return np.array(vertices).reshape(-1, 3), np.array(triangles, int).reshape(-1, 3)
 
 
-def obstacle_mesh(problem: Problem) -> tuple[FloatArray, np.ndarray] | None:
-    """All obstacles as vertices and triangles; None where there are none."""
+Solid = tuple[FloatArray, float, float]
+
+
+def solids_of(problem: Problem) -> list[Solid]:
+    """All obstacles: corners (V, 2) in the plan, lower and upper height."""
     boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
     turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     found = [(box[:2] + turns * box[3:5], box[2] - box[5], box[2] + box[5]) for box in boxes]
-    found += zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True)
-    if not found:
-        return None
+    return found + list(zip(prisms.corners, prisms.low_m, prisms.high_m, strict=True))
+
+
+def mesh_of(solids: list[Solid]) -> tuple[FloatArray, np.ndarray]:
+    """Solids as vertices (K, 3) and triangles (T, 3)."""
     points, triangles, count = [], [], 0
-    for ring, low, high in found:
+    for ring, low, high in solids:
         # Corners of prisms are repeated up to a common number.
         ring = ring[np.append(True, (np.diff(ring, axis=0) != 0).any(axis=1))]
         size, here = len(ring), np.arange(len(ring))

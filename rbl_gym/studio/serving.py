@@ -12,6 +12,7 @@ from typing import Any
 
 from rbl_gym.checks import check_count
 from rbl_gym.studies.extras import require
+from rbl_gym.studio.scene_view import PANEL
 
 # Ports that are tried from the first on.
 _PORTS = 50
@@ -51,6 +52,8 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym
     server.gui.configure_theme(
         control_width="medium", show_logo=False, show_share_button=False, brand_color=BRAND
     )
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(PANEL)
     server.scene.set_up_direction("+z")
     server.scene.configure_environment_map(None)
     return server

@@ -40,8 +40,13 @@ def read_layout(path: str) -> Layout:
     ValueError
         On a file that is none, names the file, the line and the column.
     """
+    return parse_layout(path, Path(path).read_bytes())
+
+
+def parse_layout(path: str, content: bytes) -> Layout:
+    """`read_layout` of a file's bytes; `path` is what errors call it."""
     try:
-        text = Path(path).read_bytes().decode("utf-8-sig")
+        text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: must be a text in UTF-8, {error.reason}") from error
     first = text.partition("\n")[0]
