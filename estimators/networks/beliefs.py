@@ -1,6 +1,6 @@
-"""Beliefs over the poses of a planar network, from one epoch: the cycle consensus and its noise."""
+"""Beliefs over the poses of a planar network from one epoch, by cycle consensus."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ _TOL = 1e-9
 
 
 class Consensus(NamedTuple):
-    """How the cycle iteration runs, as the arguments of `cycle_iteration`."""
+    """Options of the cycle iteration; see `cycle_iteration`."""
 
     cycles: str = "bfs"
     kappa: float | str | None = None
     order: str = "synchronous"
-    steps: int = 5000  # at most
+    steps: int = 5000  # maximum
 
 
 class NetworkBelief(NamedTuple):
     """Beliefs (...) over n nodes in the frame of node 0."""
 
     orientations: FloatArray  # (..., n) radians in [-pi, pi)
-    positions: FloatArray | None  # (..., n, 2) metres, None without lengths
+    positions: FloatArray | None  # (..., n, 2) metres; None without lengths
     # (..., n, 3, 3) of each node's orientation, x and y; (..., n, 1, 1) without lengths.
     covariance: FloatArray
-    chi_square: FloatArray  # (...) per degree of freedom of the residuals, 0 without one
+    chi_square: FloatArray  # (...) per degree of freedom of the residuals; 0 without any
 
 
 def check_consensus(cycles: Any, kappa: Any, order: Any, steps: Any) -> Consensus:
-    """The options, tried on a triangle, or a ValueError that names one."""
+    """Check the options by a run on a triangle; raise ValueError that names a wrong one."""
     steps = check_count("steps", steps, least=0)
     if not isinstance(cycles, str):
         raise ValueError(f"cycles must be a name, got {cycles!r:.80}")
@@ -55,17 +55,17 @@ def consensus(
     options: Consensus | None = None,
     rng: np.random.Generator | None = None,
 ) -> tuple[FloatArray, int, bool]:
-    """Orientations (n,) of one network by the cycle iteration, its steps, whether it converged.
+    """Estimate orientations (n,) by the cycle iteration; return also steps and convergence.
 
     Parameters
     ----------
     links, bearings
         (n, n) symmetric; (n, n) of j in the frame of i, radians.
     before
-        Orientations (n,) that are near: edge angles are then taken within pi of theirs, and
-        cycles sum to what they should.
+        Approximate orientations (n,). Edge angles are then taken within pi of theirs, so that the
+        branch of every cycle is known.
     options, rng
-        Of the iteration; the source of its order where that is random.
+        Options of the iteration, and the random generator of its order.
     """
     options = options or Consensus()
     n_nodes = len(links)
@@ -80,7 +80,7 @@ def consensus(
     size = int(near.sum())
     branch: FloatArray | None = None
     if before is not None:
-        # Around any cycle the expected angles sum to 0, and so must those that are near them.
+        # The expected angles sum to 0 around any cycle, so angles near them must also.
         expected = before[j] - before[i]
         y = expected + proj(y - expected)
         count = len(edges) - size + 1
@@ -110,19 +110,19 @@ def network_belief(
     positions: FloatArray,
     sensing: Sensing,
 ) -> NetworkBelief:
-    """The belief around orientations found; with lengths, poses by maximum likelihood from there.
+    """Return the belief about given orientations; with lengths, maximum-likelihood poses.
 
-    Variances are scaled by max(1, chi-square per degree of freedom of the residuals), and end
-    at those of the prior.
+    Variances are scaled by max(1, chi-square per degree of freedom of the residuals). The variances
+    of the prior are an upper bound.
 
     Parameters
     ----------
     links, bearings, lengths
-        (..., n, n) as `network_poses`; lengths are None where none are measured.
+        (..., n, n) as in `network_poses`; lengths are None if not measured.
     orientations, positions
-        (..., n) of `consensus`, and (..., n, 2), where nodes stay that have no path to node 0.
+        (..., n) from `consensus`, and (..., n, 2). Nodes without a path to node 0 keep these.
     sensing
-        Deviations of the sensors and of the prior.
+        Standard deviations of the sensors and of the prior.
     """
     if lengths is None:
         P = linked_covariance(links, sensing.bearing_std_rad, sensing.prior_std_rad)
@@ -141,7 +141,7 @@ def network_belief(
         node = np.arange(before)
         rows = np.stack([node, before + 2 * node, before + 2 * node + 1], axis=-1)
         blocks = poses.covariance[..., rows[:, :, None], rows[:, None, :]]
-    # Less than one degree of freedom says nothing about the noise.
+    # Less than one degree of freedom carries no information about the noise.
     chi_square = np.where(degrees > 0.9, chi_square / np.maximum(degrees, 0.9), 0.0)
     return NetworkBelief(orientations, places, _scaled(blocks, chi_square, sensing), chi_square)
 
@@ -149,18 +149,18 @@ def network_belief(
 def _of_angles(
     links: BoolArray, bearings: FloatArray, theta: FloatArray, sensing: Sensing
 ) -> tuple[FloatArray, FloatArray]:
-    """Chi-square (...) of the edge angles' residuals, and its degrees of freedom: the cycles."""
+    """Return chi-square (...) of the edge angles' residuals, and its degrees of freedom."""
     near = linked_to_0(links)
     y = bearings - bearings.swapaxes(-1, -2) + np.pi
     off = np.where(near, proj(y - theta[..., None, :] + theta[..., :, None]), 0.0)
-    # Each edge stands twice in the matrix; its variance is 2 sigma^2.
+    # Each edge occurs twice in the matrix; its variance is 2 sigma^2.
     chi_square = (off**2).sum(axis=(-2, -1)) / (4 * sensing.bearing_std_rad**2)
     unknown = np.maximum(near.any(axis=-1).sum(axis=-1) - 1, 0)
     return chi_square, near.sum(axis=(-2, -1)) / 2 - unknown
 
 
 def _scaled(blocks: FloatArray, chi_square: FloatArray, sensing: Sensing) -> FloatArray:
-    """Covariances (..., n, k, k), node 0's first, scaled up to the prior's at most."""
+    """Return covariances (..., n, k, k), node 0 first, scaled up to at most the prior."""
     most = np.array([sensing.prior_std_rad, sensing.prior_std_m, sensing.prior_std_m]) ** 2
     variance = np.diagonal(blocks, axis1=-2, axis2=-1)
     room = (most[: blocks.shape[-1]] / variance).min(axis=-1)

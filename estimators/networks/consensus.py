@@ -1,15 +1,15 @@
-"""Edge angles made consistent around cycles: the ring's least squares, the cycle iteration.
+"""Consistent edge angles around cycles: least squares of a ring, and the cycle iteration.
 
-True edge angles sum to a multiple of 2 pi around every cycle, ``C psi = 2 pi k``. Measured
-ones, y, do not; which k is meant is the branch. On a branch the least squares are a projection;
-the iteration (14) reaches it with exchanges inside of each cycle only. The cycles may be any set,
-dependent ones too; then not every k has a psi.
+True edge angles sum to a multiple of 2 pi around every cycle, ``C psi = 2 pi k``. Measured angles y
+do not. The integers k are the branch. On a branch, the least-squares solution is a projection. The
+iteration (14) converges to it with exchanges only inside each cycle. The cycles may be any set,
+also dependent ones; then not every k has a solution psi.
 
 Source: G. Piovan, I. Shames, B. Fidan, F. Bullo, B. D. O. Anderson, "On frame and orientation
-localization for relative sensing networks". Numbers of equations are the paper's.
+localization for relative sensing networks". Equation numbers are those of the paper.
 """
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportOptionalSubscript=false, reportArgumentType=false
 from __future__ import annotations
 
@@ -33,56 +33,57 @@ from rbl_gym.networks.sensing import check_edge_angles, proj
 
 _TURN = 2 * np.pi
 _DENSE = 1500  # cycles or edges up to which matrices are dense
-_ZERO = 1e-9  # eigenvalues and pivots below this share of the largest are zero
-_PATIENCE = 100  # rounds of random order after which contradicting branches stay
+_ZERO = 1e-9  # eigenvalues and pivots below this fraction of the largest are zero
+_PATIENCE = 100  # rounds of random order after which branches count as contradictory
 ORDERS = ("synchronous", "asynchronous")
 STEP_RULES = ("theorem", "best", "trace", "rows")
 
 
 class CycleExchange(NamedTuple):
-    """How the cycles talk: in which order, and what is lost on the way."""
+    """Communication of the cycles: order, and loss of messages."""
 
     order: str = "synchronous"  # or "asynchronous": one cycle at a time, in random order
-    rng: np.random.Generator | None = None  # source of the order and of losses
-    loss: float = 0.0  # probability that a message is lost: the cycle's turn has no effect
+    rng: np.random.Generator | None = None  # for order and losses
+    loss: float = 0.0  # probability that a message is lost, so that the cycle's turn has no effect
 
 
 class CycleRun(NamedTuple):
-    """A run of the cycle iteration."""
+    """Result of the cycle iteration."""
 
     psi: FloatArray  # (m,) consistent edge angles, radians, not wrapped
     branch: NDArray[np.intp]  # (q,) k of ``C psi = 2 pi k`` at the end
-    steps: int  # of all cycles; asynchronous: rounds in which each cycle had its turn
+    steps: int  # of all cycles; asynchronous: rounds with one turn of each cycle
     kappa: float | None  # None: each cycle divides by its length
-    converged: bool  # all cycles' errors are zero, to the tolerance
-    consistent: bool  # False: the branches contradict each other, no psi satisfies all cycles
+    converged: bool  # all cycle errors are zero to the tolerance
+    consistent: bool  # False: the branches are contradictory, no psi satisfies all cycles
     history: FloatArray | None  # (steps + 1, m), y first
 
 
 def ring_least_squares(y: ArrayLike) -> FloatArray:
-    """Least-squares edge angles of one ring, (12)-(13): ``y - proj(sum y) / n``.
+    """Return least-squares edge angles of one ring, (12)-(13): ``y - proj(sum y) / n``.
 
     Parameters
     ----------
     y
-        (..., n) edge angles, all along the ring (1 to 2, 2 to 3, ..., n to 1), radians.
+        (..., n) edge angles, all in the same direction of the ring (1 to 2, 2 to 3, ..., n to 1),
+        radians.
     """
     y = check_array("y", y, ("n",))
     return y - proj(y.sum(axis=-1, keepdims=True)) / y.shape[-1]
 
 
 def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
-    """Smallest nonzero and largest eigenvalue of ``F = C C^T``; 1 and 1 without any cycle.
+    """Return the smallest nonzero and the largest eigenvalue of ``F = C C^T``; 1, 1 without cycles.
 
     Raises
     ------
     ValueError
-        If more than 1500 cycles over as many edges depend on each other.
+        If there are more than 1500 dependent cycles over more than 1500 edges.
     """
     if C.shape[0] == 0:
         return 1.0, 1.0
     if min(C.shape) <= _DENSE:
-        # C^T C has the same ones.
+        # C^T C has the same eigenvalues.
         gram = C @ C.T if C.shape[0] <= C.shape[1] else C.T @ C
         values = np.linalg.eigvalsh(gram.toarray())
         values = values[values > _ZERO * values[-1]]
@@ -100,7 +101,7 @@ def eigenvalues(C: sp.csr_matrix) -> tuple[float, float]:
 
 
 def largest_eigenvalue(C: sp.csr_matrix) -> float:
-    """Largest eigenvalue of ``C C^T``."""
+    """Return the largest eigenvalue of ``C C^T``."""
     if min(C.shape) <= max(_DENSE, 2):
         return eigenvalues(C)[1]
     start = np.ones(C.shape[0])
@@ -108,7 +109,7 @@ def largest_eigenvalue(C: sp.csr_matrix) -> float:
 
 
 def step_size(C: sp.csr_matrix, rule: str = "theorem") -> float:
-    """Step kappa of the cycle iteration by a rule; every rule converges.
+    """Return the step kappa of the cycle iteration by a rule; every rule converges.
 
     Parameters
     ----------
@@ -116,11 +117,10 @@ def step_size(C: sp.csr_matrix, rule: str = "theorem") -> float:
         Cycle matrix (q, m); ``F = C C^T``.
     rule
         ``"theorem"``: ``2 / (1 + lambda_max(F))``, the bound of Theorem 19. ``"best"``: ``2 /
-        (lambda_min + lambda_max)``, lambda_min the smallest eigenvalue that is not zero: the
-        fastest there is. ``"trace"``: ``2 / (1 + sum of the cycles' lengths)``, Section IV-E:
-        no eigenvalue, only the lengths have to be known. ``"rows"``, ours: the largest row sum
-        of ``|F|`` in place of lambda_max, so that cycles need to know only which edges they
-        share.
+        (lambda_min + lambda_max)``, lambda_min the smallest nonzero eigenvalue: the
+        fastest convergence. ``"trace"``: ``2 / (1 + sum of the cycles' lengths)``, Section IV-E; it
+        needs only the lengths. ``"rows"`` (not in the paper): the largest row sum of ``|F|`` in
+        place of lambda_max, so that cycles only need to know which edges they share.
     """
     check_one_of("kappa", rule, STEP_RULES)
     if C.shape[0] == 0:
@@ -133,36 +133,36 @@ def step_size(C: sp.csr_matrix, rule: str = "theorem") -> float:
 
 
 def convergence_factor(C: sp.csr_matrix, kappa: float) -> float:
-    """Factor of a step on the error: ``max |1 - kappa lambda_i|`` over F's nonzero eigenvalues."""
+    """Return the error factor of a step: ``max |1 - kappa lambda_i|``, lambda_i nonzero of F."""
     low, high = eigenvalues(C)
     return max(abs(1 - kappa * low), abs(1 - kappa * high))
 
 
 def printed_factor(kappa: float) -> float:
-    """Theorem 19's factor ``(1 - kappa)^2``, of the SQUARED error.
+    """Return the factor ``(1 - kappa)^2`` of Theorem 19, of the SQUARED error.
 
-    It holds where ``kappa <= 2 / (1 + lambda_max)`` and lambda_min is at least 1, as it is for the
-    cycles of any spanning tree; shorter cycles can have a smaller lambda_min, and are slower than
-    printed. `convergence_factor` is the true one, of the error itself.
+    It holds if ``kappa <= 2 / (1 + lambda_max)`` and lambda_min is at least 1, as for the cycles of
+    any spanning tree. Shorter cycles can have a smaller lambda_min, and converge more slowly than
+    the theorem states. `convergence_factor` is the exact factor of the error itself.
     """
     return (1 - kappa) ** 2
 
 
 def cycle_projection(C: sp.csr_matrix, y: ArrayLike, branch: ArrayLike | None = None) -> FloatArray:
-    """Least-squares edge angles (..., m) with ``C psi = 2 pi k``, exactly; (11) on a branch.
+    """Return least-squares edge angles (..., m) with ``C psi = 2 pi k`` exactly; (11) on a branch.
 
     Parameters
     ----------
     C, y
         Cycle matrix (q, m), of any cycles, and edge angles (..., m).
     branch
-        k (..., q), whole numbers; None: the nearest, cycle by cycle.
+        Integers k (..., q); None: the nearest for each cycle.
 
     Raises
     ------
     ValueError
-        On another shape, a branch that is not of whole numbers, or branches of dependent cycles
-        that contradict each other: then no psi satisfies all of them.
+        If a shape is wrong, a branch is not an integer, or branches of dependent cycles are
+        contradictory, so that no psi satisfies all of them.
     """
     C = sp.csr_matrix(C)
     y = check_array("y", y, (C.shape[1],)) if C.shape[1] else np.zeros(0)
@@ -179,12 +179,12 @@ def cycle_projection(C: sp.csr_matrix, y: ArrayLike, branch: ArrayLike | None = 
 
 
 def _times(C: sp.csr_matrix, x: FloatArray) -> FloatArray:
-    """``C x`` (..., q) of vectors (..., m)."""
+    """Return ``C x`` (..., q) of vectors (..., m)."""
     return (C @ x.reshape(-1, C.shape[1]).T).T.reshape(*x.shape[:-1], C.shape[0])
 
 
 def _least_norm(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
-    """The shortest x (..., m) with ``C x = off``, in the least-squares sense where none has."""
+    """Return the least-norm x (..., m) of ``C x = off``, in the least-squares sense."""
     right = off.reshape(-1, C.shape[0]).T
     return _least_norm_columns(C, right).T.reshape(*off.shape[:-1], C.shape[1])
 
@@ -208,7 +208,7 @@ def _least_norm_columns(C: sp.csr_matrix, off: FloatArray) -> FloatArray:
 
 
 def _solves(C: sp.csr_matrix, x: FloatArray, off: FloatArray) -> bool:
-    """Whether ``C x = off``, but for rounding: what no x solves is wrong by parts of a turn."""
+    """Return whether ``C x = off`` up to rounding; without a solution the error is large."""
     return bool((np.abs(_times(C, x) - off) < 1e-6 * max(1.0, np.abs(off).max(initial=0.0))).all())
 
 
@@ -229,17 +229,17 @@ def cycle_consensus(
     kappa: float | str | None = None,
     **options: object,
 ) -> FloatArray:
-    """Consistent edge angles psi (m,) by the cycle iteration (14); `cycle_iteration`'s `psi`.
+    """Return consistent edge angles psi (m,) by the cycle iteration (14).
 
-    Arguments as `cycle_iteration`.
+    This is the `psi` of `cycle_iteration`, with the same arguments.
 
     Raises
     ------
     ValueError
-        As `cycle_iteration`.
+        As in `cycle_iteration`.
     RuntimeError
-        If it does not converge in `max_steps`, or the branches of dependent cycles contradict
-        each other.
+        If it does not converge in `max_steps`, or the branches of dependent cycles are
+        contradictory.
     """
     run = cycle_iteration(edges, y, n_nodes, cycles, kappa, **options)  # pyright: ignore[reportArgumentType]
     if not run.converged:
@@ -261,37 +261,37 @@ def cycle_iteration(
     exchange: CycleExchange | None = None,
     branch: ArrayLike | None = None,
 ) -> CycleRun:
-    """The cycle-distributed iteration, (14): ``psi <- psi - kappa C^T proj(C psi)`` from y.
+    """Run the cycle-distributed iteration (14), ``psi <- psi - kappa C^T proj(C psi)``, from y.
 
     Parameters
     ----------
     edges, y, n_nodes
         (m, 2) and (m,) of a connected graph; y estimates ``theta_j - theta_i``, radians.
     cycles
-        A name of `graphs.cycle_matrix`, or a cycle matrix of one's own, of any cycles.
+        A name of `graphs.cycle_matrix`, or a cycle matrix of any cycles.
     kappa
         Step, or a rule of `step_size`; None: "theorem". Asynchronous: a number, or None for one
-        over the length of the cycle, which no cycle has to ask another for.
+        over the length of the cycle, which needs no exchange between cycles.
     tol, max_steps
-        It ends when the cycles' errors ``proj(C psi)`` have a norm of at most `tol`, after so
-        many steps, or where dependent cycles hold each other at errors that no psi takes away.
+        The iteration ends when the norm of the cycle errors ``proj(C psi)`` is at most `tol`, after
+        `max_steps` steps, or when it stalls because no psi satisfies dependent cycles.
     history
-        Whether to keep all psi on the way.
+        Whether to keep psi of all steps.
     exchange
-        Order of the cycles, and losses; None: all at once and without.
+        Order of the cycles, and losses; None: synchronous without losses.
     branch
-        k (q,) of ``C psi = 2 pi k``, whole numbers, where it is known, for instance from an
-        earlier estimate; None: each cycle takes the nearest, at every step.
+        Integers k (q,) of ``C psi = 2 pi k`` if known, for instance from an earlier estimate; None:
+        each cycle takes the nearest at every step.
 
     Raises
     ------
     ValueError
-        If the graph is not connected, a cycle is none, kappa is not in ``(0, 2 / lambda_max)``,
-        or the branches given contradict each other.
+        If the graph is not connected, a row is not a cycle, kappa is not in
+        ``(0, 2 / lambda_max)``, or the given branches are contradictory.
 
     Notes
     -----
-    No step makes ``|proj(C psi)|`` larger: the iteration always comes to rest.
+    No step increases ``|proj(C psi)|``, so the iteration always settles.
     """
     edges = check_connected(edges, n_nodes)
     psi = check_edge_angles(y, edges).copy()
@@ -352,17 +352,17 @@ def cycle_iteration(
 
 
 def _consistent(C: sp.csr_matrix, branch: NDArray[Any]) -> bool:
-    """Whether some psi has ``C psi = 2 pi k``."""
+    """Return whether ``C psi = 2 pi k`` has a solution psi."""
     return _solves(C, _least_norm(C, branch.astype(float)), branch.astype(float))
 
 
 def _step(C: sp.csr_matrix, kappa: float | str | None, one_by_one: bool) -> float | None:
-    """Step to use, checked against the true condition; None: one over the cycle's length."""
+    """Return the step, checked against the exact condition; None: one over the cycle's length."""
     if one_by_one and kappa is None:
         return None
     if kappa is None or isinstance(kappa, str):
         return step_size(C, "theorem" if kappa is None else kappa)
-    # One cycle alone is a row of C C^T: its length is the eigenvalue.
+    # For a single cycle the eigenvalue of C C^T is its length.
     limit = 2 / max(np.diff(C.indptr).max(initial=1) if one_by_one else largest_eigenvalue(C), 1.0)
     kappa = check_number("kappa", kappa)
     if not 0 < kappa < limit:
@@ -378,7 +378,7 @@ def _whole(branch: ArrayLike, size: int) -> FloatArray:
 
 
 def _around(sums: FloatArray, target: FloatArray | None) -> FloatArray:
-    """What is left of the cycles' sums: to the nearest multiple of 2 pi, or to the target."""
+    """Return the cycle sums less the nearest multiple of 2 pi, or less the target."""
     return proj(sums) if target is None else sums - target
 
 
@@ -389,7 +389,7 @@ def _one_by_one(
     target: FloatArray | None,
     turns: NDArray[np.intp],
 ) -> None:
-    """Each cycle of `turns` in its turn, on the edges as they are by then."""
+    """Update each cycle of `turns` in order, with the current edges."""
     for row in turns:
         part = slice(C.indptr[row], C.indptr[row + 1])
         edges, signs = C.indices[part], C.data[part]

@@ -1,10 +1,10 @@
 """Frames of a planar network: orientations and positions of all nodes from raw bearings.
 
-Bearings fix the shape, one known distance (or ranges) its scale. A linear start, then the joint
-maximum likelihood: the positions share in what the bearings say about the orientations.
+Bearings determine the shape; one known distance, or ranges, determines its scale. A linear start is
+refined by joint maximum likelihood of orientations and positions.
 """
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from rbl_gym.networks.sensing import (
 
 _MAX_STEPS = 200
 _DAMPING, _LEAST_DAMPING = 1e-3, 1e-9
-_SETTLED = 1e-9  # radians, and share of the network's size
+_SETTLED = 1e-9  # radians, and fraction of the network's size
 _REWEIGHTINGS = 3
 
 
@@ -40,7 +40,7 @@ class FrameEstimate(NamedTuple):
 
     orientations: FloatArray  # (n,) radians in [-pi, pi)
     positions: FloatArray  # (n, 2) metres
-    cost: float  # sum of squared residuals, each over its standard deviation
+    cost: float  # sum of squared whitened residuals
     converged: bool
 
 
@@ -48,7 +48,7 @@ class _Measured(NamedTuple):
     edges: IntArray
     bearings: FloatArray  # (m, 2)
     bearing_std: float
-    ranges: FloatArray  # (m,), 0 where none
+    ranges: FloatArray  # (m,), 0 for none
     range_std: float
     known: tuple[int, int] | None
     length: float
@@ -65,25 +65,27 @@ def frames(
     ranges: ArrayLike | None = None,
     range_std_m: float | None = None,
 ) -> FrameEstimate:
-    """Orientations and positions from bearings, by joint maximum likelihood (Problems 9, 10).
+    """Estimate orientations and positions from bearings by joint maximum likelihood.
+
+    These are Problems 9 and 10 of the paper.
 
     Parameters
     ----------
     edges, bearings, n_nodes
         (m, 2) and (m, 2): of j seen by i, of i seen by j, each in its own frame, radians.
     known_pair, length_m
-        Two nodes and their distance, taken as exact; not beside ranges.
+        Two nodes and their exact distance; not together with ranges.
     bearing_std_rad
-        Standard deviation of a bearing; it matters beside ranges only.
+        Standard deviation of a bearing; used only with ranges.
     ranges, range_std_m
-        Measured lengths (m,) of the edges, metres, 0 where there is none, and their standard
-        deviation. They give the scale, and sharpen the orientations, too.
+        Measured lengths (m,) of the edges, metres, 0 for none, and their standard deviation. They
+        determine the scale, and also improve the orientations.
 
     Raises
     ------
     ValueError
-        If the frames are not determined: the graph is not connected, or not (with ranges:
-        jointly) rigid, Proposition 16; the message names the components or the missing rank.
+        If the frames are not determined because the graph is not connected, or not (with ranges:
+        jointly) rigid, Proposition 16. The message names the components or the missing rank.
     """
     edges = check_connected(edges, n_nodes)
     bearings = check_edge_values("bearings", bearings, edges, 2)
@@ -92,7 +94,7 @@ def frames(
     )
     if n_nodes == 1:
         return FrameEstimate(np.zeros(1), np.zeros((1, 2)), 0.0, True)
-    # Of positions in general: the true ones are not known.
+    # Generic rigidity, because the true positions are unknown.
     anywhere = np.random.default_rng(0).uniform(size=(n_nodes, 2))
     if measured.known is None:
         check_joint(anywhere, edges, edges[measured.ranges > 0])
@@ -125,10 +127,11 @@ def _measured(
 
 
 def _linear_start(measured: _Measured, theta: FloatArray) -> FloatArray:
-    """Positions (n, 2), node 0 at the origin: edges have no part across their direction.
+    """Return linear positions (n, 2), node 0 at the origin.
 
-    Along it they have the measured lengths, else a common scale. Weighted anew by the lengths
-    found, because a bearing's error shifts a far node more.
+    Edges have no component across their direction. Along it they have the measured lengths, or else
+    a common scale. The weights are updated by the estimated lengths, because a bearing error shifts
+    a far node more.
     """
     edges, bearings = measured.edges, measured.bearings
     toward = theta[edges[:, 0]] + bearings[:, 0]
@@ -154,7 +157,7 @@ def _linear_start(measured: _Measured, theta: FloatArray) -> FloatArray:
 
 
 def _of_scale_one(flat: sp.spmatrix, mean_length: FloatArray) -> FloatArray:
-    """Minimum of the quadratic form where the mean length along the edges is 1."""
+    """Minimise the quadratic form with mean length 1 along the edges."""
     row = sp.csr_matrix(mean_length)
     bordered = sp.bmat([[flat, row.T], [row, None]], format="csc")
     right = np.zeros(len(mean_length) + 1)
@@ -170,16 +173,16 @@ def _scaled(measured: _Measured, positions: FloatArray) -> FloatArray:
 
 
 def _differences(edges: IntArray, vectors: FloatArray, n_nodes: int) -> sp.csr_matrix:
-    """Rows (m, 2 n - 2): ``v' (p_j - p_i)`` of each edge's vector v, node 0 at the origin."""
+    """Return rows (m, 2 n - 2) of ``v' (p_j - p_i)`` for each edge's vector v, node 0 at origin."""
     columns = (2 * edges[:, :, None] + [0, 1]).reshape(-1, 4)
     values = np.concatenate([-vectors, vectors], axis=1)
     return sparse_rows(values, columns, 2 * n_nodes)[:, 2:]
 
 
 def _joint(measured: _Measured, theta: FloatArray, positions: FloatArray) -> FrameEstimate:
-    """Levenberg-Marquardt on all bearings and ranges.
+    """Run Levenberg-Marquardt on all bearings and ranges.
 
-    Bearings see no change of scale: the damping keeps that move out, the scale is set at last.
+    Bearings do not depend on scale. The damping suppresses changes of scale; it is set at the end.
     """
     n_nodes = len(theta)
     free = free_columns(n_nodes)
@@ -204,7 +207,7 @@ def _joint(measured: _Measured, theta: FloatArray, positions: FloatArray) -> Fra
             break
         else:
             damping *= 10
-        # At the minimum rounding alone can keep the cost from falling.
+        # At the minimum, rounding alone can prevent a decrease of the cost.
         if size <= _SETTLED:
             converged = True
             break
@@ -212,7 +215,7 @@ def _joint(measured: _Measured, theta: FloatArray, positions: FloatArray) -> Fra
 
 
 def _residuals(measured: _Measured, theta: FloatArray, positions: FloatArray) -> FloatArray:
-    """All residuals over their standard deviations, bearings first."""
+    """Return all whitened residuals, bearings first."""
     edges, ranged = measured.edges, measured.ranges > 0
     angles = proj(measured.bearings - true_bearings(positions, theta, edges)) / measured.bearing_std
     apart = positions[edges[ranged, 1]] - positions[edges[ranged, 0]]
@@ -221,7 +224,7 @@ def _residuals(measured: _Measured, theta: FloatArray, positions: FloatArray) ->
 
 
 def _jacobian(measured: _Measured, positions: FloatArray) -> sp.csr_matrix:
-    """Derivative of the predictions over their standard deviations."""
+    """Return the derivative of the whitened predictions."""
     ranged = measured.edges[measured.ranges > 0]
     rows: list[Any] = [bearing_jacobian(positions, measured.edges) / measured.bearing_std]
     rows.append(range_jacobian(positions, ranged) / measured.range_std)

@@ -1,8 +1,8 @@
 """Orientations of the nodes of a planar network from its edge angles.
 
 The maximum-likelihood orientations minimise the sum of squared wrapped residuals
-``proj(y - B theta)``, each over its variance. From the chordal start they are a few solves with
-one factorised graph Laplacian, whatever the number of cycles.
+``proj(y - B theta)``, each over its variance. From the chordal start this takes a few solves with
+one factorised graph Laplacian, for any number of cycles.
 """
 
 # scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
@@ -22,21 +22,22 @@ from rbl_gym.networks.edges import IntArray
 from rbl_gym.networks.graphs import check_connected, spanning_tree, sum_to_root
 from rbl_gym.networks.sensing import check_edge_angles, check_edge_values, proj
 
-# A step is exact to rounding once no residual wraps: the next one is far below this.
+# A step is exact to rounding once no residual wraps; the next one is far below this.
 _SETTLED_RAD = 1e-10
 _MAX_STEPS = 100
-# A weight beside the largest. Two parts that lighter edges alone join would be turned by rounding.
+# Least weight relative to the largest. Rounding would rotate two parts joined only by lighter
+# edges.
 LEAST_WEIGHT = 1e-12
 _SMALLEST = 5e-324
 _DENSE = 50  # nodes up to which all eigenvectors are computed
-# Pivots of the dual matrix below this share of the sum of a node's weights count as zero.
+# Pivots of the dual matrix below this fraction of the sum of a node's weights count as zero.
 _PIVOT_FLOOR = 1e-10
 
 
 class ChordalOptimum(NamedTuple):
-    """A stationary point of the chordal cost, and whether it is proved to be the global one."""
+    """A stationary point of the chordal cost, and whether it is proved to be the global minimum."""
 
-    theta: FloatArray  # (n,) radians, that of node 0 is 0
+    theta: FloatArray  # (n,) radians, 0 at node 0
     # Sum of w |e^{i theta_j} - e^{i y} e^{i theta_i}|^2 = 2 w (1 - cos residual).
     cost: float
     certified: bool
@@ -51,30 +52,30 @@ def orientations(
     weights: ArrayLike | None = None,
     **options: Any,
 ) -> FloatArray:
-    """Orientations (n,) of the nodes relative to node 0, radians in [-pi, pi).
+    """Estimate orientations (n,) of the nodes relative to node 0, radians in [-pi, pi).
 
     Parameters
     ----------
     edges, y, n_nodes
         (m, 2) and (m,) of a connected graph; y estimates ``theta_j - theta_i``, radians. An
-        edge may come twice. One node alone has orientation 0.
+        edge may occur twice. A single node has orientation 0.
     method
         ``"ml"``: least squares of the wrapped residuals from the chordal start. ``"chordal"``:
         phases of the complex least squares with ``z_0 = 1``. ``"cycle"``: the cycle iteration
         (14), then along a tree. ``"tree"``: y along the breadth-first tree. ``"spectral"``:
         phases of the eigenvector of the connection Laplacian's smallest eigenvalue.
     weights
-        (m,) above 0: the information of each y, one over its variance, in any unit; none below
-        `LEAST_WEIGHT` of the largest, which rounding would drown. None: all alike. Not for
-        ``"cycle"`` and ``"tree"``, which have none.
+        (m,) above 0: the information of each y, one over its variance, in any unit. None may be
+        below `LEAST_WEIGHT` of the largest, because of rounding. None: equal weights. Not for
+        ``"cycle"`` and ``"tree"``, which are unweighted.
     options
-        Of `cycle_consensus`, with ``"cycle"``.
+        Options of `cycle_consensus`, with ``"cycle"``.
 
     Raises
     ------
     ValueError
         If the graph is not connected (the message names the components), or an argument is
-        not as described.
+        invalid.
     """
     check_one_of("method", method, tuple(METHODS))
     edges = check_connected(edges, n_nodes)
@@ -94,16 +95,16 @@ def orientations(
 def cost(
     edges: ArrayLike, y: ArrayLike, theta: ArrayLike, weights: ArrayLike | None = None
 ) -> float:
-    """Sum of the squared wrapped residuals ``proj(y - (theta_j - theta_i))``, rad^2.
+    """Return the sum of squared wrapped residuals ``proj(y - (theta_j - theta_i))``, rad^2.
 
-    With weights (m,), of their products with the weights.
+    With weights (m,), the sum is weighted.
     """
     residual = residuals(np.asarray(edges), np.asarray(y), np.asarray(theta))
     return float(residual @ residual if weights is None else residual**2 @ np.asarray(weights))
 
 
 def check_weights(weights: ArrayLike | None, edges: IntArray) -> FloatArray:
-    """`weights` of edges (m,), ones for None, or a ValueError."""
+    """Return checked `weights` of edges (m,), ones for None, or raise ValueError."""
     if weights is None:
         return np.ones(len(edges))
     array = check_edge_values("weights", weights, edges)
@@ -120,12 +121,12 @@ def check_weights(weights: ArrayLike | None, edges: IntArray) -> FloatArray:
 
 
 def residuals(edges: IntArray, y: FloatArray, theta: FloatArray) -> FloatArray:
-    """Wrapped residuals (m,)."""
+    """Return the wrapped residuals (m,)."""
     return proj(y - (theta[edges[:, 1]] - theta[edges[:, 0]])) if len(edges) else np.zeros(0)
 
 
 def along_tree(edges: IntArray, y: FloatArray, n_nodes: int) -> FloatArray:
-    """Orientations (n,) summed up along the breadth-first tree, not wrapped."""
+    """Return orientations (n,) summed along the breadth-first tree, not wrapped."""
     tree = spanning_tree(edges, n_nodes)
     return sum_to_root(tree.parent, y[tree.edge] * tree.sign if len(y) else np.zeros(1))
 
@@ -157,16 +158,16 @@ def maximum_likelihood(
     start: FloatArray | None = None,
     weights: FloatArray | None = None,
 ) -> FloatArray:
-    """Weighted least squares (n,) of the wrapped residuals: Gauss-Newton steps that wrap anew.
+    """Return the weighted least squares (n,) of the wrapped residuals.
 
-    One factorisation of the Laplacian serves all steps; once no residual wraps, a step is
-    exact. `start` (n,) takes the place of the chordal one.
+    Gauss-Newton steps wrap the residuals anew. All use one factorisation of the Laplacian. Once no
+    residual wraps, a step is exact. `start` (n,) replaces the chordal start.
     """
     if n_nodes == 1:
         return np.zeros(1)
     weights = check_weights(weights, edges)
     theta, rank = _chordal(edges, y, n_nodes, weights) if start is None else (start, None)
-    # The chordal system has found a good order of elimination: the nodes are named by it.
+    # Reuse the order of elimination of the chordal system for the nodes.
     names = np.arange(n_nodes) if rank is None else rank
     named = names[edges]
     at = np.empty(n_nodes)
@@ -184,9 +185,9 @@ def maximum_likelihood(
 def spectral(
     edges: IntArray, y: FloatArray, n_nodes: int, weights: FloatArray | None = None
 ) -> FloatArray:
-    """Phases (n,) of the eigenvector of the connection Laplacian's smallest eigenvalue."""
+    """Return phases (n,) of the eigenvector of the connection Laplacian's smallest eigenvalue."""
     weights = check_weights(weights, edges)
-    # Of a mean weight of 1, so that the shift below is small beside it.
+    # Scaled to mean weight 1, so that the shift below is small in comparison.
     weights = weights / weights.mean() if len(weights) else weights
     L = _laplacian(edges, weights * np.exp(-1j * y), n_nodes)
     if n_nodes <= _DENSE:
@@ -219,25 +220,25 @@ def chordal_optimum(
     start: ArrayLike | None = None,
     weights: ArrayLike | None = None,
 ) -> ChordalOptimum:
-    """Minimum of the chordal cost ``sum 2 w (1 - cos(y - theta_j + theta_i))``, with its proof.
+    """Minimise the chordal cost ``sum 2 w (1 - cos(y - theta_j + theta_i))``, with a proof.
 
     At a stationary point z the dual matrix is the connection Laplacian less a diagonal that
-    makes ``S z = 0``. Where S is positive semidefinite no other z has a lower cost. Its
-    positive pivots, once node 0 is taken out, prove it.
+    makes ``S z = 0``. If S is positive semidefinite, no other z has a lower cost. Positive
+    pivots without node 0 prove this.
 
     Parameters
     ----------
     edges, y, n_nodes
-        As `orientations`.
+        As in `orientations`.
     start
         (n,) radians; None: the maximum-likelihood orientations.
     weights
-        As `orientations`.
+        As in `orientations`.
 
     Raises
     ------
     ValueError
-        As `orientations`, and on a start of another shape.
+        As in `orientations`, and if the start has a wrong shape.
     """
     edges = check_connected(edges, n_nodes)
     y = check_edge_angles(y, edges)
@@ -255,7 +256,7 @@ def chordal_optimum(
         theta = theta - theta[0]
     for _ in range(_MAX_STEPS):
         residual = residuals(edges, y, theta)
-        # Newton's curvature where it is safe, that of the squares elsewhere.
+        # Newton's curvature, bounded from below.
         curvature = weights * np.maximum(np.cos(residual), 0.1)
         L = _laplacian(edges, curvature, n_nodes)
         slope = _gathered(edges, weights * np.sin(residual), n_nodes)
@@ -272,10 +273,10 @@ def chordal_optimum(
 def _dual(
     edges: IntArray, residual: FloatArray, n_nodes: int, weights: FloatArray | None = None
 ) -> sp.csc_matrix:
-    """The dual matrix in the gauge of the solution, where its null vector is 1.
+    """Return the dual matrix in the gauge of the solution, in which its null vector is 1.
 
-    Rows and columns over the roots of the nodes' sums of weights: definite as before, and a
-    pivot is small beside 1 if it is small beside its own node's weights.
+    Rows and columns are divided by the roots of the nodes' sums of weights. This keeps
+    definiteness, and makes pivots relative to the weights of their own node.
     """
     weights = check_weights(weights, edges)
     L = _laplacian(edges, weights * np.exp(-1j * residual), n_nodes)
@@ -285,7 +286,7 @@ def _dual(
 
 
 def _is_positive(S: sp.csc_matrix) -> bool:
-    """Whether a Hermitian matrix has positive pivots only, eliminated in symmetric order."""
+    """Return whether a Hermitian matrix has only positive pivots, in symmetric elimination."""
     try:
         factors = _factorised(S)
     except RuntimeError:  # exactly singular
@@ -296,9 +297,9 @@ def _is_positive(S: sp.csc_matrix) -> bool:
 
 
 def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matrix:
-    """Hermitian matrix with ``-links`` at (i, j), their conjugates at (j, i), and the sums of
-    their sizes on the diagonal: the graph Laplacian of weights, the connection Laplacian of
-    ``e^{-iy}``.
+    """Return the Laplacian of complex links.  It is the Hermitian matrix with ``-links`` at (i, j),
+    their conjugates at (j, i), and the sums of their absolute values on the diagonal: the graph
+    Laplacian of weights, the connection Laplacian of ``e^{-iy}``.
     """
     i, j = edges.T
     nodes = np.arange(n_nodes)
@@ -309,7 +310,7 @@ def _laplacian(edges: IntArray, links: np.ndarray, n_nodes: int) -> sp.csc_matri
 
 
 def _factorised(A: sp.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any:
-    """LU of a Hermitian matrix with pivots on its diagonal, of minimum degree or as it is."""
+    """Factorise a Hermitian matrix with diagonal pivots, in minimum-degree or natural order."""
     return scipy.sparse.linalg.splu(
         sp.csc_matrix(A),
         permc_spec=order,
@@ -319,5 +320,5 @@ def _factorised(A: sp.csc_matrix, order: str = "MMD_AT_PLUS_A") -> Any:
 
 
 def _gathered(edges: IntArray, values: FloatArray, n_nodes: int) -> FloatArray:
-    """``B^T values`` (n,)."""
+    """Return ``B^T values`` (n,)."""
     return np.bincount(edges[:, 1], values, n_nodes) - np.bincount(edges[:, 0], values, n_nodes)

@@ -51,7 +51,7 @@ class _Measured(NamedTuple):
     lengths: FloatArray  # typical and measured
     information: FloatArray  # of the lengths
     prior: FloatArray  # (3 n,) information
-    nearest: float  # nodes that come nearer count as this far: no bearing becomes infinitely sharp
+    nearest: float  # least distance in the derivatives, which bounds the information of bearings
 
 
 def network_poses(
@@ -62,28 +62,28 @@ def network_poses(
     orientations: FloatArray,
     positions: FloatArray,
 ) -> NetworkPoses:
-    """Orientations and positions from bearings and lengths, by Levenberg-Marquardt.
+    """Estimate orientations and positions from bearings and lengths by Levenberg-Marquardt.
 
     Parameters
     ----------
     links, bearings
-        (..., n, n) symmetric, who sees whom; (..., n, n) of j in the frame of i, radians.
+        (..., n, n) symmetric mask of measured pairs; (..., n, n) of j in the frame of i, radians.
     lengths
-        (..., n, n) symmetric, metres, 0 where none is measured. Beside links only.
+        (..., n, n) symmetric, metres, 0 if not measured. Only for pairs in `links`.
     sensing
-        Their standard deviations, and what is known beforehand.
+        Standard deviations of the measurements and of the prior.
     orientations
-        (..., n) near the truth: the start.
+        (..., n) start, near the truth.
     positions
         (..., n, 2), node 0 at the origin. A node without a path to node 0 keeps its orientation
-        and its place, with the standard deviations of the prior. Others are not pulled towards
-        theirs; the prior only bounds their variances.
+        and position, with the standard deviations of the prior. For the other nodes the prior only
+        bounds the variances; it does not pull the estimate.
     """
     links = linked_to_0(links)
     n_nodes = links.shape[-1]
     ranged, (typical, typical_std) = links & (lengths > 0), sensing.typical_length_m
     information = length_information(links, ranged, sensing)
-    # The mean of the measured and the typical length: one residual stands for both.
+    # Weighted mean of measured and typical length, so that one residual represents both.
     share = np.where(ranged, typical_std**2 / (typical_std**2 + sensing.length_std_m**2), 0.0)
     measured = _Measured(
         links,
@@ -112,7 +112,7 @@ def network_poses(
         places = np.where(better[..., None, None], new_places, places)
         slope = np.where(better[..., None], new_slope, slope)
         cost = np.where(better, new_cost, cost)
-        # At the minimum rounding alone can keep the cost from falling.
+        # At the minimum, rounding alone can prevent a decrease of the cost.
         active = active & (size > _SETTLED) & (damping < _MOST_DAMPING)
         damping = np.where(better, np.maximum(damping / 10, _LEAST_DAMPING), damping * 10)
         if not active.any():
@@ -136,7 +136,7 @@ def _found(
     chi_square = (bearings**2 * measured.links).sum(axis=(-2, -1)) / measured.bearing_std**2
     chi_square = chi_square + (off**2 * of_lengths).sum(axis=(-2, -1)) / 2
     count = measured.links.sum(axis=(-2, -1)) + (of_lengths > 0).sum(axis=(-2, -1)) / 2
-    # Measurements determine tr(P H) of the unknowns, H their information.
+    # Measurements determine tr(P H) unknowns, with H their information.
     H = _of(measured, places, of_lengths)
     used = (covariance * H[..., free[:, None], free]).sum(axis=(-2, -1))
     return NetworkPoses(proj(theta), places, covariance, chi_square, count - used)
@@ -156,7 +156,7 @@ def _of(measured: _Measured, places: FloatArray, of_lengths: FloatArray) -> Floa
 
 
 def _solved(H: FloatArray, slope: FloatArray, damping: FloatArray) -> FloatArray:
-    """The damped step (..., 3 n), 0 in the frame of node 0."""
+    """Return the damped step (..., 3 n), 0 for node 0."""
     free = free_columns(slope.shape[-1] // 3)
     part = H[..., free[:, None], free]
     diagonal = np.arange(len(free))
@@ -176,7 +176,7 @@ def _moved(
 def _residuals(
     measured: _Measured, theta: FloatArray, places: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Of all bearings and of all lengths (..., n, n), whether measured or not."""
+    """Return residuals of all bearings and lengths (..., n, n), measured or not."""
     along, distance = lines_of_sight(places)
     toward = np.arctan2(along[..., 1], along[..., 0])
     return proj(measured.bearings - toward + theta[..., None]), measured.lengths - distance
@@ -185,14 +185,14 @@ def _residuals(
 def _slope(
     measured: _Measured, theta: FloatArray, places: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Cost (...) and minus half its gradient (..., 3 n)."""
+    """Return the cost (...) and minus half its gradient (..., 3 n)."""
     along, distance = lines_of_sight(places)
     across = across_of(along, distance, measured.nearest)
     bearings, lengths = _residuals(measured, theta, places)
     turned = measured.links * bearings / measured.bearing_std**2
     stretched = measured.information * lengths
     pull = turned[..., None] * across
-    # across of (j, i) is minus that of (i, j).
+    # `across` of (j, i) is the negative of that of (i, j).
     moved = -(pull + stretched[..., None] * along).sum(axis=-2) + pull.sum(axis=-3)
     slope = [-turned.sum(axis=-1), moved.reshape(*theta.shape[:-1], -1)]
     cost = (turned * bearings).sum(axis=(-2, -1)) + (stretched * lengths).sum(axis=(-2, -1)) / 2
@@ -200,9 +200,10 @@ def _slope(
 
 
 def _linear_start(measured: _Measured, theta: FloatArray, positions: FloatArray) -> FloatArray:
-    """Positions (..., n, 2): links have their length, and no part across their direction.
+    """Return positions (..., n, 2) by linear least squares.
 
-    Weighted anew by the lengths found, because a bearing's error shifts a far node more.
+    Links have their length along their direction and no component across it. The weights are
+    updated by the estimated lengths, because a bearing error shifts a far node more.
     """
     links, tied = measured.links, measured.information
     toward = theta[..., None] + measured.bearings
@@ -211,7 +212,7 @@ def _linear_start(measured: _Measured, theta: FloatArray, positions: FloatArray)
     along = np.stack([np.cos(toward), np.sin(toward)], axis=-1)
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     n_nodes = theta.shape[-1]
-    # Where a node stays that nothing is measured of; no more than a hint to the others.
+    # A weak prior that keeps unmeasured nodes in place and hardly affects the others.
     prior = _HINT * measured.prior[-1]
     apart = measured.lengths
     for _ in range(_REWEIGHTINGS):

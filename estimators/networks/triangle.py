@@ -1,9 +1,9 @@
-"""Three nodes in space: orientations, and places up to scale, from the bearings of one another.
+"""Orientations of three nodes in space, and positions up to scale, from mutual bearings.
 
-The interior angles of a triangle sum to pi, and that is all that six bearings know twice. So the
-maximum likelihood is the ring's least squares (12) over again: every angle takes a third of what is
-missing, half of it at either bearing; then the frames fit without a rest, ``R_1^0 R_2^1 R_0^2 = I``
-(3).
+The interior angles of a triangle sum to pi, which is the only redundancy of the six bearings.
+Maximum likelihood is therefore the ring's least squares (12): every angle takes a third of the
+misfit, half of it at either bearing. The frames are then exactly consistent, ``R_1^0 R_2^1 R_0^2 =
+I`` (3).
 """
 
 from __future__ import annotations
@@ -15,37 +15,37 @@ from numpy.typing import ArrayLike
 
 from rbl_gym.checks import FloatArray, check_array, check_number
 
-# The layout of bearings: each row of the nodes 0, 1, 2 and the next one.
+# Layout of bearings: each row is of the nodes 0, 1, 2 and the next one.
 TRIANGLE_EDGES = ((0, 1), (1, 2), (2, 0))
 _SMALLEST_SINE = 1e-9
 
 
 class TriangleFrames(NamedTuple):
-    """The frames of three nodes relative to node 0's."""
+    """Frames of three nodes relative to that of node 0."""
 
     rotation: FloatArray  # (..., 3, 3, 3) from each node's frame to node 0's
-    position: FloatArray  # (..., 3, 3) in node 0's frame, metres; NaN where no triangle fits
+    position: FloatArray  # (..., 3, 3) in node 0's frame, metres; NaN if no triangle fits
     angle: FloatArray  # (..., 3) interior angles, radians, sum pi
     misfit: FloatArray  # (...), pi less the sum of the measured angles: N(0, 6 sigma^2)
 
 
 def triangle_frames(bearings: ArrayLike, length_m: float = 1.0) -> TriangleFrames:
-    """Maximum-likelihood frames of three nodes in space from their mutual bearings.
+    """Estimate maximum-likelihood frames of three nodes in space from mutual bearings.
 
     Parameters
     ----------
     bearings
         (..., 3, 2, 3) directions along the edges (0, 1), (1, 2), (2, 0): of the second node in the
-        frame of the first, then of the first in the frame of the second. Made unit here. Noise of
-        all of them alike, isotropic across the direction.
+        frame of the first, then of the first in the frame of the second. They are normalised here.
+        The noise is equal for all, and isotropic across the direction.
     length_m
-        Distance of nodes 0 and 1, which bearings do not tell.
+        Distance of nodes 0 and 1, which bearings do not determine.
 
     Raises
     ------
     ValueError
-        On another shape, a bearing of no length, or a node that sees both others on one line:
-        turns about that line stay free.
+        If a shape is wrong, a bearing is zero, or a node sees both others on one line, so that
+        rotations about that line are not determined.
     """
     bearings = check_array("bearings", bearings, (3, 2, 3))
     length_m = check_number("length_m", length_m, low=1e-12)
@@ -53,7 +53,7 @@ def triangle_frames(bearings: ArrayLike, length_m: float = 1.0) -> TriangleFrame
     if not size.all():
         raise ValueError("bearings must be directions, got one of length 0")
     unit = bearings / size
-    # Of every node, what it sees of the next one and of the one before.
+    # For every node, the bearings of the next node and of the one before.
     ahead, behind = unit[..., 0, :], np.roll(unit[..., 1, :], 1, axis=-2)
     normal = np.cross(ahead, behind)
     sine = np.linalg.norm(normal, axis=-1)
