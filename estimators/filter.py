@@ -115,9 +115,8 @@ def make(
     ----------
     name
         ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
-        ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; a name from the
-        entry-point group ``rbl_gym.filters`` of another package; or ``"package.module:factory"``,
-        which is imported.
+        ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; a name from the entry-point group
+        ``rbl_gym.filters`` of another package; or ``"package.module:factory"``, which is imported.
     tags
         (N, 3), positions in the body frame, metres.
     noise

@@ -83,11 +83,11 @@ def innovations(
     Parameters
     ----------
     filter
-        Any filter. A filter whose states bias the ranges has a method ``biases_of(state,
-        anchors)``. It returns the states besides the pose (..., K), the covariance (..., 6 + K,
-        6 + K) of the errors of pose and states, and the derivative (M N, K) of the ranges by the
-        states. A filter whose ranges share an unknown offset has an attribute ``offset``. NIS,
-        likelihood and residuals are then those with the offsets removed.
+        Any filter. A filter whose states bias the ranges has a method
+        ``biases_of(state, anchors)``. It returns the states besides the pose (..., K), the
+        covariance (..., 6 + K, 6 + K) of the errors of pose and states, and the derivative (M N, K)
+        of the ranges by the states. A filter whose ranges share an unknown offset has an attribute
+        ``offset``. NIS, likelihood and residuals are then those with the offsets removed.
     before, after
         Its states, as returned by `predict` and by `update`.
     ranges, anchors, links

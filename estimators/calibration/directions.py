@@ -266,7 +266,7 @@ class _Told(NamedTuple):
 
 class _Found(NamedTuple):
     cost: FloatArray  # (H, K)
-    residual: FloatArray  # (H, K, M, N) over the deviation
+    residual: FloatArray  # (H, K, M, N) over the standard deviation
     std: FloatArray
     bias: FloatArray
 

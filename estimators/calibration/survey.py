@@ -99,7 +99,7 @@ class _Problem(NamedTuple):
     ranges: FloatArray
     links: BoolArray
     tags: FloatArray
-    pairs: FloatArray  # (M, M) ranges between anchors, 0 where there is none; upper triangle
+    pairs: FloatArray  # (M, M) ranges between anchors, 0 for none; upper triangle
     known: BoolArray  # (M,)
     model: SurveyModel
     lasting: float

@@ -212,7 +212,7 @@ def update_augmented(
 
     Returns
     -------
-    The fields of the state. The covariance is NaN where the information about the pose is not
+    The fields of the state. The covariance is NaN if the information about the pose is not
     positive definite.
     """
     return update_any(

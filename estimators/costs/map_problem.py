@@ -47,10 +47,9 @@ class Cost(Protocol):
 class MapProblem:
     """Maximum a posteriori pose of one epoch; arrays with leading batch axes.
 
-    `data` is the cost of the measurements (`RangeCost`, `doa_cost.DoaCost`, or a sum of costs).
-    The cost is that of the measurements plus half the squared Mahalanobis distance to the prior,
-    with residual
-    ``(log(Q Q_pred^T), t - t_pred)``.
+    `data` is the cost of the measurements (`RangeCost`, `doa_cost.DoaCost`, or a sum of costs). The
+    cost is that of the measurements plus half the squared Mahalanobis distance to the prior, with
+    residual ``(log(Q Q_pred^T), t - t_pred)``.
     """
 
     prior: PoseState

@@ -49,8 +49,8 @@ class PoseEstimate(NamedTuple):
     Attributes
     ----------
     rotation, translation
-        (..., 3, 3), always a proper rotation, and (..., 3) in metres. NaN if the links of
-        a trial are not enough for the method.
+        (..., 3, 3), always a proper rotation, and (..., 3) in metres. NaN if the links of a trial
+        are not enough for the method.
     covariance
         (..., 6, 6) of the error (w, v), ``rotation = exp(w) Q``, ``translation = t + v``, by
         the theory of the method. Very large along directions that the ranges do not determine.

@@ -140,7 +140,7 @@ def most_likely_pose(
     Parameters
     ----------
     ranges, weights, anchors, tags
-        As of `RangeCost`.
+        As in `RangeCost`.
     rotation, translation
         Starts; NaN for none.
     net

@@ -2,10 +2,10 @@
 
 With known directions, K distances from the base station determine the positions of K tags. The
 searches find K distances for which the distances between tags match those on the body. The paper
-names the two searches but gives neither objective nor parameters. Ours minimise ``sum_ij (|d_i u_i
-- d_j u_j| - |c_i - c_j|)^2``; the y of all tags has one sign. The two classes list the other
-assumptions. Population, steps, reach and the fraction of new individuals were tuned once for the
-fraction of poses near the truth.
+names the two searches but gives neither objective nor parameters. Ours minimise
+``sum_ij (|d_i u_i - d_j u_j| - |c_i - c_j|)^2``; the y of all tags has one sign. The two classes
+list the other assumptions. Population, steps, reach and the fraction of new individuals were tuned
+once for the fraction of poses near the truth.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class ParticleSwarm:
     """Particle swarm optimisation with constriction (Clerc and Kennedy 2002), global best.
 
     Assumed: 400 particles, 120 steps, inertia 0.7298, both attractions 1.4962, distances up to 2.5
-    times the largest that the directions allow, places clipped to that, velocities start at zero.
+    times the largest that the directions allow, positions clipped to that, velocities start at
+    zero.
     """
 
     size: int = 400

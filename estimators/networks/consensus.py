@@ -117,10 +117,10 @@ def step_size(C: sp.csr_matrix, rule: str = "theorem") -> float:
         Cycle matrix (q, m); ``F = C C^T``.
     rule
         ``"theorem"``: ``2 / (1 + lambda_max(F))``, the bound of Theorem 19. ``"best"``: ``2 /
-        (lambda_min + lambda_max)``, lambda_min the smallest nonzero eigenvalue: the
-        fastest convergence. ``"trace"``: ``2 / (1 + sum of the cycles' lengths)``, Section IV-E; it
-        needs only the lengths. ``"rows"`` (not in the paper): the largest row sum of ``|F|`` in
-        place of lambda_max, so that cycles only need to know which edges they share.
+        (lambda_min + lambda_max)``, lambda_min the smallest nonzero eigenvalue: the fastest
+        convergence. ``"trace"``: ``2 / (1 + sum of the cycles' lengths)``, Section IV-E; it needs
+        only the lengths. ``"rows"`` (not in the paper): the largest row sum of ``|F|`` in place of
+        lambda_max, so that cycles only need to know which edges they share.
     """
     check_one_of("kappa", rule, STEP_RULES)
     if C.shape[0] == 0:
@@ -286,8 +286,8 @@ def cycle_iteration(
     Raises
     ------
     ValueError
-        If the graph is not connected, a row is not a cycle, kappa is not in
-        ``(0, 2 / lambda_max)``, or the given branches are contradictory.
+        If the graph is not connected, a row is not a cycle, kappa is not in ``(0, 2 /
+        lambda_max)``, or the given branches are contradictory.
 
     Notes
     -----

@@ -67,7 +67,7 @@ def frames(
 ) -> FrameEstimate:
     """Estimate orientations and positions from bearings by joint maximum likelihood.
 
-    These are Problems 9 and 10 of the paper.
+    These are Problems 9 and 10 of Piovan et al.; see `consensus`.
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 The interior angles of a triangle sum to pi, which is the only redundancy of the six bearings.
 Maximum likelihood is therefore the ring's least squares (12): every angle takes a third of the
-misfit, half of it at either bearing. The frames are then exactly consistent, ``R_1^0 R_2^1 R_0^2 =
-I`` (3).
+misfit, half of it at either bearing. The frames are then exactly consistent,
+``R_1^0 R_2^1 R_0^2 = I`` (3).
 """
 
 from __future__ import annotations
