@@ -231,7 +231,7 @@ def cycle_consensus(
 ) -> FloatArray:
     """Return consistent edge angles psi (m,) by the cycle iteration (14).
 
-    This is the `psi` of `cycle_iteration`, with the same arguments.
+    This is the `psi` of `cycle_iteration`. Arguments as `cycle_iteration`.
 
     Raises
     ------

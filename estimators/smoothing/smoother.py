@@ -56,7 +56,7 @@ __all__ = ["LogModel", "RangeLog", "Smoothed", "smooth"]
 _HUBER = 1.5
 # Iteration stops if the predicted decrease of the cost per epoch is below this.
 _TOLERANCE, _COARSE = 1e-6, 1e-3
-# Damping, information (1/rad^2, 1/m^2) added to a pose after a step too far: least and greatest.
+# Damping: information (1/rad^2, 1/m^2) added to a pose if a step goes too far, small and large.
 _SMALL, _MOST_DAMPING = 0.1, 1e12
 
 
