@@ -95,12 +95,27 @@ def last_session(state: State, folder: Path) -> FloatArray | None:
     return None if np.array_equal(anchors, state.anchors) else anchors
 
 
-def save_report(state: State, report: Report, folder: Path, name: str) -> Path:
-    """Write NAME.pdf, the report of a state. Arguments and errors as `save`."""
-    stem = owned(folder, name)
-    path = stem.with_name(f"{stem.name}.pdf")
+def save_report(
+    state: State, tables: Mapping[str, Any], folder: Path, name: str, report: Report
+) -> list[Path]:
+    """`save`, and NAME.pdf, the report. Arguments and errors as there.
+
+    Parameters
+    ----------
+    state, tables, folder, name
+        As in `save`.
+    report
+        Writes the report.
+    """
+    scene, layout = save(state, tables, folder, name)
+    path = scene.with_suffix(".pdf")
     replace(path, lambda draft: report(state.problem, state.anchors, str(draft)))
-    return path
+    return [scene, layout, path]
+
+
+def names(paths: list[Path]) -> str:
+    """The names of files, with commas."""
+    return ", ".join(path.name for path in paths)
 
 
 def owned(folder: Path, name: str) -> Path:

@@ -24,7 +24,7 @@ VERDICTS = {
 }
 SIGNS = {"pass": "\u2713", "fail": "\u2717", "undecided": "?", "no requirement": ""}
 # Radius of an anchor, and least size of the body: shares of the room's largest extent.
-_ANCHOR, _BODY = 0.011, 0.03
+_ANCHOR, _BODY = 0.013, 0.03
 # A link that keeps this share of its information counts as seen.
 SEEN = 0.5
 

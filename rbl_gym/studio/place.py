@@ -64,7 +64,7 @@ class PlacePage:
         # The anchor that is held, and the state before that.
         self._held: tuple[int, State] | None = None
         self._selected: int | None = None
-        self._status = "Drag an anchor. Click one to select it."
+        self.status = "Drag an anchor. Click one to select it."
         self._progress: float | None = None
         self._others = Others()
         self._autosave_found = files.last_session(start, folder)
@@ -87,12 +87,11 @@ class PlacePage:
             "reset_knobs": lambda: self.turn_knobs(**knobs_of(start.world.base)._asdict()),
             "save": self.save,
             "report": self.write_report,
-            "restore": self._restore,
+            "restore": self.restore,
             "load": self.load,
         }
         self._display = Display(server, start, actions, report is not None)
         self._display.panel.offer_restore(self._autosave_found is not None)
-        self._worker.post(self._show)
         self._worker.post(self._refine)
         threading.Thread(target=self._search, args=(start,), daemon=True).start()
 
@@ -165,7 +164,7 @@ class PlacePage:
         """Improve the layout from where it is, a step at a time; any change ends it."""
 
         def task() -> None:
-            self._progress, self._status = 0.0, "Optimising ..."
+            self._progress, self.status = 0.0, "Optimising ..."
             self._show()
             self._worker.when_idle(self._improve(self.state))
 
@@ -176,7 +175,7 @@ class PlacePage:
 
         def task() -> None:
             self._end_work()
-            self._status = "Stopped."
+            self.status = "Stopped."
             self._show()
             self._refine()
 
@@ -191,7 +190,7 @@ class PlacePage:
             if found is not None and not now.fixed.any():
                 self._edit(lambda at: state.set_layout(at, Layout(found, at.fixed)))
                 return
-            self._status = "Searching the best layout from scratch ..."
+            self.status = "Searching the best layout from scratch ..."
             self._show()
             threading.Thread(target=self._search, args=(now, True), daemon=True).start()
 
@@ -202,7 +201,7 @@ class PlacePage:
 
         def task() -> None:
             paths = files.save(self.state, self._tables, self._folder, name)
-            self._say("Saved", ", ".join(path.name for path in paths), "teal")
+            self._say("Saved", files.names(paths), "teal")
 
         self._worker.post(task)
 
@@ -213,25 +212,33 @@ class PlacePage:
             places = parse_layout(name, content).positions
             loaded = state.open_state(self.state.world.base, places).layout
             self._edit(lambda now: state.set_layout(now, loaded))
-            self._status = f"{len(places)} anchors of {name}."
+            self.status = f"{len(places)} anchors of {name}."
 
         self._worker.post(task)
 
     def write_report(self, name: str) -> None:
-        """Write the report into the folder; it takes a while, beside everything else."""
+        """`save`, and the report; that takes a while, beside everything else."""
         now, report = self.state, self._report
         assert report is not None  # else there is no button
 
         def task() -> None:
             try:
-                path = files.save_report(now, report, self._folder, name)
+                paths = files.save_report(now, self._tables, self._folder, name, report)
             except Exception as error:
                 self._worker.post(functools.partial(self._failed, error))
             else:
-                self._worker.post(lambda: self._say("Saved", path.name, "teal"))
+                self._worker.post(lambda: self._say("Saved", files.names(paths), "teal"))
 
         self._worker.post(lambda: self._say("Report", f"{name}.pdf is being made", "gray"))
         threading.Thread(target=task, daemon=True).start()
+
+    def restore(self) -> None:
+        """Put the layout of the last session in place."""
+        anchors = self._autosave_found
+        if anchors is not None:
+            restored = Layout(anchors, np.zeros(len(anchors), bool))
+            self.edit(lambda now: state.set_layout(now, restored))
+            self._display.panel.offer_restore(False)
 
     def settle(self, timeout: float = 60.0) -> bool:
         """Wait until all that was asked for is shown; whether that was so in time."""
@@ -251,7 +258,7 @@ class PlacePage:
         self._end_work()
         if self._selected is not None and self._selected >= len(self.state.anchors):
             self._selected = None
-        self._status = "Nothing to change." if self.state is before else ""
+        self.status = "Nothing to change." if self.state is before else ""
         self._show_coarse()
         self._refine()
 
@@ -261,7 +268,7 @@ class PlacePage:
             self._edit(change)
             if len(self.state.anchors) > count:
                 self._selected = len(self.state.anchors) - 1
-                self._status = f"Anchor {self._selected + 1} added."
+                self.status = f"Anchor {self._selected + 1} added."
                 self._show()
 
         self._worker.post(task)
@@ -285,7 +292,7 @@ class PlacePage:
             return
         start = self._held[1]
         if phase == "end":
-            self._held, self._status = None, ""
+            self._held, self.status = None, ""
             if start.fixed[index]:
                 self._say("Fixed", f"Anchor {index + 1} is fixed: release it first.", "orange")
         if not start.fixed[index]:
@@ -313,16 +320,16 @@ class PlacePage:
             yield
         gain = 100 * (1 - self.state.score / before)
         self._end_work()
-        self._status = "No step from here helps."
+        self.status = "No step from here helps."
         if gain >= 0.05:
-            self._status = f"Optimised: b is {gain:.1f} % smaller."
+            self.status = f"Optimised: b is {gain:.1f} % smaller."
         self._show()
         yield from self._refined()
 
     def _end_work(self) -> None:
         """Leave an optimisation where it is."""
         if self._progress is not None:
-            self._progress, self._status = None, ""
+            self._progress, self.status = None, ""
         self._worker.when_idle(None)
 
     # --- showing ----------------------------------------------------------------------------
@@ -350,7 +357,7 @@ class PlacePage:
     def _show(self) -> None:
         now = self.state
         others = self._others.scores(now.world, len(now.anchors))
-        marks = self._selected, self._progress, self._status
+        marks = self._selected, self._progress, self.status
         self._display.show(Shown(now, self.figures, self.map, others, *marks))
 
     # --- beside the worker ------------------------------------------------------------------
@@ -376,19 +383,12 @@ class PlacePage:
 
         self._worker.post(task)
 
-    def _restore(self) -> None:
-        anchors = self._autosave_found
-        if anchors is not None:
-            restored = Layout(anchors, np.zeros(len(anchors), bool))
-            self.edit(lambda now: state.set_layout(now, restored))
-            self._display.panel.offer_restore(False)
-
     def _autosave(self) -> None:
         if self.state.past or self.state.future:
             files.autosave(self.state, self._tables, self._folder)
 
     def _say(self, title: str, text: str, colour: str) -> None:
-        self._status = f"{title}: {text}"
+        self.status = f"{title}: {text}"
         self._display.notify(title, text, colour)
         self._show()
 

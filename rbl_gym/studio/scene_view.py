@@ -76,16 +76,20 @@ def view_of(problem: Problem, aspect: float) -> tuple[FloatArray, FloatArray]:
     """
     low, high = corners(problem)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    forward = -_TOWARDS / np.linalg.norm(_TOWARDS)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(right, forward), forward])
+    axes = view_axes(-_TOWARDS)
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     across, up, ahead = axes @ (signs * half).T
     limit = math.tan(0.5 * _FOV_RAD)
     # How far away each corner comes to the edge of the window.
     needed = np.maximum(np.abs(across) / aspect, np.abs(up)) / (_FILLED * limit) - ahead
-    return middle, middle - needed.max() * forward
+    return middle, middle - needed.max() * axes[2]
+
+
+def view_axes(forward: FloatArray) -> FloatArray:
+    """Axes (3, 3) of a camera that looks along a direction (3,): right, up, forward."""
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    axes = np.stack([right, np.cross(right, forward), forward])
+    return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
 # --- what stands still -----------------------------------------------------------------------
