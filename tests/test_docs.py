@@ -61,6 +61,8 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
     # What a block registers is forgotten after the test.
     monkeypatch.setattr(belief, "_FACTORIES", dict(belief._FACTORIES))
     monkeypatch.chdir(tmp_path)
+    if page.stem == "studio":
+        pytest.importorskip("viser", reason="needs the extra studio")
     if page.stem == "bags":
         pytest.importorskip("rosbags", reason="needs the extra bags")
         from tests import test_bags

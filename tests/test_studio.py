@@ -250,7 +250,7 @@ def test_the_picture_is_clear_off_the_zones_and_red_where_errors_are_large():
     values = np.full((8, 10), np.nan)
     values[:, :5], values[4:, :5] = 0.1, 0.4
     corner = np.zeros(3)
-    found = maps.SliceMap(values, corner, corner + 1, 1, maps.QUANTITIES["position"])
+    found = maps.SliceMap(values, corner, corner + 1, 1, maps.QUANTITIES["position"], (0.1, 0.4))
     shown = maps.picture(found)
     height, width = shown.shape[:2]
     assert shown[:, -1, 3].max() == 0
@@ -259,6 +259,21 @@ def test_the_picture_is_clear_off_the_zones_and_red_where_errors_are_large():
     assert shown[0, 0, 0] > shown[0, 0, 2]
     assert shown[height - 1, 0, 0] < shown[height - 1, 0, 2]
     assert width / height == 10 / 8
+
+
+def test_colours_are_kept_while_a_layout_changes(warehouse):
+    before = maps.slice_map(warehouse)
+    *_, (_, better) = optimise(warehouse)
+    during = maps.slice_map(better, before=before)
+    assert during.limits == before.limits
+    assert np.nanmean(during.values) < np.nanmean(before.values)
+    other = cut(better, quantity="heading")
+    assert maps.slice_map(other, before=before).limits != before.limits
+    fresh = maps.slice_map(better)
+    assert fresh.beside(fresh._replace(limits=(0.9 * fresh.limits[0], fresh.limits[1]))).limits != (
+        fresh.limits
+    )
+    assert fresh.beside(fresh._replace(limits=(0.1, 9.0))).limits == fresh.limits
 
 
 def test_figures_follow_the_layout(warehouse):

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from rbl_gym import studio
+from rbl_gym.app import place_pdf
+from rbl_gym.app.cli import main
 from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import design
 from rbl_gym.studio import Studio, place
@@ -29,11 +31,12 @@ CHROMIUM = next(
 ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
+def designed(problem: Any, seed: int) -> design.Design:
+    return design.Design(design.usual_layouts(problem, seed)["grid"], "grid", {})
+
+
 @pytest.fixture
 def served(request, tmp_path, monkeypatch) -> Iterator[Studio]:
-    def designed(problem, seed):
-        return design.Design(design.usual_layouts(problem, seed)["grid"], "grid", {})
-
     # The search takes seconds, and has tests of its own.
     monkeypatch.setattr(place.design, "design_layout", designed)
     options = studio.Options(
@@ -177,6 +180,45 @@ def test_the_server_is_on_loopback_and_speaks_to_its_own_pages_alone(served):
 
 def test_a_notebook_shows_the_page(served):
     assert f'src="{served.url}"' in served._repr_html_()
+
+
+# --- the command -----------------------------------------------------------------------------
+
+
+def test_the_command_serves_a_file_with_its_tables_and_report(tmp_path, monkeypatch, capsys):
+    seen: dict[str, Any] = {}
+
+    def wait(opened: Studio) -> None:
+        page = opened.page
+        page.save("hall")
+        page.write_report("hall")
+        until(lambda: page.status.endswith("hall.pdf") or page.status.startswith("Not done"), 60)
+        seen.update(anchors=page.state.anchors, url=opened.url, status=page.status)
+        opened.stop()
+
+    monkeypatch.setattr(Studio, "wait", wait)
+    monkeypatch.setattr(place.design, "design_layout", designed)
+    layout = tmp_path / "layout.csv"
+    layout.write_text("x_m,y_m,z_m\n0,0,6\n10,1,6\n2,10,1\n-9,-10,4\n")
+    folder = tmp_path / "new"
+    arguments = ["--layout", str(layout), "--folder", str(folder), "--port", "0", "--no-browser"]
+    monkeypatch.setattr(place_pdf, "write_pdf", lambda placed, path: Path(path).write_text("x"))
+    assert main(["studio", WAREHOUSE, *arguments]) == 0
+    assert seen["status"] == "Saved: hall.toml, hall.csv, hall.pdf"
+    assert seen["anchors"].shape == (4, 3)
+    assert seen["url"] in capsys.readouterr().out
+    # What only the file knows is kept: its region, its name.
+    tables = scene_files.load(str(folder / "hall.toml"))
+    assert tables["name"] == "warehouse"
+    assert tables["region"] == scene_files.load(WAREHOUSE)["region"]
+
+
+def test_the_command_says_what_is_wrong_with_a_file(tmp_path, capsys):
+    bad = tmp_path / "bad.toml"
+    bad.write_text("name = 3")
+    for arguments in (["nowhere"], [str(bad)], [str(tmp_path / "none.toml")]):
+        assert main(["studio", *arguments, "--no-browser"]) == 2
+        assert capsys.readouterr().err.startswith("rbl-gym studio: ")
 
 
 # --- in a browser ----------------------------------------------------------------------------

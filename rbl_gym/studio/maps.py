@@ -21,6 +21,8 @@ COARSE, REFINED, _ANCHORS = 800, 3200, 8
 _LEAST_CELLS = 200
 # A map that hardly varies must not look as if it did: its colours span at least this ratio.
 _LEAST_CONTRAST = 1.3
+# Colours are kept as long as the values at their ends change by less than this factor.
+_KEPT = 1.5
 # Pixels along a cell; the browser smooths the picture too. Shades of the colours.
 _ZOOM, _SHADES = 6, 256
 # Within and beyond a requirement (Okabe and Ito): told apart by everyone.
@@ -68,6 +70,8 @@ class SliceMap(NamedTuple):
         The axis of the rows; that of the columns is x.
     quantity
         What is shown.
+    limits
+        Between which values the colours run.
     """
 
     values: FloatArray
@@ -75,17 +79,30 @@ class SliceMap(NamedTuple):
     high: FloatArray
     up: int
     quantity: Quantity
+    limits: tuple[float, float]
 
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Between which values the colours run: most of the cells lie there."""
-        if not np.isfinite(self.values).any():
-            return 0.0, 1.0
-        if self.quantity is QUANTITIES["requirement"]:
-            return 0.0, 2.0
-        low, high = np.nanquantile(self.values, (0.02, 0.98)).tolist()
-        middle = math.sqrt(low * high)
-        return min(low, middle / _LEAST_CONTRAST**0.5), max(high, middle * _LEAST_CONTRAST**0.5)
+    def is_like(self, other: SliceMap) -> bool:
+        """Whether both show the same on the same plane."""
+        same = self.quantity is other.quantity and self.up == other.up
+        return same and bool((self.low == other.low).all())
+
+    def beside(self, before: SliceMap) -> SliceMap:
+        """In the colours of the map before, where that is like it and its values fit them."""
+        fits = all(
+            1 / _KEPT < new / old < _KEPT
+            for new, old in zip(self.limits, before.limits, strict=True)
+            if old > 0
+        )
+        return self._replace(limits=before.limits) if fits and self.is_like(before) else self
+
+
+def own_limits(values: FloatArray, quantity: Quantity) -> tuple[float, float]:
+    """Between which values the colours of a map run: most of its cells lie there."""
+    if quantity is QUANTITIES["requirement"] or not np.isfinite(values).any():
+        return 0.0, 2.0
+    low, high = np.nanquantile(values, (0.02, 0.98)).tolist()
+    middle = math.sqrt(low * high)
+    return min(low, middle / _LEAST_CONTRAST**0.5), max(high, middle * _LEAST_CONTRAST**0.5)
 
 
 def shape_of(extent: FloatArray, cells: int) -> tuple[int, int]:
@@ -97,7 +114,7 @@ def shape_of(extent: FloatArray, cells: int) -> tuple[int, int]:
     return max(1, round(cells / columns)), max(1, round(columns))
 
 
-def slice_map(state: State, cells: int = COARSE) -> SliceMap:
+def slice_map(state: State, cells: int = COARSE, before: SliceMap | None = None) -> SliceMap:
     """The map of the slice of a state.
 
     Parameters
@@ -106,6 +123,8 @@ def slice_map(state: State, cells: int = COARSE) -> SliceMap:
         Gives the problem, the layout and the slice.
     cells
         About how many there are, with few anchors; with many there are fewer.
+    before
+        A map whose colours are kept where it is like this one, whatever its values; None: its own.
     """
     problem, at = state.world.problem, state.slice
     low, high = plane(state)
@@ -125,7 +144,11 @@ def slice_map(state: State, cells: int = COARSE) -> SliceMap:
         if here.any():
             errors = accuracy(problem, state.anchors, places[here], zone)
             values[here] = _shown(errors, at.quantity, zone)
-    return SliceMap(values, low, high, at.up, QUANTITIES[at.quantity])
+    quantity = QUANTITIES[at.quantity]
+    found = SliceMap(values, low, high, at.up, quantity, own_limits(values, quantity))
+    if before is not None and found.is_like(before):
+        return found._replace(limits=before.limits)
+    return found
 
 
 def _shown(errors: Errors, quantity: str, zone: object) -> FloatArray:
@@ -135,16 +158,8 @@ def _shown(errors: Errors, quantity: str, zone: object) -> FloatArray:
     return shown.scale * getattr(errors, shown.field)
 
 
-def picture(found: SliceMap, limits: tuple[float, float] | None = None) -> np.ndarray:
-    """The map as pixels (height, width, 4), the upper row first; clear where there is no value.
-
-    Parameters
-    ----------
-    found
-        The map.
-    limits
-        Values between which the colours run; None: its own.
-    """
+def picture(found: SliceMap) -> np.ndarray:
+    """The map as pixels (height, width, 4), the upper row first; clear where there is no value."""
     values = found.values[::-1]
     free = np.isfinite(values)
     # Colours do not run into the gaps.
@@ -158,7 +173,7 @@ def picture(found: SliceMap, limits: tuple[float, float] | None = None) -> np.nd
     if found.quantity is QUANTITIES["requirement"]:
         shown[..., :3] = np.where((fine <= 1)[..., None], WITHIN, BEYOND)
     else:
-        shown[..., :3] = colours(fine, limits or found.limits)
+        shown[..., :3] = colours(fine, found.limits)
     shown[..., 3] = np.where(np.repeat(np.repeat(free, zoom, 0), zoom, 1), 235, 0)
     return shown
 

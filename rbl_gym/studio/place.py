@@ -335,7 +335,7 @@ class PlacePage:
     # --- showing ----------------------------------------------------------------------------
 
     def _show_coarse(self) -> None:
-        self.map = maps.slice_map(self.state, maps.COARSE)
+        self.map = maps.slice_map(self.state, before=self.map)
         self.figures = figures(self.state, few=True)
         self._show()
 
@@ -346,7 +346,7 @@ class PlacePage:
         self.figures = figures(self.state)
         self._show()
         yield
-        self.map = maps.slice_map(self.state, maps.REFINED)
+        self.map = maps.slice_map(self.state, maps.REFINED).beside(self.map)
         self._show()
         yield
         self._others.search_usual(self.state.world, len(self.state.anchors))
