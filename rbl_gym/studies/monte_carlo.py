@@ -130,15 +130,39 @@ def told_readings(
         anchors = simulation.surveyed(simulation.epoch_of(episode, 0), episode.anchors)
     readings = []
     for epoch, measured in enumerate(measurements):
-        at, law = simulation.epoch_of(episode, epoch), None
+        at, quality = simulation.epoch_of(episode, epoch), None
         if scene.obstacles:
             quality = simulation.link_quality(scene, at, episode.anchors)
-            law = WeakenedNoise(told.noise, quality)
-        twist, inertial = (at.twist, at.readings) if epoch else (None, None)
-        readings.append(
-            Reading(measured.ranges, anchors, measured.links, law, twist, told.dt, inertial)
-        )
+        readings.append(told_reading(told, at, measured, anchors, quality, first=not epoch))
     return readings
+
+
+def told_reading(
+    told: Scene,
+    at: simulation.Epoch,
+    measured: ranging.Measurement,
+    anchors: FloatArray,
+    quality: FloatArray | None,
+    first: bool,
+) -> Reading:
+    """What filters are told of one epoch.
+
+    Parameters
+    ----------
+    told
+        The scene as filters know it.
+    at, measured
+        The epoch, and what was measured.
+    anchors
+        Places (..., M, 3) that filters are told.
+    quality
+        Share (..., M) of their information that links keep; None: all of it.
+    first
+        Whether the epoch is the first, to which no twist leads.
+    """
+    law = None if quality is None else WeakenedNoise(told.noise, quality)
+    twist, inertial = (None, None) if first else (at.twist, at.readings)
+    return Reading(measured.ranges, anchors, measured.links, law, twist, told.dt, inertial)
 
 
 def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:

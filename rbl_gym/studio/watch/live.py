@@ -1,0 +1,246 @@
+"""Simulated episodes as frames: filters side by side, and disturbances while they run."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray, check_count, check_number
+from rbl_gym.measurements.ranging import Measurement
+from rbl_gym.placement.building import Problem
+from rbl_gym.studies.epochs import Reading, track_epochs
+from rbl_gym.studies.monte_carlo import scene_filter, told_reading
+from rbl_gym.studio.watch.frames import Frame, Links, Named, Pose, tracked
+from rbl_gym.worlds import simulation
+from rbl_gym.worlds.scene import Scene
+
+__all__ = ["CALM", "Disturbances", "Stage", "frames", "stage_of_problem", "stage_of_scene"]
+
+# How long an episode is watched where the body keeps within its volume, seconds.
+_WATCHED_S = 60.0
+# A body in a building: speed, turn rate, seconds a step, and the noise of its motion after 1 s.
+_SPEED, _SPIN, _DT = 1.0, 0.29, 0.1
+_ROTATION_RAD, _TRANSLATION_M = 0.083, 0.095
+_STAYS = ("waypoints", "orbit", "lawn-mower")
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """What disturbs the ranges, beside what the scene itself does.
+
+    Parameters
+    ----------
+    nlos, lost
+        Chance that a range comes over a reflected path, and that a link gives none.
+    wrong_m
+        By how much the place that filters are told of the first anchor is off, towards the middle
+        of the volume, metres.
+    noise
+        Factor on the noise of all ranges. Filters are not told.
+    """
+
+    nlos: float = 0.0
+    lost: float = 0.0
+    wrong_m: float = 0.0
+    noise: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("nlos", "lost"):
+            check_number(name, getattr(self, name), low=0.0, high=1.0)
+        for name in ("wrong_m", "noise"):
+            check_number(name, getattr(self, name), low=0.0)
+
+
+CALM = Disturbances()
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Where an episode is played.
+
+    Parameters
+    ----------
+    scene
+        The world.
+    share
+        Share (M,) of its information that each link from anchors (M, 3) to a place (3,) keeps;
+        None: as the scene's obstacles tell.
+    """
+
+    scene: Scene
+    share: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+
+    def quality(self, at: simulation.Epoch, anchors: FloatArray) -> FloatArray | None:
+        """Share (M,) of its information that each link keeps; None: all of it."""
+        if self.share is not None:
+            return self.share(anchors, at.translation)
+        if self.scene.obstacles:
+            return simulation.link_quality(self.scene, at, anchors)
+        return None
+
+
+def stage_of_scene(scene: Scene, steps: int | None = None) -> Stage:
+    """A named scene as it is watched.
+
+    Parameters
+    ----------
+    scene
+        The world.
+    steps
+        Of the episode; None: those of the scene, and a minute at least where the body keeps within
+        its volume.
+    """
+    if steps is None:
+        watched = int(np.ceil(_WATCHED_S / scene.dt)) if scene.trajectory in _STAYS else 0
+        steps = max(scene.steps, watched)
+    return Stage(dataclasses.replace(scene, steps=check_count("steps", steps)))
+
+
+def stage_of_problem(problem: Problem, anchors: FloatArray, steps: int | None = None) -> Stage:
+    """A building with anchors (M, 3), as it is watched: the body goes about in the first zone.
+
+    Links are weakened by all obstacles and by the anchors' gain. Obstacles do not stop the body.
+    """
+    low, high = problem.zones[0].bounds()
+    volume = dataclasses.replace(problem.scene.volume, low=tuple(low), high=tuple(high))
+    scene = dataclasses.replace(
+        problem.scene,
+        volume=volume,
+        n_anchors=len(anchors),
+        anchors=tuple(map(tuple, anchors.tolist())),
+        speed_m_s=_SPEED,
+        spin_rad_s=_SPIN,
+        dt=_DT,
+        process=dataclasses.replace(
+            problem.scene.process, rotation_rad=_ROTATION_RAD, translation_m=_TRANSLATION_M
+        ),
+        initial_rotation_rad=min(problem.prior.rotation_rad, 0.2),
+        initial_translation_m=min(problem.prior.position_m, 0.5),
+    )
+    share = None
+    if problem.obstacles or problem.gain:
+
+        def share(anchors: FloatArray, place: FloatArray) -> FloatArray:
+            return problem.share(anchors, place[None])[0]
+
+    return Stage(stage_of_scene(scene, steps).scene, share)
+
+
+class _Moment(NamedTuple):
+    """An epoch of the simulation, and what filters are told of it."""
+
+    time_s: float
+    truth: Pose
+    anchors: FloatArray
+    links: Links
+    reading: Reading
+
+
+def frames(
+    stage: Stage,
+    filters: Sequence[Named],
+    seed: int,
+    disturb: Callable[[int], Disturbances] = lambda epoch: CALM,
+) -> Iterator[Frame]:
+    """An episode, a frame an epoch, with filters side by side.
+
+    All random numbers are drawn at the start: the same seed and disturbances give the same frames,
+    and epochs without disturbances are the same whatever came before. Undisturbed it is the
+    episode that ``RBL/Tracking-v0`` plays after ``reset(seed=seed)``, while both last.
+
+    Parameters
+    ----------
+    stage
+        Where it is played.
+    filters
+        Of `filter_named`.
+    seed
+        Of all random numbers.
+    disturb
+        Called with the number of every epoch, says what disturbs its ranges.
+
+    Raises
+    ------
+    ValueError
+        On a filter that is not known, or that does not fit the scene; before the first frame.
+    """
+    check_count("seed", seed, least=0)
+    made = [scene_filter(stage.scene, one.name, one.options) for one in filters]
+    return _played(stage, filters, made, seed, disturb)
+
+
+def _played(
+    stage: Stage,
+    filters: Sequence[Named],
+    made: Sequence[object],
+    seed: int,
+    disturb: Callable[[int], Disturbances],
+) -> Iterator[Frame]:
+    scene = stage.scene
+    episode = simulation.draw_episode(_with_links(scene, 0.5), np.random.default_rng(seed))
+    prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
+    moments, *copies = itertools.tee(_moments(stage, episode, disturb), len(filters) + 1)
+    runs = [
+        track_epochs(filter, prior, (moment.reading for moment in copy))  # type: ignore
+        for filter, copy in zip(made, copies, strict=True)
+    ]
+    for moment, *steps in zip(moments, *runs, strict=True):
+        found = tuple(
+            tracked(one.label, filter, step, scene.body, scene.noise, moment.truth)  # type: ignore
+            for one, filter, step in zip(filters, made, steps, strict=True)
+        )
+        told = moment.reading.anchors
+        yield Frame(moment.time_s, moment.truth, moment.anchors, told, moment.links, found)
+
+
+def _moments(
+    stage: Stage, episode: simulation.Episode, disturb: Callable[[int], Disturbances]
+) -> Iterator[_Moment]:
+    scene, anchors = stage.scene, episode.anchors
+    for epoch in range(scene.steps + 1):
+        at, now = simulation.epoch_of(episode, epoch), disturb(epoch)
+        quality = stage.quality(at, anchors)
+        measured = _measured(scene, at, anchors, quality, now)
+        told = simulation.surveyed(at, anchors)
+        if now.wrong_m > 0:
+            inwards = np.mean(scene.volume.bounds(), axis=0) - told[0]
+            told[0] += now.wrong_m * inwards / max(float(np.linalg.norm(inwards)), 1e-9)
+        yield _Moment(
+            epoch * scene.dt,
+            Pose(at.rotation, at.translation),
+            anchors,
+            Links(measured.links, measured.nlos),
+            told_reading(scene, at, measured, told, quality, first=not epoch),
+        )
+
+
+def _measured(
+    scene: Scene,
+    at: simulation.Epoch,
+    anchors: FloatArray,
+    quality: FloatArray | None,
+    now: Disturbances,
+) -> Measurement:
+    """The ranges of an epoch under disturbances."""
+    links = scene.links
+    lost = 1 - (1 - links.drop_probability) * (1 - now.lost)
+    nlos = 1 - (1 - links.nlos_probability) * (1 - now.nlos)
+    disturbed = _with_links(scene, nlos, lost)
+    if not disturbed.links.is_random:
+        at = at._replace(uniforms=None)
+    at = at._replace(normals=now.noise * at.normals)
+    return simulation.measure_epoch(disturbed, at, anchors, quality)
+
+
+def _with_links(scene: Scene, nlos: float, lost: float | None = None) -> Scene:
+    links = scene.links
+    lost = links.drop_probability if lost is None else lost
+    if (links.nlos_probability, links.drop_probability) == (nlos, lost):
+        return scene
+    changed = dataclasses.replace(links, nlos_probability=nlos, drop_probability=lost)
+    return dataclasses.replace(scene, links=changed)
