@@ -20,9 +20,9 @@ LOST, USED, REFLECTED, REFUSED = range(4)
 
 
 class Pose(NamedTuple):
-    """A pose: rotation (3, 3) and translation (3,), metres."""
+    """A pose: rotation (3, 3), None where it is not known, and translation (3,), metres."""
 
-    rotation: FloatArray
+    rotation: FloatArray | None
     translation: FloatArray
 
 
@@ -179,8 +179,8 @@ def tracked(
     # A filter that is not robust takes whatever comes.
     refused = measured & ~found.used & bool(is_robust(filter))
     errors = np.full(3, np.nan)
-    if truth is not None:
-        judged = pose_errors(step.belief, *truth, tags)
+    if truth is not None and truth.rotation is not None:
+        judged = pose_errors(step.belief, truth.rotation, truth.translation, tags)
         turn, move = judged.pose[:3], judged.pose[3:]
         errors = [np.linalg.norm(move), np.rad2deg(np.linalg.norm(turn)), judged.nees]
     figures = map(float, (*errors, found.nis))
