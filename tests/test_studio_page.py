@@ -16,9 +16,9 @@ from rbl_gym.app import place_pdf
 from rbl_gym.app.cli import main
 from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import design
-from rbl_gym.studio import Studio, place
+from rbl_gym.studio import Studio, place, state
 from rbl_gym.studio.panel import length
-from tests.helpers import ROOT
+from tests.helpers import ROOT, with_kernels
 from tests.test_studio import placement_score
 
 pytest.importorskip("viser", reason="needs the extra studio")
@@ -47,7 +47,7 @@ def served(request, tmp_path, monkeypatch) -> Iterator[Studio]:
     found.stop()
 
 
-def until(condition: Callable[[], Any], seconds: float = 30.0) -> None:
+def until(condition: Callable[[], Any], seconds: float = 60.0) -> None:
     """Wait for a condition, or fail."""
     end = time.monotonic() + seconds
     while not condition():
@@ -64,6 +64,7 @@ def drag(page: Any, index: int, *places: tuple[float, float, float]) -> None:
         page.drag(index, phase, CAMERA, np.array(point))
 
 
+@with_kernels
 def test_a_dragged_anchor_changes_map_and_figures(served):
     page = served.page
     page.settle()
@@ -77,14 +78,15 @@ def test_a_dragged_anchor_changes_map_and_figures(served):
     assert not np.array_equal(page.map.values, shown, equal_nan=True)
     # Let go, it is refined.
     assert page.map.values.size > 3000
-    page.edit(studio.state.undo)
+    page.edit(state.undo)
     page.settle()
     assert page.figures.score_m == before
 
 
+@with_kernels
 def test_a_fixed_anchor_is_not_dragged_and_one_hand_holds_at_a_time(served):
     page = served.page
-    page.edit(lambda now: studio.state.fix(now, 0))
+    page.edit(lambda now: state.fix(now, 0))
     drag(page, 0, (-4, -10, 4), (-8, -10, 4))
     page.settle()
     assert "Anchor 1 is fixed" in page.status
@@ -98,6 +100,7 @@ def test_a_fixed_anchor_is_not_dragged_and_one_hand_holds_at_a_time(served):
     np.testing.assert_array_equal(page.state.anchors[2:], layout[2:])
 
 
+@with_kernels
 def test_optimising_can_be_stopped_and_goes_on_while_the_slice_moves(served):
     page = served.page
     before = page.state.score
@@ -114,7 +117,7 @@ def test_optimising_can_be_stopped_and_goes_on_while_the_slice_moves(served):
 
 def test_files_are_saved_in_the_folder_and_nowhere_else(served, tmp_path):
     page = served.page
-    page.edit(studio.state.add)
+    page.edit(state.add)
     page.save("hall")
     page.settle()
     page.write_report("hall")
@@ -145,9 +148,10 @@ def test_lists_are_loaded_and_bad_ones_get_a_message(served):
     assert page.state.anchors.tolist() == [[0, 0, 6], [1, 1, 6], [2, 10, 1]]
 
 
+@with_kernels
 def test_a_session_goes_on_after_the_server_was_killed(served, tmp_path):
     page = served.page
-    page.edit(studio.state.add)
+    page.edit(state.add)
     page.settle()  # nothing is asked to stop
     options = studio.Options(port=0, folder=tmp_path, browser=False)
     again = studio.show(scene_files.problem(WAREHOUSE), options=options)
@@ -185,6 +189,7 @@ def test_a_notebook_shows_the_page(served):
 # --- the command -----------------------------------------------------------------------------
 
 
+@with_kernels
 def test_the_command_serves_a_file_with_its_tables_and_report(tmp_path, monkeypatch, capsys):
     seen: dict[str, Any] = {}
 
@@ -246,12 +251,13 @@ def on_screen(camera: Any, point: np.ndarray) -> tuple[float, float]:
     return 0.5 * camera.image_width + x, 0.5 * camera.image_height - y
 
 
+@with_kernels
 @pytest.mark.parametrize("served", ["uwb_room"], indirect=True)
 def test_in_a_browser_an_anchor_is_dragged_optimised_and_saved(served, browser, tmp_path):
     page = served.page
     window = browser.new_page(viewport={"width": 1000, "height": 600})
     window.goto(served.url)
-    window.get_by_text(length(page.figures.score_m), exact=True).first.wait_for(timeout=30_000)
+    window.get_by_text(length(page.figures.score_m), exact=True).first.wait_for(timeout=60_000)
     until(served.server.get_clients)
     camera = next(iter(served.server.get_clients().values())).camera
     # The panel is docked after the first picture.
@@ -287,5 +293,5 @@ def test_in_a_browser_an_anchor_is_dragged_optimised_and_saved(served, browser, 
 
     second = browser.new_page(viewport={"width": 1000, "height": 600})
     second.goto(served.url)
-    second.get_by_text(length(page.figures.score_m), exact=True).first.wait_for(timeout=30_000)
+    second.get_by_text(length(page.figures.score_m), exact=True).first.wait_for(timeout=60_000)
     assert "Saved: by hand.toml" in second.inner_text("body")

@@ -216,8 +216,9 @@ def add(state: State, point: FloatArray | None = None) -> State:
         problem, rng = state.world.problem, np.random.default_rng(len(state.anchors))
         drawn = choosing.candidates(problem, rng, _CANDIDATES)
         apart = np.linalg.norm(drawn[:, None] - state.anchors, axis=-1).min(axis=1)
-        point = drawn[int(apart.argmax())]
-    place = snap(state.world, point)
+        place = snap(state.world, drawn[int(apart.argmax())])
+    else:
+        place = snap(state.world, point)
     if not _is_free(state, place, state.anchors):
         raise ValueError("no anchor may stand there: inside of an obstacle, or taken")
     return with_one_more(state, place)
@@ -236,8 +237,8 @@ def remove(state: State, index: int) -> State:
         raise ValueError(f"anchor {index + 1} is fixed: release it first")
     if len(state.anchors) <= MIN_ANCHORS:
         raise ValueError(f"fewer than {MIN_ANCHORS} anchors never tell a pose")
-    anchors, fixed = (np.delete(array, index, axis=0) for array in state.layout)
-    return set_layout(state, Layout(anchors, fixed))
+    anchors = np.delete(state.anchors, index, axis=0)
+    return set_layout(state, Layout(anchors, np.delete(state.fixed, index)))
 
 
 def fix(state: State, index: int, fixed: bool = True) -> State:

@@ -25,7 +25,7 @@ class Worker:
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
-        self._tasks: dict[object, Callable[[], None]] = {}
+        self._tasks: dict[object, Callable[[], object]] = {}
         self._idle: Iterator[Any] | None = None
         self._busy = False
         self._stopped = False
@@ -33,7 +33,7 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name="studio", daemon=True)
         self._thread.start()
 
-    def post(self, task: Callable[[], None], key: object = None) -> None:
+    def post(self, task: Callable[[], object], key: object = None) -> None:
         """Do a task after those before it.
 
         Parameters
