@@ -58,7 +58,7 @@ def test_the_list_says_how_high_which_way_and_how_far_from_corners(problem):
 
 
 def test_csv_is_a_layout_that_place_reads(problem, tmp_path):
-    from rbl_gym.studies.placing.layout_files import read_layout
+    from rbl_gym.placement.layout_files import read_layout
 
     path = tmp_path / "new" / "l.csv"
     write_layout(problem, ANCHORS, str(path), ["N", "E", "S", "W"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rbl_gym.studies.placing import layout_files
+from rbl_gym.placement import layout_files
 
 
 def read(tmp_path, text, encoding="utf-8"):

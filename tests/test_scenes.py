@@ -154,7 +154,10 @@ KINDS: dict[type, str] = {
 
 
 def as_overrides(scene: Scene) -> dict[str, Any]:
-    """Every field of a scene as JSON-able overrides; regions and noises with their kind."""
+    """The fields of a scene as JSON-able overrides; regions and noises with their kind.
+
+    Without prisms, which files alone have.
+    """
 
     def plain(value: Any) -> Any:
         if not dataclasses.is_dataclass(value) or isinstance(value, type):
@@ -162,7 +165,8 @@ def as_overrides(scene: Scene) -> dict[str, Any]:
         kind = {"kind": KINDS[type(value)]} if type(value) in KINDS else {}
         return kind | dataclasses.asdict(value)
 
-    return {entry.name: plain(getattr(scene, entry.name)) for entry in dataclasses.fields(scene)}
+    names = (entry.name for entry in dataclasses.fields(scene) if entry.name != "prisms")
+    return {name: plain(getattr(scene, name)) for name in names}
 
 
 @every_scene

@@ -10,9 +10,9 @@ import pytest
 
 from rbl_gym import placement, studio
 from rbl_gym.placement import scene_files
+from rbl_gym.placement.layout_files import read_layout
 from rbl_gym.placement.problem import PlacementTask
 from rbl_gym.studies.placing.accuracy import accuracy
-from rbl_gym.studies.placing.layout_files import read_layout
 from rbl_gym.studio import files, maps
 from rbl_gym.studio.figures import body_figures, figures, usual_scores
 from rbl_gym.studio.rays import under_pointer

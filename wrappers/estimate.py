@@ -96,7 +96,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._family = family_of(env)
         if self._family is not None:
             # Options that a scene of the family refuses are refused now.
-            self._scene = next((s for s in self._family.corners if s.obstacles), self._scene)
+            self._scene = next((s for s in self._family.corners if s.weakens), self._scene)
         self._filter = make_filter(env, self._scene, *self._named)
         self._state: Any = None
         self.observation_space = self._viewer.space_of(env, self._scene, env.observation_space)
@@ -177,7 +177,7 @@ def unpadded(observation: Mapping[str, np.ndarray], scene: Scene) -> dict[str, n
     for key in ("ranges", "links"):
         told[key] = told[key][..., :m, :n]
     told["anchors"] = told["anchors"][..., :m, :]
-    if scene.obstacles:
+    if scene.weakens:
         told["quality"] = told["quality"][..., :m]
     else:
         told.pop("quality", None)
@@ -260,7 +260,7 @@ def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
 
 def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:
     """A ValueError where obstacles give every epoch its own law and the filter takes none."""
-    if scene.obstacles:
+    if scene.weakens:
         check_takes_noise(name, filter, "the scene's obstacles give every epoch its own noise")
 
 

@@ -164,7 +164,7 @@ def _layout(options: argparse.Namespace) -> Any:
         raise ValueError("--keep needs --optimise: else all of the layout stays")
     if options.anchors is not None and not options.optimise:
         raise ValueError("--anchors means nothing with --layout alone: its anchors are judged")
-    from rbl_gym.studies.placing.layout_files import read_layout
+    from rbl_gym.placement.layout_files import read_layout
 
     return read_layout(options.layout)
 

@@ -46,7 +46,7 @@ def add_studio(commands: Any) -> None:
 def _studio(options: argparse.Namespace) -> int:
     require("viser", "studio")
     from rbl_gym import studio
-    from rbl_gym.studies.placing.layout_files import read_layout
+    from rbl_gym.placement.layout_files import read_layout
     from rbl_gym.studio.opening import Options
 
     layout = read_layout(options.layout).positions if options.layout else None

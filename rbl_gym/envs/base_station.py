@@ -53,7 +53,7 @@ def world(scene: Mapping[str, Any] | None) -> Scene:
     found = scenes.get({**WORLD, **changes})
     if found.n_anchors != 1:
         raise ValueError(f"scene must have n_anchors = 1, got {found.n_anchors}")
-    if found.links != LinkModel() or found.obstacles:
+    if found.links != LinkModel() or found.weakens:
         raise ValueError("scene must have neither links that fail nor obstacles")
     return found
 

@@ -16,7 +16,7 @@ from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import rows_of
 from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.geometry.regions import Region
-from rbl_gym.placement.problem import Context, score_of_checked
+from rbl_gym.placement.problem import Context, information_of_fixed, score_of_checked
 from rbl_gym.rendering import placement as rendering
 
 # Signs by which a problem may be mirrored: neither, x, y, both.
@@ -123,7 +123,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
             self._seen[rows] = placement.sight_fractions(self.task, fresh, self._mounts)
         if self.mode == "mounts":
             self._taken[rows] = False
-            self._information[rows] = 0.0
+            self._information[rows] = information_of_fixed(self.task, fresh)
             self._log_score[rows] = math.log(EMPTY_SCORE_M)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
@@ -308,7 +308,7 @@ def check_sight(sight: bool, task: placement.PlacementTask) -> bool:
     """Whether the sight of the mount points is observed: only where racks can block it."""
     if not isinstance(sight, bool):
         raise ValueError(f"sight must be True or False, got {sight!r:.80}")
-    if sight and not task.racks and not task.scene.obstacles:
+    if sight and not task.racks and not task.scene.obstruction:
         raise ValueError("sight must be False without racks, which alone block it, got racks=0")
     return sight
 
@@ -328,7 +328,7 @@ def is_symmetric(task: placement.PlacementTask) -> bool:
     """Whether legal space and volume have one centre in x and y: problems may be mirrored."""
     centres = [_centre(region)[:2] for region in (task.scene.volume, task.scene.anchor_region)]
     # Obstacles that always stand there would have to be mirrored as well.
-    return bool(np.allclose(*centres, atol=1e-9)) and not task.scene.obstacles
+    return bool(np.allclose(*centres, atol=1e-9)) and not task.scene.weakens
 
 
 def _centre(region: Region) -> FloatArray:

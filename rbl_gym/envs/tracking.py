@@ -248,7 +248,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
 def observed(scene: Scene, at: simulation.Epoch, anchors: FloatArray) -> dict[str, np.ndarray]:
     """What an epoch tells: ranges and links with `nlos`, behind obstacles `quality`."""
-    quality = simulation.link_quality(scene, at, anchors) if scene.obstacles else None
+    quality = simulation.link_quality(scene, at, anchors) if scene.weakens else None
     measured = simulation.measure_epoch(scene, at, anchors, quality)
     told: dict[str, np.ndarray] = {
         "ranges": measured.ranges,
@@ -321,7 +321,7 @@ def observation_space(scene: Scene | SceneFamily) -> spaces.Dict:
         "ranges": spaces.Box(*scene.range_bounds_m, links, np.float64),
         "links": spaces.MultiBinary(links),
     }
-    if scene.obstacles:
+    if scene.weakens:
         keys["quality"] = spaces.Box(0.0, 1.0, (scene.n_anchors,), np.float64)
     if scene.inertial is not None:
         limits = scene.inertial.gyro_limit_rad_s, scene.inertial.accel_limit_m_s2

@@ -93,6 +93,19 @@ class Prisms:
         """How many there are."""
         return len(self.corners)
 
+    def __eq__(self, other: object) -> bool:
+        """Whether others are the same, number by number."""
+        return isinstance(other, Prisms) and self._key == other._key
+
+    def __hash__(self) -> int:
+        """Of the numbers."""
+        return hash(self._key)
+
+    @functools.cached_property
+    def _key(self) -> tuple[object, ...]:
+        columns = self.corners, self.low_m, self.high_m, self.share
+        return (self.corners.shape, *(column.tobytes() for column in columns))
+
     @functools.cached_property
     def limits(self) -> FloatArray:
         """(K, 7): least and largest x, y, z of each, and its share, as `share_behind` takes them.

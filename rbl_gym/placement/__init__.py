@@ -1,6 +1,6 @@
 """Placement of anchors: the problem, layouts, search, criteria, files."""
 
-from rbl_gym.placement.gain import Gain
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.placement.gradient import score_and_gradient
 from rbl_gym.placement.problem import (
     MAX_RACKS,

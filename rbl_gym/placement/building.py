@@ -16,9 +16,9 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.polygons import contains
 from rbl_gym.geometry.regions import Box, Region
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
-from rbl_gym.placement.gain import Gain
 from rbl_gym.placement.problem import Context
 from rbl_gym.worlds.scene import Scene
 

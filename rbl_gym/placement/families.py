@@ -111,7 +111,12 @@ def task_family(value: Any, n_anchors: int | None = None, racks: int = 0) -> Tas
     if isinstance(value, TaskFamily):
         return value
     found = TaskFamily(members_of(value), n_anchors, racks)
-    assert found.corners
+    for one in found.corners:
+        if len(one.scene.prisms) or one.scene.gain or one.scene.fixed:
+            raise ValueError(
+                "scenes must have no walls, limits of range and view, nor fixed anchors, as "
+                f"building files have, got {one.scene.name!r}"
+            )
     return found
 
 

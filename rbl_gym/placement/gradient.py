@@ -8,7 +8,7 @@ from rbl_gym import bounds
 from rbl_gym.checks import FloatArray, as_float, check_array, check_finite
 from rbl_gym.kernels import compiled
 from rbl_gym.measurements import ranging
-from rbl_gym.placement.gain import EVERYWHERE, Gain, share_and_slope
+from rbl_gym.measurements.gain import EVERYWHERE, Gain, share_and_slope
 from rbl_gym.placement.problem import root_of
 from rbl_gym.placement.sample import Sample
 

@@ -87,7 +87,7 @@ class PlacementTask:
         what a blocked link keeps of its information (sight is judged from the anchor to the
         body's centre).
     n_anchors
-        How many are placed.
+        How many are placed, besides those that the scene has `fixed`.
     racks
         Boxes on the floor that every problem draws besides, 0 to 2; only in rooms (scenes with
         walls).
@@ -131,7 +131,7 @@ class PlacementTask:
 
     def obstacles(self, context: Context) -> Obstacles:
         """What stands in the way in a context."""
-        return Obstacles(context.racks, self.scene.blocked_information)
+        return Obstacles(context.racks, self.scene.blocked_information, self.scene.prisms)
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
@@ -176,7 +176,7 @@ def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0)
     """
     scene = scenes.get(scene)
     racks = check_count("racks", racks, least=0, most=MAX_RACKS)
-    usual = scene.n_anchors - bool(racks)
+    usual = scene.n_anchors - len(scene.fixed) - bool(racks)
     return PlacementTask(scene, usual if n_anchors is None else n_anchors, racks)
 
 
@@ -237,7 +237,8 @@ def positions(task: PlacementTask, context: Context) -> FloatArray:
 def information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
     """Fisher information (..., P, 6, 6) at the task's poses, without the prior.
 
-    It is a sum over the anchors: the information of a layout is that of its parts together.
+    It is a sum over the anchors: the information of a layout is that of its parts together. That of
+    the scene's fixed anchors is not in it.
     """
     places = positions(task, context)
     share = _share(task, context, anchors, places)[..., None]
@@ -246,14 +247,27 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
     )
 
 
+def information_of_fixed(task: PlacementTask, context: Context) -> FloatArray:
+    """`information` (..., P, 6, 6) of the scene's fixed anchors."""
+    batch = context.centre.shape[:-1]
+    if not task.scene.fixed:
+        return np.zeros((*batch, task.n_poses, 6, 6))
+    fixed = np.broadcast_to(task.scene.fixed, (*batch, len(task.scene.fixed), 3))
+    return information(task, context, fixed)
+
+
 def _share(
     task: PlacementTask, context: Context, anchors: FloatArray, places: FloatArray
 ) -> FloatArray:
     """Share (..., P, M) of its information that each anchor's sight of each place leaves."""
-    in_the_way = task.obstacles(context)
-    if not in_the_way:
+    in_the_way, gain = task.obstacles(context), task.scene.gain
+    if not in_the_way and not gain:
         return np.ones((task.n_poses, anchors.shape[-2]))
-    return in_the_way.share(anchors, places)
+    share = in_the_way.share(anchors, places)
+    if not gain:
+        return share
+    normals = task.scene.anchor_region.normal(anchors)[..., None, :, :]
+    return share * gain.share(places[..., None, :] - anchors[..., None, :, :], normals)
 
 
 def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
@@ -274,6 +288,9 @@ def score_of_checked(task: PlacementTask, context: Context, anchors: FloatArray)
 
 def arguments(task: PlacementTask, context: Context, anchors: FloatArray) -> tuple[FloatArray, ...]:
     """What the score is computed from: arguments of `mean_square`."""
+    if task.scene.fixed:
+        fixed = np.broadcast_to(task.scene.fixed, (*anchors.shape[:-2], len(task.scene.fixed), 3))
+        anchors = np.concatenate([fixed, anchors], axis=-2)
     places = positions(task, context)
     share = _share(task, context, anchors, places)
     law = ranging.numbers_of(task.scene.noise, len(task.scene.tags))

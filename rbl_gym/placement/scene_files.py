@@ -20,13 +20,14 @@ from rbl_gym import placement
 from rbl_gym.checks import FloatArray, check_array, check_number, check_one_of
 from rbl_gym.geometry.obstacles import Obstacles, Prisms, inside
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.ranging import NOISE_LAWS, NoiseLaw
 from rbl_gym.placement.building import Plan, Prior, Problem, Zone
 from rbl_gym.placement.file_checks import check_numbers, check_problem
 from rbl_gym.placement.file_keys import BODIES, FORMAT, MAX_ANCHORS, MIN_ANCHORS
+from rbl_gym.placement.file_lines import line_of
 from rbl_gym.placement.file_tables import as_table, check_text, read_table
 from rbl_gym.placement.file_walls import WallPieces, read_mounts, read_obstacles, rectangle, show
-from rbl_gym.placement.gain import Gain
 from rbl_gym.placement.mounting import cut_mounts
 from rbl_gym.worlds import scenes
 
@@ -72,7 +73,9 @@ def problem(
         try:
             return of_mapping(tables, n_anchors, region, name=path.stem, folder=path.parent)
         except ValueError as error:
-            raise ValueError(f"{scene}: {error}") from error
+            line = line_of(path.read_text(encoding="utf-8"), str(error))
+            where = "" if line is None or path.suffix.lower() != ".toml" else f" (line {line})"
+            raise ValueError(f"{scene}: {error}{where}") from error
     known = scenes.get(check_one_of("scene", scene, list(scenes.SCENES)))
     task = placement.task(known, n_anchors, racks)
     context = placement.whole_volume(task)

@@ -11,8 +11,8 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Region, Shell, Walls
 from rbl_gym.measurements import ranging
+from rbl_gym.measurements.gain import EVERYWHERE, Gain
 from rbl_gym.placement.building import Problem
-from rbl_gym.placement.gain import EVERYWHERE, Gain
 from rbl_gym.placement.gradient import of_arrays
 from rbl_gym.placement.problem import Context, PlacementTask, weighted_square
 from rbl_gym.placement.sample import Sample, of_context
@@ -117,7 +117,10 @@ class Setting(NamedTuple):
 def of_task(task: PlacementTask, context: Context) -> Setting:
     """The setting of an environment's problem, a context without batch axes."""
     scene, poses = task.scene, of_context(task, context)
-    return Setting(scene.body, scene.noise, poses, scene.anchor_region, task.obstacles(context))
+    setting = Setting(
+        scene.body, scene.noise, poses, scene.anchor_region, task.obstacles(context), scene.gain
+    )
+    return _with_fixed(setting, np.array(scene.fixed).reshape(-1, 3))
 
 
 def of_problem(problem: Problem, sample: Sample) -> Setting:
@@ -125,6 +128,11 @@ def of_problem(problem: Problem, sample: Sample) -> Setting:
     setting = Setting(
         problem.tags, problem.noise, sample, problem.mounts, problem.obstacles, problem.gain
     )
-    if not len(problem.fixed):
+    return _with_fixed(setting, problem.fixed)
+
+
+def _with_fixed(setting: Setting, fixed: FloatArray) -> Setting:
+    """The setting with what anchors (F, 3) tell that stay in the prior."""
+    if not len(fixed):
         return setting
-    return setting._replace(sample=sample._replace(prior=setting.told(problem.fixed)))
+    return setting._replace(sample=setting.sample._replace(prior=setting.told(fixed)))

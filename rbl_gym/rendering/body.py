@@ -63,6 +63,7 @@ def _stage(scene: Scene, title: str | None = None) -> Stage:
         scene.obstacles,
         scene.steps,
         scene.dt,
+        scene.prisms,
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.obstacles import Prisms
 
 Image = NDArray[np.uint8]
 # Truth, belief and bound, anchors, error, what stands in the way.
@@ -219,6 +220,15 @@ def box_edges(low: Any, high: Any) -> FloatArray:
 def box_faces(low: Any, high: Any) -> FloatArray:
     """The faces (6, 4, 3) of a box."""
     return box_corners(low, high)[_BOX_FACES]
+
+
+def prism_faces(prisms: Prisms) -> FloatArray:
+    """The upright faces (F, 4, 3) of prisms."""
+    start, end = prisms.corners, np.roll(prisms.corners, -1, axis=1)
+    heights = (z[:, None, None] for z in (prisms.low_m, prisms.high_m))
+    low, high = (np.broadcast_to(z, (*start.shape[:2], 1)) for z in heights)
+    rings = [(start, low), (end, low), (end, high), (start, high)]
+    return np.stack([np.concatenate(one, axis=-1) for one in rings], axis=-2).reshape(-1, 4, 3)
 
 
 def body_edges(tags: Any) -> NDArray[np.intp]:

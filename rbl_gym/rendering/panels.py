@@ -26,6 +26,7 @@ from rbl_gym.rendering.drawing import (
     chain,
     gapped,
     outline,
+    prism_faces,
     rings,
     round_number,
     space,
@@ -57,6 +58,10 @@ class _World:
                 patch = panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
                 patch.set_xy(face)
                 patch.set_animated(False)
+        for wall in view(prism_faces(stage.prisms)):
+            patch = panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
+            patch.set_xy(wall)
+            patch.set_animated(False)
         panel.freeze()
         self._shadow = panel.line(color="#c3c9ce", lw=1.2)
         self._stems = panel.line(color="#b4bac0", lw=0.7, ls=(0, (2, 2)))

@@ -22,6 +22,7 @@ from rbl_gym.rendering.drawing import (
     box_edges,
     box_faces,
     gapped,
+    prism_faces,
     space,
     view_of,
     write,
@@ -157,6 +158,11 @@ class _World:
                           ha="center", color="#495057")  # fmt: skip
         panel.freeze()
         self._view, self._floor = view_of(axes), low[2]
+        for wall in self._view(prism_faces(task.scene.prisms)):
+            patch = panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
+            patch.set_xy(wall)
+            patch.set_animated(False)
+        panel.freeze()
         self._racks = [
             panel.patch(fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.35)
             for _ in range(6 * _boxes(task))
@@ -212,6 +218,10 @@ class _Plan:
         axes.tick_params(labelsize=7, length=2.5)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.3, lw=0.5)
+        for corners in task.scene.prisms.corners:
+            patch = panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)
+            patch.set_xy(corners)
+            patch.set_animated(False)
         panel.freeze()
         self._racks = [
             panel.patch(axes, fc=OBSTACLE, ec="#495057", lw=0.5, alpha=0.5)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from rbl_gym.checks import BoolArray, FloatArray
+from rbl_gym.geometry.obstacles import Prisms
 from rbl_gym.worlds.scene import Points
 
 
@@ -39,3 +40,4 @@ class Stage:
     obstacles: tuple[tuple[float, ...], ...]
     steps: int
     dt: float
+    prisms: Prisms = field(default_factory=Prisms)

@@ -131,7 +131,7 @@ def told_readings(
     readings = []
     for epoch, measured in enumerate(measurements):
         at, quality = simulation.epoch_of(episode, epoch), None
-        if scene.obstacles:
+        if scene.weakens:
             quality = simulation.link_quality(scene, at, episode.anchors)
         readings.append(told_reading(told, at, measured, anchors, quality, first=not epoch))
     return readings

@@ -50,6 +50,13 @@ class SceneFamily:
                     "scenes must have no inertial sensor: its readings have a shape of their own "
                     f"in every scene, got one in {scene.name!r}"
                 )
+            first = self.corners[0]
+            alike = scene.prisms == first.prisms and scene.gain == first.gain
+            if not alike or (scene.gain and scene.anchor_region != first.anchor_region):
+                raise ValueError(
+                    "scenes of building files with walls, or limits of range and view, must all be "
+                    f"of one file, got {scene.name!r} beside {first.name!r}"
+                )
             if scene.survey_std_m > 0:
                 raise ValueError(
                     "scenes must have survey_std_m = 0, got "
@@ -107,7 +114,7 @@ class SceneFamily:
             "anchor_mask": ((m,), np.int8),
             "tag_mask": ((n,), np.int8),
         }
-        if any(scene.obstacles for scene in self.corners):
+        if any(scene.weakens for scene in self.corners):
             fields["quality"] = ((m,), np.float64)
         return fields
 

@@ -19,9 +19,10 @@ from rbl_gym.checks import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.obstacles import Obstacles, check_obstacles
+from rbl_gym.geometry.obstacles import Obstacles, Prisms, check_obstacles
 from rbl_gym.geometry.regions import REGIONS, Box, Region
 from rbl_gym.measurements import inertial
+from rbl_gym.measurements.gain import EVERYWHERE, Gain
 from rbl_gym.measurements.ranging import NOISE_LAWS, LinkModel, NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -33,7 +34,11 @@ _FIELD_KINDS: dict[str, tuple[type, ...]] = {
     "noise": tuple(NOISE_LAWS.values()),
     "process": (ProcessNoise,),
     "links": (LinkModel,),
+    "prisms": (Prisms,),
+    "gain": (Gain,),
 }
+# No less than this is left of a link where its noise is bounded.
+_LEAST_SHARE = 1e-6
 TRAJECTORIES = ("waypoints", "constant", "random-twist", "orbit", "lawn-mower")
 Points = tuple[tuple[float, float, float], ...]
 
@@ -95,6 +100,13 @@ class Scene:
         Boxes (K, 6) that block sight, centre and half size; a link without line of sight from
         the anchor to the body's origin keeps this share of its information: its noise is
         stronger. 0: it gives no range.
+    prisms
+        Obstacles that are polygons in the plan between two heights, such as walls; they come with
+        the files of buildings.
+    gain
+        How far and how wide an anchor reaches; this too comes with files.
+    fixed
+        Places (F, 3) of the first anchors, where the others are drawn or placed.
     process
         Noise of the motion: standard deviations after 1 s.
     dt, steps
@@ -136,6 +148,9 @@ class Scene:
     anchor_speed_m_s: float = 0.0
     obstacles: tuple[tuple[float, ...], ...] = ()
     blocked_information: float = 0.02
+    prisms: Prisms = field(default_factory=Prisms)
+    gain: Gain = EVERYWHERE
+    fixed: Points = ()
     links: LinkModel = field(default_factory=LinkModel)
     steps: int = 100
     trajectory: str = "waypoints"
@@ -189,6 +204,16 @@ class Scene:
             raise ValueError(
                 f"anchors must hold n_anchors = {self.n_anchors} places, got {len(self.anchors)}"
             )
+        if self.fixed:
+            fixed = check_array("fixed", self.fixed, ("F", 3))
+            if self.anchors is not None or fixed.ndim != 2 or len(fixed) > self.n_anchors:
+                raise ValueError(
+                    f"fixed must be places of at most n_anchors = {self.n_anchors} anchors, and "
+                    f"anchors None, got {self.fixed!r:.80}"
+                )
+            object.__setattr__(self, "fixed", as_tuples(fixed))
+        else:
+            object.__setattr__(self, "fixed", ())
         self._check_trajectory()
         if self.inertial is not None:
             object.__setattr__(self, "inertial", inertial.sensor(self.inertial))
@@ -221,7 +246,13 @@ class Scene:
     @functools.cached_property
     def obstruction(self) -> Obstacles:
         """The obstacles, and what they leave of a link."""
-        return Obstacles(np.array(self.obstacles).reshape(-1, 6), self.blocked_information)
+        boxes = np.array(self.obstacles).reshape(-1, 6)
+        return Obstacles(boxes, self.blocked_information, self.prisms)
+
+    @functools.cached_property
+    def weakens(self) -> bool:
+        """Whether anything takes information from links: then they have a `quality`."""
+        return bool(self.obstruction) or bool(self.gain)
 
     @functools.cached_property
     def body(self) -> FloatArray:
@@ -282,8 +313,11 @@ class Scene:
         spread = 10 * float(self.process.std()[3:].max()) * math.sqrt(duration)
         reach = np.full((1, len(self.tags)), extent + speed * (duration + self.dt) + spread + body)
         noise = 10 * float(np.sqrt(self.noise.variance(reach).max()))
-        if self.obstacles and self.blocked_information > 0:
-            noise /= math.sqrt(self.blocked_information)
+        if self.gain:
+            noise /= math.sqrt(_LEAST_SHARE)
+        elif self.obstruction:
+            shares = np.array([self.blocked_information, *self.prisms.share])
+            noise /= math.sqrt(max(shares[shares > 0].prod(), _LEAST_SHARE))
         return float(reach[0, 0]) + noise + self.links.nlos_bias_m
 
     @property

@@ -8,6 +8,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from importlib import import_module
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,13 @@ from rbl_gym.worlds import overrides
 from rbl_gym.worlds.scene import Scene
 
 __all__ = ["SCENES", "get"]
+
+# Who reads files, by their suffixes: entry points, as Gymnasium's, of packages above this one.
+READERS = {
+    ".toml": "rbl_gym.placement.file_scenes:scene_of_file",
+    ".json": "rbl_gym.placement.file_scenes:scene_of_file",
+    ".csv": "rbl_gym.placement.layout_files:read_layout",
+}
 
 
 def _per_step(translation_m: float, rotation_deg: float, dt: float) -> ProcessNoise:
@@ -198,12 +207,16 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`, `kappa` and `snr`). Another
         number of anchors than the scene has, without their places, draws them anew in the region
         at every reset. ``"stretch": [x, y, z]`` then multiplies volume, anchor region (boxes and
-        walls), anchors and obstacles along the axes.
+        walls), anchors and obstacles along the axes. A name that ends in ``.toml`` or ``.json`` is
+        the path of a building file (docs/building_files.md), see
+        `rbl_gym.placement.file_scenes.scene_of_file`. ``"layout": "layout.csv"``: the anchors
+        stand where a file of ``rbl-gym place`` says.
 
     Raises
     ------
     ValueError
-        On an unknown name or field, or a value that its field refuses.
+        On an unknown name or field, or a value that its field refuses; of a file it names the file
+        and the line.
     """
     if isinstance(scene, Scene):
         return scene
@@ -211,15 +224,34 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
         scene = {"name": scene}
     if not isinstance(scene, Mapping) or "name" not in scene:
         raise ValueError(f"scene must be a name or a dict with the key 'name', got {scene!r:.120}")
-    changes = {key: value for key, value in scene.items() if key not in ("name", "stretch")}
-    base = SCENES[check_one_of("scene", scene["name"], list(SCENES))]
+    special = ("name", "stretch", "layout")
+    changes = {key: value for key, value in scene.items() if key not in special}
+    base = _named(scene["name"])
+    if "layout" in scene:
+        if "anchors" in changes:
+            raise ValueError("scene must have either anchors or a layout, got both")
+        changes["anchors"] = as_tuples(_entry_point(READERS[".csv"])(scene["layout"]).positions)
     if changes.get("n_anchors", base.n_anchors) != base.n_anchors:
         changes.setdefault("anchors", None)
     anchors = changes.get("anchors")
     if anchors is not None:
+        changes.setdefault("fixed", ())
         changes.setdefault("n_anchors", len(check_array("anchors", anchors, ("M", 3))))
     made = overrides.replace(base, changes, "scene")
     return _stretched(made, scene["stretch"]) if "stretch" in scene else made
+
+
+def _named(name: Any) -> Scene:
+    """A scene by its name or by the path of its file."""
+    suffix = PurePath(name).suffix.lower() if isinstance(name, str) else ""
+    if suffix in READERS and name not in SCENES:
+        return _entry_point(READERS[suffix])(name)
+    return SCENES[check_one_of("scene", name, list(SCENES))]
+
+
+def _entry_point(name: str) -> Any:
+    module, _, attribute = name.partition(":")
+    return getattr(import_module(module), attribute)
 
 
 def _stretched(scene: Scene, stretch: Any) -> Scene:

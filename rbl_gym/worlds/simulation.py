@@ -212,6 +212,8 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
         else:
             around = path.translation[..., :1, :] + scene.anchor_start_m * (2 * spots - 1)
             anchors = scene.anchor_region.project(around)
+        if scene.fixed:
+            anchors[..., : len(scene.fixed), :] = scene.fixed
     else:
         anchors = np.full((*batch, scene.n_anchors, 3), scene.anchors)
     covariance = np.full((*batch, 6, 6), covariance)
@@ -303,7 +305,7 @@ def measure_epoch(
     other obstacles than the scene's.
     """
     normals = at.normals
-    if quality is None and scene.obstacles:
+    if quality is None and scene.weakens:
         quality = link_quality(scene, at, anchors)
     if quality is not None:
         normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
@@ -316,7 +318,7 @@ def measure_epoch(
     # A range of zero has no variance under a proportional law: such a reading is no reading.
     measured = ranges > 0
     links = measured if links is None else links & measured
-    if quality is not None and not np.all(scene.blocked_information):
+    if quality is not None and not np.all(quality):
         links &= quality[..., None] > 0
         ranges[~links] = 0.0
     measured = ranging.Measurement(ranges, links, nlos)
@@ -333,13 +335,19 @@ def surveyed(at: Epoch, anchors: FloatArray) -> FloatArray:
 
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
-    """Share (..., M) of its information that the sight from each anchor leaves a link."""
-    return scene.obstruction.share(anchors, at.translation[..., None, :])[..., 0, :]
+    """Share (..., M) of its information that sight, range and view of each anchor leave a link."""
+    centre = at.translation[..., None, :]
+    if not scene.gain:
+        return scene.obstruction.share(anchors, centre)[..., 0, :]
+    share = scene.gain.share(centre - anchors, scene.anchor_region.normal(anchors))
+    if scene.obstruction:
+        share = share * scene.obstruction.share(anchors, centre)[..., 0, :]
+    return share
 
 
 def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> Any:
     """Share (..., M, N) of its information that each link has: none where it gave no range."""
-    return links * link_quality(scene, at, anchors)[..., None] if scene.obstacles else links
+    return links * link_quality(scene, at, anchors)[..., None] if scene.weakens else links
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:

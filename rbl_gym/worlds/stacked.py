@@ -16,6 +16,8 @@ import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.geometry.obstacles import Obstacles
+from rbl_gym.geometry.regions import Region
+from rbl_gym.measurements.gain import Gain
 from rbl_gym.measurements.noise_laws import StackedNoise, numbers_of
 from rbl_gym.motion.kinematics import ProcessNoise
 from rbl_gym.worlds import simulation
@@ -144,7 +146,7 @@ class StackedScenes:
         return self.arrays.range_limit_m
 
     @property
-    def obstacles(self) -> bool:
+    def weakens(self) -> bool:
         """Whether any scene of the family has obstacles."""
         return "quality" in self.family.fields
 
@@ -153,10 +155,23 @@ class StackedScenes:
         """(B, 1, 1)."""
         return self.arrays.blocked
 
+    @property
+    def gain(self) -> Gain:
+        """The same of all."""
+        return self.scenes[0].gain
+
+    @property
+    def anchor_region(self) -> Region:
+        """Where anchors may stand: of all the same, where their view is limited."""
+        return self.scenes[0].anchor_region
+
     @functools.cached_property
     def obstruction(self) -> Obstacles:
         """The boxes of all of them, (B, K, 6)."""
-        return Obstacles(self.arrays.boxes, self.arrays.blocked)  # pyright: ignore[reportArgumentType]
+        prisms, blocked = self.scenes[0].prisms, self.arrays.blocked
+        if len(prisms):
+            blocked = blocked[:, 0, 0]
+        return Obstacles(self.arrays.boxes, blocked, prisms)  # pyright: ignore[reportArgumentType]
 
     @functools.cached_property
     def noise(self) -> StackedNoise:

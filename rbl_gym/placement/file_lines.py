@@ -1,0 +1,37 @@
+"""Where in a TOML file an error is: the line of a table's key."""
+
+from __future__ import annotations
+
+import re
+
+# What an error begins with: a table, maybe one of many, maybe a key of it.
+_SUBJECT = re.compile(r"^([A-Za-z_]\w*)(?:\[(\d+)\])?(?:(?:\.|: )([A-Za-z_]\w*))?")
+
+_UNKNOWN = re.compile(r"unknown key '(\w+)'")
+
+
+def line_of(text: str, message: str) -> int | None:
+    """The line, from 1, of what an error about the tables of a TOML file is about.
+
+    None where the file does not have it, or has it in another way than as tables with keys.
+    """
+    subject = _SUBJECT.match(message)
+    if subject is None:
+        return None
+    table, index, key = subject.groups()
+    unknown = _UNKNOWN.search(message)
+    key = unknown[1] if unknown else key
+    headers = [f"[[{table}]]"] if index is not None else [f"[{table}]", f"[[{table}]]"]
+    lines = [line.split("#")[0].strip() for line in text.splitlines()]
+    starts = [k for k, line in enumerate(lines) if line.replace(" ", "") in headers]
+    which = int(index or 0)
+    if which >= len(starts):
+        top = [k for k, line in enumerate(lines) if re.match(rf"{table}\s*=", line)]
+        return top[0] + 1 if top and index is None else None
+    start = starts[which]
+    for k in range(start + 1, len(lines)):
+        if lines[k].startswith("["):
+            break
+        if key is not None and re.match(rf"{key}\s*=", lines[k]):
+            return k + 1
+    return start + 1

@@ -1,0 +1,58 @@
+"""Worlds of building files: the scene that a file of `rbl-gym place` describes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from pathlib import Path
+
+from rbl_gym.checks import as_tuples
+from rbl_gym.motion.kinematics import ProcessNoise
+from rbl_gym.placement.scene_files import problem
+from rbl_gym.worlds.scene import Scene
+
+__all__ = ["scene_of_file"]
+
+# How a body moves that a file says nothing of: as in `uwb_room`.
+_DT = 0.1
+_MOTION = {
+    "dt": _DT,
+    "speed_m_s": 1.0,
+    "spin_rad_s": 0.29,
+    "process": ProcessNoise(math.radians(1.5) / _DT**0.5, 0.03 / _DT**0.5),
+}
+
+
+def scene_of_file(path: str) -> Scene:
+    """The world of a building file (docs/building_files.md).
+
+    The body moves in the box around the file's zones. The fixed anchors of the file stay; the
+    others, up to its number, are drawn anew at every reset, where they may stand. What the file
+    says nothing of (speeds, process noise, time) is that of the scene ``"uwb_room"``.
+
+    Raises
+    ------
+    ValueError
+        On a file that is none; the message names the file and, where it can be told, the line.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise ValueError(f"scene must be a name or a file, there is no file {path!r}")
+    return _read(path, file.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=64)
+def _read(path: str, changed_ns: int) -> Scene:
+    """The scene of a file as it was at that time: equal files give one and the same."""
+    found = problem(path)
+    fixed = as_tuples(found.fixed) if len(found.fixed) else ()
+    every = len(fixed) == found.n_anchors
+    return dataclasses.replace(
+        found.scene,
+        anchors=fixed if every else None,
+        fixed=() if every else fixed,
+        prisms=found.obstacles.prisms,
+        gain=found.gain,
+        **_MOTION,
+    )
