@@ -79,7 +79,7 @@ class Stage:
         """Share (M,) of its information that each link keeps; None: all of it."""
         if self.share is not None:
             return self.share(anchors, at.translation)
-        if self.scene.obstacles:
+        if self.scene.weakens:
             return simulation.link_quality(self.scene, at, anchors)
         return None
 
