@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import FloatArray
+from rbl_gym.placement.layout_files import parse_layout
 from rbl_gym.studies.placing import design
-from rbl_gym.studies.placing.layout_files import parse_layout
 from rbl_gym.studio import files, maps, searches, state
 from rbl_gym.studio.display import Display
 from rbl_gym.studio.figures import Others, body_figures, figures
