@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 
 import gymnasium as gym
@@ -12,6 +13,7 @@ import pytest
 from rbl_gym import bounds, motion
 from rbl_gym.wrappers import controllers
 from rbl_gym.wrappers.selection import AnchorSelectionVectorEnv
+from rbl_gym.wrappers.situations import situations
 from rbl_gym.wrappers.tasks import MobileAnchorsVectorEnv
 from tests.helpers import share_by_hand
 
@@ -39,7 +41,9 @@ def test_mobile_actions_are_legal_and_follow_the_generator(difficulty, name):
         env.step(actions)
 
 
-@pytest.mark.parametrize("arguments", [{}, {"k": 1}, {"k": 12}, {"mode": "priced"}])
+@pytest.mark.parametrize(
+    "arguments", [{}, {"k": 1}, {"k": 12}, {"mode": "priced"}, {"mode": "subset", "k": 2}]
+)
 @pytest.mark.parametrize("name", controllers.SELECTION)
 def test_selection_actions_are_legal_and_follow_the_generator(arguments, name):
     env = AnchorSelectionVectorEnv(4, **arguments)
@@ -51,6 +55,12 @@ def test_selection_actions_are_legal_and_follow_the_generator(arguments, name):
         assert actions.shape == env.action_space.shape
         if isinstance(env.single_action_space, gym.spaces.MultiBinary):
             assert np.isin(actions, (0, 1)).all()
+        elif isinstance(env.single_action_space, gym.spaces.Discrete):
+            scores = AnchorSelectionVectorEnv(4, k=2)
+            scores.reset(seed=1)
+            if not env.seen["links"].any():
+                chosen = scores._choice(controller(scores, np.random.default_rng(7)))
+                np.testing.assert_array_equal(env._choice(actions), chosen)
         else:
             assert np.abs(actions).max() <= 1
         env.step(actions)
@@ -202,3 +212,69 @@ def test_selection_controllers_are_in_their_order(mode):
     }
     assert losses["greedy-with-map"] < losses["greedy-blind"] < losses["random"]
     assert losses["greedy-blind"] <= losses["nearest"] + 0.01
+
+
+# --- families of scenes -----------------------------------------------------------------------
+
+CRAFT = {
+    "name": "auv_craft",
+    "n_anchors": {"integers": [2, 5]},
+    "anchor_speed_m_s": {"choice": [2.0, 4.0]},
+}
+RACK = [{"uniform": [-15, 15]}, {"uniform": [-7, 7]}, 1.5, 0.5, 4.0, 1.5]
+HALLS = {
+    "name": "hall",
+    "n_anchors": {"integers": [6, 12]},
+    "obstacles": {"repeat": {"count": [1, 3], "of": RACK}},
+}
+
+
+@pytest.mark.parametrize(
+    ("make", "scene", "known"),
+    [
+        (MobileAnchorsVectorEnv, {"name": "auv_craft", "n_anchors": 3}, controllers.MOBILE),
+        (AnchorSelectionVectorEnv, {"name": "hall", "steps": 50}, controllers.SELECTION),
+    ],
+)
+def test_a_family_of_one_scene_is_that_scene(make, scene, known):
+    alone, family = make(3, scene=scene), make(3, scenes=[scene])
+    for env in (alone, family):
+        env.reset(seed=4)
+    for controller in known.values():
+        one, other = (controller(env, np.random.default_rng(1)) for env in (alone, family))
+        np.testing.assert_allclose(one, other, atol=1e-9)
+        assert one.dtype == other.dtype
+
+
+@pytest.mark.parametrize("name", ["ring", "orbit"])
+def test_craft_of_each_world_go_where_they_would_alone(name):
+    """A world of a family by itself: the same situation, in an environment of its own scene."""
+    env = MobileAnchorsVectorEnv(6, scenes=CRAFT)
+    _, info = env.reset(seed=2)
+    actions = controllers.MOBILE[name](env, np.random.default_rng(0))
+    assert len({len(json.loads(one)) for one in info["scene"]}) == 1
+    found = {}
+    for rows, situation in situations(env):
+        m = situation.scene.n_anchors
+        assert {env.world.scenes[row] for row in rows} == {situation.scene}
+        for row in rows:
+            found[row] = m
+            alone = MobileAnchorsVectorEnv(1, scene=situation.scene)
+            alone.reset(seed=0)
+            alone.seen = {key: value[row : row + 1].copy() for key, value in env.seen.items()}
+            alone.seen["anchors"] = alone.seen["anchors"][:, :m]
+            alone.order = env.order[row : row + 1, :m]
+            wanted = controllers.MOBILE[name](alone, np.random.default_rng(0))[0]
+            np.testing.assert_allclose(actions[row, : 2 * m], wanted, atol=1e-12)
+            assert not actions[row, 2 * m :].any()
+    assert sorted(found) == list(range(6))
+    assert len(set(found.values())) > 1
+
+
+@pytest.mark.parametrize("mode", ["top-k", "priced"])
+def test_drawn_halls_have_references_in_their_order(mode):
+    losses = {
+        name: mean_loss(AnchorSelectionVectorEnv(24, mode, scenes=HALLS), controller, 12)
+        for name, controller in controllers.SELECTION.items()
+    }
+    assert losses["greedy-with-map"] < losses["greedy-blind"] < losses["random"]

@@ -1,13 +1,11 @@
 """Reference policies of the tasks with a filter in the loop: what learned ones are measured by.
 
-A controller is a function ``(env, rng) -> actions`` of a vector environment of `tasks`; it reads
-the belief and the model, never the truth. Only `greedy_with_map` knows where the racks stand.
+A controller is a function ``(env, rng) -> actions`` of a vector environment with one scene; it
+reads the belief and the model, never the truth. Only `greedy_with_map` knows where the racks
+stand. Those in `MOBILE` and `SELECTION` take families of scenes too.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -15,14 +13,13 @@ from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
 from rbl_gym.motion.kinematics import propagate
 from rbl_gym.wrappers.selection import AnchorSelectionVectorEnv
+from rbl_gym.wrappers.situations import Controller, in_each_scene
 from rbl_gym.wrappers.tasks import MobileAnchorsVectorEnv
 
 __all__ = [
     "MOBILE", "SELECTION", "greedy_blind", "greedy_with_map", "nearest", "orbit",
     "receding_horizon", "ring",
 ]  # fmt: skip
-
-Controller = Callable[[Any, np.random.Generator], np.ndarray]
 
 # Radius of ring and orbit in units of the vehicle's depth, and the angle between two craft (more
 # are spread evenly): tuned on the task's own worlds. Two craft see the vehicle from one side
@@ -54,22 +51,39 @@ def orbit(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
 
 
 def _around(env: MobileAnchorsVectorEnv, depths: float, ahead: float) -> FloatArray:
-    """Targets (B, M, 2) on a ring, the craft in the order of their bearings.
+    """Targets (B, M, 2) on a ring about the estimate, see `on_ring`."""
+    reach = np.full(env.num_envs, env.scene.anchor_speed_m_s * env.scene.dt)
+    centre = env.belief.translation + env.twist[:, 3:] * (env.scene.dt, env.scene.dt, 0.0)
+    return on_ring(centre, env.anchors, reach, depths, ahead)
 
-    `ahead`: how many steps of travel along the ring they lie before the craft.
+
+def on_ring(
+    centre: FloatArray, craft: FloatArray, reach_m: FloatArray, depths: float, ahead: float
+) -> FloatArray:
+    """Targets (B, M, 2) of craft on a ring, in the order of their bearings.
+
+    Parameters
+    ----------
+    centre
+        Of the ring (B, 3), at the vehicle's depth.
+    craft, reach_m
+        Places (B, M, 3), and how far each goes in a step (B,).
+    depths
+        Radius in units of the vehicle's depth.
+    ahead
+        How many steps of travel along the ring the targets lie before the craft.
     """
-    centre = env.belief.translation[:, None, :2] + env.twist[:, None, 3:5] * env.scene.dt
-    radius = depths * np.maximum(np.abs(env.belief.translation[:, 2]), 10.0)[:, None]
-    gap = env.anchors[..., :2] - centre
+    n_craft = craft.shape[-2]
+    radius = depths * np.maximum(np.abs(centre[:, 2]), 10.0)[:, None]
+    gap = craft[..., :2] - centre[:, None, :2]
     angle = np.arctan2(gap[..., 1], gap[..., 0])
     rank = np.argsort(np.argsort(angle, axis=-1), axis=-1)
-    n_anchors = env.scene.n_anchors
-    slot = (PAIR_ANGLE if n_anchors == 2 else 2 * np.pi / n_anchors) * rank
+    slot = (PAIR_ANGLE if n_craft == 2 else 2 * np.pi / n_craft) * rank
     # The turn of the ring that fits the craft best.
     turn = np.angle(np.exp(1j * (angle - slot)).mean(axis=-1))[:, None]
-    travel = ahead * env.scene.anchor_speed_m_s * env.scene.dt / radius
-    place = turn + slot + travel
-    return centre + radius[..., None] * np.stack([np.cos(place), np.sin(place)], axis=-1)
+    place = turn + slot + ahead * reach_m[:, None] / radius
+    around = radius[..., None] * np.stack([np.cos(place), np.sin(place)], axis=-1)
+    return centre[:, None, :2] + around
 
 
 def _towards(env: MobileAnchorsVectorEnv, targets: FloatArray) -> np.ndarray:
@@ -160,16 +174,16 @@ def nearest(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarr
 
 def greedy_blind(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
     """One after the other where it helps the predicted belief most, as if nothing blocked sight."""
-    return _greedy(env, np.ones((env.num_envs, env.scene.n_anchors)))
+    return greedy(env, np.ones((env.num_envs, env.scene.n_anchors)))
 
 
 def greedy_with_map(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
     """As `greedy_blind`, with the racks known."""
     _, translation = propagate(env.belief.rotation, env.belief.translation, env.twist, env.scene.dt)
-    return _greedy(env, env.scene.obstruction.share(env.anchors, translation[:, None])[:, 0])
+    return greedy(env, env.scene.obstruction.share(env.anchors, translation[:, None])[:, 0])
 
 
-def _greedy(env: AnchorSelectionVectorEnv, quality: FloatArray) -> np.ndarray:
+def greedy(env: AnchorSelectionVectorEnv, quality: FloatArray) -> np.ndarray:
     """Actions that choose greedily, links weighted by `quality` (B, M)."""
     scene, tags = env.scene, np.asarray(env.scene.tags)
     rows = np.arange(env.num_envs)
@@ -201,14 +215,14 @@ def _greedy(env: AnchorSelectionVectorEnv, quality: FloatArray) -> np.ndarray:
 
 
 MOBILE: dict[str, Controller] = {
-    "random": random_velocities,
-    "ring": ring,
-    "orbit": orbit,
-    "receding-horizon": receding_horizon,
+    "random": in_each_scene(random_velocities),
+    "ring": in_each_scene(ring),
+    "orbit": in_each_scene(orbit),
+    "receding-horizon": in_each_scene(receding_horizon),
 }
 SELECTION: dict[str, Controller] = {
-    "random": random_anchors,
-    "nearest": nearest,
-    "greedy-blind": greedy_blind,
-    "greedy-with-map": greedy_with_map,
+    "random": in_each_scene(random_anchors),
+    "nearest": in_each_scene(nearest),
+    "greedy-blind": in_each_scene(greedy_blind),
+    "greedy-with-map": in_each_scene(greedy_with_map),
 }

@@ -90,6 +90,11 @@ class _AnchorSelection(Task):
         chosen[(*worlds_of(action.shape[:-1]), best)] = 1
         return chosen
 
+    def subset_of(self, chosen: BoolArray) -> np.ndarray:
+        """The action (...) of ``mode="subset"`` that chooses these k anchors (..., M)."""
+        alike = self._subsets == np.asarray(chosen, dtype=np.int8)[..., None, :]
+        return alike.all(axis=-1).argmax(axis=-1)
+
     def action_masks(self) -> BoolArray:
         """Which actions choose only anchors that there are, as sb3-contrib's ``MaskablePPO`` asks.
 

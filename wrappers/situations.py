@@ -1,0 +1,95 @@
+"""What a controller reads of a vector environment, of worlds that share a scene."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.estimators import PoseBelief
+from rbl_gym.worlds.scene import Scene
+
+Controller = Callable[[Any, np.random.Generator], np.ndarray]
+
+
+class Situation(NamedTuple):
+    """Worlds of a learning task that share a scene; the names are those of its environment."""
+
+    num_envs: int
+    scene: Scene
+    belief: PoseBelief
+    twist: FloatArray
+    anchors: FloatArray
+    order: np.ndarray | None
+    mode: str | None
+    k: int | None
+    price: float | None
+
+
+def situations(env: Any) -> Iterator[tuple[np.ndarray, Situation]]:
+    """Rows of the worlds of an environment that share a scene, and what is known there.
+
+    A scalar environment is one row.
+    """
+    one = env.anchors.ndim == 2
+    fields = [*env.belief, env.twist, env.anchors, getattr(env, "order", None)]
+    if one:
+        fields = [None if field is None else field[None] for field in fields]
+    *belief, twist, anchors, order = fields
+    scenes = getattr(env.world, "scenes", (env.world,) * len(anchors))
+    alike: dict[Scene, list[int]] = {}
+    for row, scene in enumerate(scenes):
+        alike.setdefault(scene, []).append(row)
+    choice = [getattr(env, name, None) for name in ("mode", "k", "price")]
+    if choice[0] == "subset":
+        # The same choice, told in another way.
+        choice[0] = "top-k"
+    for scene, found in alike.items():
+        rows, m = np.array(found), scene.n_anchors
+        yield (
+            rows,
+            Situation(
+                len(rows),
+                scene,
+                PoseBelief(*(field[rows] for field in belief)),
+                twist[rows],
+                anchors[rows, :m],
+                None if order is None else order[rows, :m],
+                *choice,
+            ),
+        )
+
+
+def action_of(env: Any, scores: np.ndarray) -> np.ndarray:
+    """The action of scores (..., M) of the anchors, in the form that the environment takes."""
+    if env.mode == "priced":
+        return (scores > 0).astype(np.int8)
+    if env.mode == "top-k":
+        return scores
+    best = (-scores).argsort(axis=-1, kind="stable")[..., : env.k]
+    chosen = np.zeros(scores.shape, dtype=np.bool_)
+    np.put_along_axis(chosen, best, True, axis=-1)
+    return env.subset_of(chosen)
+
+
+def in_each_scene(controller: Controller) -> Controller:
+    """A controller of worlds that share a scene, as one of worlds that may have their own.
+
+    Craft that a scene does not have stand still, and anchors have the lowest score.
+    """
+
+    @functools.wraps(controller)
+    def act(env: Any, rng: np.random.Generator) -> np.ndarray:
+        # Of the craft, velocities of two axes.
+        columns = 2 if hasattr(env, "order") else 1
+        shape = env.num_envs, columns * env.anchors.shape[1]
+        actions = np.full(shape, 0.0 if columns == 2 else -1.0)
+        for rows, situation in situations(env):
+            own = controller(situation, rng)
+            actions[rows, : own.shape[1]] = own
+        return actions if columns == 2 else action_of(env, actions)
+
+    return act
