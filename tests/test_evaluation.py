@@ -202,7 +202,8 @@ def test_a_training_says_how_good_the_policy_is_that_it_saved(monkeypatch, tmp_p
     size = rl_task("auv_buoys").make(1).single_observation_space.shape[0]
     bad = random_policy("box", (size, 8, 3))
 
-    def pretend(name, task, steps, seed, advance):
+    def pretend(name, task, steps, seed, advance, algorithm):
+        assert algorithm == "ppo"
         curve = [{"steps": steps, "mean_return": 99.0}]
         figures = {"task": name, "seed": seed, "steps": steps, "seconds": 1.0, "cpu_seconds": 1.0,
                    "env_share": 0.1, "curve": curve}  # fmt: skip

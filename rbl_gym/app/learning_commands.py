@@ -15,7 +15,9 @@ from rbl_gym.app.terminal import (
 )
 from rbl_gym.checks import check_one_of
 from rbl_gym.studies.extras import MissingExtraError
-from rbl_gym.studies.learning.rl_tasks import TASKS, rl_task
+from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
+from rbl_gym.studies.learning.training import ALGORITHMS
+from rbl_gym.worlds.scene_source import read_scene, read_scenes
 
 # Held-out worlds in which a trained policy is scored, those of ``evaluate``.
 _WORLDS = 256
@@ -25,10 +27,12 @@ def add_train(commands: Any) -> None:
     """The parser of ``rbl-gym train``."""
     train = commands.add_parser(
         "train",
-        help="learn a policy by PPO (extra rl)",
-        description="Train a policy by PPO on a task; the same seed gives the same policy.",
+        help="learn a policy (extra rl)",
+        description="Train a policy on a task; the same seed gives the same policy.",
     )
     train.add_argument("task", choices=sorted(TASKS))
+    _add_worlds(train)
+    train.add_argument("--algorithm", choices=list(ALGORITHMS), help="default: the task's own")
     train.add_argument("--steps", type=positive, help="default: what the task's figures took")
     add_seed(train)
     train.add_argument("--out", metavar="F", help="default out/TASK-SEED.npz")
@@ -66,11 +70,37 @@ def add_transfer(commands: Any) -> None:
     transfer.set_defaults(run=_transfer)
 
 
+def _add_worlds(parser: argparse.ArgumentParser) -> None:
+    """In which worlds the task is played."""
+    worlds = parser.add_mutually_exclusive_group()
+    worlds.add_argument(
+        "--scene", metavar="NAME|F", help="another scene: its name, or a JSON or TOML file"
+    )
+    worlds.add_argument(
+        "--scenes", metavar="F", help="scenes to draw from: a list, or one with laws (JSON, TOML)"
+    )
+
+
+def _task(options: argparse.Namespace) -> RlTask:
+    """The task in the worlds that are asked for."""
+    task = rl_task(options.task)
+    if options.scenes:
+        return task.in_worlds(scenes=read_scenes(options.scenes))
+    return task.in_worlds(read_scene(options.scene) if options.scene else None)
+
+
+def _title(options: argparse.Namespace) -> str:
+    """The task and its worlds, in a word."""
+    worlds = options.scene or options.scenes
+    return f"{options.task} in {worlds}" if worlds else options.task
+
+
 def _add_players(
     parser: argparse.ArgumentParser, tasks: list[str], worlds: int, references: str
 ) -> None:
     """The task, the policies and references that play it, and the worlds they play it in."""
     parser.add_argument("task", choices=sorted(tasks))
+    _add_worlds(parser)
     parser.add_argument(
         "--policy",
         action="append",
@@ -86,16 +116,20 @@ def _add_players(
 def _train(options: argparse.Namespace) -> int:
     from rbl_gym.studies.learning import evaluation, policies, training
 
-    task = rl_task(options.task)
+    task = _task(options)
     steps = options.steps or task.steps
     path = Path(options.out or f"out/{options.task}-{options.seed}.npz")
+    algorithm = options.algorithm or task.algorithm
     try:
-        with progress(f"PPO on {options.task}", steps) as advance:
-            policy, result = training.train(options.task, task, steps, options.seed, advance)
+        with progress(f"{algorithm} on {_title(options)}", steps) as advance:
+            policy, result = training.train(
+                options.task, task, steps, options.seed, advance, algorithm
+            )
     except ModuleNotFoundError as error:
         raise MissingExtraError(
             f"training needs the extra rl ({error.name} is missing): pip install 'rbl-gym[rl]'"
         ) from error
+    policy.meta["command"] = _command(options, steps, algorithm)
     policies.save(policy, path)
     result["policy"] = str(path)
     # Of the file, not of what PPO remembers: that is what others will play.
@@ -107,18 +141,29 @@ def _train(options: argparse.Namespace) -> int:
     return 0
 
 
+def _command(options: argparse.Namespace, steps: int, algorithm: str) -> str:
+    """What makes a policy again."""
+    worlds = {"--scene": options.scene, "--scenes": options.scenes}
+    told = [f"{flag} {value}" for flag, value in worlds.items() if value]
+    if algorithm != rl_task(options.task).algorithm:
+        told.append(f"--algorithm {algorithm}")
+    return " ".join(
+        ["rbl-gym train", options.task, *told, f"--steps {steps} --seed {options.seed}"]
+    )
+
+
 def _evaluate(options: argparse.Namespace) -> int:
     from rbl_gym.studies.learning import evaluation
 
-    task = rl_task(options.task)
+    task = _task(options)
     loaded = _policies(options.policy)
-    names = _references(options, evaluation.references(task))
+    names = _references(options, task, evaluation.references(task))
     try:
-        with progress(options.task) as advance:
+        with progress(_title(options)) as advance:
             result = evaluation.evaluate(task, loaded, names, options.worlds, options.seed, advance)
     except ModuleNotFoundError as error:
         raise MissingExtraError(str(error)) from error
-    result["task"] = options.task
+    result["task"] = _title(options)
     if write_json(result, options.json):
         from rbl_gym.app import reports
 
@@ -129,17 +174,17 @@ def _evaluate(options: argparse.Namespace) -> int:
 def _transfer(options: argparse.Namespace) -> int:
     from rbl_gym.studies.learning import transfer
 
-    task = rl_task(options.task)
+    task = _task(options)
     loaded = _policies(options.policy)
-    names = _references(options, transfer.transfer_references(task))
+    names = _references(options, task, transfer.transfer_references(task))
     try:
-        with progress(options.task) as advance:
+        with progress(_title(options)) as advance:
             result = transfer.transfer_layouts(
                 task, loaded, names, options.worlds, options.repeats, options.seed, advance
             )
     except ModuleNotFoundError as error:
         raise MissingExtraError(str(error)) from error
-    result["task"] = options.task
+    result["task"] = _title(options)
     if write_json(result, options.json):
         from rbl_gym.app import reports
 
@@ -147,11 +192,11 @@ def _transfer(options: argparse.Namespace) -> int:
     return 0
 
 
-def _references(options: argparse.Namespace, default: list[str]) -> list[str]:
+def _references(options: argparse.Namespace, task: RlTask, default: list[str]) -> list[str]:
     """Names of references of the task, each once; without the option, the default ones."""
     from rbl_gym.studies.learning import evaluation
 
-    known = evaluation.references(rl_task(options.task))
+    known = evaluation.references(task)
     names = options.references.split(",") if options.references else default
     return list(dict.fromkeys(check_one_of("reference", name, known) for name in names))
 

@@ -224,13 +224,17 @@ def print_training(result: dict[str, Any]) -> None:
     """The learning curve in a few points, where the time went, and how good the policy is."""
     console = new_console()
     curve = result["curve"]
+    explores = result["env_share"] is not None
     for point in curve[:: max(1, len(curve) // 10)]:
+        told = (f"{name.replace('_', ' ')} {value:.4f}" for name, value in point.items())
+        next(told)
         console.print(
-            f"{point['steps']:>10,} steps  mean return {point['mean_return']:.4f} while exploring"
+            f"{point['steps']:>10,} steps  {', '.join(told)}{' while exploring' * explores}"
         )
+    share = result["env_share"] if explores else 0.0
+    of_it = f"; the environment took {100 * share:.0f} % of the processor's time" * explores
     console.print(
-        f"{result['steps']:,} steps in {result['seconds']:.0f} s; the environment took "
-        f"{100 * result['env_share']:.0f} % of the processor's time\npolicy: {result['policy']}"
+        f"{result['steps']:,} steps in {result['seconds']:.0f} s{of_it}\npolicy: {result['policy']}"
     )
     held_out = result["held_out"]
     returns = {name: held_out[f"{name}_mean_return"] for name in ("policy", "random")}

@@ -19,7 +19,7 @@ from rbl_gym import placement
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import layouts, search
 from rbl_gym.placement.problem import Context, PlacementTask
-from rbl_gym.studies.learning.policies import Policy, check_fit
+from rbl_gym.studies.learning.policies import AnyPolicy, check_fit
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.wrappers import controllers
@@ -65,7 +65,7 @@ def _controllers(task: RlTask) -> dict[str, controllers.Controller]:
 
 def evaluate(
     task: RlTask,
-    policies: dict[str, Policy],
+    policies: dict[str, AnyPolicy],
     names: list[str],
     worlds: int,
     seed: int,
@@ -122,7 +122,7 @@ def evaluate(
     }
 
 
-def held_out_returns(task: RlTask, policy: Policy, worlds: int, seed: int) -> dict[str, Any]:
+def held_out_returns(task: RlTask, policy: AnyPolicy, worlds: int, seed: int) -> dict[str, Any]:
     """Returns of the policy as it is saved, and of random actions, in the worlds of `evaluate`.
 
     A training's own returns are those of actions drawn about the policy's, in other worlds.
@@ -140,7 +140,7 @@ def held_out_returns(task: RlTask, policy: Policy, worlds: int, seed: int) -> di
         return env.action_space.sample()
 
     result: dict[str, Any] = {"worlds": worlds}
-    for name, act in (("policy", lambda _, seen: policy(seen)), ("random", by_chance)):
+    for name, act in (("policy", policy.player()), ("random", by_chance)):
         returns = _returns(task, act, worlds, seed)[0]
         result[f"{name}_mean_return"] = float(returns.mean())
         spread = float(returns.std(ddof=1)) if worlds > 1 else 0.0
@@ -164,7 +164,7 @@ def _figures(
     }
 
 
-def _check_policies(task: RlTask, policies: dict[str, Policy]) -> None:
+def _check_policies(task: RlTask, policies: dict[str, AnyPolicy]) -> None:
     """Before hours of references: a ValueError on a policy that cannot be played or told apart."""
     envs = task.make(1)
     for label, policy in policies.items():
@@ -181,12 +181,12 @@ def _held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str,
 
 def _of_all(
     task: RlTask,
-    policies: dict[str, Policy],
+    policies: dict[str, AnyPolicy],
     names: list[str],
     seed: int,
     advance: Advance,
     of_reference: Callable[[str, np.random.Generator], FloatArray],
-    of_policy: Callable[[Policy], FloatArray],
+    of_policy: Callable[[AnyPolicy], FloatArray],
 ) -> dict[str, FloatArray]:
     """What two functions give of references, each with a generator of its own, and of policies."""
     _check_policies(task, policies)
@@ -207,7 +207,7 @@ def _of_all(
 
 def _loop_losses(
     task: RlTask,
-    policies: dict[str, Policy],
+    policies: dict[str, AnyPolicy],
     names: list[str],
     worlds: int,
     seed: int,
@@ -217,8 +217,8 @@ def _loop_losses(
         controller = _controllers(task)[name]
         return _rollout(task, lambda env, _: controller(env, rng), worlds, seed)
 
-    def policy(played: Policy) -> FloatArray:
-        return _rollout(task, lambda _, seen: played(seen), worlds, seed)
+    def policy(played: AnyPolicy) -> FloatArray:
+        return _rollout(task, played.player(), worlds, seed)
 
     return _of_all(task, policies, names, seed, advance, reference, policy)
 
@@ -252,7 +252,7 @@ def _returns(
 
 def _placement_losses(
     task: RlTask,
-    policies: dict[str, Policy],
+    policies: dict[str, AnyPolicy],
     names: list[str],
     worlds: int,
     seed: int,
@@ -272,7 +272,7 @@ def _placement_losses(
 
 def layouts_of(
     task: RlTask,
-    policies: dict[str, Policy],
+    policies: dict[str, AnyPolicy],
     names: list[str],
     worlds: int,
     seed: int,
@@ -330,11 +330,11 @@ def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generato
     return {**layouts.LAYOUTS, **search.SEARCHES}[name](problem, contexts, rng)
 
 
-def _policy_layout(task: RlTask, policy: Policy, worlds: int, seed: int) -> FloatArray:
+def _policy_layout(task: RlTask, policy: AnyPolicy, worlds: int, seed: int) -> FloatArray:
     env, observation, info = _held_out(task, worlds, seed)
-    done = np.zeros(worlds, dtype=np.bool_)
+    done, play = np.zeros(worlds, dtype=np.bool_), policy.player()
     while not done.all():
-        observation, _, done, _, info = env.step(policy(observation))
+        observation, _, done, _, info = env.step(play(env, observation))
     return info["anchors"]
 
 

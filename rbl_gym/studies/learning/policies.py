@@ -1,9 +1,10 @@
-"""Trained policies as small files: a multilayer perceptron in numpy, no learning library needed."""
+"""Trained policies as small files, played by numpy: no learning library needed."""
 
 from __future__ import annotations
 
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,11 +12,36 @@ import gymnasium as gym
 import numpy as np
 
 from rbl_gym.checks import FloatArray, check_array, check_finite, check_one_of
+from rbl_gym.studies.learning.deep_sets import DeepSets
+from rbl_gym.studies.learning.set_policies import SET_KINDS, SetPolicy
 
-__all__ = ["KINDS", "Policy", "load", "save"]
+__all__ = ["KINDS", "Lstm", "Policy", "load", "save"]
 
 _META = "meta"
 KINDS = ("box", "discrete", "multi-binary")
+
+
+class Lstm(NamedTuple):
+    """A layer with a memory, its gates in the order input, forget, cell, output (torch).
+
+    Attributes
+    ----------
+    reads, recalls, bias
+        (4 H, n_in), (4 H, H) and (4 H,).
+    """
+
+    reads: FloatArray
+    recalls: FloatArray
+    bias: FloatArray
+
+    def __call__(
+        self, observation: FloatArray, hidden: FloatArray, cell: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Hidden and cell state (..., H) after an observation (..., n_in)."""
+        gates = observation @ self.reads.T + hidden @ self.recalls.T + self.bias
+        enter, keep, new, out = np.split(gates, 4, axis=-1)
+        cell = _sigmoid(keep) * cell + _sigmoid(enter) * np.tanh(new)
+        return _sigmoid(out) * np.tanh(cell), cell
 
 
 class Policy(NamedTuple):
@@ -29,46 +55,98 @@ class Policy(NamedTuple):
         ``"box"``: actions cut to [-1, 1]. ``"discrete"``: the largest of the outputs.
         ``"multi-binary"``: which outputs are positive.
     meta
-        Where it comes from: task, seed, steps, the command that makes it again.
+        Where it comes from: task, seed, steps, the command that makes it again. With
+        ``"algorithm": "maskable-ppo"`` it is played with the environment's action masks.
+    lstm
+        A layer with a memory before the others; None: there is none.
     """
 
     weights: tuple[FloatArray, ...]
     biases: tuple[FloatArray, ...]
     kind: str
     meta: dict[str, Any]
+    lstm: Lstm | None = None
 
-    def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Actions (...,) or (..., n) of observations (..., n_in)."""
-        hidden = np.asarray(observation, dtype=np.float64)
-        if hidden.shape[-1] != self.weights[0].shape[1]:
+    @property
+    def n_inputs(self) -> int:
+        """Entries of an observation."""
+        first = self.weights[0] if self.lstm is None else self.lstm.reads
+        return first.shape[1]
+
+    def __call__(self, observation: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
+        """Actions (...,) or (..., n) of observations (..., n_in).
+
+        `mask` (..., n), of a discrete policy: True for the actions that there are.
+        """
+        if self.lstm is not None:
+            raise ValueError("a policy with a memory is played by player(), one for each episode")
+        return self._action(self._checked(observation), mask)
+
+    def player(self) -> Callable[[Any, np.ndarray], np.ndarray]:
+        """A function ``(env, observation) -> actions``: make one for each episode."""
+        masked = self.meta.get("algorithm") == "maskable-ppo"
+        state = None
+
+        def play(env: Any, observation: np.ndarray) -> np.ndarray:
+            nonlocal state
+            hidden = self._checked(observation)
+            if self.lstm is not None:
+                if state is None:
+                    state = (np.zeros((*hidden.shape[:-1], self.lstm.recalls.shape[1])),) * 2
+                state = self.lstm(hidden, *state)
+                hidden = state[0]
+            return self._action(hidden, env.unwrapped.action_masks() if masked else None)
+
+        return play
+
+    def _checked(self, observation: np.ndarray) -> FloatArray:
+        seen = np.asarray(observation, dtype=np.float64)
+        if seen.shape[-1] != self.n_inputs:
             raise ValueError(
-                f"observation must have {self.weights[0].shape[1]} entries for this policy, "
-                f"got {hidden.shape[-1]}: it was trained on {self.meta.get('task')!r}"
+                f"observation must have {self.n_inputs} entries for this policy, "
+                f"got {seen.shape[-1]}: it was trained on {self.meta.get('task')!r}"
             )
+        return seen
+
+    def _action(self, hidden: FloatArray, mask: np.ndarray | None) -> np.ndarray:
         *inner, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for w, b in inner:
             hidden = np.tanh(hidden @ w.T + b)
         output = hidden @ weight.T + bias
         if self.kind == "discrete":
-            return output.argmax(axis=-1)
+            return (output if mask is None else np.where(mask, output, -np.inf)).argmax(axis=-1)
         if self.kind == "multi-binary":
             return (output > 0).astype(np.int8)
         return np.clip(output, -1.0, 1.0)
 
 
-def save(policy: Policy, path: str | Path) -> None:
+AnyPolicy = Policy | SetPolicy
+
+
+def _sigmoid(x: FloatArray) -> FloatArray:
+    return 0.5 * (1 + np.tanh(0.5 * x))
+
+
+def save(policy: AnyPolicy, path: str | Path) -> None:
     """Write a policy as npz, in single precision."""
     arrays: dict[str, Any] = {}
-    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        arrays[f"weight_{k}"] = weight.astype(np.float32)
-        arrays[f"bias_{k}"] = bias.astype(np.float32)
+    if isinstance(policy, SetPolicy):
+        for name, layers in policy.network._asdict().items():
+            for k, (weight, bias) in enumerate(layers):
+                arrays[f"{name}_weight_{k}"], arrays[f"{name}_bias_{k}"] = weight, bias
+    else:
+        for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+            arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
+        if policy.lstm is not None:
+            arrays.update({f"lstm_{name}": one for name, one in policy.lstm._asdict().items()})
+    arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
     arrays[_META] = np.array(json.dumps({"kind": policy.kind, **policy.meta}))
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "wb") as file:
         np.savez_compressed(file, **arrays)
 
 
-def load(path: str | Path) -> Policy:
+def load(path: str | Path) -> AnyPolicy:
     """Read a policy.
 
     Raises
@@ -76,15 +154,26 @@ def load(path: str | Path) -> Policy:
     ValueError
         If the file is no policy.
     """
-    # Read first: an OSError from here on is the archive's.
-    data = Path(path).read_bytes()
+    # numpy keeps the handle of a file that is no archive.
+    data = io.BytesIO(Path(path).read_bytes())
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+        with np.load(data, allow_pickle=False) as file:
             meta = json.loads(str(file[_META]))
-            n_layers = sum(name.startswith("weight_") for name in file.files)
-            weights = tuple(file[f"weight_{k}"].astype(float) for k in range(n_layers))
-            biases = tuple(file[f"bias_{k}"].astype(float) for k in range(n_layers))
-        policy = Policy(weights, biases, check_one_of("kind", meta.pop("kind"), KINDS), meta)
+            arrays = {key: file[key].astype(float) for key in file.files if key != _META}
+        kind = check_one_of("kind", meta.pop("kind"), [*KINDS, *SET_KINDS])
+        if kind in SET_KINDS:
+            network = DeepSets(_layers(arrays, "inner_"), _layers(arrays, "outer_"))
+            policy = SetPolicy(network, kind, meta)
+            policy.check()
+            return policy
+        layers = _layers(arrays, "")
+        lstm = None
+        if "lstm_bias" in arrays:
+            lstm = Lstm(*(arrays[f"lstm_{name}"] for name in Lstm._fields))
+        weights, biases = (
+            (tuple(part) for part in zip(*layers, strict=True)) if layers else ((), ())
+        )
+        policy = Policy(weights, biases, kind, meta, lstm)
         _check_layers(policy)
     # What zipfile and numpy raise of a broken archive has no common kind but this.
     except Exception as error:
@@ -92,11 +181,24 @@ def load(path: str | Path) -> Policy:
     return policy
 
 
+def _layers(arrays: dict[str, np.ndarray], name: str) -> tuple[tuple[FloatArray, FloatArray], ...]:
+    """Weights and biases whose names begin with `name`."""
+    count = sum(key.startswith(f"{name}weight_") for key in arrays)
+    return tuple((arrays[f"{name}weight_{k}"], arrays[f"{name}bias_{k}"]) for k in range(count))
+
+
 def _check_layers(policy: Policy) -> None:
     """A ValueError unless the layers are finite and fit together."""
     if not policy.weights:
         raise ValueError("it has no layers")
     n_in = policy.weights[0].shape[-1]
+    if policy.lstm is not None:
+        for name, array in policy.lstm._asdict().items():
+            check_finite(f"lstm_{name}", array)
+        size = n_in
+        check_array("lstm_reads", policy.lstm.reads, (4 * size, "n_in"))
+        check_array("lstm_recalls", policy.lstm.recalls, (4 * size, size))
+        check_array("lstm_bias", policy.lstm.bias, (4 * size,))
     for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         check_finite(f"bias_{k}", check_array(f"bias_{k}", bias, ("n_out",)))
         check_finite(f"weight_{k}", check_array(f"weight_{k}", weight, (len(bias), n_in)))
@@ -111,13 +213,18 @@ def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
     return kind, int(np.prod(space.shape or ()))
 
 
-def check_fit(policy: Policy, label: str, envs: Any) -> None:
+def check_fit(policy: AnyPolicy, label: str, envs: Any) -> None:
     """A ValueError unless a policy reads and acts as a vector environment asks for."""
+    trained = f"policy {label!r} does not fit: it was trained on {policy.meta.get('task')!r}"
+    if isinstance(policy, SetPolicy):
+        wanted = SET_KINDS[policy.kind][0]
+        if envs.unwrapped.spec.id != wanted:
+            raise ValueError(f"{trained} and plays {wanted}, not {envs.unwrapped.spec.id}")
+        return
     n_in, n_out = envs.single_observation_space.shape[0], len(policy.biases[-1])
-    wanted = (n_in, *kind_and_outputs(envs.single_action_space))
-    got = (policy.weights[0].shape[1], policy.kind, n_out)
-    if got != wanted:
+    asked = (n_in, *kind_and_outputs(envs.single_action_space))
+    got = (policy.n_inputs, policy.kind, n_out)
+    if got != asked:
         raise ValueError(
-            f"policy {label!r} does not fit: it was trained on {policy.meta.get('task')!r} and "
-            f"has (observation, kind, outputs) = {got}, the task's are {wanted}"
+            f"{trained} and has (observation, kind, outputs) = {got}, the task's are {asked}"
         )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
 
 from rbl_gym.checks import check_one_of
+from rbl_gym.worlds.families import SceneFamily, family
 
 __all__ = [
     "TASKS",
@@ -37,6 +39,8 @@ class RlTask:
         Discount and advantage mixing; 1 where only the end counts.
     num_envs, batch_size, epochs, learning_rate, hidden, log_std_init
         As their names say; the learning rate falls linearly to zero.
+    algorithm
+        What learns it unless told otherwise, of `training.ALGORITHMS`.
     """
 
     env_id: str
@@ -51,6 +55,7 @@ class RlTask:
     learning_rate: float = 1e-3
     hidden: tuple[int, ...] = (128, 128)
     log_std_init: float = -0.5
+    algorithm: str = "ppo"
 
     def make(self, num_envs: int, autoreset_mode: str = "SameStep") -> Any:
         """The vector environment."""
@@ -60,6 +65,29 @@ class RlTask:
             autoreset_mode=autoreset_mode,
             **self.arguments,
         )
+
+    def in_worlds(self, scene: Any = None, scenes: Any = None) -> RlTask:
+        """The task in another scene, or in a family of scenes.
+
+        Parameters
+        ----------
+        scene
+            As the environment takes it; what the task says of its own scene goes.
+        scenes
+            A family in its place, see `rbl_gym.worlds.families.family`.
+        """
+        if scene is None and scenes is None:
+            return self
+        if scene is not None and scenes is not None:
+            raise ValueError("scene must not be given beside scenes")
+        given = {"scene": scene} if scenes is None else {"scenes": scenes}
+        kept = {k: v for k, v in self.arguments.items() if k not in ("scene", "scenes")}
+        return dataclasses.replace(self, arguments={**kept, **given})
+
+    def family(self) -> SceneFamily:
+        """The scenes of the environment, of a task with a filter in the loop."""
+        env = self.make(1)
+        return env.family or family([env.scene])
 
 
 def _mobile(steps: int, rollout: int, **arguments: Any) -> RlTask:
@@ -80,6 +108,30 @@ def _placement(steps: int, n_anchors: int, **arguments: Any) -> RlTask:
     return RlTask("RBL/AnchorPlacement-v0", arguments, steps, 4 * n_anchors)
 
 
+# Two craft, which need the most skill, are drawn as often as all other numbers together.
+CRAFT = (
+    {"name": "auv_craft", "n_anchors": 2, "anchor_speed_m_s": {"choice": [2.0, 2.0, 4.0]}},
+    {
+        "name": "auv_craft",
+        "n_anchors": {"integers": [2, 5]},
+        "anchor_speed_m_s": {"choice": [2.0, 4.0, 4.0]},
+    },
+)
+_RACK = {
+    "choice": [
+        [{"uniform": [-15, 15]}, {"uniform": [-7, 7]}, 1.5, 0.5, 4.0, 1.5],
+        [{"uniform": [-15, 15]}, {"uniform": [-7, 7]}, 1.5, 4.0, 0.5, 1.5],
+    ]
+}
+# Halls 24 to 56 m long with 2 to 6 racks and 6 to 12 anchors; and, once in four, `hall` itself.
+_DRAWN_HALL = {
+    "name": "hall",
+    "n_anchors": {"integers": [6, 12]},
+    "stretch": [{"uniform": [0.6, 1.4]}, {"uniform": [0.6, 1.4]}, 1.0],
+    "obstacles": {"repeat": {"count": [2, 6], "of": _RACK}},
+}
+HALLS = (_DRAWN_HALL, _DRAWN_HALL, _DRAWN_HALL, "hall")
+
 TASKS: dict[str, RlTask] = {
     "auv_buoys": _placement(300_000, 4, scene="auv_buoys"),
     "drone_yard": _placement(450_000, 6, scene="drone_yard"),
@@ -88,9 +140,17 @@ TASKS: dict[str, RlTask] = {
     "mounts": _placement(1_200_000, 5, scene="uwb_room", racks=2, mode="mounts"),
     "mobile-easy": _mobile(600_000, 50, difficulty="easy"),
     "mobile-hard": _mobile(1_500_000, 13, difficulty="hard"),
+    "craft": RlTask(
+        "RBL/MobileAnchors-v0", {"scenes": CRAFT}, 1_500_000, 20, algorithm="set-ppo",
+        gamma=0.95, gae_lambda=0.9, num_envs=128,
+    ),
     "selection": _selection(k=3),
     "selection-priced": _selection(mode="priced"),
-}
+    "halls": RlTask(
+        "RBL/AnchorSelection-v0", {"k": 3, "scenes": HALLS}, 160_000, 13,
+        algorithm="supervised", gamma=0.8, gae_lambda=0.9, num_envs=256,
+    ),
+}  # fmt: skip
 
 
 def rl_task(name: str) -> RlTask:

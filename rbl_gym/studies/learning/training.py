@@ -1,4 +1,7 @@
-"""PPO (stable-baselines3) on a learning task; the result is a small policy in numpy."""
+"""Training on a learning task: PPO and its kin, or what a task knows better; the result is a file.
+
+PPO is stable-baselines3's, `MaskablePPO` and `RecurrentPPO` are sb3-contrib's.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.studies.learning.policies import Policy, kind_and_outputs
+from rbl_gym.checks import check_one_of
+from rbl_gym.studies.learning.policies import AnyPolicy, Lstm, Policy, kind_and_outputs
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
+from rbl_gym.studies.learning.set_policies import SetPolicy
 
-__all__ = [
-    "train",
-]
+__all__ = ["ALGORITHMS", "train"]
+
+# What learns, and the policies that it makes.
+ALGORITHMS = {
+    "ppo": "a multilayer perceptron",
+    "maskable-ppo": "the same, which is told the actions that there are",
+    "recurrent-ppo": "one with a memory (LSTM)",
+    "set-ppo": "one network for craft of any number, which starts as the orbit",
+    "supervised": "a choice of any number of anchors by what will be in sight",
+}
+# Units of the memory, and of the layer behind it.
+_MEMORY, _BEHIND = 64, 64
 
 
 def train(
@@ -23,8 +37,9 @@ def train(
     steps: int,
     seed: int,
     advance: Callable[[int], None] = lambda steps: None,
-) -> tuple[Policy, dict[str, Any]]:
-    """Train a policy by PPO, and say how it went.
+    algorithm: str | None = None,
+) -> tuple[AnyPolicy, dict[str, Any]]:
+    """Train a policy, and say how it went.
 
     Parameters
     ----------
@@ -34,62 +49,101 @@ def train(
         Environment steps, and the seed of worlds, networks and actions.
     advance
         Called after every rollout, with its environment steps.
+    algorithm
+        Of `ALGORITHMS`; None: the task's own.
 
     Returns
     -------
     The deterministic policy, and figures: learning curve (environment steps, mean return of the
-    episodes since the point before), seconds, and the share that the environment took of them.
+    episodes since the point before), seconds, and the share that the environment took of them
+    (None where it is not a step by itself).
 
     Raises
     ------
     ValueError
-        On a seed whose worlds are held out for evaluations.
+        On a seed whose worlds are held out for evaluations, or an algorithm that cannot learn the
+        task.
     ModuleNotFoundError
-        Without stable-baselines3 (extra ``rl``).
+        Without stable-baselines3 or sb3-contrib (extra ``rl``).
     """
     if seed * SEED_STRIDE >= HELD_OUT_SEED:
         raise ValueError(
             f"seed must be below {HELD_OUT_SEED // SEED_STRIDE}, got {seed}: the "
             "worlds of larger ones are held out for evaluations"
         )
+    algorithm = check_one_of("algorithm", algorithm or task.algorithm, list(ALGORITHMS))
+    _check_goes_with(algorithm, task)
     import torch  # pyright: ignore[reportMissingImports]
 
     # Small networks: threads cost more than they give, and vary the sums.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
+    learn = _taught if algorithm in _TAUGHT else _explored
+    begin, cpu = time.perf_counter(), time.process_time()
     try:
-        return _train(name, task, steps, seed, advance)
+        make, figures = learn(algorithm, task, steps, seed, advance)
     finally:
         torch.set_num_threads(threads)
+    meta = {"task": name, "seed": seed, "steps": steps, "algorithm": algorithm}
+    seconds = {
+        "seconds": time.perf_counter() - begin,
+        "cpu_seconds": time.process_time() - cpu,
+    }
+    return make(meta), {**meta, **seconds, **figures}
 
 
-def _train(
-    name: str, task: RlTask, steps: int, seed: int, advance: Callable[[int], None]
-) -> tuple[Policy, dict[str, Any]]:
+def _check_goes_with(algorithm: str, task: RlTask) -> None:
+    """A ValueError where an algorithm cannot learn a task."""
+    if algorithm in _TAUGHT:
+        if task.env_id != _TAUGHT[algorithm]:
+            raise ValueError(
+                f"algorithm {algorithm!r} is for {_TAUGHT[algorithm]}, the task is of {task.env_id}"
+            )
+    elif algorithm == "maskable-ppo":
+        kind, _ = kind_and_outputs(task.make(1).single_action_space)
+        if kind == "box":
+            raise ValueError(
+                "algorithm 'maskable-ppo' is for tasks with discrete actions, those of "
+                f"{task.env_id} are continuous here: use ppo or recurrent-ppo"
+            )
+
+
+# --- policies that are taught -----------------------------------------------------------------
+
+# Algorithms that make policies for any number of anchors, and what they are for.
+_TAUGHT = {"set-ppo": "RBL/MobileAnchors-v0", "supervised": "RBL/AnchorSelection-v0"}
+
+
+def _taught(
+    algorithm: str, task: RlTask, steps: int, seed: int, advance: Callable[[int], None]
+) -> tuple[Callable[[dict[str, Any]], SetPolicy], dict[str, Any]]:
+    if algorithm == "set-ppo":
+        from rbl_gym.studies.learning.craft_training import train_craft
+
+        kind = "craft"
+        network, curve = train_craft(task, steps, seed, advance)
+    else:
+        from rbl_gym.studies.learning.sight_training import train_sight
+
+        kind = "sight"
+        k = int(task.arguments.get("k", 3))
+        network, curve = train_sight(task.family(), k, steps, seed, advance)
+    figures = {"env_share": None, "curve": curve}
+    return lambda meta: SetPolicy(network.arrays(), kind, meta), figures
+
+
+# --- policies that explore --------------------------------------------------------------------
+
+
+def _explored(
+    algorithm: str, task: RlTask, steps: int, seed: int, advance: Callable[[int], None]
+) -> tuple[Callable[[dict[str, Any]], Policy], dict[str, Any]]:
     import torch  # pyright: ignore[reportMissingImports]
-    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 
     from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
     envs = _Timed(Sb3VecEnv(task.make(task.num_envs)))
-    continuous = kind_and_outputs(envs.venv.action_space)[0] == "box"
-    log_std = {"log_std_init": task.log_std_init} if continuous else {}
-    with warnings.catch_warnings():
-        # The last batch of a rollout may be a smaller one.
-        warnings.filterwarnings("ignore", "You have specified a mini-batch size")
-        model = PPO(
-            "MlpPolicy",
-            envs.venv,
-            n_steps=task.rollout,
-            batch_size=task.batch_size,
-            n_epochs=task.epochs,
-            gamma=task.gamma,
-            gae_lambda=task.gae_lambda,
-            learning_rate=lambda remaining: task.learning_rate * remaining,
-            policy_kwargs={"net_arch": list(task.hidden), **log_std},
-            seed=seed,
-            device="cpu",
-        )
+    model = _model(algorithm, task, envs.venv, seed)
     if task.gamma < 1:
         # Rewards that never end sum to far from zero: a critic that starts there learns what
         # matters, the differences, from the first update on.
@@ -97,25 +151,52 @@ def _train(
             model.policy.value_net.bias.fill_(_mean_reward(task, seed) / (1 - task.gamma))
     # After PPO has seeded the worlds itself, with seeds that neighbouring trainings share.
     envs.venv.seed(seed * SEED_STRIDE)
-    curve = _Curve(advance)
-    begin, cpu = time.perf_counter(), time.process_time()
+    curve, cpu = _Curve(advance), time.process_time()
     model.learn(steps, callback=curve.callback())
     figures = {
-        "task": name,
-        "seed": seed,
         "steps": int(model.num_timesteps),
-        "seconds": time.perf_counter() - begin,
-        "cpu_seconds": time.process_time() - cpu,
         "env_share": envs.seconds / (time.process_time() - cpu),
         "curve": curve.points,
     }
-    meta = {
-        "task": name,
-        "seed": seed,
-        "steps": steps,
-        "command": f"rbl-gym train {name} --steps {steps} --seed {seed}",
-    }
-    return _policy(model, meta), figures
+    return lambda meta: _policy(model, meta), figures
+
+
+def _model(algorithm: str, task: RlTask, envs: Any, seed: int) -> Any:
+    """The algorithm of stable-baselines3 or sb3-contrib, set for the task."""
+    kind = kind_and_outputs(envs.action_space)[0]
+    network: dict[str, Any] = {"net_arch": list(task.hidden)}
+    if kind == "box":
+        network["log_std_init"] = task.log_std_init
+    policy = "MlpPolicy"
+    if algorithm == "maskable-ppo":
+        from sb3_contrib import MaskablePPO  # pyright: ignore[reportMissingImports]
+
+        form = MaskablePPO
+    elif algorithm == "recurrent-ppo":
+        from sb3_contrib import RecurrentPPO  # pyright: ignore[reportMissingImports]
+
+        form, policy = RecurrentPPO, "MlpLstmPolicy"
+        network |= {"lstm_hidden_size": _MEMORY, "net_arch": [_BEHIND]}
+    else:
+        from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+
+        form = PPO
+    with warnings.catch_warnings():
+        # The last batch of a rollout may be a smaller one.
+        warnings.filterwarnings("ignore", "You have specified a mini-batch size")
+        return form(
+            policy,
+            envs,
+            n_steps=task.rollout,
+            batch_size=task.batch_size,
+            n_epochs=task.epochs,
+            gamma=task.gamma,
+            gae_lambda=task.gae_lambda,
+            learning_rate=lambda remaining: task.learning_rate * remaining,
+            policy_kwargs=network,
+            seed=seed,
+            device="cpu",
+        )
 
 
 def _mean_reward(task: RlTask, seed: int) -> float:
@@ -174,14 +255,22 @@ class _Curve:
 
 
 def _policy(model: Any, meta: dict[str, Any]) -> Policy:
-    """The policy network of a PPO model as arrays."""
+    """The policy network of a model as arrays."""
     import torch  # pyright: ignore[reportMissingImports]
+
+    def array(tensor: Any) -> Any:
+        return tensor.detach().numpy().astype(float)
 
     layers = [m for m in model.policy.mlp_extractor.policy_net if isinstance(m, torch.nn.Linear)]
     layers.append(model.policy.action_net)
+    lstm, memory = getattr(model.policy, "lstm_actor", None), None
+    if lstm is not None:
+        reads, recalls, *biases = (array(one) for one in lstm.parameters())
+        memory = Lstm(reads, recalls, sum(biases))
     return Policy(
-        tuple(layer.weight.detach().numpy().astype(float) for layer in layers),
-        tuple(layer.bias.detach().numpy().astype(float) for layer in layers),
+        tuple(array(layer.weight) for layer in layers),
+        tuple(array(layer.bias) for layer in layers),
         kind_and_outputs(model.action_space)[0],
         meta,
+        memory,
     )

@@ -21,7 +21,7 @@ from rbl_gym.placement import search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.learning import evaluation
-from rbl_gym.studies.learning.policies import Policy
+from rbl_gym.studies.learning.policies import AnyPolicy
 from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.worlds.scene import Scene
@@ -71,7 +71,7 @@ class Bodies(NamedTuple):
 
 def transfer_layouts(
     task: RlTask,
-    policies: dict[str, Policy],
+    policies: dict[str, AnyPolicy],
     names: list[str],
     worlds: int,
     repeats: int,

@@ -1,0 +1,137 @@
+"""Policies for any number of anchors, played by numpy: craft that move, links that have sight."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rbl_gym.motion.kinematics import propagate
+from rbl_gym.studies.learning.deep_sets import DeepSets, check_sets
+from rbl_gym.worlds.scene import Scene
+from rbl_gym.wrappers import controllers, craft_tokens, sight_tokens, views
+from rbl_gym.wrappers.situations import action_of, situations
+
+__all__ = ["SET_KINDS", "SetPolicy"]
+
+# What a policy of a kind plays, and the numbers of its network: element, pair, output.
+SET_KINDS: dict[str, tuple[str, tuple[int, int, int]]] = {
+    "craft": ("RBL/MobileAnchors-v0", (craft_tokens.OWN, craft_tokens.PAIR, 2)),
+    "sight": ("RBL/AnchorSelection-v0", (sight_tokens.QUERY, sight_tokens.EVENT, 1)),
+}
+
+
+class SetPolicy(NamedTuple):
+    """A deterministic policy that reads the environment's belief, not its observation.
+
+    Attributes
+    ----------
+    network
+        What is learned.
+    kind
+        ``"craft"``: the network corrects the orbit of `controllers`, for 2 craft or more.
+        ``"sight"``: it tells from what was measured so far which anchors will see the body, and the
+        anchors are chosen greedily by the score to be expected.
+    meta
+        Where it comes from.
+    """
+
+    network: DeepSets
+    kind: str
+    meta: dict[str, Any]
+
+    def player(self) -> Callable[[Any, Any], np.ndarray]:
+        """A function ``(env, observation) -> actions`` that remembers: make one for each episode.
+
+        `env` is the environment of a task, scalar or vector, after `reset` or `step`.
+        """
+        if self.kind == "craft":
+            return _craft_player(self.network)
+        return _Chooser(self.network)
+
+    def check(self) -> None:
+        """A ValueError unless the network is one of its kind."""
+        check_sets(self.network, *SET_KINDS[self.kind][1])
+
+
+def _batched(env: Any, *arrays: np.ndarray) -> list[np.ndarray]:
+    """Arrays of one world or of many, as those of many."""
+    one = env.anchors.ndim == 2
+    return [np.asarray(array)[None] if one else np.asarray(array) for array in arrays]
+
+
+def _mask(env: Any) -> np.ndarray:
+    seen: Mapping[str, np.ndarray] = env.seen
+    mask = seen.get("anchor_mask", np.ones(env.anchors.shape[:-1]))
+    return _batched(env, mask)[0].astype(np.float64)
+
+
+def craft_seen(env: Any) -> craft_tokens.CraftTokens:
+    """What each craft of an environment sees now, arrays (B, M, ...); of a scalar one B is 1."""
+    told = _batched(env, *env.belief[:3], env.twist, env.anchors)
+    reach = np.broadcast_to(views.reach_of_craft(env.world), len(told[0]))
+    return craft_tokens.craft_tokens(*told, _mask(env), reach, env.world.dt)
+
+
+def craft_actions(env: Any, seen: craft_tokens.CraftTokens, own: np.ndarray) -> np.ndarray:
+    """Actions of an environment of level velocities (B, M, 2) in the frames of the craft."""
+    length = np.linalg.norm(own, axis=-1, keepdims=True)
+    velocity = own / np.maximum(length, 1.0)
+    velocity = (np.swapaxes(seen.frames, -1, -2) @ velocity[..., None])[..., 0]
+    (order,) = _batched(env, env.order)
+    actions = np.take_along_axis(velocity, order[..., None], axis=-2).reshape(len(own), -1)
+    return actions if env.anchors.ndim == 3 else actions[0]
+
+
+def _craft_player(network: DeepSets) -> Callable[[Any, Any], np.ndarray]:
+    def play(env: Any, _: Any) -> np.ndarray:
+        seen = craft_seen(env)
+        return craft_actions(env, seen, network(seen.own, seen.pairs, seen.others) + seen.orbit)
+
+    return play
+
+
+class _Chooser:
+    """Chooses anchors greedily by the sight that the network expects, and remembers what it saw."""
+
+    def __init__(self, network: DeepSets) -> None:
+        self._network = network
+        self._chosen: np.ndarray | None = None
+
+    def __call__(self, env: Any, observation: Any) -> np.ndarray:
+        told = _batched(env, *env.belief[:2], env.twist, env.anchors)
+        rotation, translation, twist, anchors = told
+        batch, mask = len(anchors), _mask(env)
+        if self._chosen is None:
+            self._memory = sight_tokens.forgotten(batch, anchors.shape[1])
+        else:
+            sight = _sight(env)
+            self._memory = sight_tokens.remember(self._memory, self._chosen, translation, sight)
+        dt = np.broadcast_to(env.world.dt, batch)
+        _, body = propagate(rotation, translation, twist, dt)
+        middle, half = volumes(env.world, batch)
+        tokens = sight_tokens.sight_tokens(anchors, body, self._memory, middle, half)
+        clear = 1 / (1 + np.exp(-self._network(*tokens)[..., 0]))
+        actions = np.full(mask.shape, -1.0)
+        for rows, situation in situations(env):
+            m = situation.scene.n_anchors
+            likely = clear[rows, :m]
+            quality = likely + (1 - likely) * situation.scene.blocked_information
+            actions[rows, :m] = controllers.greedy(situation, quality)
+        self._chosen = (actions > 0) & (mask > 0)
+        return action_of(env, actions if env.anchors.ndim == 3 else actions[0])
+
+
+def _sight(env: Any) -> np.ndarray:
+    """1 where an anchor saw the body in the last step, else -1."""
+    (links,) = _batched(env, env.seen["links"])
+    (quality,) = _batched(env, env.seen.get("quality", np.ones(env.anchors.shape[:-1])))
+    return np.where(links.any(axis=-1) & (quality > 0.5), 1.0, -1.0)
+
+
+def volumes(world: Any, batch: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and half sizes (B, 3) of the volumes of a scene or of scenes side by side."""
+    scenes = (world,) * batch if isinstance(world, Scene) else world.scenes
+    corners = np.array([one.volume.bounds() for one in scenes])
+    return corners.mean(axis=1), np.maximum(0.5 * (corners[:, 1] - corners[:, 0]), 1.0)

@@ -1,0 +1,168 @@
+"""Scenes and families from files, tasks in other worlds, and every way to train, in a few steps."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from rbl_gym.studies.learning import policies
+from rbl_gym.studies.learning.policies import Policy
+from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
+from rbl_gym.studies.learning.set_policies import SetPolicy
+from rbl_gym.worlds.families import family
+from rbl_gym.worlds.scene_source import read_scene, read_scenes
+from tests.helpers import needs
+
+DRAWN = {"name": "auv_craft", "n_anchors": {"integers": [2, 3]}, "steps": 4}
+TOML = """
+[[scenes]]
+name = "auv_craft"
+steps = 4
+n_anchors = { integers = [2, 3] }
+"""
+
+
+def test_families_from_files(tmp_path):
+    (tmp_path / "one.json").write_text(json.dumps(DRAWN))
+    (tmp_path / "many.json").write_text(json.dumps([DRAWN, "auv_craft"]))
+    (tmp_path / "many.toml").write_text(TOML)
+    (tmp_path / "one.toml").write_text('name = "hall"\nsteps = 7')
+    assert read_scenes(tmp_path / "one.json") == DRAWN
+    assert read_scenes(tmp_path / "many.json") == [DRAWN, "auv_craft"]
+    assert read_scenes(tmp_path / "many.toml") == [DRAWN]
+    assert read_scene(str(tmp_path / "one.toml")) == {"name": "hall", "steps": 7}
+    assert read_scene("hall") == "hall"
+    assert family(read_scenes(tmp_path / "many.json")).n_anchors == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.json", "[{]", r"a\.json: .*line 1 column 3"),
+        ("a.toml", "x = = 1", r"a\.toml: .*line 1, column 5"),
+        ("a.json", "[]", "holds no scenes"),
+        ("a.json", '["hall", {"steps": 3}]', "scene 1 must be a name or a table"),
+        ("a.yaml", "", r"must come from a \.json or \.toml file"),
+    ],
+)
+def test_files_that_hold_no_scenes_are_named(tmp_path, name, text, message):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_scenes(tmp_path / name)
+
+
+def test_a_scene_file_without_a_name_is_refused(tmp_path):
+    (tmp_path / "a.json").write_text('{"steps": 3}')
+    with pytest.raises(ValueError, match="must hold a table with the key 'name'"):
+        read_scene(str(tmp_path / "a.json"))
+
+
+def test_a_task_in_other_worlds_keeps_what_else_it_says():
+    task = rl_task("halls").in_worlds({"name": "hall", "steps": 5})
+    assert task.arguments == {"k": 3, "scene": {"name": "hall", "steps": 5}}
+    assert task.make(2).episode_steps == 5
+    task = rl_task("selection").in_worlds(scenes=["hall"])
+    assert task.family().n_anchors == 12
+    assert rl_task("selection").in_worlds() is rl_task("selection")
+    with pytest.raises(ValueError, match="must not be given beside"):
+        task.in_worlds("hall", ["hall"])
+
+
+def test_a_task_of_one_scene_is_a_family_of_one():
+    assert [one.n_anchors for one in rl_task("mobile-hard").family().corners] == [2]
+
+
+# --- training ---------------------------------------------------------------------------------
+
+FEW = RlTask(
+    "RBL/MobileAnchors-v0", {"scenes": [DRAWN]}, 24, 3, 0.9, num_envs=4, algorithm="set-ppo"
+)
+HALL = RlTask("RBL/AnchorSelection-v0", {"scene": {"name": "hall", "steps": 3}}, 9, 3, num_envs=3)
+MOUNTS = RlTask("RBL/AnchorPlacement-v0", dict(TASKS["mounts"].arguments), 20, 5, num_envs=4)
+
+
+@pytest.mark.parametrize(
+    ("task", "algorithm", "kind"),
+    [
+        (FEW, "set-ppo", "craft"),
+        (HALL, "supervised", "sight"),
+        (HALL, "recurrent-ppo", "box"),
+        (MOUNTS, "maskable-ppo", "discrete"),
+    ],
+)
+@needs("torch", "stable_baselines3", "sb3_contrib")
+def test_every_way_to_train_makes_a_policy_that_plays(monkeypatch, tmp_path, task, algorithm, kind):
+    from rbl_gym.studies.learning import evaluation, sight_training, training
+
+    monkeypatch.setattr(sight_training, "_TRACKS", 3)
+    steps: list[int] = []
+    made = [training.train("mine", task, task.steps, 1, steps.append, algorithm) for _ in range(2)]
+    policy, figures = made[0]
+    assert policy.kind == kind
+    assert policy.meta["algorithm"] == figures["algorithm"] == algorithm
+    assert sum(steps) >= 2 * task.steps
+    for k, (one, _) in enumerate(made):
+        policies.save(one, tmp_path / f"{k}.npz")
+    # The same seed gives the same bytes.
+    assert (tmp_path / "0.npz").read_bytes() == (tmp_path / "1.npz").read_bytes()
+    again = policies.load(tmp_path / "0.npz")
+    assert isinstance(again, SetPolicy if kind in ("craft", "sight") else Policy)
+    told = evaluation.held_out_returns(task, again, 3, seed=0)
+    assert np.isfinite(told["policy_mean_return"])
+
+
+@pytest.mark.parametrize(
+    ("task", "algorithm", "message"),
+    [
+        ("auv_buoys", "set-ppo", r"is for RBL/MobileAnchors-v0, the task is of RBL/AnchorPlace"),
+        ("craft", "supervised", r"is for RBL/AnchorSelection-v0"),
+        ("craft", "maskable-ppo", "is for tasks with discrete actions"),
+        ("craft", "nix", "algorithm must be one of"),
+    ],
+)
+def test_what_cannot_learn_a_task_is_named(task, algorithm, message):
+    from rbl_gym.studies.learning import training
+
+    assert {one.algorithm for one in TASKS.values()} <= set(training.ALGORITHMS)
+    with pytest.raises(ValueError, match=message):
+        training.train(task, rl_task(task), 10, 0, algorithm=algorithm)
+
+
+@needs("torch", "stable_baselines3")
+def test_advantages_by_hand():
+    from rbl_gym.studies.learning import craft_training
+
+    rng, gamma, mixing = np.random.default_rng(0), 0.9, 0.8
+    reward, value = rng.standard_normal((5, 3)), rng.standard_normal((5, 3))
+    last, beyond = rng.random((5, 3)) < 0.3, rng.standard_normal(3)
+    nothing = np.zeros(0)
+    rollout = craft_training._Rollout(*(nothing,) * 7, value=value, reward=reward, last=last)
+    got, target = craft_training._advantages(rollout, beyond, gamma, mixing)
+    scaled = value / (1 - gamma)
+    for world in range(3):
+        for start in range(5):
+            total, factor = 0.0, 1.0
+            for t in range(start, 5):
+                after = scaled[t + 1, world] if t < 4 else beyond[world] / (1 - gamma)
+                after = scaled[t, world] if last[t, world] else after
+                total += factor * (reward[t, world] + gamma * after - scaled[t, world])
+                factor *= gamma * mixing
+                if last[t, world]:
+                    break
+            np.testing.assert_allclose(got[start, world], total)
+    np.testing.assert_allclose(target, (got + scaled) * (1 - gamma))
+
+
+@needs("torch", "stable_baselines3")
+def test_a_new_policy_for_craft_is_the_orbit():
+    from rbl_gym.studies.learning import craft_training
+    from rbl_gym.wrappers import controllers
+
+    env = rl_task("craft").make(4, "Disabled")
+    seen, _ = env.reset(seed=0)
+    network = craft_training._Learner.new().actor.arrays()
+    actions = SetPolicy(network, "craft", {}).player()(env.unwrapped, seen)
+    wanted = controllers.MOBILE["orbit"](env.unwrapped, np.random.default_rng(0))
+    np.testing.assert_allclose(actions, wanted, atol=1e-9)
