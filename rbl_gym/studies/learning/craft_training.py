@@ -24,7 +24,7 @@ __all__ = ["train_craft"]
 
 # Passes over a rollout, samples of an update, the ratio's limit, the highest norm of a gradient.
 _EPOCHS, _SAMPLES, _LIMIT, _CLIP = 4, 640, 0.2, 0.5
-_LEARNING_RATE, _CRITICS_RATE, _STD = 4e-4, 1e-3, 0.3
+_LEARNING_RATE, _CRITICS_RATE, _STD = 6e-4, 1e-3, 0.3
 
 
 class _Rollout(NamedTuple):

@@ -108,9 +108,11 @@ def _placement(steps: int, n_anchors: int, **arguments: Any) -> RlTask:
     return RlTask("RBL/AnchorPlacement-v0", arguments, steps, 4 * n_anchors)
 
 
-# Two craft, which need the most skill, are drawn as often as all other numbers together.
+# Two slow craft need the most skill: they are drawn twice as often as all others together.
+_SLOW_PAIR = {"name": "auv_craft", "n_anchors": 2, "anchor_speed_m_s": 2.0}
 CRAFT = (
-    {"name": "auv_craft", "n_anchors": 2, "anchor_speed_m_s": {"choice": [2.0, 2.0, 4.0]}},
+    _SLOW_PAIR,
+    _SLOW_PAIR,
     {
         "name": "auv_craft",
         "n_anchors": {"integers": [2, 5]},
