@@ -11,8 +11,8 @@ each on several forms of the same worlds:
   `SyncVectorEnv` of scalar ones, each in `RecordEpisodeStatistics`; and
   ``gym.make_vec(vectorization_mode="sync")``.
 
-All have 1024 steps between updates, batches of 512, 10 epochs and two layers of 128. Smaller batches
-would make PPO slower and the ratios smaller.
+All have 1024 steps between updates, batches of 512, 10 epochs and two layers of 128. Smaller
+batches would make PPO slower and the ratios smaller.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ class Clock:
 
 
 def train_sb3(envs: Any, steps: int) -> Cost:
-    """Process time of a whole training of stable-baselines3's PPO, and what the steps took of it."""
+    """Process time of a training by stable-baselines3's PPO, and what the steps took of it."""
     model = PPO(
         "MlpPolicy",
         envs,
@@ -193,7 +193,8 @@ def example_ppo() -> ModuleType:
     """examples/ppo_single_file.py as a module."""
     path = Path(__file__).parents[1] / "examples" / "ppo_single_file.py"
     spec = importlib.util.spec_from_file_location("ppo_single_file", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
