@@ -2,7 +2,7 @@
 
     python benchmarks/training_loops.py [--repeats 3] [--steps 8192] [--json F]
 
-Takes the extra rl. One thread, process time, the whole training: environment and PPO. Two learners,
+Takes the extra rl. One thread, process time, the whole training: environment and PPO. Learners,
 each on several forms of the same worlds:
 
 - stable-baselines3's PPO: `Sb3VecEnv` on the native environment; `make_vec_env` (DummyVecEnv and
@@ -10,6 +10,8 @@ each on several forms of the same worlds:
 - the loop of examples/ppo_single_file.py, which is CleanRL's: the native environment;
   `SyncVectorEnv` of scalar ones, each in `RecordEpisodeStatistics`; and
   ``gym.make_vec(vectorization_mode="sync")``.
+- RLlib's PPO with one local runner, where ray is installed, of 16 worlds: its own vector of scalar
+  ones, and the native environment.
 
 All have 1024 steps between updates, batches of 512, 10 epochs and two layers of 128. Smaller
 batches would make PPO slower and the ratios smaller.
@@ -39,7 +41,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from rbl_gym.wrappers.sb3 import Sb3VecEnv
 
-SIZES = 8, 16, 64
+SIZES, RLLIB_SIZE = (8, 16, 64), 16
 ROLLOUT, BATCH, EPOCHS, LEARNING_RATE = 1024, 512, 10, 1e-3
 BELIEF = {"filter": "iekf", "observation": "flat"}
 
@@ -51,9 +53,13 @@ class Worlds(NamedTuple):
     arguments: dict[str, Any]
     belief: bool = False
 
-    def native(self, n: int) -> VectorEnv[Any, Any, Any]:
-        envs = gym.make_vec(self.env_id, num_envs=n, autoreset_mode="SameStep", **self.arguments)
+    def native(self, n: int, mode: str = "SameStep") -> VectorEnv[Any, Any, Any]:
+        envs = gym.make_vec(self.env_id, num_envs=n, autoreset_mode=mode, **self.arguments)
         return VectorEstimatePose(envs, **BELIEF) if self.belief else envs
+
+    def native_next_step(self, n: int) -> VectorEnv[Any, Any, Any]:
+        """As RLlib resets."""
+        return self.native(n, "NextStep")
 
     def scalar(self) -> gym.Env[Any, Any]:
         env = gym.make(self.env_id, **self.arguments)
@@ -134,6 +140,11 @@ def measured(
             "make_vec sync": job(loop, worlds.make_vec_sync),
         },
     }
+    if n == RLLIB_SIZE and importlib.util.find_spec("ray"):
+        learners["rllib"] = {
+            "native": lambda: train_rllib(worlds.native_next_step, "vector_entry_point", steps),
+            "its own vector": lambda: train_rllib(lambda _: worlds.scalar(), "sync", steps),
+        }
     rows = {}
     for learner, forms in learners.items():
         # The first run of each form compiles, and fills caches.
@@ -187,6 +198,36 @@ def train_sb3(envs: Any, steps: int) -> Cost:
     begin = time.process_time()
     model.learn(steps)
     return time.process_time() - begin, clock.seconds
+
+
+def train_rllib(make: Callable[[int], Any], mode: str, steps: int) -> Cost:
+    """The same of RLlib's PPO with one local runner."""
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.tune.registry import register_env
+
+    register_env("worlds", lambda config: make(config.get("num_envs", 1)))
+    config = (
+        PPOConfig()
+        .environment("worlds")
+        .env_runners(
+            num_env_runners=0, num_envs_per_env_runner=RLLIB_SIZE, gym_env_vectorize_mode=mode
+        )
+        .training(
+            lr=LEARNING_RATE,
+            train_batch_size_per_learner=ROLLOUT,
+            minibatch_size=BATCH,
+            num_epochs=EPOCHS,
+        )
+        .rl_module(model_config={"fcnet_hiddens": [128, 128], "fcnet_activation": "tanh"})
+    )
+    algorithm = config.build_algo()
+    clock = Clock(algorithm.env_runner.env, "step")
+    begin = time.process_time()
+    for _ in range(steps // ROLLOUT):
+        algorithm.train()
+    cost = time.process_time() - begin, clock.seconds
+    algorithm.stop()
+    return cost
 
 
 def example_ppo() -> ModuleType:
