@@ -21,8 +21,8 @@ from tests.helpers import ROOT, needs
 # Its blocks are files of a package: tests/test_your_estimator.py.
 OF_ITS_OWN = "your_estimator"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
-# Libraries that are in no extra of ours: blocks that import them are compiled only.
-FOREIGN = re.compile(r"^from (torchrl|ray)\b", re.MULTILINE)
+# Learners, which take long to train: blocks that import them are compiled only.
+FOREIGN = re.compile(r"^from (torchrl|ray|stable_baselines3|sb3_contrib)\b", re.MULTILINE)
 
 
 def blocks(page: Path, language: str) -> list[str]:
