@@ -1,6 +1,6 @@
 """PPO on scalar environments, as most people make them, against the native vector environments.
 
-    python benchmarks/training_loops.py [--repeats 3] [--steps 8192] [--json F]
+    python benchmarks/training_loops.py [--repeats 3] [--steps 8192] [--rllib 1] [--json F]
 
 Takes the extra rl. One thread, process time, the whole training: environment and PPO. Learners,
 each on several forms of the same worlds:
@@ -10,8 +10,8 @@ each on several forms of the same worlds:
 - the loop of examples/ppo_single_file.py, which is CleanRL's: the native environment;
   `SyncVectorEnv` of scalar ones, each in `RecordEpisodeStatistics`; and
   ``gym.make_vec(vectorization_mode="sync")``.
-- RLlib's PPO with one local runner, where ray is installed, of 16 worlds: its own vector of scalar
-  ones, and the native environment.
+- with --rllib 1 also RLlib's PPO, one local runner of 16 worlds: its own vector of scalar ones, and
+  the native environment.
 
 All have 1024 steps between updates, batches of 512, 10 epochs and two layers of 128. Smaller
 batches would make PPO slower and the ratios smaller.
@@ -100,13 +100,14 @@ Cost = tuple[float, float]
 
 
 def main() -> None:
-    options = side_by_side.arguments(__doc__, repeats=3, steps=8192)
+    options = side_by_side.arguments(__doc__, repeats=3, steps=8192, rllib=0)
     torch.set_num_threads(1)
     example = example_ppo()
     result: dict[str, dict[str, dict[str, float]]] = {}
     for task, worlds in TASKS.items():
         for n in SIZES:
-            rows = measured(worlds, n, options.steps, options.repeats, example)
+            with_rllib = bool(options.rllib) and n == RLLIB_SIZE
+            rows = measured(worlds, n, options.steps, options.repeats, example, with_rllib)
             result[f"{task}, {n}"] = rows
             for form, row in rows.items():
                 print(
@@ -119,7 +120,7 @@ def main() -> None:
 
 
 def measured(
-    worlds: Worlds, n: int, steps: int, repeats: int, example: ModuleType
+    worlds: Worlds, n: int, steps: int, repeats: int, example: ModuleType, with_rllib: bool
 ) -> dict[str, dict[str, float]]:
     """Seconds of every form, the share of the environment, and the ratio to the native form."""
 
@@ -140,7 +141,7 @@ def measured(
             "make_vec sync": job(loop, worlds.make_vec_sync),
         },
     }
-    if n == RLLIB_SIZE and importlib.util.find_spec("ray"):
+    if with_rllib:
         learners["rllib"] = {
             "native": lambda: train_rllib(worlds.native_next_step, "vector_entry_point", steps),
             "its own vector": lambda: train_rllib(lambda _: worlds.scalar(), "sync", steps),
