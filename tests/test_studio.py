@@ -15,6 +15,7 @@ from rbl_gym.placement.problem import PlacementTask
 from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studio import files, maps
 from rbl_gym.studio.figures import body_figures, figures, usual_scores
+from rbl_gym.studio.panel import Shown, headline, length, status
 from rbl_gym.studio.rays import under_pointer
 from rbl_gym.studio.searches import add_best, optimise
 from rbl_gym.studio.state import (
@@ -293,6 +294,24 @@ def test_figures_follow_the_layout(warehouse):
     np.testing.assert_allclose(
         figures(start, few=True).zones[0].share, before.zones[0].share, atol=0.2
     )
+
+
+def test_the_panel_shows_names_as_text(warehouse):
+    evil = "<img src=x onerror=alert(1)> {1+1}"
+    zones = tuple(dataclasses.replace(z, name=evil) for z in warehouse.world.base.zones)
+    start = open_state(dataclasses.replace(warehouse.world.base, zones=zones), warehouse.anchors)
+    shown = Shown(start, figures(start), maps.slice_map(start), {"usual": None}, 2, 0.5, evil)
+    for page in (headline(shown), status(shown)):
+        assert "<img" not in page
+        assert "&lt;img" in page
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"),
+    [(0.0031, "3.1 mm"), (0.0999, "10.0 cm"), (1.234, "1.23 m"), (12.34, "12.3 m"), (250, "250 m")],
+)
+def test_lengths_are_read_easily(metres, text):
+    assert length(metres) == text
 
 
 # --- the pointer -----------------------------------------------------------------------------

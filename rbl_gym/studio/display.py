@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from rbl_gym.studio import files, moving_view, scene_view
 from rbl_gym.studio.panel import Panel, Shown
 from rbl_gym.studio.state import State
 
+# Size at which the body is seen well: shares of the extents of the room and of all zones.
+_BODY, _OF_ZONES = 0.03, 0.12
 # A message goes away after so long, seconds.
 _MESSAGE_S = 6.0
 
@@ -39,11 +43,14 @@ class Display:
         self._server, scene = server, server.scene
         problem = start.world.problem
         extent = scene_view.extent_of(problem)
+        zones = float(np.ptp(problem.corners(), axis=0).max())
         scene_view.set_camera(server, problem)
         scene_view.draw_room(server, problem)
         self._map = moving_view.MapView(scene)
         self._zones = moving_view.ZoneView(scene, problem.zones)
-        self._body = moving_view.BodyView(scene, extent, actions["drag_body"])
+        self._body = moving_view.BodyView(
+            scene, min(_BODY * extent, _OF_ZONES * zones), actions["drag_body"]
+        )
         self._anchors = moving_view.AnchorView(scene, extent, actions["drag"], actions["select"])
         self.panel = Panel(server.gui, start, files.default_name(problem), actions, has_report)
 

@@ -25,6 +25,8 @@ _LEAST_CONTRAST = 1.3
 _KEPT = 1.5
 # Pixels along a cell; the browser smooths the picture too. Shades of the colours.
 _ZOOM, _SHADES = 6, 256
+# Of the map, up to 255: what lies below it is seen through it.
+_OPACITY = 215
 # Within and beyond a requirement (Okabe and Ito): told apart by everyone.
 WITHIN, BEYOND = (86, 180, 233), (213, 94, 0)
 # Green for small errors over yellow to red for large ones, light enough for black lines.
@@ -174,7 +176,7 @@ def picture(found: SliceMap) -> np.ndarray:
         shown[..., :3] = np.where((fine <= 1)[..., None], WITHIN, BEYOND)
     else:
         shown[..., :3] = colours(fine, found.limits)
-    shown[..., 3] = np.where(np.repeat(np.repeat(free, zoom, 0), zoom, 1), 235, 0)
+    shown[..., 3] = np.where(np.repeat(np.repeat(free, zoom, 0), zoom, 1), _OPACITY, 0)
     return shown
 
 

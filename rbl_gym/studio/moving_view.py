@@ -23,8 +23,10 @@ VERDICTS = {
     "no requirement": (73, 80, 87),
 }
 SIGNS = {"pass": "\u2713", "fail": "\u2717", "undecided": "?", "no requirement": ""}
-# Radius of an anchor, and least size of the body: shares of the room's largest extent.
-_ANCHOR, _BODY = 0.013, 0.03
+# Radius of an anchor: a share of the room's largest extent.
+_ANCHOR = 0.013
+# More anchors than so many are drawn smaller.
+_FEW = 16
 # A link that keeps this share of its information counts as seen.
 SEEN = 0.5
 
@@ -94,15 +96,14 @@ class BodyView:
 
     Parameters
     ----------
-    scene, extent
-        Where it is drawn, and the largest extent of the room, metres: the body is drawn so large
-        that it can be seen.
+    scene, least_m
+        Where it is drawn, and how large at least, metres, so that it can be seen.
     dragged
         Called with 0, the phase, the camera's place (3,) and a point (3,) under the pointer.
     """
 
-    def __init__(self, scene: Any, extent: float, dragged: Dragged) -> None:
-        self._scene, self._extent, self._dragged = scene, extent, dragged
+    def __init__(self, scene: Any, least_m: float, dragged: Dragged) -> None:
+        self._scene, self._least_m, self._dragged = scene, least_m, dragged
         self._frame = scene.add_frame("/body", show_axes=False)
         self._tags: Any = None
         self._links: Any = None
@@ -122,10 +123,10 @@ class BodyView:
 
     def _add(self, tags: FloatArray) -> None:
         size = float(np.ptp(tags, axis=0).max())
-        spots = max(1.0, _BODY * self._extent / max(size, 1e-9)) * tags
+        spots = max(1.0, self._least_m / max(size, 1e-9)) * tags
         arms = np.stack([np.zeros_like(spots), spots], axis=1)
         lines(self._scene, "/body/arms", arms, BODY, 2.5)
-        radius = 0.5 * max(_BODY * self._extent, size)
+        radius = 0.5 * max(self._least_m, size)
         self._scene.add_point_cloud(
             "/body/tags", spots.astype(np.float32), BODY, point_size=0.3 * radius,
             point_shape="circle", precision="float32",
@@ -172,9 +173,13 @@ class AnchorView:
             self._looks.pop()
         while len(self.balls) < len(anchors):
             self._add(len(self.balls))
-        up = np.array([0.0, 0.0, 1.3 * self._radius])
+        # Many are drawn smaller.
+        size = round(min(1.0, (_FEW / len(anchors)) ** 0.5), 2)
+        up = np.array([0.0, 0.0, 1.3 * size * self._radius])
         for k, place in enumerate(anchors):
             ball, label = self.balls[k], self._labels[k]
+            if ball.scale != size:
+                ball.scale, label.font_screen_scale = size, max(size, 0.75)
             if (np.asarray(ball.position) != place).any():
                 ball.position = tuple(place)
                 label.position = tuple(place + up)

@@ -11,13 +11,14 @@ import numpy as np
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.polygons import ears
-from rbl_gym.geometry.regions import Walls
+from rbl_gym.geometry.regions import Shell, Walls
 from rbl_gym.placement.building import Problem
 
 # Width of the panel, pixels.
 PANEL = 310
 INK = (52, 58, 64)
 WALL, FLOOR, GRID, RACK = (206, 212, 218), (241, 243, 245), (222, 226, 230), (173, 181, 189)
+EDGE = (173, 181, 189)
 # Where the camera stands, its vertical field of view, and how much of the window is filled.
 _TOWARDS = np.array([-0.25, -1.0, 0.85])
 _FOV_RAD, _FILLED = 0.7, 0.92
@@ -97,18 +98,12 @@ def view_axes(forward: FloatArray) -> FloatArray:
 
 def draw_room(server: Any, problem: Problem) -> None:
     """Floor, walls, obstacles and where anchors may stand."""
-    scene, extent = server.scene, extent_of(problem)
+    scene = server.scene
     scene.configure_default_lights(cast_shadow=False)
     scene.add_light_ambient("/light", intensity=1.2)
     low, high = corners(problem)
-    flat = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-    floor = np.column_stack([flat, np.full(4, low[2] - 0.002 * extent)])
-    scene.add_mesh_simple(
-        "/room/floor", floor, np.array([[0, 1, 2], [0, 2, 3]]), color=FLOOR, side="double",
-        cast_shadow=False, receive_shadow=False,
-    )  # fmt: skip
-    step = next(s for s in (1, 2, 5, 10, 50, 100, 1000, 1e9) if extent / s < 50)
-    lines(scene, "/room/grid", _grid(low, high, step, floor[0, 2] + 3e-4 * extent), GRID, 1)
+    if not isinstance(problem.mounts, Shell):
+        _draw_floor(scene, low, high)
     if isinstance(problem.mounts, Walls):
         faces = _room_faces(*problem.mounts.bounds())
         # Seen from the inside alone: the walls between camera and room are left out.
@@ -124,8 +119,12 @@ def draw_room(server: Any, problem: Problem) -> None:
                 "/room/mounts", vertices, triangles, color=(116, 143, 252), opacity=0.3,
                 side="double", cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
+    elif isinstance(problem.mounts, Shell):
+        for name in ("inner_m", "outer_m"):
+            circles = _circles(getattr(problem.mounts, name))
+            lines(scene, f"/room/{name}", circles, EDGE, 1)
     else:
-        lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), (173, 181, 189), 1)
+        lines(scene, "/room/edges", box_edges(*problem.mounts.bounds()), EDGE, 1)
     tall = low[2] + _TALL * (high - low)[2]
     for name, opacity, which in (("racks", 0.85, False), ("walls-within", 0.3, True)):
         solids = [solid for solid in solids_of(problem) if (solid[2] > tall) == which]
@@ -134,6 +133,29 @@ def draw_room(server: Any, problem: Problem) -> None:
                 f"/room/{name}", *mesh_of(solids), color=RACK, opacity=opacity,
                 flat_shading=True, side="double",
             )  # fmt: skip
+
+
+def _draw_floor(scene: Any, low: FloatArray, high: FloatArray) -> None:
+    """A floor with a grid of whole metres below all of it."""
+    extent = float((high - low).max())
+    flat = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    floor = np.column_stack([flat, np.full(4, low[2] - 0.002 * extent)])
+    scene.add_mesh_simple(
+        "/room/floor", floor, np.array([[0, 1, 2], [0, 2, 3]]), color=FLOOR, side="double",
+        cast_shadow=False, receive_shadow=False,
+    )  # fmt: skip
+    step = next(s for s in (1, 2, 5, 10, 50, 100, 1000, 1e9) if extent / s < 50)
+    lines(scene, "/room/grid", _grid(low, high, step, floor[0, 2] + 3e-4 * extent), GRID, 1)
+
+
+def _circles(radius: float) -> FloatArray:
+    """Segments (S, 2, 3) of three great circles of a sphere about the origin."""
+    angle = np.linspace(0, 2 * np.pi, 97)
+    found = []
+    for axis in range(3):
+        points = np.insert(np.stack([np.cos(angle), np.sin(angle)], axis=1), axis, 0.0, axis=1)
+        found.append(np.stack([points[:-1], points[1:]], axis=1))
+    return radius * np.concatenate(found)
 
 
 def lines(scene: Any, name: str, segments: FloatArray, colour: Any, width: float) -> Any:
