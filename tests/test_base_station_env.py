@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils import seeding
 from gymnasium.utils.env_checker import check_env
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rbl_gym import bounds
 from rbl_gym.bounds import doa
@@ -32,6 +34,13 @@ WORLDS: dict[str, dict[str, Any]] = {
     "fixed station": {"scene": {"steps": 5, "anchor_speed_m_s": 0}},
     "coarse": {"scene": {"steps": 5}, "angle_std_rad": 0.05, "reward": "none"},
 }
+DRAWN: list[Any] = [
+    {"speed_m_s": {"uniform": [1.0, 4.0]}, "steps": {"integers": [3, 5]}},
+    {"tags": [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2]], "dt": 0.2, "steps": 4},
+    {"anchor_speed_m_s": 0.0, "steps": 3},
+]
+WORLDS["drawn"] = {"scenes": DRAWN}
+WORLDS["drawn, coarse"] = {"scenes": DRAWN, "angle_std_rad": 0.05, "reward": "none"}
 every_world = pytest.mark.parametrize("kind", WORLDS)
 
 
@@ -51,7 +60,8 @@ def test_world_i_of_a_vector_is_the_scalar_environment_seeded_alike(kind):
     vector = BaseStationVectorEnv(3, **WORLDS[kind])
     peer = peer_of(BaseStationEnv, AutoresetMode.NEXT_STEP, 3, WORLDS[kind])
     steps = assert_steps_alike(vector, peer, 9, 7, {"rtol": 1e-9, "atol": 1e-9})
-    assert [truncated.all() for _, _, _, truncated, _ in steps].count(True) == 1
+    if "scenes" not in WORLDS[kind]:
+        assert [truncated.all() for _, _, _, truncated, _ in steps].count(True) == 1
 
 
 def test_angles_and_score_by_hand():
@@ -181,3 +191,58 @@ def test_filters_of_a_vector_are_those_of_scalar_environments(mode):
 def test_filters_of_ranges_are_refused():
     with pytest.raises(ValueError, match="filter 'kf' has no option 'measurement'"):
         EstimatePose(gym.make(ID), "kf")
+
+
+# --- worlds drawn anew ------------------------------------------------------------------------
+
+
+def test_a_drawn_episode_equals_that_of_its_scene_alone():
+    seen = set()
+    for seed in range(8, 28):
+        env = BaseStationEnv(scenes=DRAWN)
+        observation, info = env.reset(seed=seed)
+        told = json.loads(info["scene"])
+        seen.add((told.get("dt", 0.1), told["steps"]))
+        alone = BaseStationEnv(scene=told)
+        generator, _ = seeding.np_random(seed)
+        assert env.family is not None
+        env.family.draw(generator)
+        alone.np_random = generator
+        want, _ = alone.reset()
+        for step in range(told["steps"]):
+            np.testing.assert_array_equal(observation.pop("tags"), alone.scene.body)
+            assert_same(observation, want, rtol=1e-12)
+            action = np.full(3, 0.5) if env.scene.anchor_speed_m_s > 0 else 0
+            observation, reward, _, over, _ = env.step(np.full(3, 0.5))
+            want, expected, _, ended, _ = alone.step(action)
+            assert reward == pytest.approx(expected, rel=1e-12)
+            assert over == ended == (step == told["steps"] - 1)
+    assert len(seen) > 3
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("observation", ["dict", "flat", "tokens"])
+def test_filters_run_in_drawn_worlds(mode, observation):
+    native: Any = VectorEstimatePose(
+        BaseStationVectorEnv(3, scenes=DRAWN, autoreset_mode=mode), observation=observation
+    )
+    peer = SyncVectorEnv(
+        [lambda: EstimatePose(BaseStationEnv(scenes=DRAWN), observation=observation)] * 3,
+        autoreset_mode=mode,
+    )
+    assert_steps_alike(native, peer, 8, 3, {"rtol": 2e-5, "atol": 2e-5})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"scenes": DRAWN, "scene": {"steps": 3}}, "scene must not be given beside scenes"),
+        ({"scenes": ["hall"]}, r"scenes\[0\] must be a dict of changes, got 'hall'"),
+        ({"scenes": []}, "scenes must hold at least one scene"),
+        ({"scenes": [{}, {"tags": [[0, 0, 0]]}]}, r"bodies of one number of tags, got \[1, 4\]"),
+        ({"scenes": {"n_anchors": 2, "anchors": None}}, "scene must have n_anchors = 1, got 2"),
+    ],
+)
+def test_wrong_families_are_named(arguments, named):
+    with pytest.raises(ValueError, match=named):
+        BaseStationEnv(**arguments)

@@ -168,6 +168,8 @@ def family_of(env: Any) -> SceneFamily | None:
 
 def unpadded(observation: Mapping[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
     """What a filter reads of the anchors and tags of a scene of a family."""
+    if "angles" in observation:
+        return measured_of(observation)
     told = {
         key: observation[key]
         for key in ("ranges", "links", "anchors", "quality", "twist")

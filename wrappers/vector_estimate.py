@@ -68,7 +68,8 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             self._scene = env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
         self._reward = reward_of(reward)
         self._viewer = viewer_of(observation)
-        self._stacks = self._varied and _takes_stacks(env, self._scene, *self._named)
+        ranged = "ranges" in env.single_observation_space  # pyright: ignore[reportOperatorIssue]
+        self._stacks = self._varied and ranged and _takes_stacks(env, self._scene, *self._named)
         self._parts = self._parted()
         self._state: Any = None
         self._belief: PoseBelief | None = None

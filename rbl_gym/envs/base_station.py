@@ -14,18 +14,19 @@ from rbl_gym import rendering
 from rbl_gym.bounds import posterior
 from rbl_gym.checks import BoolArray, FloatArray, check_number, check_one_of
 from rbl_gym.envs.batch import BatchEnv
-from rbl_gym.envs.episodes import EpisodeStore
+from rbl_gym.envs.episodes import EpisodeStore, FamilyStore
 from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.envs.tracking import REWARDS, action_space, observation_space
 from rbl_gym.geometry import bodies
 from rbl_gym.measurements import bearing
 from rbl_gym.measurements.ranging import LinkModel
-from rbl_gym.worlds import scenes, simulation
+from rbl_gym.worlds import families, scenes, simulation
+from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 
 ANGLE_STD_RAD = math.radians(0.1)
 # What the info of a reset holds besides.
-_PRIOR = ("prior_rotation", "prior_translation", "prior_covariance")
+_PRIOR = ("prior_rotation", "prior_translation", "prior_covariance", "scene")
 # The world, as changes of a scene; it keeps the body on the station's side y > 0.
 WORLD: dict[str, Any] = {
     "name": "drone_yard",
@@ -50,11 +51,31 @@ def world(scene: Mapping[str, Any] | None) -> Scene:
     changes = {} if scene is None else scene
     if not isinstance(changes, Mapping):
         raise ValueError(f"scene must be a dict of changes, got {scene!r:.80}")
-    found = scenes.get({**WORLD, **changes})
+    return checked_world(scenes.get({**WORLD, **changes}))
+
+
+def checked_world(found: Scene) -> Scene:
+    """The scene, or a ValueError as of `world`."""
     if found.n_anchors != 1:
         raise ValueError(f"scene must have n_anchors = 1, got {found.n_anchors}")
     if found.links != LinkModel() or found.weakens:
         raise ValueError("scene must have neither links that fail nor obstacles")
+    return found
+
+
+def family_of_worlds(members: Any) -> SceneFamily:
+    """The family of worlds that changes of `WORLD` make, with laws; or a ValueError."""
+    changes = families.members_of(members)
+    for index, change in enumerate(changes):
+        if not isinstance(change, Mapping):
+            raise ValueError(f"scenes[{index}] must be a dict of changes, got {change!r:.80}")
+    found = SceneFamily(tuple({**WORLD, **change} for change in changes))
+    counts = {len(checked_world(one).tags) for one in found.corners}
+    if len(counts) > 1:
+        raise ValueError(
+            f"scenes must have bodies of one number of tags, got {sorted(counts)}: angles have no "
+            "masks"
+        )
     return found
 
 
@@ -74,68 +95,110 @@ class BaseStationVectorEnv(BatchEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        scenes: Any = None,
     ) -> None:
-        self.scene = world(scene)
+        if scenes is not None and scene is not None:
+            raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
+        self.family = None if scenes is None else family_of_worlds(scenes)
+        self._scene = world(scene) if self.family is None else self.family.corners[0]
+        worlds = self.family or self._scene
         self.noise = bearing.AngleNoise(check_number("angle_std_rad", angle_std_rad, low=1e-12))
         self.reward_mode = check_one_of("reward", reward, REWARDS)
-        shape = (2, len(self.scene.tags))
-        of_ranges = observation_space(self.scene)
+        shape = (2, len(self._scene.tags))
+        of_ranges = observation_space(worlds)
         place = of_ranges["anchors"]
         assert isinstance(place, spaces.Box)
-        self.single_observation_space = spaces.Dict(
-            {
-                "angles": spaces.Box(0.0, np.pi, shape, np.float64),
-                "station": spaces.Box(place.low[0], place.high[0], dtype=np.float64),
-                "twist": of_ranges["twist"],
-            }
+        observed: dict[str, spaces.Space[Any]] = {
+            "angles": spaces.Box(0.0, np.pi, shape, np.float64),
+            "station": spaces.Box(place.low[0], place.high[0], dtype=np.float64),
+            "twist": of_ranges["twist"],
+        }
+        if self.family is not None:
+            observed["tags"] = of_ranges["tags"]
+        self.single_observation_space = spaces.Dict(observed)
+        self.single_action_space = action_space(worlds)
+        self.film = (
+            rendering.film_of(render_mode, self._scene, "base station")
+            if self.family is None
+            else rendering.film_of_many(render_mode, self._scene_of, worlds.steps)
         )
-        self.single_action_space = action_space(self.scene)
-        self.film = rendering.film_of(render_mode, self.scene, "base station")
-        self._configure(num_envs, render_mode, self.scene.steps, max_episode_steps, autoreset_mode)
-        self._episodes = EpisodeStore(self.scene, num_envs)
-        self._normals = np.zeros((num_envs, self.scene.steps + 1, *shape))
+        self._configure(num_envs, render_mode, worlds.steps, max_episode_steps, autoreset_mode)
+        self._longest = self.steps_limit
+        self._episodes = (
+            EpisodeStore(self._scene, num_envs)
+            if self.family is None
+            else FamilyStore(self.family, num_envs)
+        )
+        self._normals = np.zeros((num_envs, worlds.steps + 1, *shape))
         self._stations = np.zeros((num_envs, 1, 3))
         self._angles = np.zeros((num_envs, *shape))
         self._information = np.zeros((num_envs, 6, 6))
         self._score_m = np.zeros(num_envs)
         self._at: simulation.Motion | None = None
 
+    @property
+    def episode_steps(self) -> int:
+        """Steps of an episode, of a family those of the longest."""
+        return self._longest
+
+    @property
+    def scene(self) -> Scene:
+        """The scene; of a family that of world 0 now."""
+        return self._scene if self.family is None else self._scene_of(0)
+
+    @property
+    def world(self) -> Any:
+        """The scene; of a family those of the worlds now, side by side."""
+        return self._episodes.stack if isinstance(self._episodes, FamilyStore) else self._scene
+
+    def _scene_of(self, row: int) -> Scene:
+        return self.world.scenes[row]
+
     def _restart(
         self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
     ) -> dict[str, np.ndarray]:
         start = self._episodes.begin(chosen, generators)
+        if self.family is not None:
+            self.steps_limit = np.minimum(self.world.arrays.steps, self._longest)
         for row, generator in zip(chosen, generators, strict=True):
-            generator.standard_normal(out=self._normals[row])
+            steps = self._scene.steps if self.family is None else self._scene_of(row).steps
+            generator.standard_normal(out=self._normals[row, : steps + 1])
         self._stations[chosen] = start["anchors"]
         self._information[chosen] = np.linalg.inv(start["prior_covariance"])
         self._measure(chosen, 0.0)
-        return {name: start[name] for name in _PRIOR}
+        return {name: start[name] for name in _PRIOR if name in start}
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
         rows = slice(None) if moving.all() else np.flatnonzero(moving)
-        if self.scene.anchor_speed_m_s > 0:
+        if self.family is not None and self.family.anchor_speed_m_s > 0:
+            self._stations[rows] = self.world.move_anchors(self._stations, actions)[rows]
+        elif self.family is None and self._scene.anchor_speed_m_s > 0:
             self._stations[rows] = simulation.move_anchors(
-                self.scene, self._stations[rows], actions[rows]
+                self._scene, self._stations[rows], actions[rows]
             )
-        self._measure(rows, self.scene.dt)
+        dt = self.world.dt
+        self._measure(rows, dt if self.family is None else dt[rows])
         reward = np.zeros(self.num_envs)
         if self.reward_mode == "bound":
             reward = -np.log(self._score_m)
         return reward, np.zeros(self.num_envs, dtype=np.bool_)
 
-    def _measure(self, rows: np.ndarray | slice, step: float) -> None:
+    def _measure(self, rows: np.ndarray | slice, step: Any) -> None:
         """Angles of some worlds at their epochs, and what they tell after `step` seconds."""
         self._at = self._episodes.motion_at(self._epochs)
         rotation, translation, twist = (field[rows] for field in self._at)
         station, std = self._stations[rows], self.noise.std_rad
         normals = self._normals[np.arange(self.num_envs), self._epochs][rows]
+        body, process = self.world.body, self.world.process.std()
+        if self.family is not None:
+            body, process = body[rows], process[rows]
         self._angles[rows] = bearing.sample(
-            rotation, translation, self.scene.body, station[:, 0], normals, std
+            rotation, translation, body, station[:, 0], normals, std
         )
         if self.reward_mode == "bound":
             information, score = posterior.step_of_angles(
-                self._information[rows], twist, step, self.scene.process.std(), station[:, 0],
-                self.scene.body, rotation, translation, std,
+                self._information[rows], twist, step, process, station[:, 0], body, rotation,
+                translation, std,
             )  # fmt: skip
             if not math.isfinite(np.vdot(score, score)):
                 raise ValueError("the information about the pose is singular or not finite")
@@ -148,11 +211,12 @@ class BaseStationVectorEnv(BatchEnv):
         return self._at
 
     def _observe(self) -> dict[str, np.ndarray]:
-        return {
+        told = {
             "angles": self._angles.copy(),
             "station": self._stations[:, 0].copy(),
             "twist": self._seen.twist.copy(),
         }
+        return told if self.family is None else {**told, "tags": self.world.body.copy()}
 
     def _inform(self) -> dict[str, np.ndarray]:
         info = {
@@ -220,6 +284,11 @@ class BaseStationEnv(ScalarEnv):
     The wrapper `EstimatePose` runs the iterated EKF on the angles.
     `scene`: changes of the world (`WORLD`), see `rbl_gym.worlds.scenes.get`; its noise of ranges is not
     used. `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``.
+    `scenes` in place of `scene`: a list of such changes, or one, with laws
+    (`rbl_gym.worlds.families.SceneFamily`); every reset draws a world, as
+    ``scenes={"speed_m_s": {"uniform": [1, 4]}}``. All bodies have one number of tags. The
+    observation then has `tags` (N, 3), metres, body frame; `info["scene"]` of the reset is JSON,
+    the overrides that were drawn.
 
     ## Version history
     * v0: first version.
@@ -233,8 +302,16 @@ class BaseStationEnv(ScalarEnv):
         angle_std_rad: float = ANGLE_STD_RAD,
         reward: str = "bound",
         render_mode: str | None = None,
+        scenes: Any = None,
     ) -> None:
-        self._configure(render_mode, scene=scene, angle_std_rad=angle_std_rad, reward=reward)
+        self._configure(
+            render_mode, scene=scene, angle_std_rad=angle_std_rad, reward=reward, scenes=scenes
+        )
+
+    @property
+    def family(self) -> SceneFamily | None:
+        """What every reset draws a world of; None: there is one."""
+        return self._batch.family
 
     @property
     def scene(self) -> Scene:

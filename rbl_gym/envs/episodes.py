@@ -146,6 +146,11 @@ class FamilyStore:
             if field is not None:
                 row[tuple(slice(size) for size in field.shape)] = field
 
+    def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
+        """The motion of all worlds, each at its epoch (B,); copies."""
+        where = epochs, np.arange(len(epochs))
+        return simulation.Motion(*(field[where] for field in self._timed[:3]))
+
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
         """All worlds, each at its epoch (B,); random numbers not to be written to."""
         where = epochs, np.arange(len(epochs))
