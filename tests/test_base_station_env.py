@@ -217,7 +217,7 @@ def test_a_drawn_episode_equals_that_of_its_scene_alone():
             want, expected, _, ended, _ = alone.step(action)
             assert reward == pytest.approx(expected, rel=1e-12)
             assert over == ended == (step == told["steps"] - 1)
-    assert len(seen) > 3
+    assert len(seen) >= 3
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
