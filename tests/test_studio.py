@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import threading
 
 import numpy as np
@@ -178,6 +179,20 @@ def test_a_state_opens_with_fixed_anchors_and_refuses_illegal_ones(room):
         open_state(problem, room.anchors * np.where(np.arange(6) == 1, 0.5, 1.0)[:, None])
     with pytest.raises(ValueError, match="3 to 256"):
         open_state(problem, room.anchors[:2])
+
+
+def test_a_first_layout_has_no_two_anchors_at_one_place():
+    pytest.importorskip("shapely")
+    points = [[x, y, 3.0] for x in (0.0, 6.0) for y in (0.0, 4.0)]
+    tables = {
+        "mounts": [{"kind": "points", "points": points}],
+        "anchors": {"number": 4},
+        "region": {"low": [1, 1, 0.5], "high": [5, 3, 2]},
+        "body": {"shape": "octahedron"},
+        "noise": {"floor_m": 0.1},
+    }
+    start = open_state(scene_files.of_mapping(tables))
+    assert sorted(start.anchors.tolist()) == points
 
 
 # --- knobs -----------------------------------------------------------------------------------
@@ -364,6 +379,19 @@ def test_losses_of_walls_are_saved_with_them(tmp_path):
     scene_path, _ = files.save(start, scene_files.load(office), tmp_path, "office")
     again = open_state(scene_files.problem(str(scene_path)))
     assert again.score == pytest.approx(start.score, rel=1e-9)
+
+
+def test_a_saved_scene_finds_the_drawing_behind_it(room, tmp_path):
+    tables = files.tables_of(room.world.base)
+    (tmp_path / "plans").mkdir()
+    tables["plan"] = {"image": "floor.png", "metres_per_pixel": 0.02}
+    problem = scene_files.of_mapping({**tables, "anchors": {**tables["anchors"], "number": 6}},
+                                     folder=tmp_path / "plans")  # fmt: skip
+    start = open_state(problem, room.anchors)
+    scene_path, _ = files.save(start, tables, tmp_path / "out", "x")
+    found = scene_files.problem(str(scene_path)).plan
+    assert found is not None
+    assert os.path.normpath(str(found.image)) == str(tmp_path / "plans" / "floor.png")
 
 
 @pytest.mark.parametrize("name", ["../x", "a/b", "", ".", "..", "a\\b", "x" * 90, "/etc/x", "a\n"])

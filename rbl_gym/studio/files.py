@@ -71,7 +71,9 @@ def save(state: State, tables: Mapping[str, Any], folder: Path, name: str) -> li
     """
     stem = owned(folder, name)
     scene, layout = stem.with_name(f"{stem.name}.toml"), stem.with_name(f"{stem.name}.csv")
-    replace(scene, lambda path: path.write_text(scene_text(state, tables), encoding="utf-8"))
+    replace(
+        scene, lambda path: path.write_text(scene_text(state, tables, folder), encoding="utf-8")
+    )
     replace(layout, lambda path: write_layout(state.problem, state.anchors, str(path)))
     return [scene, layout]
 
@@ -80,7 +82,8 @@ def autosave(state: State, tables: Mapping[str, Any], folder: Path) -> Path:
     """Keep the layout as it is in NAME-autosave.toml. Arguments as `save`."""
     stem = owned(folder, default_name(state.problem) + _AUTOSAVE)
     path = stem.with_name(f"{stem.name}.toml")
-    replace(path, lambda p: p.write_text(scene_text(state, tables), encoding="utf-8"))
+    text = scene_text(state, tables, folder)
+    replace(path, lambda draft: draft.write_text(text, encoding="utf-8"))
     return path
 
 
@@ -157,8 +160,8 @@ def replace(path: Path, write: Callable[[Path], Any]) -> None:
 # --- the scene file --------------------------------------------------------------------------
 
 
-def scene_text(state: State, tables: Mapping[str, Any]) -> str:
-    """The scene file (TOML) of a state: `tables` with its anchors and its knobs."""
+def scene_text(state: State, tables: Mapping[str, Any], folder: Path) -> str:
+    """The scene file (TOML) of a state, in a folder: `tables` with its anchors and its knobs."""
     anchors = state.anchors.tolist()
     head = [
         HEAD,
@@ -171,6 +174,12 @@ def scene_text(state: State, tables: Mapping[str, Any]) -> str:
         "number": len(anchors),
         "fixed": anchors,
     }
+    plan = state.world.base.plan
+    if plan is not None and "plan" in tables:
+        # Paths of a file are relative to where it is.
+        paths = {key: getattr(plan, key) for key in ("image", "drawing")}
+        found = {key: os.path.relpath(path, folder) for key, path in paths.items() if path}
+        changed["plan"] = {**tables["plan"], **found}
     return to_toml(_with_knobs(changed, state), head)
 
 

@@ -158,17 +158,20 @@ def open_state(problem: Problem, anchors: FloatArray | None = None) -> State:
 
 
 def _first_layout(world: World) -> FloatArray:
-    """The best of the usual layouts whose anchors are legal; the fixed anchors come first."""
+    """The best of the usual layouts whose anchors are legal and apart; the fixed ones are first."""
     problem, fixed = world.problem, world.problem.fixed
-    found = []
-    for anchors in design.usual_layouts(problem, 0).values():
-        anchors = np.concatenate([fixed, anchors[: len(anchors) - len(fixed)]])
-        if world.setting.legal(anchors[len(fixed) :]).all():
-            found.append(anchors)
-    if not found:
-        drawn = design.design.free_candidates(problem, np.random.default_rng(0), 4)
-        found = [np.concatenate([fixed, drawn[: problem.n_anchors - len(fixed)]])]
-    return min(found, key=world.score)
+    count = problem.n_anchors - len(fixed)
+    drawn = design.design.free_candidates(problem, np.random.default_rng(0), max(count, 4))
+    usual = [anchors[:count] for anchors in design.usual_layouts(problem, 0).values()]
+    found = [np.concatenate([fixed, anchors]) for anchors in usual]
+    found = [layout for layout in found if _is_proper(world, layout, len(fixed))]
+    return min(found, key=world.score) if found else np.concatenate([fixed, drawn[:count]])
+
+
+def _is_proper(world: World, anchors: FloatArray, n_fixed: int) -> bool:
+    """Whether no two anchors stand at one place, and those after the fixed ones are legal."""
+    apart = np.abs(anchors[:, None] - anchors).max(axis=-1) + 2 * _APART_M * np.eye(len(anchors))
+    return bool((apart > _APART_M).all() and world.setting.legal(anchors[n_fixed:]).all())
 
 
 # --- one anchor ------------------------------------------------------------------------------
