@@ -7,6 +7,7 @@ import math
 import re
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.envs.placement import AnchorPlacementEnv
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import Context, layouts, search
-from rbl_gym.studies.learning import evaluation, policies, training, transfer
+from rbl_gym.studies.learning import evaluation, policies, rollouts, training, transfer
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
 from rbl_gym.studies.progress import silent
 from rbl_gym.wrappers.selection import AnchorSelectionEnv
@@ -71,7 +72,7 @@ def test_a_policys_loss_is_minus_its_mean_reward_in_scalar_worlds(kind, seed):
 @pytest.mark.parametrize("name", ["ring", "corners", "random"])
 def test_a_layouts_loss_is_its_log_score(name):
     task = rl_task("auv_buoys")
-    problem, contexts, found = evaluation.layouts_of(task, {}, [name], 3, 1, silent)
+    ((problem, contexts, found),) = evaluation.layouts_of(task, {}, [name], 3, 1, silent)
     losses = evaluation._loss_of(problem, contexts, found[name])
     for i in range(3):
         env = AnchorPlacementEnv()
@@ -275,7 +276,7 @@ def test_an_unknown_task_is_named():
 @pytest.mark.parametrize("name", ["uwb_room", "auv_buoys"])
 def test_filter_errors_by_hand(name):
     task = rl_task(name)
-    problem, contexts, found = evaluation.layouts_of(task, {}, ["ring"], 2, 3, silent)
+    ((problem, contexts, found),) = evaluation.layouts_of(task, {}, ["ring"], 2, 3, silent)
     bodies = transfer._bodies(problem, contexts, 1, np.random.default_rng(4))
     got = transfer._tag_rmse(problem, contexts, found["ring"], bodies, "iekf", 1)
     scene, tags = problem.scene, np.array(problem.scene.tags)
@@ -406,3 +407,58 @@ def test_errors_are_one_line(tmp_path, capsys):
                       ["transfer", "selection"]):  # fmt: skip
         with pytest.raises(SystemExit):
             main(arguments)
+
+
+# --- scenes that are drawn --------------------------------------------------------------------
+
+ROOMS = [
+    {"name": "uwb_room", "n_anchors": {"integers": [4, 6]}, "racks": {"integers": [0, 1]}},
+    {"name": "drone_yard", "n_anchors": 7},
+]
+
+
+def test_drawn_problems_are_each_placed_in_by_itself():
+    task = rl_task("auv_buoys").in_worlds(scenes=ROOMS)
+    assert "one-for-all" not in evaluation.references(task)
+    env = task.make(1)
+    size = env.single_observation_space.shape[0]
+    policy = random_policy("box", (size, 4, 3), seed=1)
+    groups = evaluation.layouts_of(task, {"mine": policy}, ["random", "ring"], 8, 0)
+    assert [len(one.contexts.centre) for one in groups] == [1] * 8
+    assert len({one.problem.n_anchors for one in groups}) > 1
+    played = policy.player()
+    for i, (problem, contexts, found) in enumerate(groups):
+        alone = gym.make("rbl_gym:RBL/AnchorPlacement-v0", **task.arguments)
+        seen, _ = alone.reset(seed=HELD_OUT_SEED + i)
+        terminated = False
+        while not terminated:
+            seen, reward, terminated, _, info = alone.step(played(None, seen).astype(np.float32))
+        placed = info["anchors"][: problem.n_anchors]
+        np.testing.assert_allclose(found["mine"][0], placed, atol=1e-5)
+        score = placement.score(problem, contexts, found["mine"])
+        np.testing.assert_allclose(-np.log(score[0]), reward, atol=1e-4)
+        assert found["ring"].shape == (1, problem.n_anchors, 3)
+        assert found["random"].shape == (1, 8, problem.n_anchors, 3)
+
+
+def test_layouts_in_drawn_rooms_are_tracked():
+    task = rl_task("auv_buoys").in_worlds(scenes=ROOMS)
+    found = transfer.transfer_layouts(task, {}, ["random", "ring"], 3, 1, 0)
+    for rows in found["filters"].values():
+        assert rows["ring"]["tag_rmse_m"] < rows["random"]["tag_rmse_m"]
+
+
+def test_worlds_with_episodes_of_their_own_length():
+    scenes = [{"name": "hall", "steps": 3}, {"name": "hall", "steps": 6}]
+    task = rl_task("selection").in_worlds(scenes=scenes)
+    totals, steps = rollouts.returns(task, lambda env, _: np.ones(env.action_space.shape), 6, 0)
+    assert set(steps.tolist()) == {3, 6}
+    for i in range(6):
+        env = gym.make("rbl_gym:RBL/AnchorSelection-v0", **task.arguments)
+        env.reset(seed=HELD_OUT_SEED + i)
+        total, over, count = 0.0, False, 0
+        while not over:
+            _, reward, _, over, _ = env.step(np.ones(12, np.float32))
+            total, count = total + float(reward), count + 1
+        assert count == steps[i]
+        np.testing.assert_allclose(total, totals[i], atol=1e-6)

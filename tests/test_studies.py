@@ -161,8 +161,8 @@ def test_transfer_is_layouts_and_bodies_among_them(monkeypatch):
     task, told = rl_task("mounts"), Told()
     found = transfer.transfer_layouts(task, {}, ["random", "greedy"], 2, 1, 3, told)
     assert told.done == told.announced > 2
-    problem, contexts, layouts = evaluation.layouts_of(task, {}, ["random", "greedy"], 2, 3)
-    again = transfer.track_layouts(problem, contexts, layouts, ["iekf"], 1, 3)
+    layouts = evaluation.layouts_of(task, {}, ["random", "greedy"], 2, 3)
+    again = transfer.track_layouts(layouts, ["iekf"], 1, 3)
     assert again["filters"]["iekf"] == found["filters"]["iekf"]
     assert (found["worlds"], found["seed"]) == (2, 3)
 

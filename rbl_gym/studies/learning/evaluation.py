@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,12 +19,14 @@ from rbl_gym import placement
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import layouts, search
 from rbl_gym.placement.problem import Context, PlacementTask
+from rbl_gym.studies.learning import rollouts
 from rbl_gym.studies.learning.policies import AnyPolicy, check_fit
-from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
+from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.studies.progress import Advance, silent
 from rbl_gym.wrappers import controllers
 
 __all__ = [
+    "Layouts",
     "evaluate",
     "held_out_returns",
     "layouts_of",
@@ -48,7 +50,9 @@ def references(task: RlTask) -> list[str]:
             return ["random", "greedy", "greedy-swaps"]
         last = search.STRONGEST
         others = [name for name in search.SEARCHES if name not in last]
-        return [*layouts.LAYOUTS, _ONE_LAYOUT, *others, *last]
+        # No layout is one for rooms that differ.
+        one = [] if "scenes" in task.arguments else [_ONE_LAYOUT]
+        return [*layouts.LAYOUTS, *one, *others, *last]
     return list(_controllers(task))
 
 
@@ -141,7 +145,7 @@ def held_out_returns(task: RlTask, policy: AnyPolicy, worlds: int, seed: int) ->
 
     result: dict[str, Any] = {"worlds": worlds}
     for name, act in (("policy", policy.player()), ("random", by_chance)):
-        returns = _returns(task, act, worlds, seed)[0]
+        returns = rollouts.returns(task, act, worlds, seed)[0]
         result[f"{name}_mean_return"] = float(returns.mean())
         spread = float(returns.std(ddof=1)) if worlds > 1 else 0.0
         result[f"{name}_std_error"] = spread / math.sqrt(worlds)
@@ -173,21 +177,15 @@ def _check_policies(task: RlTask, policies: dict[str, AnyPolicy]) -> None:
         check_fit(policy, label, envs)
 
 
-def _held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str, Any]]:
-    """An environment at the start of its held-out episodes, its observation and info."""
-    env = task.make(worlds, "Disabled")
-    return env, *env.reset(seed=HELD_OUT_SEED + SEED_STRIDE * seed)
-
-
 def _of_all(
     task: RlTask,
     policies: dict[str, AnyPolicy],
     names: list[str],
     seed: int,
     advance: Advance,
-    of_reference: Callable[[str, np.random.Generator], FloatArray],
-    of_policy: Callable[[AnyPolicy], FloatArray],
-) -> dict[str, FloatArray]:
+    of_reference: Callable[[str, np.random.Generator], Any],
+    of_policy: Callable[[AnyPolicy], Any],
+) -> dict[str, Any]:
     """What two functions give of references, each with a generator of its own, and of policies."""
     _check_policies(task, policies)
     advance(0, more=len(names) + len(policies))
@@ -227,24 +225,8 @@ def _rollout(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> FloatArray:
     """Losses (worlds,) of one episode of each world."""
-    returns, steps = _returns(task, act, worlds, seed)
+    returns, steps = rollouts.returns(task, act, worlds, seed)
     return -returns / steps
-
-
-def _returns(
-    task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
-) -> tuple[FloatArray, int]:
-    """Sums of the rewards (worlds,) of one episode of each world, and its steps."""
-    env, observation, _ = _held_out(task, worlds, seed)
-    env.action_space.seed(seed)
-    total, steps = np.zeros(worlds), 0
-    done = np.zeros(worlds, dtype=np.bool_)
-    while not done.all():
-        observation, reward, terminated, truncated, _ = env.step(act(env, observation))
-        total += reward
-        steps += 1
-        done = terminated | truncated
-    return total, steps
 
 
 # --- placement --------------------------------------------------------------------------------
@@ -258,16 +240,38 @@ def _placement_losses(
     seed: int,
     advance: Advance,
 ) -> dict[str, FloatArray]:
-    problem, contexts, found = layouts_of(task, policies, names, worlds, seed, advance)
+    groups = layouts_of(task, policies, names, worlds, seed, advance)
     if task.arguments.get("mode") != "mounts":
         advance(0, more=len(policies))
         rng = np.random.default_rng([seed, len(references(task))])
         for label in policies:
-            found[f"{label} + gradient"] = search.along_gradient(
-                problem, contexts, rng, REFINE_EVALUATIONS, found[label]
-            )
+            for problem, contexts, found in groups:
+                found[f"{label} + gradient"] = search.along_gradient(
+                    problem, contexts, rng, REFINE_EVALUATIONS, found[label]
+                )
             advance()
-    return {name: _loss_of(problem, contexts, anchors) for name, anchors in found.items()}
+    return {
+        name: np.concatenate(
+            [_loss_of(problem, contexts, found[name]) for problem, contexts, found in groups]
+        )
+        for name in groups[0].found
+    }
+
+
+class Layouts(NamedTuple):
+    """Layouts of C contexts of one problem.
+
+    Attributes
+    ----------
+    problem, contexts
+        What is to be placed, and the work regions.
+    found
+        Layouts (C, M, 3) by label; the random ones are (C, 8, M, 3).
+    """
+
+    problem: PlacementTask
+    contexts: Context
+    found: dict[str, FloatArray]
 
 
 def layouts_of(
@@ -277,7 +281,7 @@ def layouts_of(
     worlds: int,
     seed: int,
     advance: Advance = silent,
-) -> tuple[PlacementTask, Context, dict[str, FloatArray]]:
+) -> list[Layouts]:
     """Layouts of references and policies in held-out contexts.
 
     Parameters
@@ -293,24 +297,35 @@ def layouts_of(
 
     Returns
     -------
-    The problem, its contexts, and the layouts (C, M, 3) by label; the random ones are
-    (C, 8, M, 3).
+    Those of all contexts together; of scenes that are drawn, of each world by itself.
     """
-    env, _, _ = _held_out(task, worlds, seed)
+    problems = _problems(task, worlds, seed)
     found = _of_all(
         task,
         policies,
         names,
         seed,
         advance,
-        lambda name, rng: _reference_layout(task, env, name, rng),
-        lambda policy: _policy_layout(task, policy, worlds, seed),
+        lambda name, rng: [_reference_layout(task, *one, name, rng) for one in problems],
+        lambda policy: _policy_layouts(task, policy, worlds, seed, problems),
     )
-    return env.task, env.contexts, found
+    return [
+        Layouts(*one, {name: several[i] for name, several in found.items()})
+        for i, one in enumerate(problems)
+    ]
 
 
-def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generator) -> FloatArray:
-    problem, contexts = env.task, env.contexts
+def _problems(task: RlTask, worlds: int, seed: int) -> list[tuple[PlacementTask, Context]]:
+    env, _, _ = rollouts.held_out(task, worlds, seed)
+    if "scenes" not in task.arguments:
+        return [(env.task, env.contexts)]
+    contexts = (Context(*(field[None] for field in env.problem(i))) for i in range(worlds))
+    return list(zip(env.tasks, contexts, strict=True))
+
+
+def _reference_layout(
+    task: RlTask, problem: PlacementTask, contexts: Context, name: str, rng: np.random.Generator
+) -> FloatArray:
     worlds = len(contexts.centre)
     if task.arguments.get("mode") == "mounts":
         candidates = placement.mounts(problem)
@@ -330,12 +345,21 @@ def _reference_layout(task: RlTask, env: Any, name: str, rng: np.random.Generato
     return {**layouts.LAYOUTS, **search.SEARCHES}[name](problem, contexts, rng)
 
 
-def _policy_layout(task: RlTask, policy: AnyPolicy, worlds: int, seed: int) -> FloatArray:
-    env, observation, info = _held_out(task, worlds, seed)
-    done, play = np.zeros(worlds, dtype=np.bool_), policy.player()
-    while not done.all():
-        observation, _, done, _, info = env.step(play(env, observation))
-    return info["anchors"]
+def _policy_layouts(
+    task: RlTask,
+    policy: AnyPolicy,
+    worlds: int,
+    seed: int,
+    problems: list[tuple[PlacementTask, Context]],
+) -> list[FloatArray]:
+    anchors: Any = None
+    for _, _, ends, info in rollouts.steps(task, policy.player(), worlds, seed):
+        anchors = info["anchors"].copy() if anchors is None else anchors
+        anchors[ends] = info["anchors"][ends]
+    if "scenes" not in task.arguments:
+        return [anchors]
+    several = zip(anchors, problems, strict=True)
+    return [own[None, : problem.n_anchors] for own, (problem, _) in several]
 
 
 def _loss_of(problem: PlacementTask, contexts: Context, anchors: FloatArray) -> FloatArray:

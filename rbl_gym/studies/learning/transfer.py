@@ -21,6 +21,7 @@ from rbl_gym.placement import search
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.learning import evaluation
+from rbl_gym.studies.learning.evaluation import Layouts
 from rbl_gym.studies.learning.policies import AnyPolicy
 from rbl_gym.studies.learning.rl_tasks import RlTask
 from rbl_gym.studies.progress import Advance, silent
@@ -54,8 +55,11 @@ def transfer_references(task: RlTask) -> list[str]:
 
 def tracking_filters(task: RlTask) -> list[str]:
     """Filters that can track in the task's scene: UC-KF needs anchors that are not coplanar."""
-    low, high = placement.task(task.arguments["scene"]).scene.anchor_region.bounds()
-    return [name for name in FILTERS if name != "uc-kf" or (high > low).all()]
+    env = task.make(1)
+    known = env.family.corners if "scenes" in task.arguments else (env.task,)
+    corners = [one.scene.anchor_region.bounds() for one in known]
+    solid = all((high > low).all() for low, high in corners)
+    return [name for name in FILTERS if name != "uc-kf" or solid]
 
 
 class Bodies(NamedTuple):
@@ -97,16 +101,13 @@ def transfer_layouts(
     -------
     See `track_layouts`; with `worlds` and `seed`.
     """
-    problem, contexts, layouts = evaluation.layouts_of(task, policies, names, worlds, seed, advance)
-    filters = tracking_filters(task)
-    found = track_layouts(problem, contexts, layouts, filters, repeats, seed, advance)
+    groups = evaluation.layouts_of(task, policies, names, worlds, seed, advance)
+    found = track_layouts(groups, tracking_filters(task), repeats, seed, advance)
     return found | {"worlds": worlds, "seed": seed}
 
 
 def track_layouts(
-    task: PlacementTask,
-    contexts: Context,
-    layouts: dict[str, FloatArray],
+    groups: list[Layouts],
     filters: list[str],
     repeats: int,
     seed: int,
@@ -116,10 +117,8 @@ def track_layouts(
 
     Parameters
     ----------
-    task, contexts
-        The problem, and the C worlds of the layouts.
-    layouts
-        By label: anchors (C, M, 3), or L layouts of each world (C, L, M, 3).
+    groups
+        Layouts of C worlds of one problem each, or L layouts of each world (C, L, M, 3).
     filters
         Of `FILTERS`.
     repeats, seed
@@ -133,35 +132,45 @@ def track_layouts(
     (`score_m`) and error (`tag_rmse_m`), and the correlation of these logarithms over the
     layouts (None of fewer than three).
     """
-    bodies = _bodies(task, contexts, repeats, np.random.default_rng([seed, 2]))
-    scores = {
-        label: placement.score(
-            task, search.expand(contexts) if anchors.ndim == 4 else contexts, anchors
-        )
-        for label, anchors in layouts.items()
-    }
+    several = [
+        _bodies(*one[:2], repeats, np.random.default_rng([seed, 2, *([i] if i else [])]))
+        for i, one in enumerate(groups)
+    ]
+    labels = list(groups[0].found)
     result: dict[str, Any] = {"steps": _STEPS, "repeats": repeats, "filters": {}}
-    advance(0, more=len(filters) * len(layouts))
+    advance(0, more=len(filters) * len(labels))
     for name in filters:
         rows = {}
-        for label, anchors in layouts.items():
-            several = anchors if anchors.ndim == 4 else anchors[:, None]
-            errors = np.stack(
-                [
-                    _tag_rmse(task, contexts, several[:, k], bodies, name, repeats)
-                    for k in range(several.shape[1])
-                ],
-                axis=1,
-            )
-            score = scores[label].reshape(errors.shape)
+        for label in labels:
+            pairs = [
+                _logs(one, label, bodies, name, repeats)
+                for one, bodies in zip(groups, several, strict=True)
+            ]
+            score, errors = (np.concatenate(part) for part in zip(*pairs, strict=True))
             rows[label] = {
-                "score_m": float(np.exp(np.log(score).mean())),
-                "tag_rmse_m": float(np.exp(np.log(errors).mean())),
-                "correlation": _correlation(np.log(score).ravel(), np.log(errors).ravel()),
+                "score_m": float(np.exp(score.mean())),
+                "tag_rmse_m": float(np.exp(errors.mean())),
+                "correlation": _correlation(score, errors),
             }
             advance()
         result["filters"][name] = rows
     return result
+
+
+def _logs(
+    group: Layouts, label: str, bodies: Bodies, name: str, repeats: int
+) -> tuple[FloatArray, FloatArray]:
+    """Logarithms of the scores of layouts and of a filter's errors, flat."""
+    task, contexts, found = group
+    anchors = found[label]
+    each = search.expand(contexts) if anchors.ndim == 4 else contexts
+    score = placement.score(task, each, anchors)
+    several = anchors if anchors.ndim == 4 else anchors[:, None]
+    errors = [
+        _tag_rmse(task, contexts, several[:, k], bodies, name, repeats)
+        for k in range(several.shape[1])
+    ]
+    return np.log(score).ravel(), np.log(np.stack(errors, axis=1)).ravel()
 
 
 def _correlation(first: FloatArray, second: FloatArray) -> float | None:
