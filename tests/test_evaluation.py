@@ -443,9 +443,10 @@ def test_drawn_problems_are_each_placed_in_by_itself():
 
 def test_layouts_in_drawn_rooms_are_tracked():
     task = rl_task("auv_buoys").in_worlds(scenes=ROOMS)
-    found = transfer.transfer_layouts(task, {}, ["random", "ring"], 3, 1, 0)
-    for rows in found["filters"].values():
-        assert rows["ring"]["tag_rmse_m"] < rows["random"]["tag_rmse_m"]
+    groups = evaluation.layouts_of(task, {}, ["random", "ring"], 3, 0)
+    rows = transfer.track_layouts(groups, ["iekf"], 1, 0)["filters"]["iekf"]
+    assert rows["ring"]["tag_rmse_m"] < rows["random"]["tag_rmse_m"]
+    assert "uc-kf" not in transfer.tracking_filters(task.in_worlds(scenes=["auv_buoys"]))
 
 
 def test_worlds_with_episodes_of_their_own_length():
