@@ -229,7 +229,7 @@ def test_evaluations_and_trainings_never_share_worlds():
     with pytest.raises(ValueError, match="seed must be below 1000, got 1000"):
         training.train("auv_buoys", rl_task("auv_buoys"), 64, 1000, lambda _: None)
     first, second = (
-        evaluation._held_out(rl_task("auv_buoys"), 50, seed)[0].contexts.centre for seed in (0, 1)
+        rollouts.held_out(rl_task("auv_buoys"), 50, seed)[0].contexts.centre for seed in (0, 1)
     )
     assert not {tuple(row) for row in first} & {tuple(row) for row in second}
 
