@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from rbl_gym.measurements.offsets import OFFSETS
@@ -25,8 +25,11 @@ _FILES = (
 )
 
 
-def add_reading(parser: argparse.ArgumentParser) -> None:
-    """The options that `read_runs` reads."""
+def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ()) -> None:
+    """The options that `read_runs` reads.
+
+    `left_out`: names of files whose options the command has itself. Then no file is required.
+    """
     files = parser.add_argument_group("files")
     for name, text in (
         (
@@ -44,7 +47,9 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         ("imu", "t,wx,wy,wz,ax,ay,az, rad/s and m/s^2"),
         ("imu-frame", "its axes in the body's: rotation vector in degrees, or a file qw,qx,qy,qz"),
     ):
-        files.add_argument(f"--{name}", required=name == "ranges", metavar="F", help=text)
+        if name not in left_out:
+            required = name == "ranges" and not left_out
+            files.add_argument(f"--{name}", required=required, metavar="F", help=text)
     reading = parser.add_argument_group("reading (see docs/recordings.md)")
     reading.add_argument(
         "--columns",

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from rbl_gym.app.plan_options import add_plan_options, is_plan, read_plan, read_problem
+from rbl_gym.app.reading_options import add_reading, read_runs
 from rbl_gym.app.terminal import add_seed, natural, positive
 from rbl_gym.studies.extras import require
 
@@ -14,16 +15,23 @@ def add_studio(commands: Any) -> None:
     """The parser of ``rbl-gym studio``."""
     studio = commands.add_parser(
         "studio",
-        help="take anchors by the hand: a page in the browser",
-        description="Open a page on which anchors are dragged while a map of the accuracy follows. "
+        help="take anchors by the hand, watch filters at work: a page in the browser",
+        description="Open a page on which anchors are dragged while a map of the accuracy follows; "
+        "with --watch, --env or --ranges one on which filters are at work. "
         "Whoever can open the page can change the layout and save into the folder.",
     )
     studio.add_argument(
         "scene",
+        nargs="?",
         metavar="SCENE|FILE",
         help="a named scene, a building file .toml or .json, or a plan .dxf, .geojson, .png, .jpg",
     )
-    studio.add_argument("--anchors", type=positive, metavar="N", help="how many, to begin with")
+    studio.add_argument(
+        "--anchors",
+        type=_count_or_file,
+        metavar="N|F",
+        help="how many, to begin with; with --ranges the file anchor,x,y,z",
+    )
     studio.add_argument("--layout", metavar="F", help="anchors to begin with: a CSV file")
     studio.add_argument(
         "--host",
@@ -37,24 +45,43 @@ def add_studio(commands: Any) -> None:
     studio.add_argument(
         "--folder", default=".", metavar="D", help="where files are saved, default the working one"
     )
-    add_seed(studio, "of all searches")
+    add_seed(studio, "of all searches, and of what is watched")
     studio.add_argument("--no-browser", action="store_true", help="print the address alone")
+    watch = studio.add_argument_group("filters at work")
+    watch.add_argument("--watch", action="store_true", help="an episode of SCENE|FILE")
+    watch.add_argument(
+        "--filter",
+        metavar="NAME[,NAME]",
+        help="one or several side by side; NAME-robust and NAME-late are NAME with that loss; "
+        "default iekf,iekf-robust, of a recording iekf-log",
+    )
     add_plan_options(studio)
+    add_reading(studio, left_out=("anchors",))
     studio.set_defaults(run=_studio, region=None, racks=0)
+
+
+def _count_or_file(text: str) -> int | str:
+    return positive(text) if text.lstrip("-").isdigit() else text
 
 
 def _studio(options: argparse.Namespace) -> int:
     require("viser", "studio")
     from rbl_gym import studio
-    from rbl_gym.placement.layout_files import read_layout
     from rbl_gym.studio.opening import Options
 
-    layout = read_layout(options.layout).positions if options.layout else None
-    count = options.anchors if layout is None else len(layout)
+    shown = {}
+    if options.ranges or options.watch:
+        what, beside = _program(options), None
+    else:
+        _check_scene(options)
+        beside = _layout(options)
+        count = options.anchors if beside is None else len(beside)
+        what = read_problem(options, count)
+        shown["tables"] = _tables(options, count)
     page = studio.show(
-        read_problem(options, count),
-        layout,
-        tables=_tables(options, count),
+        what,
+        beside,
+        **shown,
         options=Options(
             options.host,
             options.port,
@@ -67,6 +94,61 @@ def _studio(options: argparse.Namespace) -> int:
     print(f"{page.url}   (Ctrl-C ends it)", flush=True)
     page.wait()
     return 0
+
+
+def _check_scene(options: argparse.Namespace) -> None:
+    if options.scene is None:
+        raise ValueError("SCENE|FILE is missing: a named scene as uwb_room, or a building file")
+    if isinstance(options.anchors, str):
+        raise ValueError(f"--anchors must be a number without --ranges, got {options.anchors!r}")
+
+
+def _layout(options: argparse.Namespace) -> Any:
+    """Anchors (M, 3) of --layout; None: there is none."""
+    from rbl_gym.placement.layout_files import read_layout
+
+    return read_layout(options.layout).positions if options.layout else None
+
+
+def _program(options: argparse.Namespace) -> Any:
+    """What is watched."""
+    from rbl_gym.studies import replay
+    from rbl_gym.studio.watch import program
+    from rbl_gym.studio.watch.frames import filter_named
+    from rbl_gym.studio.watch.recorded import track_all
+
+    labels = tuple(filter(None, (options.filter or "").split(",")))
+    if not options.ranges:
+        _check_scene(options)
+        return _simulation(options, labels or program.LIVE)
+    if options.scene is not None:
+        raise ValueError(f"SCENE|FILE must be left out with --ranges, got {options.scene!r}")
+    if isinstance(options.anchors, int):
+        raise ValueError(f"--anchors must be a file with --ranges, got {options.anchors}")
+    runs = read_runs(options)
+    if len(runs) > 1:
+        raise ValueError(f"{options.ranges} has the runs {[*runs]!r:.200}: choose one by --run")
+    (recording,) = runs.values()
+    settings, named = replay.Settings(), [*map(filter_named, labels or program.RECORDED)]
+    tracks = track_all(recording, tuple(named), settings)
+    return program.recorded_program(recording, tracks, settings)
+
+
+def _simulation(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
+    """An episode of a named scene with the anchors of --layout, or of a building."""
+    from rbl_gym.studio.state import open_state
+    from rbl_gym.studio.watch import live, program
+    from rbl_gym.worlds import scenes
+
+    layout = _layout(options)
+    if options.scene in scenes.SCENES and layout is None and options.anchors is None:
+        scene = scenes.get(options.scene)
+        room = program.room_of(scene)
+        return program.live_program(live.stage_of_scene(scene), labels, room, options.seed)
+    problem = read_problem(options, options.anchors if layout is None else len(layout))
+    anchors = open_state(problem, layout).anchors
+    stage = live.stage_of_problem(problem, anchors)
+    return program.live_program(stage, labels, problem, options.seed)
 
 
 def _tables(options: argparse.Namespace, count: int | None) -> dict[str, Any] | None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import webbrowser
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +13,8 @@ from rbl_gym.placement.building import Problem
 from rbl_gym.studio import files, serving
 from rbl_gym.studio.place import PlacePage
 from rbl_gym.studio.state import open_state
+from rbl_gym.studio.watch.page import WatchPage
+from rbl_gym.studio.watch.program import program_of
 
 __all__ = ["Options", "Studio", "show"]
 
@@ -83,7 +86,7 @@ class Studio:
 
 def show(
     what: Any,
-    layout: FloatArray | None = None,
+    beside: Any = None,
     *,
     tables: Mapping[str, Any] | None = None,
     options: Options | None = None,
@@ -93,9 +96,13 @@ def show(
     Parameters
     ----------
     what
-        A `Problem` of `placement.scene_files`.
-    layout
-        Anchors (M, 3), metres; None: those of the problem, or a usual layout.
+        A `Problem` of `placement.scene_files`: its anchors are placed by hand. Or what is watched:
+        a `Scene` (an episode), a `Recording` with its track, a
+        `rbl_gym.studio.watch.program.Program`.
+    beside
+        Of a problem, anchors (M, 3), metres; None: its own, or a usual layout. Of a recording, its
+        `Track` or a mapping of tracks by labels; None: that of the filter ``"iekf-log"``. Of a
+        scene, labels of filters; None: ``"iekf"`` and ``"iekf-robust"``.
     tables
         Of the file from which the problem was read, for saving; None: made of the problem.
     options
@@ -110,14 +117,13 @@ def show(
     """
     options = Options() if options is None else options
     check_count("seed", options.seed, least=0)
-    if not isinstance(what, Problem):
-        raise ValueError(f"what must be a Problem of placement.scene_files, got {what!r:.80}")
-    start = open_state(what, layout)
-    tables = files.tables_of(what) if tables is None else tables
+    make = _placing(what, beside, tables, options)
+    if make is None:
+        program = program_of(what, beside, options.seed)
+        make = functools.partial(WatchPage, program=program)
     server = serving.open_server(options.host, options.port)
-    folder = Path(options.folder).resolve()
     try:
-        page = PlacePage(server, start, tables, folder, options.report, options.seed)
+        page = make(server)
     except BaseException:
         serving.stop_server(server)
         raise
@@ -125,3 +131,15 @@ def show(
     if options.browser:
         webbrowser.open(studio.url)
     return studio
+
+
+def _placing(
+    what: Any, layout: FloatArray | None, tables: Mapping[str, Any] | None, options: Options
+) -> Callable[[Any], Any] | None:
+    """Makes the page of a problem; None: it is none."""
+    if not isinstance(what, Problem):
+        return None
+    start = open_state(what, layout)
+    tables = files.tables_of(what) if tables is None else tables
+    folder = Path(options.folder).resolve()
+    return lambda server: PlacePage(server, start, tables, folder, options.report, options.seed)

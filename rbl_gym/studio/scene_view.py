@@ -46,8 +46,11 @@ def extent_of(problem: Problem) -> float:
     return float(np.ptp(corners(problem), axis=0).max())
 
 
-def set_camera(server: Any, problem: Problem) -> None:
-    """A view from the south and above in which all of it is seen, for every browser that comes."""
+def set_camera(server: Any, problem: Problem, panels: int = PANEL) -> None:
+    """A view from the south and above in which all of it is seen, for every browser that comes.
+
+    `panels`: how wide all panels are together, pixels.
+    """
     camera = server.initial_camera
     camera.fov = _FOV_RAD
     reach = extent_of(problem)
@@ -56,13 +59,18 @@ def set_camera(server: Any, problem: Problem) -> None:
 
     @server.on_client_connect
     async def _(client: Any) -> None:
-        view = client.camera
-        # What the panel leaves of the window.
-        aspect = max(view.image_width - PANEL, 0.4 * view.image_width) / view.image_height
-        look_at, position = view_of(problem, aspect)
-        # The place takes the point that is looked at with it.
-        client.camera.position = position
-        client.camera.look_at = look_at
+        look(client, problem, panels)
+
+
+def look(client: Any, problem: Problem, panels: int = PANEL) -> None:
+    """The camera of a browser where all of a problem is seen."""
+    view = client.camera
+    # What the panels leave of the window.
+    aspect = max(view.image_width - panels, 0.4 * view.image_width) / view.image_height
+    look_at, position = view_of(problem, aspect)
+    # The place takes the point that is looked at with it.
+    client.camera.position = position
+    client.camera.look_at = look_at
 
 
 def view_of(problem: Problem, aspect: float) -> tuple[FloatArray, FloatArray]:
@@ -96,14 +104,17 @@ def view_axes(forward: FloatArray) -> FloatArray:
 # --- what stands still -----------------------------------------------------------------------
 
 
-def draw_room(server: Any, problem: Problem) -> None:
-    """Floor, walls, obstacles and where anchors may stand."""
+def draw_room(server: Any, problem: Problem, floor_opacity: float | None = None) -> None:
+    """Floor, walls, obstacles and where anchors may stand.
+
+    `floor_opacity` None: nothing is seen below the floor.
+    """
     scene = server.scene
     scene.configure_default_lights(cast_shadow=False)
     scene.add_light_ambient("/light", intensity=1.2)
     low, high = corners(problem)
     if not isinstance(problem.mounts, Shell):
-        _draw_floor(scene, low, high)
+        _draw_floor(scene, low, high, floor_opacity)
     if isinstance(problem.mounts, Walls):
         faces = _room_faces(*problem.mounts.bounds())
         # Seen from the inside alone: the walls between camera and room are left out.
@@ -135,14 +146,14 @@ def draw_room(server: Any, problem: Problem) -> None:
             )  # fmt: skip
 
 
-def _draw_floor(scene: Any, low: FloatArray, high: FloatArray) -> None:
+def _draw_floor(scene: Any, low: FloatArray, high: FloatArray, opacity: float | None) -> None:
     """A floor with a grid of whole metres below all of it."""
     extent = float((high - low).max())
     flat = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
     floor = np.column_stack([flat, np.full(4, low[2] - 0.002 * extent)])
     scene.add_mesh_simple(
         "/room/floor", floor, np.array([[0, 1, 2], [0, 2, 3]]), color=FLOOR, side="double",
-        cast_shadow=False, receive_shadow=False,
+        opacity=opacity, cast_shadow=False, receive_shadow=False,
     )  # fmt: skip
     step = next(s for s in (1, 2, 5, 10, 50, 100, 1000, 1e9) if extent / s < 50)
     lines(scene, "/room/grid", _grid(low, high, step, floor[0, 2] + 3e-4 * extent), GRID, 1)

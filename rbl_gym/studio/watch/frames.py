@@ -15,8 +15,8 @@ from rbl_gym.studies.epochs import Step, innovations_of, pose_errors
 __all__ = ["LINKS", "Frame", "Links", "Named", "Pose", "Tracked", "filter_named", "link_kinds"]
 
 # Kinds of links, in the order of their numbers.
-LINKS = ("lost", "used", "reflected", "refused")
-LOST, USED, REFLECTED, REFUSED = range(4)
+LINKS = ("lost", "used", "reflected", "refused", "behind an obstacle")
+LOST, USED, REFLECTED, REFUSED, WEAK = range(5)
 
 
 class Pose(NamedTuple):
@@ -35,10 +35,14 @@ class Links(NamedTuple):
         (M, N): which gave a range.
     reflected
         (M, N): which of these came over a reflected path; only a simulation knows.
+    weak
+        (M, 1) or (M, N): which have less than half of their information, for what stands in the
+        way; filters are told.
     """
 
     measured: BoolArray
     reflected: BoolArray
+    weak: BoolArray
 
 
 class Tracked(NamedTuple):
@@ -149,7 +153,7 @@ def link_kinds(links: Links, refused: BoolArray | None = None) -> np.ndarray:
     refused
         (M, N), of a filter; a reflected range that it refuses counts as refused.
     """
-    kinds = np.where(links.measured, USED, LOST)
+    kinds = np.where(links.measured, np.where(links.weak, WEAK, USED), LOST)
     kinds = np.where(links.measured & links.reflected, REFLECTED, kinds)
     if refused is not None:
         kinds = np.where(links.measured & refused, REFUSED, kinds)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray, check_count, check_number
+from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number
 from rbl_gym.measurements.ranging import Measurement
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.epochs import Reading, track_epochs
@@ -26,6 +26,8 @@ _WATCHED_S = 60.0
 # A body in a building: speed, turn rate, seconds a step, and the noise of its motion after 1 s.
 _SPEED, _SPIN, _DT = 1.0, 0.29, 0.1
 _ROTATION_RAD, _TRANSLATION_M = 0.083, 0.095
+# A link that keeps this share of its information counts as seen.
+SEEN = 0.5
 _STAYS = ("waypoints", "orbit", "lawn-mower")
 
 
@@ -214,9 +216,16 @@ def _moments(
             epoch * scene.dt,
             Pose(at.rotation, at.translation),
             anchors,
-            Links(measured.links, measured.nlos),
+            Links(measured.links, measured.nlos, weak_links(measured.links, quality)),
             told_reading(scene, at, measured, told, quality, first=not epoch),
         )
+
+
+def weak_links(links: BoolArray, quality: FloatArray | None) -> BoolArray:
+    """Which links (M, N) have less than half of their information, of its share (M,)."""
+    if quality is None:
+        return np.zeros(links.shape, np.bool_)
+    return np.broadcast_to(quality[:, None] < SEEN, links.shape)
 
 
 def _measured(

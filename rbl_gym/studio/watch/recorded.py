@@ -85,7 +85,7 @@ def _frames(
     anchors = recording.anchors_by_epoch
     nowhere = np.zeros(recording.links.shape[1:], np.bool_)
     for k, time in enumerate(recording.times - recording.times[0]):
-        links = Links(recording.links[k], nowhere)
+        links = Links(recording.links[k], nowhere, nowhere)
         found = tuple(
             _tracked(label, track, errors[label], k, recording.links[k])
             for label, track in tracks.items()

@@ -1,0 +1,241 @@
+"""The page on which filters are watched: a player of frames, the same for every browser."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.studio import scene_view
+from rbl_gym.studio.watch.frames import Frame
+from rbl_gym.studio.watch.live import CALM, Disturbances
+from rbl_gym.studio.watch.panel import CHARTS_WIDTH, WatchPanel
+from rbl_gym.studio.watch.program import Program
+from rbl_gym.studio.watch.view import WatchView
+from rbl_gym.studio.worker import Worker
+
+# Pictures and charts a second at most; the longest wait between two looks at what is asked for.
+_PICTURES_HZ, _CHARTS_HZ, _WAIT_S = 20.0, 4.0, 0.05
+# What filters believe may be below the floor.
+_FLOOR = 0.5
+# From where a camera that follows the body looks at it, in radii of the body.
+_BEHIND = np.array([-2.5, -7.0, 5.0])
+
+
+class WatchPage:
+    """Ties the frames of a program to a viser server.
+
+    Parameters
+    ----------
+    server
+        On which they are shown.
+    program
+        What is watched.
+    """
+
+    def __init__(self, server: Any, program: Program) -> None:
+        self._server, self.program = server, program
+        self.frames: list[Frame] = []
+        self.at = 0
+        self._filters, self._seed = program.filters, program.seed
+        self._disturbances = CALM
+        self._speed, self._playing, self._over = 1.0, False, False
+        self._links, self._follow = 0, False
+        self.status = ""
+        self._drawn, self._charted = 0.0, 0.0
+        self._source: Iterator[Frame] = iter(())
+        self._start()
+        panels = scene_view.PANEL + (CHARTS_WIDTH if program.filters else 0)
+        scene_view.set_camera(server, program.room, panels)
+        scene_view.draw_room(server, program.room, _FLOOR)
+        extent = scene_view.extent_of(program.room)
+        self._view = WatchView(server.scene, extent, program.tags)
+        actions = {
+            "play": self.play_or_pause,
+            "step": self.step,
+            "restart": self.restart,
+            "speed": self.set_speed,
+            "seek": self.seek,
+            "begin": self.begin,
+            "disturb": self.disturb,
+            "links": self._set_links,
+            "follow": self._set_follow,
+        }
+        self._panel = WatchPanel(server.gui, program, actions)
+        self._worker = Worker(self._failed)
+        self._worker.post(lambda: self._show(True))
+
+    # --- what the page asks for -------------------------------------------------------------
+
+    def play_or_pause(self) -> None:
+        """Play from here on, or stop; at the end, from the start."""
+
+        def task() -> None:
+            if not self._playing and self._over and self.at == len(self.frames) - 1:
+                self._start()
+                self._view.clear()
+            self._set_playing(not self._playing)
+
+        self._worker.post(task)
+
+    def step(self) -> None:
+        """Stop, and show one frame more."""
+
+        def task() -> None:
+            self._set_playing(False)
+            self._advance()
+            self._show(True)
+
+        self._worker.post(task)
+
+    def restart(self) -> None:
+        """The same again from its first frame, with the disturbances that there are now."""
+        self._worker.post(lambda: self._begin(self._filters, self._seed))
+
+    def begin(self, filters: tuple[str, ...], seed: int) -> None:
+        """From the first frame, with these filters and this seed."""
+        self._worker.post(lambda: self._begin(filters, seed))
+
+    def seek(self, at: int) -> None:
+        """Stop, and show a frame that was played."""
+
+        def task() -> None:
+            self._set_playing(False)
+            self.at = min(max(at, 0), len(self.frames) - 1)
+            self._show(True)
+
+        self._worker.post(task, "seek")
+
+    def set_speed(self, factor: float) -> None:
+        """Play so many times as fast as the clock; inf: as fast as it goes."""
+
+        def task() -> None:
+            self._speed = factor
+            if self._playing:
+                self._set_playing(True)
+
+        self._worker.post(task)
+
+    def disturb(self, disturbances: Disturbances) -> None:
+        """Disturb all frames that are not made yet."""
+
+        def task() -> None:
+            self._disturbances = disturbances
+            self._panel.show_disturbances(disturbances)
+            # What was played further on goes: it knew nothing of this.
+            if not self._over and self.at < len(self.frames) - 1:
+                self.at = len(self.frames) - 1
+                self._show(True)
+
+        self._worker.post(task, "disturb")
+
+    def settle(self, timeout: float = 60.0) -> bool:
+        """Wait until all that was asked for is shown; whether that was so in time."""
+        return self._worker.settle(timeout)
+
+    def stop(self) -> None:
+        """End the worker."""
+        self._worker.stop()
+
+    def _set_links(self, which: int) -> None:
+        def task() -> None:
+            self._links = which
+            self._show(True)
+
+        self._worker.post(task)
+
+    def _set_follow(self, follow: bool) -> None:
+        def task() -> None:
+            self._follow = follow
+            if not follow:
+                for client in self._server.get_clients().values():
+                    scene_view.look(client, self.program.room, 0)
+            self._show(True)
+
+        self._worker.post(task)
+
+    # --- tasks of the worker ----------------------------------------------------------------
+
+    def _start(self) -> None:
+        """The first frame; a ValueError leaves everything as it is."""
+        source = self.program.start(self._filters, self._seed, lambda epoch: self._disturbances)
+        self.frames, self.at, self._source, self._over = [next(source)], 0, source, False
+
+    def _begin(self, filters: tuple[str, ...], seed: int) -> None:
+        before = self._filters, self._seed
+        self._filters, self._seed = filters, seed
+        try:
+            self._start()
+        except Exception:
+            self._filters, self._seed = before
+            raise
+        self._links = 0
+        self.status = ""
+        self._view.clear()
+        self._panel.name_filters(filters)
+        self._show(True)
+        if self._playing:
+            self._set_playing(True)
+
+    def _set_playing(self, playing: bool) -> None:
+        self._playing = playing
+        self._worker.when_idle(self._play() if playing else None)
+        self._show(True)
+
+    def _advance(self) -> bool:
+        """Go on by one frame; False at the end."""
+        if self.at == len(self.frames) - 1:
+            found = next(self._source, None)
+            if found is None:
+                self._over, self.status = True, "The episode is over."
+                return False
+            self.frames.append(found)
+        self.at += 1
+        return True
+
+    def _play(self) -> Iterator[None]:
+        """Frames by the clock; a step of it is short, so that tasks come between."""
+        start, first = time.perf_counter(), self.frames[self.at].time_s
+        while self._advance():
+            due = start + (self.frames[self.at].time_s - first) / self._speed
+            while (wait := due - time.perf_counter()) > 0:
+                time.sleep(min(wait, _WAIT_S))
+                yield
+            # Behind the clock by much: it goes on from here.
+            if wait < -1.0 and np.isfinite(self._speed):
+                start, first = time.perf_counter(), self.frames[self.at].time_s
+            self._show()
+            yield
+        self._playing = False
+        self._show(True)
+
+    def _show(self, whole: bool = False) -> None:
+        now = time.perf_counter()
+        if not whole and now - self._drawn < 1 / _PICTURES_HZ:
+            return
+        self._drawn = now
+        frame = self.frames[self.at]
+        with self._server.atomic():
+            self._view.show(frame, self.frames[: self.at + 1], self._links)
+            self._panel.show(self.frames, self.at, self._playing, self.status)
+            if whole or now - self._charted > 1 / _CHARTS_HZ:
+                self._charted = now
+                self._panel.chart(self.frames[: self.at + 1])
+            centre = self._view.centre(frame) if self._follow else None
+            if centre is not None:
+                position = centre + self._view.radius * _BEHIND
+                for client in self._server.get_clients().values():
+                    client.camera.position, client.camera.look_at = position, centre
+        self._server.flush()
+
+    def _failed(self, error: Exception) -> None:
+        if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
+            traceback.print_exception(error)
+        self._playing = False
+        self.status = f"Not done: {error}"
+        for client in self._server.get_clients().values():
+            client.add_notification("Not done", str(error), auto_close_seconds=6.0, color="red")
+        self._show(True)

@@ -1,0 +1,148 @@
+"""Programs: what is watched, where it is, and how its frames begin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rbl_gym.checks import FloatArray
+from rbl_gym.geometry.obstacles import Obstacles
+from rbl_gym.geometry.regions import Box
+from rbl_gym.measurements.ranging import RangeNoise
+from rbl_gym.placement.building import Prior, Problem, Zone
+from rbl_gym.placement.gain import Gain
+from rbl_gym.recordings import Recording
+from rbl_gym.studies.replay import Settings, Track
+from rbl_gym.studio.watch.frames import Frame, filter_named
+from rbl_gym.studio.watch.live import Disturbances, Stage, frames, stage_of_scene
+from rbl_gym.studio.watch.recorded import recorded_frames, track_all
+from rbl_gym.worlds.scene import Scene
+
+# Room around anchors and track of a recording, metres.
+_MARGIN_M = 0.5
+
+Disturb = Callable[[int], Disturbances]
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """What is watched.
+
+    Parameters
+    ----------
+    title
+        Above the figures.
+    room
+        What is drawn around the body.
+    tags
+        (N, 3) on the body, metres.
+    start
+        Makes the frames of filters by their labels, of a seed, under disturbances.
+    filters
+        Labels of the filters at first.
+    seed
+        At first.
+    can_disturb, can_choose, can_seed
+        Whether disturbances, the filters and the seed can be changed.
+    """
+
+    title: str
+    room: Problem
+    tags: FloatArray
+    start: Callable[[tuple[str, ...], int, Disturb], Iterator[Frame]]
+    filters: tuple[str, ...]
+    seed: int = 0
+    can_disturb: bool = False
+    can_choose: bool = False
+    can_seed: bool = False
+
+
+# Filters that are watched where none is named: in a simulation, of a recording.
+LIVE, RECORDED = ("iekf", "iekf-robust"), ("iekf-log",)
+
+
+def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:
+    """The program of what `rbl_gym.studio.show` is given, but for problems.
+
+    Raises
+    ------
+    ValueError
+        On what cannot be watched.
+    """
+    if isinstance(what, Program):
+        return what
+    if isinstance(what, Scene):
+        filters = LIVE if beside is None else tuple(beside)
+        return live_program(stage_of_scene(what), filters, room_of(what), seed)
+    if isinstance(what, Recording):
+        if beside is None:
+            beside = track_all(what, tuple(map(filter_named, RECORDED)), Settings())
+        elif isinstance(beside, Track):
+            beside = {"track": beside}
+        return recorded_program(what, beside)
+    raise ValueError(
+        "what must be a Problem, a Scene, a Recording, an environment or a Program, "
+        f"got {what!r:.80}"
+    )
+
+
+def live_program(stage: Stage, filters: tuple[str, ...], room: Problem, seed: int = 0) -> Program:
+    """A simulated episode with filters side by side."""
+
+    def start(labels: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
+        return frames(stage, [filter_named(label) for label in labels], seed, disturb)
+
+    scene = stage.scene
+    return Program(scene.name, room, scene.body, start, filters, seed, True, True, True)
+
+
+def recorded_program(
+    recording: Recording, tracks: Mapping[str, Track], settings: Settings | None = None
+) -> Program:
+    """A recording with its tracks."""
+
+    def start(labels: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
+        return recorded_frames(recording, tracks, settings)
+
+    places = [recording.anchors.reshape(-1, 3), *(track.translation for track in tracks.values())]
+    room = room_around("recording", np.concatenate(places), recording.tags)
+    return Program("Recording", room, recording.tags, start, tuple(tracks))
+
+
+def room_of(scene: Scene) -> Problem:
+    """A scene as it is drawn."""
+    low, high = scene.volume.bounds()
+    return Problem(
+        scene.name,
+        scene.body,
+        scene.noise,
+        scene.obstruction,
+        scene.anchor_region,
+        (_zone(low, high),),
+        scene.n_anchors,
+        np.empty((0, 3)),
+        Gain(),
+        Prior(1.0, 1.0),
+    )
+
+
+def room_around(name: str, places: FloatArray, tags: FloatArray) -> Problem:
+    """Nothing but a floor below places (K, 3)."""
+    found = places[np.isfinite(places).all(axis=1)]
+    # A filter that was lost for a while does not make the room any larger.
+    low, high = np.quantile(found, [0.01, 0.99], axis=0)
+    low, high = low - _MARGIN_M, high + _MARGIN_M
+    region = Box(tuple(low.tolist()), tuple(high.tolist()))
+    none, noise = Obstacles(np.empty((0, 6)), 1.0), RangeNoise(0.1)
+    fixed = np.empty((0, 3))
+    zones = (_zone(low, high),)
+    return Problem(name, tags, noise, none, region, zones, 1, fixed, Gain(), Prior(1.0, 1.0))
+
+
+def _zone(low: FloatArray, high: FloatArray) -> Zone:
+    (x0, y0, z0), (x1, y1, z1) = low.tolist(), high.tolist()
+    plan = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    return Zone("volume", plan, z0, z1)
