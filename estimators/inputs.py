@@ -17,15 +17,62 @@ from rbl_gym.checks import (
     check_links,
     check_shape,
 )
+from rbl_gym.geometry import rotations
+from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
 State = TypeVar("State", bound=tuple[Any, ...])
 _FLOAT64 = np.dtype(np.float64)
+# By how much a covariance may be off its transpose, in units of its largest entry.
+_SYMMETRIC = 1e-8
 
 # Variance of an entry of a uniformly random rotation: the variance of an uninformative prior.
 VAGUE_ENTRY_VARIANCE = 1 / 3
+
+
+def check_prior(
+    rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike, sizes: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotation (..., 3, 3), translation (..., 3), covariance of one of the sizes; or a ValueError.
+
+    Each may have leading axes of its own, which broadcast.
+    """
+    if (
+        type(rotation) is type(translation) is type(covariance) is np.ndarray
+        and rotation.dtype == translation.dtype == covariance.dtype == _FLOAT64
+        and rotation.shape == (3, 3)
+        and translation.shape == (3,)
+        and covariance.shape in [(n, n) for n in sizes]
+        and np.vdot(translation, translation) < HUGE
+        and np.vdot(covariance, covariance) < HUGE
+        and is_sound(rotation, covariance, rotations.ORTHOGONAL, _SYMMETRIC)
+    ):
+        # The quick way of one body; what is wrong goes the long one, which names it.
+        return rotation, translation, covariance
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    return rotation, translation, check_covariance(covariance, sizes)
+
+
+@compiled("priors:is_sound")
+def is_sound(
+    rotation: FloatArray, covariance: FloatArray, off_orthogonal: float, off_symmetric: float
+) -> BoolArray:
+    """Whether rotations are proper, and covariances symmetric and clearly positive definite (...).
+
+    `off_orthogonal`: by how much entries of ``Q Q^T`` may be off the identity; `off_symmetric`:
+    those of the covariance off its transpose, in units of its largest.
+    """
+    Q, P = rotation, covariance
+    defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+    variance = np.diagonal(P, axis1=-2, axis2=-1).max(axis=-1)
+    skew = np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1))
+    proper = (defect <= off_orthogonal) & (np.linalg.det(Q) > 0)
+    finite = np.isfinite(P).all(axis=(-2, -1))
+    smallest = np.linalg.eigvalsh(np.where(finite[..., None, None], P, 0.0))[..., 0]
+    return proper & (skew <= off_symmetric * variance) & (smallest > 1e-14 * variance)
 
 
 def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArray:
@@ -35,7 +82,7 @@ def check_covariance(covariance: ArrayLike, sizes: tuple[int, ...]) -> FloatArra
         wanted = " or ".join(f"(..., {n}, {n})" for n in sizes)
         raise ValueError(f"covariance must have shape {wanted}, got {covariance.shape}")
     skew = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max()
-    if skew > 1e-8 * np.abs(covariance).max():
+    if skew > _SYMMETRIC * np.abs(covariance).max():
         raise ValueError(f"covariance must be symmetric, is off by {skew:.3g}")
     smallest = np.linalg.eigvalsh(covariance).min()
     if smallest <= 0:

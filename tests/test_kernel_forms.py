@@ -9,6 +9,7 @@ import pytest
 
 from rbl_gym import kernels, metrics
 from rbl_gym.bounds import information, pose, posterior
+from rbl_gym.estimators import inputs
 from rbl_gym.estimators.linear import engines, kalman, least_squares, unitary
 from rbl_gym.geometry import obstacles, regions, rotations
 from rbl_gym.measurements import bearing, noise_laws, ranging
@@ -108,7 +109,7 @@ def test_ranges_of_an_epoch(law, batch, common):
     normals = 3 * world.rng.standard_normal((*batch, 4, 5))
     assert_equal_forms(
         ranging._sample, world.rotation, world.translation, world.tags, world.anchors, normals,
-        law.numbers,
+        law.numbers, 5.0,
     )  # fmt: skip
 
 
@@ -116,7 +117,8 @@ def test_ranges_of_an_epoch(law, batch, common):
 def test_ranges_of_an_anchor_on_a_tag(law):
     tags, anchors = np.eye(3), np.array([[1.0, 0, 0], [0, 1, 0], [9, 9, 9]])
     normals = -np.ones((3, 3))
-    assert_equal_forms(ranging._sample, np.eye(3), np.zeros(3), tags, anchors, normals, law.numbers)
+    world = np.eye(3), np.zeros(3), tags, anchors, normals
+    assert_equal_forms(ranging._sample, *world, law.numbers, 9.0)
 
 
 @every_batch
@@ -351,7 +353,27 @@ def test_linear_constraints_and_beliefs(batch, m, n):
     assert_equal_forms(unitary.coupled_fit, linear.mean, linear.P)
     assert_equal_forms(unitary.decoupled_fit, linear.mean, linear.P, *linear.epoch)
     for form in (unitary.projected_belief, unitary.constrained_belief):
-        assert_equal_forms(form, linear.mean, linear.P, np.eye(3), np.zeros(6))
+        assert_equal_forms(form, linear.mean, linear.P, np.zeros(3), np.zeros(6))
+
+
+@every_batch
+@pytest.mark.parametrize("size", [6, 12])
+def test_sound_priors(batch, size):
+    rng = np.random.default_rng(7)
+    root = rng.standard_normal((*batch, size, size))
+    Q, P = rotations.random(rng, batch), root @ np.swapaxes(root, -1, -2) + 1e-3 * np.eye(size)
+    skew, wrong = np.zeros((size, size)), P.copy()
+    skew[0, 1] = 0.1
+    wrong[..., 2, 2] = np.nan
+    no_rotations = (-Q, 1.001 * Q, Q @ np.diag([1.0, 1.0, 0.0]), np.full((3, 3), np.nan))
+    no_covariances = (-P, P - 1e4 * np.eye(size), P + skew, wrong, 0 * P, 0 * P + 1.0)
+    for rotation, covariance, sound in (
+        (Q, P, True), *((R, P, False) for R in no_rotations),
+        *((Q, C, False) for C in no_covariances),
+    ):  # fmt: skip
+        for form in (inputs.is_sound.kernel, inputs.is_sound.textbook):
+            with np.errstate(all="ignore"):
+                assert (form(rotation, covariance, 1e-6, 1e-8) == sound).all()
 
 
 @every_batch

@@ -158,7 +158,11 @@ def _with_options(options: dict[str, Any]) -> Reward:
 
 def paid_of(reward: Reward, outcome: Outcome) -> FloatArray:
     """What a reward gives for a step: finite numbers, one for each world; or a ValueError."""
-    value = np.asarray(reward(outcome), dtype=np.float64)
+    value: Any = reward(outcome)
+    one_world = isinstance(value, float) and isinstance(outcome.figures.score_m, float)
+    if one_world and math.isfinite(value):
+        return value
+    value = np.asarray(value, dtype=np.float64)
     shape = np.shape(outcome.figures.score_m)
     if value.shape != shape:
         raise ValueError(f"reward must return shape {shape}, got {value.shape}")

@@ -43,14 +43,13 @@ from rbl_gym.estimators.iekf.vague_start import (
 from rbl_gym.estimators.inputs import (
     all_links,
     check_batches,
-    check_covariance,
     check_epoch,
     check_offset_epoch,
+    check_prior,
     epoch_variance,
     is_plain_epoch,
     plain,
 )
-from rbl_gym.geometry import rotations
 from rbl_gym.measurements import offsets, ranging
 from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
@@ -119,9 +118,7 @@ class IteratedEkf:
         ValueError
             On wrong shapes, a matrix that is no rotation, a covariance that is not positive.
         """
-        rotation = rotations.check_rotation("rotation", rotation)
-        translation = check_array("translation", translation, (3,))
-        covariance = check_covariance(covariance, (6,))
+        rotation, translation, covariance = check_prior(rotation, translation, covariance, (6,))
         batch = np.broadcast_shapes(
             rotation.shape[:-2], translation.shape[:-1], covariance.shape[:-2]
         )

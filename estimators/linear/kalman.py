@@ -30,9 +30,9 @@ from rbl_gym.estimators.filter import PoseBelief, register
 from rbl_gym.estimators.inputs import (
     VAGUE_ENTRY_VARIANCE,
     check_batches,
-    check_covariance,
     check_epoch,
     check_one_process,
+    check_prior,
     epoch_variance,
     is_plain_epoch,
     plain,
@@ -60,8 +60,8 @@ from rbl_gym.measurements.noise_laws import law_of, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
-# How large the rotation and the covariance of a belief are, to kernels.
-_SIZES = np.eye(3), np.zeros(6)
+# How large the parts of a belief are, to kernels.
+_SIZES = np.zeros(3), np.zeros(6)
 
 
 class KalmanState(NamedTuple):
@@ -150,9 +150,7 @@ class KalmanFamily:
         ValueError
             On wrong shapes, a matrix that is no rotation, a covariance that is not positive.
         """
-        rotation = rotations.check_rotation("rotation", rotation)
-        translation = check_array("translation", translation, (3,))
-        covariance = check_covariance(covariance, (6, 12))
+        rotation, translation, covariance = check_prior(rotation, translation, covariance, (6, 12))
         if covariance.shape[-1] == 6:
             covariance = expand_covariance(covariance)
         batch = np.broadcast_shapes(
@@ -259,11 +257,10 @@ class KalmanFamily:
         """
         state = plain(state)
         form = constrained_belief if self.constraint == "newton" else projected_belief
-        rotation, covariance = form(state.mean, state.covariance, *_SIZES)
-        translation = state.mean[..., 9:].copy()
+        rotation, translation, covariance, matrix = form(state.mean, state.covariance, *_SIZES)
         if self.constraint in ("newton", "always"):
-            return PoseBelief(rotation, translation, covariance, rotation)
-        return PoseBelief(rotation, translation, covariance, unvec(state.mean[..., :9]).copy())
+            matrix = rotation
+        return PoseBelief(rotation, translation, covariance, matrix)
 
     @cached_property
     def _variance_rate(self) -> FloatArray:

@@ -74,29 +74,34 @@ def _fit_rotation(weight: FloatArray, q: FloatArray) -> FloatArray:
 @compiled("linear_beliefs:projected_belief")
 def projected_belief(
     mean: FloatArray, covariance: FloatArray, like: FloatArray, size: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The nearest rotation (..., 3, 3), and the covariance ``J^+ P J^+T`` of the projected pose.
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The nearest pose, its covariance ``J^+ P J^+T``, and the matrix (..., 3, 3) of the state.
 
-    `like` (3, 3) and `size` (6,) only tell a kernel how large the results are.
+    The pose is a rotation (..., 3, 3) and a translation (..., 3). `like` (3,) and `size` (6,) only
+    tell a kernel how large the results are.
     """
-    rotation = _NEAREST(unvec(mean[..., :9]))
+    matrix, translation = unvec(mean[..., :9]).copy(), mean[..., 9:].copy()
+    rotation = _NEAREST(matrix)
     # J^T J = blkdiag(2 I, I): the pseudo-inverse needs no solver.
     halves = np.array([0.5] * 3 + [1.0] * 3)[:, None]
     pinv = np.swapaxes(state_jacobian(rotation), -1, -2) * halves
-    return rotation, symmetric(pinv @ covariance @ np.swapaxes(pinv, -1, -2))
+    P = symmetric(pinv @ covariance @ np.swapaxes(pinv, -1, -2))
+    return rotation, translation, P, matrix
 
 
 @compiled("linear_beliefs:constrained_belief")
 def constrained_belief(
     mean: FloatArray, covariance: FloatArray, like: FloatArray, size: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The rotation of the state, and the covariance ``(J^T P^-1 J)^-1`` of the pose on SO(3).
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The pose of the state, its covariance ``(J^T P^-1 J)^-1`` on SO(3), and the matrix.
 
     As `projected_belief`.
     """
-    rotation = _NEAREST(unvec(mean[..., :9]))
+    matrix, translation = unvec(mean[..., :9]).copy(), mean[..., 9:].copy()
+    rotation = _NEAREST(matrix)
     J = state_jacobian(rotation)
-    return rotation, inverse(np.swapaxes(J, -1, -2) @ np.linalg.solve(covariance, J))
+    P = inverse(np.swapaxes(J, -1, -2) @ np.linalg.solve(covariance, J))
+    return rotation, translation, P, matrix
 
 
 def state_jacobian(rotation: FloatArray) -> FloatArray:

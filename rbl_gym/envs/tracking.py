@@ -200,10 +200,11 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         if self._measured is None:
             observation = observed(self.scene, at, self._anchors)
         else:
-            observation = {key: field[k].copy() for key, field in self._measured.items()}
+            observation = {key: field[k] for key, field in self._measured.items()}
+        # An epoch is told once: views of the episode are the caller's.
         info: dict[str, Any] = {
-            "rotation": at.rotation.copy(),
-            "translation": at.translation.copy(),
+            "rotation": at.rotation,
+            "translation": at.translation,
             "epoch": k,
             "nlos": observation.pop("nlos"),
         }
@@ -216,10 +217,10 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         observation["anchors"] = simulation.surveyed(at, self._anchors)
         if at.survey is not None:
             info["anchors"] = self._anchors.copy()
-        observation["twist"] = at.twist.copy()
+        observation["twist"] = at.twist
         if at.readings is not None and at.velocity is not None and at.bias is not None:
-            observation["inertial"] = at.readings.copy()
-            info["velocity"], info["inertial_bias"] = at.velocity.copy(), at.bias.copy()
+            observation["inertial"] = at.readings
+            info["velocity"], info["inertial_bias"] = at.velocity, at.bias
         if self.family is not None:
             observation = self.family.padded(observation, self.scene)
             info["nlos"] = families.padded(info["nlos"], self.family.fields["links"][0])

@@ -193,7 +193,8 @@ class Box(Faced):
 
     def project(self, points: FloatArray) -> FloatArray:
         """Every coordinate clipped."""
-        return points.clip(*self._corners)
+        low, high = self._corners
+        return np.minimum(np.maximum(points, low), high)
 
     @functools.cached_property
     def _corners(self) -> tuple[FloatArray, FloatArray]:

@@ -268,9 +268,10 @@ def from_quaternion(q: ArrayLike) -> FloatArray:
         index = tuple(int(i) for i in np.argwhere(norm < 1e-12)[0])
         raise ValueError(f"q must not be zero, got {q[index].tolist()} at index {index}")
     unit = q / norm[..., None]
-    w, v = unit[..., 0], unit[..., 1:]
     if unit.ndim == 1:
-        return _one_series(v, 2 * w, 2.0, 2 * w * w - 1)
+        w = float(unit[0])
+        return _one_series(unit[1:], 2 * w, 2.0, 2 * w * w - 1)
+    w, v = unit[..., 0], unit[..., 1:]
     return _series(v, 2 * w, np.asarray(2.0), 2 * w * w - 1)
 
 
@@ -326,7 +327,11 @@ def random(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> FloatArray:
     return from_quaternion(rng.standard_normal((*shape, 4)))
 
 
-def check_rotation(name: str, Q: ArrayLike, *, tolerance: float = 1e-6) -> FloatArray:
+# By how much entries of Q Q^T of a rotation may be off the identity.
+ORTHOGONAL = 1e-6
+
+
+def check_rotation(name: str, Q: ArrayLike, *, tolerance: float = ORTHOGONAL) -> FloatArray:
     """`Q` as float64 (..., 3, 3) proper rotations, or a ValueError that says what is wrong."""
     Q = check_array(name, Q, (3, 3))
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max(initial=0.0)

@@ -95,12 +95,12 @@ def _square(x: float, y: float, z: float, anchors: Any, m: int) -> float:
     return dx * dx + dy * dy + dz * dz
 
 
-@gufunc("(d,d),(d),(n,d),(m,d),(m,n),(l)->(m,n),(m,n)")
+@gufunc("(d,d),(d),(n,d),(m,d),(m,n),(l),()->(m,n),(m,n)")
 def measure(
     rotation: Any, translation: Any, tags: Any, anchors: Any, normals: Any, law: Any,
-    ranges: Any, distances: Any,
+    longest: float, ranges: Any, distances: Any,
 ) -> None:  # fmt: skip
-    """Noisy ranges of all links and the distances behind them."""
+    """Noisy ranges of all links, none beyond the longest, and the distances behind them."""
     for n in range(tags.shape[0]):
         x, y, z = tag_position(rotation, translation, tags, n)
         reference = reference_of(law, n)
@@ -111,7 +111,7 @@ def measure(
             square = _square(x, y, z, anchors, m)
             of_reference = square if reference == n else _square(a, b, c, anchors, m)
             distances[m, n] = math.sqrt(square)
-            ranges[m, n] = sample(law, square, of_reference, normals[m, n])
+            ranges[m, n] = min(sample(law, square, of_reference, normals[m, n]), longest)
 
 
 @gufunc("(d,d),(d),(n,d),(d),(k,n),()->(k,n)")

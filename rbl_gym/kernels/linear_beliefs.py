@@ -20,13 +20,20 @@ _cholesky12, _, _ = of_size(12)
 
 
 @helper
-def _rotation_of(state: Any, Q: Any) -> None:
-    """The proper rotation nearest to the columns in a state; Q may not share its memory."""
-    matrix = np.empty((3, 3))
+def _split(state: Any, translation: Any, matrix: Any) -> None:
+    """The translation and the matrix of a state."""
     for k in range(3):
+        translation[k] = state[9 + k]
         for i in range(3):
             matrix[i, k] = state[3 * k + i]
-    nearest_rotation(matrix, Q)
+
+
+@helper
+def _rotation_of(state: Any, Q: Any) -> None:
+    """The proper rotation nearest to the columns in a state; Q may not share its memory."""
+    work = np.empty((4, 3))
+    _split(state, work[3], work[:3])
+    nearest_rotation(work[:3], Q)
 
 
 @helper
@@ -122,15 +129,17 @@ def _add_symmetric(A: Any, s: float, G: Any) -> None:
     A[2, 2] += s * G[5]
 
 
-@gufunc("(p),(p,p),(d,d),(s)->(d,d),(s,s)")
+@gufunc("(p),(p,p),(d),(s)->(d,d),(d),(s,s),(d,d)")
 def projected_belief(
-    mean: Any, P: Any, like: Any, size: Any, rotation: Any, covariance: Any
-) -> None:
-    """The nearest rotation, and the covariance ``J^+ P J^+T`` of the projected pose.
+    mean: Any, P: Any, like: Any, size: Any, rotation: Any, translation: Any, covariance: Any,
+    matrix: Any,
+) -> None:  # fmt: skip
+    """The pose with the nearest rotation, its covariance ``J^+ P J^+T``, and the matrix itself.
 
-    `like` (3, 3) and `size` (6,) only say how large the results are.
+    `like` (3,) and `size` (6,) only say how large the results are.
     """
-    _rotation_of(mean, rotation)
+    _split(mean, translation, matrix)
+    nearest_rotation(matrix, rotation)
     work = np.empty((6, 12))
     for j in range(12):
         for i in range(3):
@@ -155,15 +164,17 @@ def projected_belief(
     _make_symmetric(covariance)
 
 
-@gufunc("(p),(p,p),(d,d),(s)->(d,d),(s,s)")
+@gufunc("(p),(p,p),(d),(s)->(d,d),(d),(s,s),(d,d)")
 def constrained_belief(
-    mean: Any, P: Any, like: Any, size: Any, rotation: Any, covariance: Any
-) -> None:
-    """The rotation in the state, and the covariance ``(J^T P^-1 J)^-1`` of the pose on SO(3).
+    mean: Any, P: Any, like: Any, size: Any, rotation: Any, translation: Any, covariance: Any,
+    matrix: Any,
+) -> None:  # fmt: skip
+    """The pose in the state, its covariance ``(J^T P^-1 J)^-1`` on SO(3), and the matrix itself.
 
     As `projected_belief`.
     """
-    _rotation_of(mean, rotation)
+    _split(mean, translation, matrix)
+    nearest_rotation(matrix, rotation)
     L, Z = np.empty((12, 12)), np.zeros((12, 6))
     for k in range(3):
         x, y, z = rotation[0, k], rotation[1, k], rotation[2, k]

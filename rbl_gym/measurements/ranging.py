@@ -219,13 +219,17 @@ def sample(
     anchors: FloatArray,
     normals: FloatArray,
     noise: NoiseLaw,
+    longest: FloatArray | float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Noisy ranges of all links (..., M, N) of bodies at given poses, and the true distances."""
+    """Noisy ranges of all links (..., M, N) of bodies at given poses, and the true distances.
+
+    No range is beyond the `longest`.
+    """
     numbers = numbers_of(noise, tags.shape[-2])
     if numbers is not None:
-        return _sample(rotation, translation, tags, anchors, normals, numbers)
+        return _sample(rotation, translation, tags, anchors, normals, numbers, longest)
     true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
-    return noise.sample(true, normals), true
+    return np.minimum(noise.sample(true, normals), np.asarray(longest)[..., None, None]), true
 
 
 @compiled("epoch:measure")
@@ -236,10 +240,12 @@ def _sample(
     anchors: FloatArray,
     normals: FloatArray,
     law: FloatArray,
+    longest: FloatArray | float,
 ) -> tuple[FloatArray, FloatArray]:
     """`sample` of a law by its numbers."""
     true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
-    return law_of(law).sample(true, normals), true
+    ranges = law_of(law).sample(true, normals)
+    return np.minimum(ranges, np.asarray(longest)[..., None, None]), true
 
 
 @checked(anchors=("M", 3), tags=("N", 3), rotation=(3, 3), translation=(3,))

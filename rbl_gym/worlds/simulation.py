@@ -272,23 +272,9 @@ def _trajectory(
 
 def epoch_of(episode: Episode, epoch: int) -> Epoch:
     """Views of an episode at one epoch, the same for the whole batch."""
-    inertial = (None, None, None)
-    if episode.velocity is not None:
-        inertial = (
-            episode.velocity[..., epoch, :],
-            episode.readings[..., epoch, :, :],  # pyright: ignore[reportOptionalSubscript]
-            episode.bias[..., epoch, :],  # pyright: ignore[reportOptionalSubscript]
-        )
-    return Epoch(
-        episode.rotation[..., epoch, :, :],
-        episode.translation[..., epoch, :],
-        episode.twists[..., epoch, :],
-        episode.normals[..., epoch, :, :],
-        None if episode.uniforms is None else episode.uniforms[..., epoch, :, :, :],
-        *inertial,
-        None if episode.offsets is None else episode.offsets[..., epoch, :, :],
-        None if episode.survey is None else episode.survey[..., epoch, :, :],
-    )
+    at = (slice(None),) * (episode.rotation.ndim - 3) + (epoch,)
+    fields = episode[: len(Epoch._fields)]
+    return Epoch(*[None if field is None else field[at] for field in fields])  # pyright: ignore[reportArgumentType]
 
 
 def whole(episode: Episode) -> Epoch:
@@ -309,15 +295,17 @@ def measure_epoch(
         quality = link_quality(scene, at, anchors)
     if quality is not None:
         normals = normals / np.sqrt(np.where(quality > 0, quality, 1.0))[..., None]
-    taken = ranging.sample(at.rotation, at.translation, scene.body, anchors, normals, scene.noise)
-    if scene.links.never_fails:
-        ranges, links, nlos = taken[0], None, np.zeros(taken[0].shape, dtype=np.bool_)
-    else:
-        ranges, links, nlos = ranging.lose_links(*taken, scene.links, at.uniforms)
-    np.minimum(ranges, scene.range_limit_m, out=ranges)
+    longest = scene.range_limit_m
+    ranges, distances = ranging.sample(
+        at.rotation, at.translation, scene.body, anchors, normals, scene.noise, longest
+    )
     # A range of zero has no variance under a proportional law: such a reading is no reading.
-    measured = ranges > 0
-    links = measured if links is None else links & measured
+    if scene.links.never_fails:
+        links, nlos = ranges > 0, np.zeros(ranges.shape, dtype=np.bool_)
+    else:
+        taken = ranging.lose_links(ranges, distances, scene.links, at.uniforms)
+        ranges = np.minimum(taken.ranges, np.asarray(longest)[..., None, None])
+        links, nlos = taken.links & (ranges > 0), taken.nlos
     if quality is not None and not np.all(quality):
         links &= quality[..., None] > 0
         ranges[~links] = 0.0

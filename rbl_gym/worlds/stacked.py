@@ -142,7 +142,7 @@ class StackedScenes:
 
     @property
     def range_limit_m(self) -> FloatArray:
-        """(B, 1, 1), metres."""
+        """(B,), metres."""
         return self.arrays.range_limit_m
 
     @property
@@ -241,7 +241,7 @@ def _numbers(family: SceneFamily, scene: Scene) -> tuple[Any, ...]:
         np.float64(scene.dt),
         np.int64(scene.steps),
         np.float64(scene.anchor_speed_m_s),
-        np.full((1, 1), scene.range_limit_m),
+        np.array(scene.range_limit_m),
         np.full((1, 1), scene.blocked_information),
         boxes,
         np.full((1, 1), links.drop_probability),
