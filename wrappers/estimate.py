@@ -23,6 +23,7 @@ from rbl_gym.wrappers.observations import Seen, ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import Outcome, RewardLike, paid_of, reward_of
 
 FilterLike = str | Mapping[str, Any]
+_FIGURES = metrics.Figures._fields
 
 
 class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -142,7 +143,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if self._rendered:
             rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
         info = with_bound(info)
-        info.update(zip(figures._fields, map(float, figures), strict=True))
+        info.update(zip(_FIGURES, map(float, figures), strict=True))
         return info, figures
 
     def _observation(self, observation: dict[str, np.ndarray], belief: PoseBelief) -> Any:

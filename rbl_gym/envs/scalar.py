@@ -91,8 +91,4 @@ def _first(observation: Observation) -> Observation:
 
 def _scalars(info: dict[str, Any]) -> dict[str, Any]:
     """Infos of the one world: numbers as Python's own."""
-    return {
-        key: value.item(0) if value.ndim == 1 else value[0]
-        for key, value in info.items()
-        if not key.startswith("_")
-    }
+    return {key: value.item(0) if value.ndim == 1 else value[0] for key, value in info.items()}

@@ -131,12 +131,18 @@ def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.
 
 def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
     """Views of the draws: `normals` and `uniforms` of an `Episode`."""
-    batch, shape = draws.normals.shape[:-1], (scene.n_anchors, len(scene.tags))
     normals = _split(draws.normals, _normal_sizes(scene))[2]
+    return _by_epoch(scene, normals, _split(draws.uniforms, _uniform_sizes(scene))[3])
+
+
+def _by_epoch(
+    scene: Scene, normals: FloatArray, uniforms: FloatArray
+) -> tuple[FloatArray, FloatArray | None]:
+    """Random numbers of the ranges and the links, with axes of epochs and links."""
+    batch, shape = normals.shape[:-1], (scene.n_anchors, len(scene.tags))
     normals = normals.reshape((*batch, scene.steps + 1, *shape))
     if not scene.links.is_random:
         return normals, None
-    uniforms = _split(draws.uniforms, _uniform_sizes(scene))[3]
     return normals, uniforms.reshape((*batch, scene.steps + 1, 2, *shape))
 
 
@@ -176,8 +182,10 @@ def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
 def build_episode(scene: Scene, draws: Draws) -> Episode:
     """The episodes that these random numbers make; batched over their leading axes."""
     batch = draws.normals.shape[:-1]
-    start, process, _, held, felt, common, surveyed = _split(draws.normals, _normal_sizes(scene))
-    places, phase, spots, _ = _split(draws.uniforms, _uniform_sizes(scene))
+    start, process, ranges, held, felt, common, surveyed = _split(
+        draws.normals, _normal_sizes(scene)
+    )
+    places, phase, spots, links = _split(draws.uniforms, _uniform_sizes(scene))
     trajectory = _trajectory(scene, start[..., :7], places, phase, held)
     steps = scene.steps_of_motion
     process = process.reshape((*batch, steps, 6))
@@ -217,7 +225,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     else:
         anchors = np.full((*batch, scene.n_anchors, 3), scene.anchors)
     covariance = np.full((*batch, 6, 6), covariance)
-    random, offsets = of_ranges(scene, draws), None
+    random, offsets = _by_epoch(scene, ranges, links), None
     if scene.links.offset is not None:
         shape = scene.links.offset_shape(scene.n_anchors, len(scene.tags))
         offsets = common.reshape((*batch, scene.steps + 1, *shape))
@@ -231,7 +239,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
 
 
 def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
-    ends = list(itertools.accumulate(sizes))
+    ends = itertools.accumulate(sizes)
     return [block[..., end - size : end] for size, end in zip(sizes, ends, strict=True)]
 
 
