@@ -173,7 +173,8 @@ class AugmentedEkf:
         if not self.biases and self.directions is None:
             return _carried(state, self.pose.update(pose, ranges, anchors, links, noise))
         ranges, variance, anchors, mask = self.pose.measured(state, ranges, anchors, links, noise)
-        ranges, variance = np.broadcast_arrays(ranges, variance)
+        if ranges.shape != variance.shape:
+            ranges, variance = np.broadcast_arrays(ranges, variance)
         check_batches(state=state.translation.shape[:-1], ranges=ranges.shape[:-2])
         state = self._with_biases(state, ranges.shape[-2:])
         weights = 1 / variance if mask is None else mask / variance

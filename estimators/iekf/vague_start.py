@@ -32,6 +32,8 @@ def is_vague(covariance: FloatArray) -> BoolArray:
     """Where (...) the rotation's largest variance is above that of `VAGUE_ROTATION_RAD`."""
     limit = VAGUE_ROTATION_RAD**2
     # The trace bounds the largest eigenvalue: most priors need no more.
+    if covariance.ndim == 2 and not sum(covariance.item(i, i) for i in range(3)) > limit:
+        return np.asarray(False)
     vague = np.asarray(
         covariance[..., 0, 0] + covariance[..., 1, 1] + covariance[..., 2, 2] > limit
     )

@@ -136,11 +136,12 @@ def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
     own = own_std(recording, settings)
     elapsed = np.diff(recording.times, prepend=recording.times[0])
     anchors = recording.anchors_by_epoch
+    complete = recording.links.all(axis=(1, 2)).tolist()
     for k, dt in enumerate(elapsed.tolist()):
         yield Reading(
             recording.ranges[k],
             anchors[k],
-            recording.links[k],
+            None if complete[k] else recording.links[k],
             None if own is None else ranging.LinkNoise(own[k]),
             np.zeros(6) if dt > 0 else None,
             dt,
