@@ -154,9 +154,11 @@ def test_imports_are_absolute_and_by_the_one_name(name):
 
 # What a module needs that may be absent: then, so is the module.
 BEYOND = {
+    "rbl_gym.studies.learning.amortised": "torch",
     "rbl_gym.studies.learning.craft_training": "torch",
     "rbl_gym.studies.learning.set_networks": "torch",
     "rbl_gym.studies.learning.sight_training": "torch",
+    "rbl_gym.studies.learning.torch_layouts": "torch",
     "rbl_gym.wrappers.sb3": "stable_baselines3",
     **{name: "numba" for name in MODULES if name.startswith("rbl_gym.kernels.")},
 }

@@ -463,7 +463,7 @@ def test_gradients_of_layouts(law, batch, limits):
         gain.numbers,
         world.rng.random((*batch, 6, 4, world.tags.shape[-2])),
     )
-    square, slope = assert_equal_forms(gradient._square_and_gradient, *args)
+    square, slope = assert_equal_forms(gradient.square_and_gradient, *args)
     assert (np.abs(slope).max(axis=(-1, -2)) > 0).all()
     assert (square > 0).all()
 

@@ -70,6 +70,13 @@ def add_place(commands: Any) -> None:
         help="anchors of --layout that stay, by their names or numbers, with commas; or all",
     )
     place.add_argument(
+        "--start",
+        choices=("search", "amortised"),
+        default="search",
+        help="amortised: the layout of a trained network and 20 steps at most, in place of the "
+        "search",
+    )
+    place.add_argument(
         "--racks",
         type=natural,
         default=0,
@@ -120,6 +127,7 @@ def _place(options: argparse.Namespace) -> int:
         options.survive,
         options.seed,
         options.trials,
+        options.start,
     )
     with progress("placing") as advance:
         placed = answer.place_anchors(problem, question, advance)

@@ -67,8 +67,8 @@ def score_and_gradient(
 
 
 def of_arrays(*arrays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`score_and_gradient`, of the arguments of `_square_and_gradient`."""
-    square, gradient = _square_and_gradient(*arrays)
+    """`score_and_gradient`, of the arguments of `square_and_gradient`."""
+    square, gradient = square_and_gradient(*arrays)
     root = root_of(square)
     return root, gradient / (2 * root[..., None, None])
 
@@ -88,7 +88,7 @@ def _shares(share: FloatArray | None, p: int, m: int, n: int) -> FloatArray:
 
 
 @compiled("layout_gradient:square_and_gradient")
-def _square_and_gradient(
+def square_and_gradient(
     anchors: FloatArray,
     normals: FloatArray,
     rotation: FloatArray,

@@ -14,9 +14,10 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.geometry.regions import Shell
+from rbl_gym.placement import amortised as network
 from rbl_gym.placement.problem import Context, PlacementTask
 
-__all__ = ["LAYOUTS", "corners", "grid", "layout", "perimeter", "random", "ring"]
+__all__ = ["LAYOUTS", "amortised", "corners", "grid", "layout", "perimeter", "random", "ring"]
 
 Layout = Callable[[PlacementTask, Context, np.random.Generator], FloatArray]
 
@@ -100,6 +101,21 @@ def ring(
     places[..., 1] = context.centre[..., 1, None] + radius * np.sin(angle)
     places[..., 2] = levels
     return task.scene.anchor_region.project(places)
+
+
+def amortised(
+    task: PlacementTask, context: Context, rng: np.random.Generator, evaluations: int = 0
+) -> FloatArray:
+    """What a network that has seen many random problems proposes, see `placement.amortised`.
+
+    Parameters
+    ----------
+    task, context, rng
+        As `layout`; 1 to 16 anchors. Nothing is drawn.
+    evaluations
+        Of score and gradient, at most, in steps along the gradient after it; 0: none.
+    """
+    return network.of_task(task, context, evaluations)
 
 
 LAYOUTS: dict[str, Layout] = {

@@ -15,7 +15,7 @@ import numpy as np
 from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.placement import exchange, setting
 from rbl_gym.placement.descent import descend
-from rbl_gym.placement.layouts import Layout, ring
+from rbl_gym.placement.layouts import Layout, amortised, ring
 from rbl_gym.placement.problem import Context, PlacementTask, information, score, score_of
 
 __all__ = [
@@ -310,6 +310,7 @@ SEARCHES: dict[str, Layout] = {
     "greedy-swaps": greedy_swaps,
     "gradient": along_gradient,
     "hybrid": hybrid,
+    "amortised": amortised,
     "cma-es": cma_es,
 }
 # Those whose best layout counts as the best known.

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.placement import criteria, scene_files
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.placing import check, choosing, design
@@ -60,6 +60,9 @@ class Question:
         1: any one anchor may fail, in judging and in the search.
     seed, trials
         Of all randomness, and bodies of the Monte-Carlo check.
+    start
+        Of `design.STARTS`: ``"search"``, or ``"amortised"``, the network's layout and a few steps
+        along the gradient in place of the search.
     """
 
     numbers: range
@@ -71,6 +74,7 @@ class Question:
     survive: int = 0
     seed: int = 0
     trials: int = 500
+    start: str = "search"
 
 
 class Placed(NamedTuple):
@@ -96,8 +100,14 @@ def place_anchors(problem: Problem, question: Question, advance: Advance = silen
     Raises
     ------
     ValueError
-        If the layout does not fit the problem or the numbers, or `fewest` has nothing to meet.
+        If the layout does not fit the problem or the numbers, `fewest` has nothing to meet, or
+        `start` is unknown or means nothing.
     """
+    check_one_of("start", question.start, design.STARTS)
+    if question.start != "search" and (question.fewest or question.layout is not None):
+        raise ValueError(
+            f"start must be 'search' with a layout or the least number, got {question.start!r}"
+        )
     problem, start = _with_kept(problem, question)
     seed, survive = question.seed, question.survive
     advance(0, more=2)
@@ -163,7 +173,7 @@ def _designed(
     """The best layout for b; where it misses a requirement, or one may fail, exchanges from it."""
     seed, survive = question.seed, question.survive
     advance(0, more=design.SEARCH_STEPS)
-    found = design.design_layout(problem, seed, advance, start)
+    found = design.design_layout(problem, seed, advance, start, question.start)
     asks = any(limits_of(zone).any() for zone in problem.zones)
     if not survive and (not asks or choosing.is_met(judge(problem, found.anchors, seed))):
         return found

@@ -8,16 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym import placement
-from rbl_gym.checks import FloatArray
+from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.geometry.obstacles import Obstacles
 from rbl_gym.geometry.regions import Box, Shell, Walls
-from rbl_gym.placement import design, layouts
+from rbl_gym.placement import amortised, design, layouts
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.studies.placing import judging
 from rbl_gym.studies.progress import Advance, silent
 
 __all__ = [
+    "STARTS",
     "Design",
     "design_layout",
     "usual_layouts",
@@ -25,6 +26,8 @@ __all__ = [
 
 # Poses over which the usual layouts are compared.
 _N_POSES = 64
+# What a design begins with: `placement.design`, or `placement.amortised` with so many steps.
+STARTS, _EVALUATIONS = ("search", "amortised"), 20
 # Usual layouts from which the search starts too, where nothing is in the way.
 _STARTS = ("grid", "ring")
 # Random layouts whose median stands for "at random".
@@ -74,6 +77,7 @@ def design_layout(
     seed: int,
     advance: Advance = silent,
     start: FloatArray | None = None,
+    begin: str = "search",
 ) -> Design:
     """The best layout of a problem that `placement.design` finds, or a usual one.
 
@@ -86,7 +90,10 @@ def design_layout(
     start
         A layout (K, 3), its first rows the fixed anchors: one more start. With fewer anchors than
         are placed, the others are added.
+    begin
+        Of `STARTS`: what looks for the layout.
     """
+    check_one_of("start", begin, STARTS)
     context, fixed = problem.context, problem.fixed
     task = free_task(problem, _N_POSES)
     rng = np.random.default_rng([seed, problem.n_anchors])
@@ -96,8 +103,12 @@ def design_layout(
         starts = {name: layout for name, layout in drawn.items() if name in _STARTS}
     if start is not None:
         starts["given"] = start[len(fixed) :]
-    found, name = design.find_layout(problem, rng, starts, advance)
-    name = f"search from {name}"
+    if begin == "amortised":
+        found, name = amortised.of_problem(problem, _EVALUATIONS), "amortised"
+        advance(SEARCH_STEPS)
+    else:
+        found, name = design.find_layout(problem, rng, starts, advance)
+        name = f"search from {name}"
     searched = {name: np.concatenate([fixed, _rounded(problem, found[len(fixed) :])])}
     if start is not None and len(start) == problem.n_anchors:
         searched["as given"] = start

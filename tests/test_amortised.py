@@ -1,0 +1,329 @@
+"""The network that places anchors: against torch, units, padding, legality, how good it is."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from rbl_gym import placement
+from rbl_gym.geometry.regions import Box, Shell, Walls
+from rbl_gym.measurements.ranging import RangeNoise
+from rbl_gym.placement import amortised, layouts, scene_files, scenery, search, setting
+from rbl_gym.placement.descent import descend
+from rbl_gym.placement.sample import sample
+from rbl_gym.placement.tokens import KINDS, Scenery, Tokens, tokens_of
+from rbl_gym.studies.placing import design
+from rbl_gym.studies.placing.answer import Question, place_anchors
+from rbl_gym.worlds import scenes
+from tests.helpers import ROOT, needs
+
+FEET = 1 / 0.3048
+SCENES = [("auv_buoys", 4, 0), ("drone_yard", 6, 0), ("satellite", 5, 0), ("uwb_room", 5, 2)]
+
+
+def problem(scene, n_anchors, racks=0, batch=(), seed=0):
+    task = placement.task(scene, n_anchors, racks)
+    return task, placement.draw_contexts(task, np.random.default_rng(seed), batch)
+
+
+def office(n_anchors=8):
+    return scene_files.problem(str(ROOT / "examples" / "office.toml"), n_anchors)
+
+
+def room_tokens(batch=(2,)):
+    task, contexts = problem("uwb_room", 5, 2, batch)
+    return tokens_of(scenery.of_task(task, contexts), 5)
+
+
+def scaled_task(task, by):
+    """The task with all its lengths in another unit."""
+    scene = task.scene
+
+    def times(region):
+        if isinstance(region, Shell):
+            return Shell(by * region.inner_m, by * region.outer_m)
+        low, high = (tuple(by * x for x in corner) for corner in (region.low, region.high))
+        return type(region)(low, high)
+
+    scene = dataclasses.replace(
+        scene,
+        volume=times(scene.volume),
+        anchor_region=times(scene.anchor_region),
+        anchors=None,
+        tags=tuple(tuple(by * x for x in tag) for tag in scene.tags),
+        noise=RangeNoise(by * scene.noise.floor_m, scene.noise.proportional),
+    )
+    return dataclasses.replace(task, scene=scene)
+
+
+# --- units -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("scene", "n_anchors", "racks"), SCENES)
+def test_feet_for_metres_scale_the_layout(scene, n_anchors, racks):
+    task, contexts = problem(scene, n_anchors, racks, (3,))
+    in_feet = placement.Context(*(FEET * field for field in contexts))
+    found = amortised.of_task(task, contexts)
+    again = amortised.of_task(scaled_task(task, FEET), in_feet)
+    np.testing.assert_allclose(again / FEET, found, rtol=1e-8, atol=1e-8 * np.abs(found).max())
+
+
+@needs("shapely")
+def test_a_building_in_feet_has_the_same_layout():
+    metres = office()
+    gain, mounts, prisms = metres.gain, metres.mounts, metres.obstacles.prisms
+    faces = mounts.faces._replace(
+        origin=FEET * mounts.faces.origin, extents=FEET * mounts.faces.extents
+    )
+    feet = dataclasses.replace(
+        metres,
+        tags=FEET * metres.tags,
+        noise=RangeNoise(FEET * metres.noise.floor_m, metres.noise.proportional),
+        obstacles=dataclasses.replace(
+            metres.obstacles,
+            boxes=FEET * metres.obstacles.boxes,
+            prisms=dataclasses.replace(
+                prisms,
+                corners=FEET * prisms.corners,
+                low_m=FEET * prisms.low_m,
+                high_m=FEET * prisms.high_m,
+            ),
+        ),
+        mounts=dataclasses.replace(mounts, pieces=FEET * mounts.pieces, faces=faces),
+        zones=tuple(
+            dataclasses.replace(
+                zone,
+                polygon=FEET * zone.polygon,
+                low_m=FEET * zone.low_m,
+                high_m=FEET * zone.high_m,
+            )
+            for zone in metres.zones
+        ),
+        fixed=FEET * metres.fixed,
+        gain=dataclasses.replace(
+            gain, max_range_m=FEET * gain.max_range_m, range_edge_m=FEET * gain.range_edge_m
+        ),
+    )
+    found = amortised.of_problem(metres)
+    np.testing.assert_allclose(amortised.of_problem(feet) / FEET, found, rtol=1e-8, atol=1e-8)
+
+
+# --- tokens ----------------------------------------------------------------------------------
+
+
+def test_the_order_of_obstacles_does_not_matter():
+    tokens, weights = room_tokens(), amortised.load().weights
+    turned = tokens._replace(obstacles=tokens.obstacles[:, ::-1])
+    for found, other in zip(
+        amortised.forward(weights, tokens, 5, 5),
+        amortised.forward(weights, turned, 5, 5),
+        strict=True,
+    ):
+        np.testing.assert_allclose(found, other, atol=1e-10)
+
+
+def test_padding_changes_nothing():
+    tokens, weights = room_tokens(), amortised.load().weights
+    padded = Tokens(
+        tokens.world,
+        *(np.pad(rows, ((0, 0), (0, 3), (0, 0))) for rows in tokens[1:]),
+    )
+    steps, scores = amortised.forward(weights, tokens, 5, 5)
+    padded_steps, padded_scores = amortised.forward(weights, padded, 5, 5)
+    np.testing.assert_allclose(padded_steps, steps, atol=1e-10)
+    np.testing.assert_allclose(padded_scores[..., : scores.shape[-1]], scores, atol=1e-10)
+    assert (padded_scores[..., scores.shape[-1] :] == -np.inf).all()
+
+
+def test_padded_zones_and_obstacles_are_padded_tokens():
+    task, contexts = problem("uwb_room", 5, 2, (2,))
+    seen = scenery.of_task(task, contexts)
+    padded = seen._replace(
+        zones=np.pad(seen.zones, ((0, 0), (0, 1), (0, 0))),
+        obstacles=np.pad(seen.obstacles, ((0, 0), (0, 1), (0, 0))),
+    )
+    assert isinstance(padded, Scenery)
+    for rows, more in zip(tokens_of(seen, 5), tokens_of(padded, 5), strict=True):
+        np.testing.assert_allclose(more[:, : rows.shape[1]], rows)
+        assert not more[:, rows.shape[1] :].any()
+
+
+def test_worlds_do_not_see_each_other():
+    task, contexts = problem("uwb_room", 5, 2, (4,))
+    together = amortised.of_task(task, contexts)
+    alone = amortised.of_task(task, placement.Context(*(field[2] for field in contexts)))
+    np.testing.assert_allclose(together[2], alone, atol=1e-9)
+
+
+# --- against torch ---------------------------------------------------------------------------
+
+
+def of_arrays(torch, tokens):
+    return Tokens(*(torch.as_tensor(rows, dtype=torch.float32) for rows in tokens))
+
+
+@needs("torch")
+def test_the_played_network_is_that_of_torch():
+    import torch
+
+    from rbl_gym.studies.learning.torch_layouts import Network
+
+    tokens = room_tokens()
+    tokens = tokens._replace(obstacles=np.pad(tokens.obstacles, ((0, 0), (0, 1), (0, 0))))
+    torch.manual_seed(0)
+    network = Network({name: getattr(tokens, name).shape[-1] for name in Tokens._fields}, 32, 2)
+    weights = {name: value.astype(float) for name, value in network.arrays().items()}
+    with torch.no_grad():
+        found = network(of_arrays(torch, tokens), 6, 6)
+    for array, other in zip(amortised.forward(weights, tokens, 6, 6), found, strict=True):
+        np.testing.assert_allclose(array, other.numpy(), atol=1e-5)
+
+
+@needs("torch")
+@pytest.mark.parametrize("family", ["boxes", "shells", "rooms"])
+def test_the_loss_of_the_training_is_the_score(family):
+    import torch
+
+    from rbl_gym.studies.learning import torch_layouts
+    from rbl_gym.studies.learning.amortised import case_of
+    from rbl_gym.studies.learning.placement_families import draw
+
+    batch = draw(family, np.random.default_rng(3), 4)
+    seen, case = batch.seen, case_of(batch)
+    origin, unit = seen.frame()
+    rng = np.random.default_rng(0)
+    steps = torch.as_tensor(rng.standard_normal((4, batch.count, 3)), dtype=torch.float32)
+    anchors = torch_layouts.legal(KINDS[seen.kind], case, steps)
+    sight = torch_layouts.sight(case, anchors, 1e-5)
+    found = torch_layouts.log_score(case, torch_layouts.information(case, anchors, sight))
+    found = found.numpy() + np.log(unit)
+    places = origin[:, None] + unit[:, None, None] * anchors.numpy().astype(float)
+    for index in range(4):
+        low, high = (tuple(corner[index]) for corner in (seen.low, seen.high))
+        if family == "shells":
+            region = Shell(float(seen.inner[index]), float(batch.outer[index]))
+        else:
+            region = Box(low, high) if family == "boxes" else Walls(low, high)
+        assert np.abs(region.project(places[index]) - places[index]).max() < 1e-4 * unit[index]
+        told = sample_of(batch, index)
+        layout = np.concatenate([seen.fixed[index], places[index]])
+        share = placement_share(seen, index, layout, batch.left[index])
+        score, _ = placement.score_and_gradient(
+            layout, told, seen.tags[index], RangeNoise(*seen.noise[index]), share
+        )
+        assert found[index] == pytest.approx(np.log(score), abs=2e-3)
+
+
+def sample_of(batch, index):
+    fields = (batch.rotation, batch.seen.places, batch.weight, batch.prior)
+    zone = np.zeros(batch.weight.shape[1], dtype=int)
+    return placement.Sample(*(field[index] for field in fields), zone)
+
+
+def placement_share(seen, index, layout, left):
+    from rbl_gym.geometry.obstacles import Obstacles
+
+    return Obstacles(seen.obstacles[index, :, :6], left).share(layout, seen.places[index])
+
+
+@needs("torch")
+def test_a_training_is_the_same_again_and_its_file_is_played(tmp_path):
+    from rbl_gym.studies.learning.amortised import save, train
+
+    networks = [train([1, 1], 4, lambda _: None)[0] for _ in range(2)]
+    for name, array in networks[0].arrays().items():
+        np.testing.assert_array_equal(array, networks[1].arrays()[name])
+    save(networks[0], {"seed": 4}, tmp_path / "network.npz")
+    played = amortised.read(tmp_path / "network.npz")
+    assert played.meta["seed"] == 4
+    task, contexts = problem("auv_buoys", 4, 0, (2,))
+    assert placement.is_legal(task, amortised.of_task(task, contexts, 0, played)).all()
+
+
+def test_the_package_says_how_its_network_was_made():
+    path = resources.files("rbl_gym.placement").joinpath("amortised.npz")
+    assert len(path.read_bytes()) < 1_000_000
+    network = amortised.load()
+    assert isinstance(network, amortised.Network)
+    assert {"command", "seed", "steps", "versions"} <= network.meta.keys()
+    json.dumps(network.meta)
+
+
+# --- what it places --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n_anchors", [1, 3, 8, 16])
+@pytest.mark.parametrize(("scene", "racks"), [(name, racks) for name, _, racks in SCENES])
+def test_anchors_are_legal(scene, racks, n_anchors):
+    task, contexts = problem(scene, n_anchors, racks, (5,))
+    found = amortised.of_task(task, contexts)
+    assert found.shape == (5, n_anchors, 3)
+    assert placement.is_legal(task, found).all()
+
+
+def test_anchors_stand_outside_of_obstacles():
+    boxes = [[x, y, 3, 14, 14, 3.1] for x in (-30, 30) for y in (-30, 30)]
+    scene = scenes.get({"name": "drone_yard", "obstacles": boxes})
+    task = placement.task(scene, 12)
+    found = amortised.of_task(task, placement.whole_volume(task))
+    assert not scene.obstruction.contain(found).any()
+    assert placement.is_legal(task, found).all()
+
+
+@needs("shapely")
+def test_a_building_keeps_its_fixed_anchors():
+    building = office()
+    for evaluations in (0, 5):
+        found = amortised.of_problem(building, evaluations)
+        assert found.shape == (8, 3)
+        np.testing.assert_array_equal(found[: len(building.fixed)], building.fixed)
+        assert setting.of_problem(building, sample(building, 64)).legal(found[1:]).all()
+        assert len(np.unique(found, axis=0)) == 8
+    only = building.with_anchors(1)
+    np.testing.assert_array_equal(amortised.of_problem(only), building.fixed)
+
+
+def test_more_anchors_than_it_has_seen_are_refused():
+    task, context = problem("auv_buoys", 17)
+    with pytest.raises(ValueError, match="n_anchors"):
+        amortised.of_task(task, context)
+
+
+@pytest.mark.parametrize(("scene", "n_anchors", "racks"), SCENES)
+def test_it_is_near_the_best_that_searches_find(scene, n_anchors, racks):
+    """Mean over 8 held-out problems, normalised: 0 a random layout, 1 the gradient's."""
+    task, contexts = problem(scene, n_anchors, racks, (8,), seed=5)
+    rng = np.random.default_rng(0)
+    assert search.SEARCHES["amortised"] is layouts.amortised
+
+    def loss(anchors):
+        return np.log(placement.score(task, contexts, anchors)).mean()
+
+    at_random = np.mean([loss(layouts.random(task, contexts, rng)) for _ in range(8)])
+    best = loss(search.along_gradient(task, contexts, rng))
+    alone = loss(layouts.amortised(task, contexts, rng))
+    stepped = loss(layouts.amortised(task, contexts, rng, evaluations=10))
+    assert (at_random - alone) / (at_random - best) > 0.9
+    assert (at_random - stepped) / (at_random - best) > 0.97
+    assert stepped <= alone
+
+
+# --- in place --------------------------------------------------------------------------------
+
+
+def test_place_starts_from_it():
+    found = scene_files.problem("drone_yard", 4)
+    assert design.STARTS == ("search", "amortised")
+    quick = design.design_layout(found, 0, begin="amortised")
+    assert quick.method == "amortised"
+    judged, task = setting.of_problem(found, sample(found, 128)), placement.task("drone_yard", 4)
+    best, _ = descend(judged, layouts.ring(task, found.context, np.random.default_rng(0)))
+    assert judged.score(quick.anchors) < 1.02 * judged.score(best)
+    with pytest.raises(ValueError, match="start"):
+        place_anchors(found, Question(range(4, 5), start="guess"))
+    with pytest.raises(ValueError, match="start must be 'search'"):
+        place_anchors(found, Question(range(4, 5), fewest=True, start="amortised"))
