@@ -39,7 +39,19 @@ def check_prior(
 
     Each may have leading axes of its own, which broadcast.
     """
-    if (
+    if _is_plain_prior(rotation, translation, covariance, sizes):
+        # The quick way of one body; what is wrong goes the long one, which names it.
+        return rotation, translation, covariance  # pyright: ignore[reportReturnType]
+    rotation = rotations.check_rotation("rotation", rotation)
+    translation = check_array("translation", translation, (3,))
+    return rotation, translation, check_covariance(covariance, sizes)
+
+
+def _is_plain_prior(
+    rotation: Any, translation: Any, covariance: Any, sizes: tuple[int, ...]
+) -> bool:
+    """Whether these are arrays of one body, and all is well with them."""
+    return (
         type(rotation) is type(translation) is type(covariance) is np.ndarray
         and rotation.dtype == translation.dtype == covariance.dtype == _FLOAT64
         and rotation.shape == (3, 3)
@@ -47,13 +59,8 @@ def check_prior(
         and covariance.shape in [(n, n) for n in sizes]
         and np.vdot(translation, translation) < HUGE
         and np.vdot(covariance, covariance) < HUGE
-        and is_sound(rotation, covariance, rotations.ORTHOGONAL, _SYMMETRIC)
-    ):
-        # The quick way of one body; what is wrong goes the long one, which names it.
-        return rotation, translation, covariance
-    rotation = rotations.check_rotation("rotation", rotation)
-    translation = check_array("translation", translation, (3,))
-    return rotation, translation, check_covariance(covariance, sizes)
+        and bool(is_sound(rotation, covariance, rotations.ORTHOGONAL, _SYMMETRIC))
+    )
 
 
 @compiled("priors:is_sound")
@@ -70,7 +77,7 @@ def is_sound(
     variance = np.diagonal(P, axis1=-2, axis2=-1).max(axis=-1)
     skew = np.abs(P - np.swapaxes(P, -1, -2)).max(axis=(-2, -1))
     proper = (defect <= off_orthogonal) & (np.linalg.det(Q) > 0)
-    finite = np.isfinite(P).all(axis=(-2, -1))
+    finite = np.asarray(np.isfinite(P).all(axis=(-2, -1)))
     smallest = np.linalg.eigvalsh(np.where(finite[..., None, None], P, 0.0))[..., 0]
     return proper & (skew <= off_symmetric * variance) & (smallest > 1e-14 * variance)
 

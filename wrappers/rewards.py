@@ -156,7 +156,7 @@ def _with_options(options: dict[str, Any]) -> Reward:
     return paid
 
 
-def paid_of(reward: Reward, outcome: Outcome) -> FloatArray:
+def paid_of(reward: Reward, outcome: Outcome) -> FloatArray | float:
     """What a reward gives for a step: finite numbers, one for each world; or a ValueError."""
     value: Any = reward(outcome)
     one_world = isinstance(value, float) and isinstance(outcome.figures.score_m, float)

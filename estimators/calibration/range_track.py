@@ -79,7 +79,7 @@ def range_track(
     held: Any = sparse.block_diag([bend.T @ bend] * 3 + [biases]) + 1e-9 * sparse.eye(3 * m + count)
     losses = [LATE]
     if isinstance(start, scipy.interpolate.BSpline):
-        first = start.c
+        first = start.c  # pyright: ignore[reportAttributeAccessIssue]
     else:
         first, losses = check_array("start", start, (3,)) + np.zeros((m, 3)), [huber(_HUBER), LATE]
     x = np.append(first.T, np.zeros(count))

@@ -205,7 +205,8 @@ def _fault_hints(recording: Recording, track: Track, settings: Settings) -> list
 
     gap_s, counts = settings.comparison.truth_gap_s, ~excluded_epochs(track.times, settings)
     step = slice(None, None, _stride(track.times, gap_s))
-    some = Track(*(field[step] for field in track[:4]))
+    poses = track.rotation[step], track.translation[step], track.covariance[step]
+    some = Track(track.times[step], *poses)
 
     def at(late_s: float, whole: bool) -> Judged:
         rotation, epochs = (truth.rotation, track) if whole else (None, some)
