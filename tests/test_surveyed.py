@@ -3,18 +3,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from scipy.optimize import least_squares
 
 from rbl_gym import bounds, estimators, motion
+from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.envs.tracking_vector import TrackingVectorEnv
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
 from rbl_gym.studies import monte_carlo
 from rbl_gym.studies.bench import worlds as bench_worlds
-from rbl_gym.worlds import families, scenes, simulation
+from rbl_gym.worlds import scenes, simulation
+from rbl_gym.wrappers import EstimatePose, VectorEstimatePose
 from tests.helpers import random_world
+from tests.side_by_side import assert_steps_alike
 
 NOISE, PROCESS = ranging.RangeNoise(0.05), motion.ProcessNoise(0.1, 0.2)
 SCENE = scenes.get({"name": "uwb_room", "steps": 12, "survey_std_m": 0.1})
@@ -111,7 +118,7 @@ def test_the_bound_of_an_episode_is_the_recursion_with_nuisances():
 
 def test_hashes_of_scenes_without_a_survey_are_as_they_were():
     facts = bench_worlds.scene_facts(scenes.get("uwb_room"))
-    assert "survey_std_m" not in facts
+    assert not {"survey_std_m", "prisms", "gain", "fixed"} & set(facts)
     assert bench_worlds.scene_facts(SCENE)["survey_std_m"] == 0.1
 
 
@@ -124,7 +131,33 @@ def test_what_cannot_be_is_refused():
     state = filter.update(state, np.full((4, 3), 5.0), 5 * np.eye(4)[:, :3] + 1)
     with pytest.raises(ValueError, match="anchors must be the 4 whose places the state holds"):
         filter.update(state, np.full((5, 3), 5.0), 5 * np.eye(5)[:, :3] + 1)
-    with pytest.raises(ValueError, match="scenes must have survey_std_m = 0"):
-        families.family([{"name": "uwb_room", "survey_std_m": 0.1}])
     with pytest.raises(ValueError, match="survey_std_m must be"):
         scenes.get({"name": "uwb_room", "survey_std_m": -1.0})
+
+
+FAMILY: list[Any] = [
+    {"name": "auv_buoys", "survey_std_m": {"uniform": [1.0, 3.0]}, "steps": 4},
+    {"name": "uwb_room", "steps": 3},
+]
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_families_have_surveys_too(mode):
+    worlds: dict[str, Any] = {"scenes": FAMILY, "reward": "none"}
+    native: Any = VectorEstimatePose(TrackingVectorEnv(4, autoreset_mode=mode, **worlds))
+    peer = SyncVectorEnv([lambda: EstimatePose(TrackingEnv(**worlds))] * 4, autoreset_mode=mode)
+    results = assert_steps_alike(native, peer, 8, 3, {"rtol": 2e-5, "atol": 2e-5})
+    told, *_, info = results[0]
+    off = np.abs(told["anchors"] - info["anchors"])
+    surveyed = told["anchor_mask"].sum(axis=-1) == 4
+    assert 0 < surveyed.sum() < 4
+    assert (off[surveyed][:, :4] > 0).all()
+    assert not off[~surveyed].any()
+
+
+def test_families_with_a_survey_have_no_bound():
+    for env in (TrackingEnv, TrackingVectorEnv):
+        with pytest.raises(ValueError, match="reward must be 'none' with scenes that have survey"):
+            env(scenes=FAMILY)
+    with pytest.raises(ValueError, match=r"bodies\[0\] must have survey_std_m = 0"):
+        gym.make("rbl_gym:RBL/SharedAnchors-v0", scene={"name": "hall", "survey_std_m": 0.1})

@@ -332,6 +332,11 @@ def family_of_bodies(scene: Any, bodies: Any) -> SceneFamily:
     merged = tuple({**base, **body} for body in bodies)
     made = [scenes.get(one) for one in merged]
     for index, one in enumerate(made):
+        if one.survey_std_m > 0:
+            raise ValueError(
+                f"bodies[{index}] must have survey_std_m = 0: all bodies see the same anchors, got "
+                f"{one.survey_std_m:g}"
+            )
         for name in _ALIKE:
             if getattr(one, name) != getattr(made[0], name):
                 raise ValueError(

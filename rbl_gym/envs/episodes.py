@@ -114,6 +114,7 @@ class FamilyStore:
         m, n, epochs = family.n_anchors, family.n_tags, family.steps + 1
         shapes = (3, 3), (3,), (6,), (m, n), (2, m, n)
         self._timed = [np.zeros((epochs, num_envs, *shape)) for shape in shapes]
+        self._survey = np.zeros((epochs, num_envs, m, 3)) if family.is_surveyed else None
 
     def begin(
         self, worlds: np.ndarray, generators: Sequence[np.random.Generator]
@@ -145,6 +146,11 @@ class FamilyStore:
             row[...] = 0.0
             if field is not None:
                 row[tuple(slice(size) for size in field.shape)] = field
+        if self._survey is not None:
+            self._survey[:, world] = 0.0
+            if fields.survey is not None:
+                steps, m, _ = fields.survey.shape
+                self._survey[:steps, world, :m] = fields.survey
 
     def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
         """The motion of all worlds, each at its epoch (B,); copies."""
@@ -154,7 +160,8 @@ class FamilyStore:
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
         """All worlds, each at its epoch (B,); random numbers not to be written to."""
         where = epochs, np.arange(len(epochs))
-        return simulation.Epoch(*(field[where] for field in self._timed))
+        survey = None if self._survey is None else self._survey[where]
+        return simulation.Epoch(*(field[where] for field in self._timed), survey=survey)
 
 
 def rows_of(worlds: np.ndarray) -> slice | np.ndarray:

@@ -117,7 +117,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     `tag_mask` (N,), int8, 1 for those that there are; `tags` (N, 3), metres, body frame. `quality`
     is there if any scene has obstacles. `info["scene"]` of the reset is JSON: the overrides that
     were drawn. `env.unwrapped.scene` is the scene of the episode. Actions move the anchors that there
-    are; if no scene of the family moves its anchors, the action is ``Discrete(1)``.
+    are; if no scene of the family moves its anchors, the action is ``Discrete(1)``. Families have
+    no inertial sensor and no `links.offset`; with `survey_std_m` they have ``reward="none"`` only.
 
     ## Version history
     * v0: first version.
@@ -137,7 +138,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     ) -> None:
         self.family, self.scene = worlds_of(scene, scenes)
         self.film = rendering.film_of(render_mode, self.scene)
-        self.reward_mode = check_one_of("reward", reward, REWARDS)
+        self.reward_mode = check_reward(reward, self.family)
         self.render_mode = render_mode
         self.observation_space = observation_space(self.family or self.scene)
         self.action_space = action_space(self.family or self.scene)
@@ -215,7 +216,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         if self.film is not None:
             self._shoot(at, observation["links"])
         observation["anchors"] = simulation.surveyed(at, self._anchors)
-        if at.survey is not None:
+        surveyed = self.family is not None and self.family.is_surveyed
+        if at.survey is not None or surveyed:
             info["anchors"] = self._anchors.copy()
         observation["twist"] = at.twist
         if at.readings is not None and at.velocity is not None and at.bias is not None:
@@ -224,6 +226,8 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         if self.family is not None:
             observation = self.family.padded(observation, self.scene)
             info["nlos"] = families.padded(info["nlos"], self.family.fields["links"][0])
+            if surveyed:
+                info["anchors"] = families.padded(info["anchors"], (self.family.n_anchors, 3))
         return observation, info, reward
 
     def _shoot(self, at: simulation.Epoch, links: np.ndarray) -> None:
@@ -245,6 +249,17 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
             self._episode.prior_covariance,
         )  # fmt: skip
         return float(score)
+
+
+def check_reward(reward: Any, family: SceneFamily | None) -> str:
+    """The reward, or a ValueError where the worlds have no such bound."""
+    check_one_of("reward", reward, REWARDS)
+    if reward == "bound" and family is not None and family.is_surveyed:
+        raise ValueError(
+            "reward must be 'none' with scenes that have survey_std_m: their bounds have states of "
+            "different sizes"
+        )
+    return reward
 
 
 def observed(scene: Scene, at: simulation.Epoch, anchors: FloatArray) -> dict[str, np.ndarray]:

@@ -9,12 +9,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from rbl_gym import rendering
-from rbl_gym.checks import BoolArray, FloatArray, check_one_of
+from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import BatchEnv
 from rbl_gym.envs.episodes import EpisodeStore, FamilyStore
 from rbl_gym.envs.tracking import (
-    REWARDS,
     action_space,
+    check_reward,
     observation_space,
     observed,
     worlds_of,
@@ -63,7 +63,7 @@ class TrackingVectorEnv(BatchEnv):
         scenes: Any = None,
     ) -> None:
         self.family, self.scene = worlds_of(scene, scenes)
-        self.reward_mode = check_one_of("reward", reward, REWARDS)
+        self.reward_mode = check_reward(reward, self.family)
         worlds = self.family or self.scene
         self.single_observation_space = observation_space(worlds)
         self.single_action_space = action_space(worlds)

@@ -118,6 +118,9 @@ class Prisms:
         return np.stack([*pairs, self.share], axis=-1)
 
 
+NO_PRISMS = Prisms()
+
+
 @dataclass(frozen=True, eq=False)
 class Obstacles:
     """Boxes and prisms in the way of links, and what is left of a link behind them.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.geometry.obstacles import Prisms
+from rbl_gym.geometry.obstacles import NO_PRISMS, Prisms
 from rbl_gym.worlds.scene import Points
 
 
@@ -40,4 +40,4 @@ class Stage:
     obstacles: tuple[tuple[float, ...], ...]
     steps: int
     dt: float
-    prisms: Prisms = field(default_factory=Prisms)
+    prisms: Prisms = NO_PRISMS

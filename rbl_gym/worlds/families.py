@@ -57,11 +57,6 @@ class SceneFamily:
                     "scenes of building files with walls, or limits of range and view, must all be "
                     f"of one file, got {scene.name!r} beside {first.name!r}"
                 )
-            if scene.survey_std_m > 0:
-                raise ValueError(
-                    "scenes must have survey_std_m = 0, got "
-                    f"{scene.survey_std_m:g} in {scene.name!r}"
-                )
             if scene.links.offset is not None:
                 raise ValueError(
                     "scenes must have ranges without an offset, got links.offset "
@@ -100,6 +95,11 @@ class SceneFamily:
     def anchor_speed_m_s(self) -> float:
         """The highest speed of an anchor; 0: they are fixed in all scenes."""
         return max(scene.anchor_speed_m_s for scene in self.corners)
+
+    @functools.cached_property
+    def is_surveyed(self) -> bool:
+        """Whether anchors of any scene are off by their survey."""
+        return any(scene.survey_std_m > 0 for scene in self.corners)
 
     @functools.cached_property
     def fields(self) -> dict[str, tuple[tuple[int, ...], type]]:

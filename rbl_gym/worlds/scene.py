@@ -19,7 +19,7 @@ from rbl_gym.checks import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.geometry.mounts import Mounts
-from rbl_gym.geometry.obstacles import Obstacles, Prisms, check_obstacles
+from rbl_gym.geometry.obstacles import NO_PRISMS, Obstacles, Prisms, check_obstacles
 from rbl_gym.geometry.regions import REGIONS, Box, Region
 from rbl_gym.measurements import inertial
 from rbl_gym.measurements.gain import EVERYWHERE, Gain
@@ -148,7 +148,7 @@ class Scene:
     anchor_speed_m_s: float = 0.0
     obstacles: tuple[tuple[float, ...], ...] = ()
     blocked_information: float = 0.02
-    prisms: Prisms = field(default_factory=Prisms)
+    prisms: Prisms = NO_PRISMS
     gain: Gain = EVERYWHERE
     fixed: Points = ()
     links: LinkModel = field(default_factory=LinkModel)

@@ -171,7 +171,9 @@ def mirrored(world: BenchWorld) -> FloatArray | None:
 
 # Fields that scenes got after the first leaderboard. They count where they differ from their
 # default: the other scenes keep their hash, from which the seed of their trials comes.
-_YOUNGER_FIELDS = frozenset({"inertial", "offset", "offset_std_m", "survey_std_m"})
+_YOUNGER_FIELDS = frozenset(
+    {"inertial", "offset", "offset_std_m", "survey_std_m", "prisms", "gain", "fixed"}
+)
 
 
 def scene_hash(scene: Scene) -> str:
