@@ -136,10 +136,12 @@ def test_the_scene_hash_sees_every_field():
     assert len(hashes) == len(scenes.SCENES)
     room = scenes.get("uwb_room")
     facts = bench_worlds.scene_facts(room)
-    # A scene without a sensor or a survey keeps the hash that it had before there were any.
-    younger = {"inertial", "survey_std_m"}
+    # A scene without what later fields say keeps the hash that it had before there were any.
+    younger = {"inertial", "survey_std_m", "prisms", "gain", "fixed"}
     assert set(facts) == {field.name for field in dataclasses.fields(room)} - younger | {"kind"}
-    for change in ({"inertial": "consumer"}, {"survey_std_m": 0.1}):
+    fixed = {"fixed": [[0, 0, 1]], "anchors": None}
+    changes = {"inertial": "consumer"}, {"survey_std_m": 0.1}, {"gain": {"max_range_m": 9.0}}, fixed
+    for change in changes:
         changed = scenes.get({"name": "uwb_room", **change})
         assert set(bench_worlds.scene_facts(changed)) == {*facts, *change}
         assert bench_worlds.scene_hash(changed) not in hashes
