@@ -80,6 +80,7 @@ FEW = RlTask(
     "RBL/MobileAnchors-v0", {"scenes": [DRAWN]}, 24, 3, 0.9, num_envs=4, algorithm="set-ppo"
 )
 HALL = RlTask("RBL/AnchorSelection-v0", {"scene": {"name": "hall", "steps": 3}}, 9, 3, num_envs=3)
+PRICED = RlTask(HALL.env_id, {**HALL.arguments, "mode": "priced"}, 9, 3, num_envs=3)
 MOUNTS = RlTask("RBL/AnchorPlacement-v0", dict(TASKS["mounts"].arguments), 20, 5, num_envs=4)
 
 
@@ -90,6 +91,7 @@ MOUNTS = RlTask("RBL/AnchorPlacement-v0", dict(TASKS["mounts"].arguments), 20, 5
         (HALL, "supervised", "sight"),
         (HALL, "recurrent-ppo", "box"),
         (MOUNTS, "maskable-ppo", "discrete"),
+        (PRICED, "maskable-ppo", "multi-binary"),
     ],
 )
 @needs("torch", "stable_baselines3", "sb3_contrib")
@@ -166,3 +168,30 @@ def test_a_new_policy_for_craft_is_the_orbit():
     actions = SetPolicy(network, "craft", {}).player()(env.unwrapped, seen)
     wanted = controllers.MOBILE["orbit"](env.unwrapped, np.random.default_rng(0))
     np.testing.assert_allclose(actions, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("task", "algorithm"),
+    [(HALL, "recurrent-ppo"), (MOUNTS, "maskable-ppo"), (PRICED, "maskable-ppo")],
+)
+@needs("torch", "stable_baselines3", "sb3_contrib")
+def test_files_play_what_the_model_would(task, algorithm):
+    """The deterministic actions of stable-baselines3 itself, along an episode."""
+    from rbl_gym.studies.learning import training
+    from rbl_gym.wrappers.sb3 import Sb3VecEnv
+
+    envs = Sb3VecEnv(task.make(3))
+    model = training._model(algorithm, task, envs, 0)
+    policy = training._policy(model, {"algorithm": algorithm})
+    env = task.make(3, "Disabled")
+    (seen, _), state, play = env.reset(seed=5), None, policy.player()
+    for step in range(3):
+        told = {}
+        if algorithm == "maskable-ppo":
+            told = {"action_masks": env.unwrapped.action_masks()}
+        else:
+            told = {"state": state, "episode_start": np.full(3, step == 0)}
+        wanted, state = model.predict(seen, deterministic=True, **told)
+        actions = play(env, seen)
+        np.testing.assert_allclose(actions, wanted, atol=1e-5)
+        seen = env.step(actions)[0]

@@ -263,14 +263,21 @@ def _policy(model: Any, meta: dict[str, Any]) -> Policy:
 
     layers = [m for m in model.policy.mlp_extractor.policy_net if isinstance(m, torch.nn.Linear)]
     layers.append(model.policy.action_net)
+    weights = [array(layer.weight) for layer in layers]
+    biases = [array(layer.bias) for layer in layers]
+    kind, n_outputs = kind_and_outputs(model.action_space)
+    if kind == "multi-binary" and len(biases[-1]) == 2 * n_outputs:
+        # With masks an anchor has an output for leaving it out, and one for choosing it.
+        weights[-1] = weights[-1][1::2] - weights[-1][::2]
+        biases[-1] = biases[-1][1::2] - biases[-1][::2]
     lstm, memory = getattr(model.policy, "lstm_actor", None), None
     if lstm is not None:
-        reads, recalls, *biases = (array(one) for one in lstm.parameters())
-        memory = Lstm(reads, recalls, sum(biases))
+        reads, recalls, *both = (array(one) for one in lstm.parameters())
+        memory = Lstm(reads, recalls, sum(both))
     return Policy(
-        tuple(array(layer.weight) for layer in layers),
-        tuple(array(layer.bias) for layer in layers),
-        kind_and_outputs(model.action_space)[0],
+        tuple(weights),
+        tuple(biases),
+        kind,
         meta,
         memory,
     )
