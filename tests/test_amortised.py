@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rbl_gym import placement
+from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.ranging import RangeNoise
 from rbl_gym.placement import amortised, layouts, scene_files, scenery, search, setting
@@ -75,6 +76,8 @@ def test_feet_for_metres_scale_the_layout(scene, n_anchors, racks):
 @needs("shapely")
 def test_a_building_in_feet_has_the_same_layout():
     metres = office()
+    assert isinstance(metres.noise, RangeNoise)
+    assert isinstance(metres.mounts, Mounts)
     gain, mounts, prisms = metres.gain, metres.mounts, metres.obstacles.prisms
     faces = mounts.faces._replace(
         origin=FEET * mounts.faces.origin, extents=FEET * mounts.faces.extents
@@ -168,7 +171,7 @@ def of_arrays(torch, tokens):
 
 @needs("torch")
 def test_the_played_network_is_that_of_torch():
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     from rbl_gym.studies.learning.torch_layouts import Network
 
@@ -186,7 +189,7 @@ def test_the_played_network_is_that_of_torch():
 @needs("torch")
 @pytest.mark.parametrize("family", ["boxes", "shells", "rooms"])
 def test_the_loss_of_the_training_is_the_score(family):
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]
 
     from rbl_gym.studies.learning import torch_layouts
     from rbl_gym.studies.learning.amortised import case_of
@@ -220,8 +223,8 @@ def test_the_loss_of_the_training_is_the_score(family):
 
 def sample_of(batch, index):
     fields = (batch.rotation, batch.seen.places, batch.weight, batch.prior)
-    zone = np.zeros(batch.weight.shape[1], dtype=int)
-    return placement.Sample(*(field[index] for field in fields), zone)
+    rotation, places, weight, prior = (field[index] for field in fields)
+    return placement.Sample(rotation, places, weight, prior, np.zeros(len(weight), dtype=int))
 
 
 def placement_share(seen, index, layout, left):

@@ -48,7 +48,7 @@ GROUPS = (
     (("boxes", 32), ("boxes", 32), ("shells", 8), ("rooms", 32), ("rooms", 32), ("buildings", 16)),
 )
 # Steps of the rounds that made the package's network.
-STEPS = (5000,)
+STEPS = (5000, 1500)
 # Anchors of a building whose choice gets its gradient in a step.
 _CHOICES = 1
 # Learning rates at their height, of the first round and of others; steps until there; weight of

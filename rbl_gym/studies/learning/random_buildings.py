@@ -116,7 +116,7 @@ def _building(rng: np.random.Generator, n_fixed: int) -> _Building:
     boxes[: len(solid), :6] = solid
     boxes[: len(solid), 6] = np.where(np.isnan(shares), blocked, shares)
     return _Building(
-        zones, np.float64(extent), boxes, spots, normals, views, fixed, rotation, places, weight,
+        zones, np.array(extent), boxes, spots, normals, views, fixed, rotation, places, weight,
         prior, gain.numbers,
     )  # fmt: skip
 
