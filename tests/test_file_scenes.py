@@ -149,7 +149,7 @@ def test_every_environment_takes_a_file(kind, floor):
     arguments = {key: value for key, value in arguments.items() if key not in SCENE}
     arguments["scene"] = {"name": floor, "steps": 4, **changes}
     name = f"rbl_gym:RBL/{name}-v0"
-    env = gym.make(name, render_mode="rgb_array", **arguments)
+    env: Any = gym.make(name, render_mode="rgb_array", **arguments)
     check_env(env.unwrapped)
     again = of_its_spec(env)
     assert_same(again.reset(seed=3), env.reset(seed=3))

@@ -279,12 +279,13 @@ def test_filters_are_named_by_dicts_too():
 
     both = belief_of(filter="iekf", options={"robust": True})
     assert_same(belief_of(filter={"name": "iekf", "robust": True}), both)
-    for name, arguments in (
+    cases: list[tuple[str, dict[str, Any]]] = [
         ("MobileAnchors", {}),
         ("AnchorSelection", {}),
         ("SharedAnchors", {}),
         ("AnchorPlacement", {"reward": "filter", "scene": "drone_yard"}),
-    ):
+    ]
+    for name, arguments in cases:
         for filter in ("uc-kf", {"name": "uc-kf"}, {"name": "iekf", "iterations": 3}):
             env = gym.make(f"rbl_gym:RBL/{name}-v0", filter=filter, **arguments)
             assert_same(of_its_spec(env).reset(seed=1), env.reset(seed=1))

@@ -143,7 +143,11 @@ def test_an_episode_equals_that_of_its_scene_alone(mode, mirror):
         got, info = env.reset(seed=seed)
         one = task_told(info)
         alone = AnchorPlacementEnv(
-            one.scene, racks=one.racks, n_anchors=one.n_anchors, sight=one.racks > 0, **arguments
+            one.scene,  # pyright: ignore[reportArgumentType]
+            racks=one.racks,
+            n_anchors=one.n_anchors,
+            sight=one.racks > 0,
+            **arguments,
         )
         generator, _ = seeding.np_random(seed)
         task_family([ROOM]).draw(generator)
@@ -223,7 +227,9 @@ def test_masks_are_of_the_mounts_only():
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_paid_by_a_filter(mode):
-    arguments = {"scenes": [{**ROOM, "n_anchors": {"integers": [2, 3]}}, "drone_yard"]}
+    arguments: dict[str, Any] = {
+        "scenes": [{**ROOM, "n_anchors": {"integers": [2, 3]}}, "drone_yard"]
+    }
     native: Any = VectorFilterReward(
         PlacementFamilyVectorEnv(3, autoreset_mode=mode, n_anchors=3, **arguments), "iekf"
     )

@@ -63,7 +63,7 @@ class _Judge:
         return np.array(found)
 
 
-def _tasks_of(env: Any) -> Sequence[PlacementTask]:
+def _tasks_of(env: Any) -> Sequence[Any]:
     """The tasks of the worlds of a placement environment, or a ValueError."""
     tasks = getattr(env.unwrapped, "tasks", None)
     if tasks is None:
@@ -172,7 +172,7 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
         final = info.get("final_info", info)
         if terminated.any():
             complete = {key: final[key][terminated] for key in _TOLD if key in final}
-            ended = [tasks[i % len(tasks)] for i in np.flatnonzero(terminated)]
+            ended = [tasks[i % len(tasks)] for i in np.flatnonzero(terminated).tolist()]
             error[terminated] = self._judge.errors(ended, complete)
             reward[terminated] = -np.log(error[terminated])
         if final is not info:

@@ -122,7 +122,7 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
             self._memory.learn(_final(observation, info), chosen)
         if "final_obs" in info:
             last = info["_final_obs"]
-            for i in np.flatnonzero(last):
+            for i in np.flatnonzero(last).tolist():
                 memory = None if self._memory is None else self._memory.row(i)
                 info["final_obs"][i] = select(info["final_obs"][i], chosen[i], memory)
             info["final_info"]["chosen"] = (chosen & last[:, None]).astype(np.int8)

@@ -113,7 +113,8 @@ class _AnchorSelection(Task):
         if self.family is not None:
             there = told["anchor_mask"].astype(np.bool_)
         if self._subsets is not None:
-            return ~(~there[..., None, :] & self._subsets.astype(np.bool_)).any(axis=-1)
+            missing = ~there[..., None, :] & self._subsets.astype(np.bool_)
+            return np.asarray(~missing.any(axis=-1))
         both = np.stack([np.ones_like(there), there], axis=-1)
         return both.reshape(*there.shape[:-1], -1)
 
