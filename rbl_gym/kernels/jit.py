@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import IO, Any, TypeVar, cast
 
 import numba
+
+from rbl_gym.kernels.helper_code import as_code, compile_helper, optimizing, types_remembered
 
 try:
     import fcntl
@@ -98,6 +101,31 @@ def _alone() -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def _in_haste() -> Iterator[None]:
+    """Without collecting garbage, which takes a seventh of the time, as compilers make much."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _compile(function: Callable[..., Any], signature: str, arguments: tuple[Any, ...]) -> Any:
+    """A generalized ufunc of a function.
+
+    numba compiles the function, then the loop over trials with it inside: the optimizer's whole
+    work is left to the second.
+    """
+    made: Any = numba.guvectorize(signature, cache=_KEPT)(function)
+    with optimizing(1), as_code():
+        made.add(arguments)
+    made.disable_compile()
+    return made.build_ufunc()
+
+
 def _lock_file() -> contextlib.AbstractContextManager[IO[str] | None]:
     if _CACHE is None or fcntl is None:
         return contextlib.nullcontext()
@@ -107,23 +135,21 @@ def _lock_file() -> contextlib.AbstractContextManager[IO[str] | None]:
         return contextlib.nullcontext()
 
 
-# numba's annotations leave out options that it takes.
-_njit: Any = numba.njit
-
-
 def helper(function: F) -> F:
-    """Compile a function that kernels call; division by zero gives inf, as in NumPy."""
-    return _njit(error_model="numpy", cache=_KEPT, no_cfunc_wrapper=True)(function)
+    """Compile a function that kernels call; division by zero gives inf, as in NumPy.
+
+    Python cannot call it.
+    """
+    return cast(F, compile_helper(function, unrolled=False))
 
 
-def inlined(function: F) -> F:
+def inlined(function: F, unrolled: bool = False) -> F:
     """A `helper` that is compiled into its callers: for innermost ones, with few places of call.
 
-    A call takes 0.1 us and more, as an array is passed as seven numbers.
+    A call takes 0.1 us and more, as an array is passed as seven numbers. `unrolled` is for loops of
+    a known length over matrices: unrolled before they are put into callers they take less time.
     """
-    return _njit(error_model="numpy", cache=_KEPT, no_cfunc_wrapper=True, forceinline=True)(
-        function
-    )
+    return cast(F, compile_helper(function, unrolled, forceinline=True))
 
 
 def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
@@ -152,9 +178,8 @@ def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
                 rank = rank if place < inputs else max(rank, 1)
                 kind = _TYPES[letter]
                 arguments.append(kind[(slice(None),) * rank] if rank else kind)
-            with _alone():
-                made = numba.guvectorize([tuple(arguments)], signature, nopython=True, cache=_KEPT)
-                made = made(function)
+            with _alone(), _in_haste(), types_remembered():
+                made = _compile(function, signature, tuple(arguments))
             # What numba wraps around NumPy's own takes a microsecond a call.
             return getattr(made, "ufunc", made)
 

@@ -5,6 +5,7 @@ The diagonal of a factor holds its inverse: whoever solves multiplies by it.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -15,14 +16,16 @@ from rbl_gym.kernels.jit import helper, inlined
 PIVOT_FLOOR = 1e-14
 
 
+@functools.cache
 def of_size(size: int) -> tuple[Callable[..., Any], ...]:
     """`cholesky`, `solve_factored` and `invert_factored` for matrices of `size` rows.
 
     With a size that is known when they are compiled they take a little more than half the time.
     None of them reads above a diagonal. 0: of any size.
     """
+    in_place = functools.partial(inlined, unrolled=True)
 
-    @inlined
+    @in_place
     def cholesky(A: Any, L: Any) -> bool:
         """Lower factor of A into L; whether all pivots were good.
 
@@ -49,7 +52,7 @@ def of_size(size: int) -> tuple[Callable[..., Any], ...]:
                 L[i, j] = total * inverse
         return good
 
-    @inlined
+    @in_place
     def solve_factored(L: Any, b: Any, x: Any) -> None:
         """The solution x of ``L L^T x = b``; x may be b."""
         n = size if size > 0 else L.shape[0]
@@ -64,7 +67,7 @@ def of_size(size: int) -> tuple[Callable[..., Any], ...]:
                 total -= L[k, i] * x[k]
             x[i] = total * L[i, i]
 
-    @inlined
+    @in_place
     def invert_factored(L: Any, P: Any) -> None:
         """``P = (L L^T)^-1``, both halves; L becomes its own inverse.
 

@@ -1,0 +1,170 @@
+"""How the functions that kernels call are compiled: once each, as LLVM code, for kernels to link.
+
+numba compiles a function anew for every literal and every memory layout of its arguments, and turns
+each of them into machine code that never runs: all kernels together take twice as long.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numba
+from numba.core.types import Array, BaseFunction, BaseTuple, Boolean, Number, unliteral
+
+try:  # private names of numba's: without them compiling takes longer
+    from llvmlite.binding import parse_assembly
+    from numba.core.codegen import JITCodeLibrary
+    from numba.core.compiler import Compiler
+    from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.registry import cpu_target
+except ImportError:
+    Compiler = JITCodeLibrary = None
+
+# numba's annotations leave out options that it takes.
+_njit: Any = numba.njit
+
+
+def _as_any(kind: Any) -> Any:
+    """The one type of an argument: no literal, and arrays of any strides."""
+    kind = unliteral(kind)
+    return kind.copy(layout="A") if isinstance(kind, Array) else kind
+
+
+def _counts_references(function: types.FunctionType) -> bool:
+    """Whether a helper makes arrays (it names `np`), or is given them by one that returns some."""
+    names = function.__code__.co_names
+    called = (function.__globals__.get(name) for name in names)
+    return "np" in names or any(getattr(one, "gives_arrays", False) for one in called)
+
+
+def compile_helper(function: Any, unrolled: bool, **options: Any) -> Callable[..., Any]:
+    """A function for kernels to call; not for Python, to which it has no entry.
+
+    `unrolled`: once for each layout, and optimized to the end before it is put into its callers.
+    """
+    if Compiler is not None:
+        options["pipeline_class"] = _UnrolledCompiler if unrolled else _HelperCompiler
+    made = _njit(
+        error_model="numpy",
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        # Else each array is counted in and out in every function that it passes.
+        _nrt=_counts_references(function),
+        **options,
+    )(function)
+    made.gives_arrays = function.__annotations__.get("return") == "Any"
+    find = made.get_call_template
+    general = unliteral if unrolled else _as_any
+    made.get_call_template = lambda args, kws: find(tuple(map(general, args)), kws)
+    return made
+
+
+@contextlib.contextmanager
+def types_remembered() -> Iterator[None]:
+    """Within, what an operator gives of numbers or of elements of arrays is looked up once.
+
+    numba tries all that it knows of an operator again at every place, a quarter of its time.
+    """
+    find: Any = BaseFunction.get_call_type
+    known: dict[Any, Any] = {}
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws or not all(map(_is_plain, args)):
+            return find(self, context, args, kws)
+        key = (self, args)
+        if key not in known:
+            known[key] = find(self, context, args, kws)
+        return known[key]
+
+    BaseFunction.get_call_type = get_call_type
+    try:
+        yield
+    finally:
+        BaseFunction.get_call_type = find
+
+
+def _is_plain(kind: Any) -> bool:
+    if isinstance(kind, BaseTuple):
+        return all(map(_is_plain, kind))
+    return isinstance(kind, (Number, Boolean, Array))
+
+
+@contextlib.contextmanager
+def optimizing(level: int) -> Iterator[None]:
+    """Within, the optimizer works at a level from 0 to 3."""
+    before: Any = numba.config.OPT
+    numba.config.OPT = type(before)(level)
+    try:
+        yield
+    finally:
+        numba.config.OPT = before
+
+
+@contextlib.contextmanager
+def as_code() -> Iterator[None]:
+    """Within, whatever is compiled stays LLVM code; other threads wait with theirs."""
+    if Compiler is None:
+        yield
+        return
+    codegen: Any = cpu_target.target_context.codegen()
+    with global_compiler_lock:
+        codegen._library_class = _Code
+        try:
+            yield
+        finally:
+            del codegen._library_class  # that of the instance
+
+
+if Compiler is not None:
+
+    class _Code(JITCodeLibrary):  # pyright: ignore[reportGeneralTypeIssues]
+        """Functions as LLVM code: what links them makes machine code of it."""
+
+        @property
+        def codegen(self) -> Any:
+            return self
+
+        def set_env(self, name: str, env: Any) -> None:
+            """Nothing: the code is nowhere yet."""
+
+        def magic_tuple(self) -> Any:
+            """Which machine the code is for, as the key on disk says."""
+            return self._codegen.magic_tuple()
+
+        def get_pointer_to_function(self, name: str) -> int | None:
+            """What a call from Python runs: a function of CPython's that raises TypeError."""
+            return ctypes.cast(ctypes.pythonapi.PyErr_BadArgument, ctypes.c_void_p).value
+
+        def serialize_using_object_code(self) -> Any:
+            """For the disk the names that loading looks for: the code is in what linked it."""
+            names = [one.name for one in self._final_module.global_variables]
+            lines = [f'@"{name}" = common global i64 0' for name in names if "NumbaEnv" in name]
+            return self.name, "bitcode", parse_assembly("\n".join(lines)).as_bitcode()
+
+        def _finalize_final_module(self) -> None:
+            self._finalize_dynamic_globals()
+            self._finalized = True
+
+    class _UnrolledCode(_Code):
+        def _optimize_functions(self, ll_module: Any) -> None:
+            with optimizing(3):
+                super()._optimize_functions(ll_module)
+
+        def _optimize_final_module(self) -> None:
+            with optimizing(3):
+                super()._optimize_final_module()
+
+    class _HelperCompiler(Compiler):  # pyright: ignore[reportGeneralTypeIssues]
+        library = _Code
+
+        def define_pipelines(self) -> Any:
+            state: Any = self.state
+            state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
+            return super().define_pipelines()
+
+    class _UnrolledCompiler(_HelperCompiler):
+        library = _UnrolledCode
