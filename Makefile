@@ -46,8 +46,8 @@ docs: copy
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # The wheel, built from the sdist and installed outside the checkout, where the folder mapping has
-# to hold by itself.
-dist: .venv/dev.stamp
+# to hold by itself. After the copy: both build in the checkout.
+dist: copy
 	rm -rf build/lib build/bdist* dist .venv/smoke
 	$(BIN)/python -m build --outdir dist .
 	$(BIN)/twine check --strict dist/*
