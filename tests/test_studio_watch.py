@@ -6,9 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym import recordings
+from rbl_gym import placement, recordings
 from rbl_gym.placement import scene_files
 from rbl_gym.studies import replay
+from rbl_gym.studies.learning import policies, rollouts
+from rbl_gym.studies.learning.evaluation import layouts_of
+from rbl_gym.studies.learning.rl_tasks import rl_task
 from rbl_gym.studio.watch.frames import (
     LINKS,
     Frame,
@@ -19,6 +22,7 @@ from rbl_gym.studio.watch.frames import (
     filter_named,
     link_kinds,
 )
+from rbl_gym.studio.watch.learned import learned_frames, learned_program
 from rbl_gym.studio.watch.live import (
     CALM,
     Disturbances,
@@ -27,8 +31,10 @@ from rbl_gym.studio.watch.live import (
     stage_of_problem,
     stage_of_scene,
 )
+from rbl_gym.studio.watch.played import env_frames
 from rbl_gym.studio.watch.recorded import recorded_frames, track_all
 from rbl_gym.worlds import scenes
+from rbl_gym.wrappers import EstimatePose, controllers
 from tests.helpers import ROOT
 
 ROOM = stage_of_scene(scenes.get("uwb_room"), 80)
@@ -77,8 +83,6 @@ def test_the_same_seed_gives_the_same_frames_and_another_one_others(calm):
 
 
 def test_an_undisturbed_run_is_the_episode_of_the_environment_and_its_filter(calm):
-    from rbl_gym.wrappers import EstimatePose
-
     env = EstimatePose(
         gym.make("rbl_gym:RBL/Tracking-v0", scene={"name": "uwb_room", "steps": 80}), "iekf"
     )
@@ -223,3 +227,80 @@ def test_a_track_of_other_epochs_is_refused(log):
         recorded_frames(shorter, {"iekf-log": track})
     with pytest.raises(ValueError, match="tracks must hold"):
         recorded_frames(log, {})
+
+
+# --- environments and policies ----------------------------------------------------------------
+
+
+def test_an_environment_is_shown_with_its_own_filter_and_others():
+    made = gym.make("rbl_gym:RBL/Tracking-v0", scene={"name": "uwb_room", "steps": 8})
+    env = EstimatePose(made, {"name": "iekf", "robust": True}, observation="flat")
+    run = [*env_frames(env, (filter_named("uc-kf"),), seed=4)]
+    assert [track.label for track in run[0].tracks] == ["iekf", "uc-kf"]
+    assert len(run) == 9
+    _, info = env.reset(seed=4)
+    for frame in run[1:]:
+        *_, info = env.step(0)
+        assert frame.tracks[0].position_m == pytest.approx(info["position_error_m"], rel=1e-9)
+        assert frame.score_m == info["score_m"]
+        np.testing.assert_array_equal(frame.truth.rotation, info["rotation"])
+
+
+def test_only_the_anchors_that_were_chosen_have_links():
+    env = gym.make("rbl_gym:RBL/AnchorSelection-v0")
+    run = [*env_frames(env, seed=1)]
+    assert {int(frame.links.measured.any(axis=1).sum()) for frame in run[1:]} == {3}
+    last, belief = run[-1].tracks[0].belief, env.unwrapped.belief
+    np.testing.assert_allclose(last.translation, belief.translation, atol=1e-9)
+    np.testing.assert_allclose(last.covariance, belief.covariance, atol=1e-9)
+
+
+def test_other_environments_are_shown_as_they_are_rendered():
+    with pytest.raises(ValueError, match="rgb_array"):
+        env_frames(gym.make("rbl_gym:RBL/PlanarNetwork-v0"))
+    env = gym.make("rbl_gym:RBL/PlanarNetwork-v0", render_mode="rgb_array")
+    frame = next(env_frames(env))
+    np.testing.assert_array_equal(frame.picture, env.render())
+    with pytest.raises(ValueError, match="env must be"):
+        env_frames("RBL/Tracking-v0")
+
+
+def random_policy(task: str, folder) -> str:
+    env = rl_task(task).make(1)
+    kind, outputs = policies.kind_and_outputs(env.single_action_space)
+    size = env.single_observation_space.shape[0]
+    weights = 0.3 * np.random.default_rng(0).standard_normal((outputs, size))
+    path = str(folder / f"{task}-0.npz")
+    policies.save(policies.Policy((weights,), (np.zeros(outputs),), kind, {"task": task}), path)
+    return path
+
+
+def test_a_policy_places_beside_a_reference(tmp_path):
+    program = learned_program(random_policy("auv_buoys", tmp_path), "ring", seed=2)
+    run = [*program.start((), 2, lambda _: CALM)]
+    assert [len(frame.anchors) for frame in run] == [0, 1, 2, 3, 4]
+    assert np.isnan(run[0].score_m)
+    ring = layouts_of(rl_task("auv_buoys"), {}, ["ring"], 1, 2)[0]
+    np.testing.assert_array_equal(run[0].ghosts["ring"], ring.found["ring"][0])
+    expected = placement.score(ring.problem, ring.contexts, run[-1].anchors[None])
+    assert run[-1].score_m == pytest.approx(float(expected[0]), rel=1e-9)
+
+
+def test_a_policy_steers_beside_a_reference_as_it_is_evaluated(tmp_path):
+    short = rl_task("mobile-easy")
+    policy = policies.load(random_policy("mobile-easy", tmp_path))
+    run = [*learned_frames(short, policy, "orbit", seed=0)]
+    returns, steps = rollouts.returns(short, policy.player(), 1, 0)
+    assert run[-1].score_m == pytest.approx(float(np.exp(-returns / steps)[0]), rel=1e-6)
+    returns, steps = rollouts.returns(short, lambda env, _: controllers.orbit(env, None), 1, 0)
+    assert run[-1].scores["orbit"] == pytest.approx(float(np.exp(-returns / steps)[0]), rel=1e-6)
+    assert run[-1].ghosts["orbit"].shape == run[-1].anchors.shape == (3, 3)
+
+
+def test_a_policy_that_cannot_be_played_is_refused(tmp_path):
+    path = random_policy("auv_buoys", tmp_path)
+    with pytest.raises(ValueError, match="reference"):
+        learned_program(path, "nobody")
+    (tmp_path / "none.npz").write_text("")
+    with pytest.raises(ValueError, match="no policy"):
+        learned_program(str(tmp_path / "none.npz"))

@@ -50,6 +50,15 @@ def add_studio(commands: Any) -> None:
     watch = studio.add_argument_group("filters at work")
     watch.add_argument("--watch", action="store_true", help="an episode of SCENE|FILE")
     watch.add_argument(
+        "--env", metavar="ID", help="an episode of an environment, as RBL/AnchorSelection-v0"
+    )
+    watch.add_argument(
+        "--policy", metavar="F", help="a policy of rbl-gym train in a held-out world of its task"
+    )
+    watch.add_argument(
+        "--reference", metavar="NAME", help="beside the policy; default the strongest"
+    )
+    watch.add_argument(
         "--filter",
         metavar="NAME[,NAME]",
         help="one or several side by side; NAME-robust and NAME-late are NAME with that loss; "
@@ -70,7 +79,7 @@ def _studio(options: argparse.Namespace) -> int:
     from rbl_gym.studio.opening import Options
 
     shown = {}
-    if options.ranges or options.watch:
+    if any((options.ranges, options.watch, options.env, options.policy)):
         what, beside = _program(options), None
     else:
         _check_scene(options)
@@ -118,6 +127,12 @@ def _program(options: argparse.Namespace) -> Any:
     from rbl_gym.studio.watch.recorded import track_all
 
     labels = tuple(filter(None, (options.filter or "").split(",")))
+    if options.policy:
+        from rbl_gym.studio.watch import learned
+
+        return learned.learned_program(options.policy, options.reference, options.seed)
+    if options.env:
+        return _episode(options, labels)
     if not options.ranges:
         _check_scene(options)
         return _simulation(options, labels or program.LIVE)
@@ -132,6 +147,21 @@ def _program(options: argparse.Namespace) -> Any:
     settings, named = replay.Settings(), [*map(filter_named, labels or program.RECORDED)]
     tracks = track_all(recording, tuple(named), settings)
     return program.recorded_program(recording, tracks, settings)
+
+
+def _episode(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
+    """An episode of an environment, in SCENE where one is given."""
+    import gymnasium as gym
+
+    from rbl_gym.studio.watch import program
+
+    scene = {} if options.scene is None else {"scene": options.scene}
+    name = options.env.removeprefix("rbl_gym:")
+    try:
+        env = gym.make(f"rbl_gym:{name}", render_mode="rgb_array", **scene)
+    except (gym.error.Error, ModuleNotFoundError, TypeError) as error:
+        raise ValueError(f"--env {options.env}: {error}") from error
+    return program.env_program(env, labels or None, options.seed)
 
 
 def _simulation(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:

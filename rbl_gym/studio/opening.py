@@ -97,12 +97,13 @@ def show(
     ----------
     what
         A `Problem` of `placement.scene_files`: its anchors are placed by hand. Or what is watched:
-        a `Scene` (an episode), a `Recording` with its track, a
+        a `Scene` (an episode), an environment, raw or wrapped, a `Recording` with its track, a
         `rbl_gym.studio.watch.program.Program`.
     beside
         Of a problem, anchors (M, 3), metres; None: its own, or a usual layout. Of a recording, its
         `Track` or a mapping of tracks by labels; None: that of the filter ``"iekf-log"``. Of a
-        scene, labels of filters; None: ``"iekf"`` and ``"iekf-robust"``.
+        scene or environment, labels of filters; None: ``"iekf"`` and ``"iekf-robust"``, or the
+        environment's own.
     tables
         Of the file from which the problem was read, for saving; None: made of the problem.
     options

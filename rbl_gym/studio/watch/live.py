@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray, check_count, check_number
+from rbl_gym.estimators import Filter
 from rbl_gym.measurements.ranging import Measurement
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.epochs import Reading, track_epochs
@@ -133,14 +134,42 @@ def stage_of_problem(problem: Problem, anchors: FloatArray, steps: int | None = 
     return Stage(stage_of_scene(scene, steps).scene, share)
 
 
-class _Moment(NamedTuple):
-    """An epoch of the simulation, and what filters are told of it."""
+class Moment(NamedTuple):
+    """An epoch of a world, and what filters are told of it."""
 
     time_s: float
     truth: Pose
     anchors: FloatArray
     links: Links
     reading: Reading
+    score_m: float = np.nan
+
+
+def moment_of(
+    scene: Scene,
+    epoch: int,
+    at: simulation.Epoch,
+    measured: Measurement,
+    anchors: FloatArray,
+    told: FloatArray,
+    quality: FloatArray | None,
+) -> Moment:
+    """An epoch as it was measured.
+
+    Parameters
+    ----------
+    scene, epoch, at
+        The world, and the epoch with its number.
+    measured
+        What was measured.
+    anchors, told
+        Where the anchors (M, 3) stand, and where filters are told that they do.
+    quality
+        Share (M,) of its information that each link keeps; None: all of it.
+    """
+    links = Links(measured.links, measured.nlos, weak_links(measured.links, quality))
+    reading = told_reading(scene, at, measured, told, quality, first=not epoch)
+    return Moment(epoch * scene.dt, Pose(at.rotation, at.translation), anchors, links, reading)
 
 
 def frames(
@@ -172,37 +201,42 @@ def frames(
         On a filter that is not known, or that does not fit the scene; before the first frame.
     """
     check_count("seed", seed, least=0)
-    made = [scene_filter(stage.scene, one.name, one.options) for one in filters]
-    return _played(stage, filters, made, seed, disturb)
-
-
-def _played(
-    stage: Stage,
-    filters: Sequence[Named],
-    made: Sequence[object],
-    seed: int,
-    disturb: Callable[[int], Disturbances],
-) -> Iterator[Frame]:
     scene = stage.scene
+    made = make_filters(scene, filters)
     episode = simulation.draw_episode(_with_links(scene, 0.5), np.random.default_rng(seed))
+    return tracked_moments(scene, episode, _moments(stage, episode, disturb), made)
+
+
+Made = Sequence[tuple[str, Filter]]
+
+
+def make_filters(scene: Scene, filters: Sequence[Named]) -> Made:
+    """Filters that know a scene, with their labels."""
+    return [(one.label, scene_filter(scene, one.name, one.options)) for one in filters]
+
+
+def tracked_moments(
+    scene: Scene, episode: simulation.Episode, moments: Iterator[Moment], filters: Made
+) -> Iterator[Frame]:
+    """Moments of an episode with filters side by side, started from its prior."""
     prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
-    moments, *copies = itertools.tee(_moments(stage, episode, disturb), len(filters) + 1)
+    first, *copies = itertools.tee(moments, len(filters) + 1)
     runs = [
-        track_epochs(filter, prior, (moment.reading for moment in copy))  # type: ignore
-        for filter, copy in zip(made, copies, strict=True)
+        track_epochs(filter, prior, (moment.reading for moment in copy))
+        for (_, filter), copy in zip(filters, copies, strict=True)
     ]
-    for moment, *steps in zip(moments, *runs, strict=True):
+    for moment, *steps in zip(first, *runs, strict=True):
         found = tuple(
-            tracked(one.label, filter, step, scene.body, scene.noise, moment.truth)  # type: ignore
-            for one, filter, step in zip(filters, made, steps, strict=True)
+            tracked(label, filter, step, scene.body, scene.noise, moment.truth)
+            for (label, filter), step in zip(filters, steps, strict=True)
         )
-        told = moment.reading.anchors
-        yield Frame(moment.time_s, moment.truth, moment.anchors, told, moment.links, found)
+        time_s, truth, anchors, links, reading, score_m = moment
+        yield Frame(time_s, truth, anchors, reading.anchors, links, found, score_m)
 
 
 def _moments(
     stage: Stage, episode: simulation.Episode, disturb: Callable[[int], Disturbances]
-) -> Iterator[_Moment]:
+) -> Iterator[Moment]:
     scene, anchors = stage.scene, episode.anchors
     for epoch in range(scene.steps + 1):
         at, now = simulation.epoch_of(episode, epoch), disturb(epoch)
@@ -212,13 +246,7 @@ def _moments(
         if now.wrong_m > 0:
             inwards = np.mean(scene.volume.bounds(), axis=0) - told[0]
             told[0] += now.wrong_m * inwards / max(float(np.linalg.norm(inwards)), 1e-9)
-        yield _Moment(
-            epoch * scene.dt,
-            Pose(at.rotation, at.translation),
-            anchors,
-            Links(measured.links, measured.nlos, weak_links(measured.links, quality)),
-            told_reading(scene, at, measured, told, quality, first=not epoch),
-        )
+        yield moment_of(scene, epoch, at, measured, anchors, told, quality)
 
 
 def weak_links(links: BoolArray, quality: FloatArray | None) -> BoolArray:

@@ -65,6 +65,7 @@ class WatchPanel:
         self._play.on_click(lambda _: actions["play"]())
         move = gui.add_button_group("", ("Step", "Restart"))
         move.on_click(lambda _: actions[move.value.lower()]())
+        self._picture: Any = None
         self._time = gui.add_slider("Epoch", 0, 1, 1, 0)
         _input(self._time, lambda: actions["seek"](int(self._time.value)))
         speed = gui.add_button_group("Speed", ("0.5x", "1x", "4x", "max"))
@@ -181,6 +182,11 @@ class WatchPanel:
     def show(self, frames: Sequence[Frame], at: int, playing: bool, status: str) -> None:
         """Show a frame, and those before it in the charts."""
         self._table.content = headline(self._program.title, frames[: at + 1])
+        picture = frames[at].picture
+        if picture is not None and self._picture is None:
+            self._picture = self._gui.add_image(picture, format="jpeg")
+        elif picture is not None:
+            self._picture.image = picture
         icon, label = ("player-pause", "Pause") if playing else ("player-play", "Play")
         if self._play.label != label:
             self._play.label, self._play.icon = label, icon

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from rbl_gym.checks import FloatArray
@@ -18,6 +20,13 @@ from rbl_gym.recordings import Recording
 from rbl_gym.studies.replay import Settings, Track
 from rbl_gym.studio.watch.frames import Frame, filter_named
 from rbl_gym.studio.watch.live import Disturbances, Stage, frames, stage_of_scene
+from rbl_gym.studio.watch.played import (
+    Act,
+    env_frames,
+    own_filter,
+    places_anchors,
+    world_of,
+)
 from rbl_gym.studio.watch.recorded import recorded_frames, track_all
 from rbl_gym.worlds.scene import Scene
 
@@ -77,6 +86,8 @@ def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:
     if isinstance(what, Scene):
         filters = LIVE if beside is None else tuple(beside)
         return live_program(stage_of_scene(what), filters, room_of(what), seed)
+    if isinstance(what, gym.Env):
+        return env_program(what, beside, seed)
     if isinstance(what, Recording):
         if beside is None:
             beside = track_all(what, tuple(map(filter_named, RECORDED)), Settings())
@@ -110,6 +121,54 @@ def recorded_program(
     places = [recording.anchors.reshape(-1, 3), *(track.translation for track in tracks.values())]
     room = room_around("recording", np.concatenate(places), recording.tags)
     return Program("Recording", room, recording.tags, start, tuple(tracks))
+
+
+def env_program(
+    env: gym.Env[Any, Any],
+    filters: Iterable[str] | None = None,
+    seed: int = 0,
+    act: Act | None = None,
+) -> Program:
+    """An episode of an environment.
+
+    Parameters
+    ----------
+    env
+        Scalar, raw or wrapped.
+    filters
+        Labels of filters beside the environment's own; None: where it has none, ``"iekf"``.
+    seed, act
+        As of `env_frames`.
+    """
+    # It refuses what cannot be shown before it is reset.
+    env_frames(env)
+    _, info = env.reset(seed=seed)
+    world, own = world_of(env), own_filter(env)
+    if world is None:
+        labels: tuple[str, ...] = ()
+    elif filters is None:
+        labels = () if own else LIVE[:1]
+    else:
+        labels = tuple(filters)
+    shown = labels if own is None or world is None else (own.label, *labels)
+
+    def start(_: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
+        return env_frames(env, tuple(map(filter_named, labels)), seed, act)
+
+    title = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+    if world is not None:
+        return Program(title, room_of(world.scene), world.scene.body, start, shown, seed)
+    if not places_anchors(env):
+        tag = np.zeros((1, 3))
+        return Program(title, room_around(title, np.eye(3), tag), tag, start, (), seed)
+    base: Any = env.unwrapped
+    scene = base.task.scene
+    centre, half = np.split(np.asarray(info["region"], float), 2)
+    racks = dataclasses.replace(scene.obstruction, boxes=np.asarray(info["racks"], float))
+    room = dataclasses.replace(
+        room_of(scene), zones=(_zone(centre - half, centre + half),), obstacles=racks
+    )
+    return Program(title, room, scene.body, start, (), seed)
 
 
 def room_of(scene: Scene) -> Problem:

@@ -1,0 +1,123 @@
+"""Trained policies at work, step by step, beside references."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from rbl_gym import placement
+from rbl_gym.checks import FloatArray, check_one_of
+from rbl_gym.studies.learning import evaluation, policies, rollouts
+from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask, rl_task
+from rbl_gym.studio.watch.frames import Frame
+from rbl_gym.studio.watch.played import env_frames
+from rbl_gym.studio.watch.program import Disturb, Program, env_program
+from rbl_gym.wrappers import controllers
+
+__all__ = ["learned_frames", "learned_program"]
+
+Policy = policies.AnyPolicy
+
+
+def learned_program(path: str, reference: str | None = None, seed: int = 0) -> Program:
+    """A trained policy in a held-out world of its task, beside a reference.
+
+    Parameters
+    ----------
+    path
+        A policy of `rbl-gym train`.
+    reference
+        A name of `evaluation.references`; None: the strongest, of placement ``"gradient"``.
+    seed
+        Which world: the first of those that `rbl-gym evaluate` has with this seed.
+
+    Raises
+    ------
+    ValueError
+        If the file is no policy, its task or the reference is not known, or it does not fit.
+    """
+    policy = policies.load(path)
+    task = rl_task(str(policy.meta.get("task")))
+    known = evaluation.references(task)
+    if reference is None:
+        reference = "gradient" if "gradient" in known else known[-1]
+    check_one_of("reference", reference, known)
+    policies.check_fit(policy, Path(path).name, task.make(1))
+
+    def start(_: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
+        return learned_frames(task, policy, reference, seed)
+
+    env = _env(task)
+    shown = env_program(env, None, _held_out(seed))
+    title = f"{policy.meta.get('task')}: {Path(path).stem}"
+    return Program(title, shown.room, shown.tags, start, shown.filters, seed)
+
+
+def learned_frames(task: RlTask, policy: Policy, reference: str, seed: int) -> Iterator[Frame]:
+    """A held-out episode of a task as a policy plays it, beside a reference.
+
+    The ghosts of a frame are the reference's anchors at the same step; the scores of both are those
+    so far: of a placement that of the anchors placed, else the geometric mean of b over the steps.
+
+    Parameters
+    ----------
+    task, policy
+        What is played, and by whom.
+    reference
+        A name of `evaluation.references`.
+    seed
+        Which world.
+    """
+    env = _env(task)
+    frames = env_frames(env, (), _held_out(seed), policy.player())
+    if task.env_id == "RBL/AnchorPlacement-v0":
+        groups = evaluation.layouts_of(task, {}, [reference], 1, seed)
+        problem, context, found = groups[0]
+        anchors = found[reference][0]
+        anchors = anchors if anchors.ndim == 2 else anchors[0]
+        score = float(placement.score(problem, context, anchors[None])[0])
+        for frame in frames:
+            yield frame._replace(ghosts={reference: anchors}, scores={reference: score})
+        return
+    logs: list[float] = []
+    others: list[float] = []
+    beside = _reference_steps(task, reference, seed)
+    for frame, (anchors, score) in zip(frames, beside, strict=False):
+        # At the reset nobody has done anything.
+        if frame.time_s > 0:
+            logs.append(math.log(frame.score_m))
+            others.append(math.log(score))
+        yield frame._replace(
+            score_m=_mean(logs), ghosts={reference: anchors}, scores={reference: _mean(others)}
+        )
+
+
+def _mean(logs: list[float]) -> float:
+    return math.exp(float(np.mean(logs))) if logs else np.nan
+
+
+def _reference_steps(task: RlTask, name: str, seed: int) -> Iterator[tuple[FloatArray, float]]:
+    """Anchors (M, 3) and b, metres, at every step of a held-out episode, from its start on."""
+    mobile = task.env_id == "RBL/MobileAnchors-v0"
+    table: Any = controllers.MOBILE if mobile else controllers.SELECTION
+    rng = np.random.default_rng([seed, evaluation.references(task).index(name)])
+    env, _, info = rollouts.held_out(task, 1, seed)
+    while True:
+        yield env.anchors[0].copy(), float(info["score_m"][0])
+        _, _, terminated, truncated, info = env.step(table[name](env, rng))
+        if (terminated | truncated).any():
+            yield env.anchors[0].copy(), float(info["score_m"][0])
+            return
+
+
+def _env(task: RlTask) -> gym.Env[Any, Any]:
+    return gym.make(f"rbl_gym:{task.env_id}", **task.arguments)
+
+
+def _held_out(seed: int) -> int:
+    return HELD_OUT_SEED + SEED_STRIDE * seed
