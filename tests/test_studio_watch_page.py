@@ -4,19 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym import studio
+from rbl_gym import recordings, studio
 from rbl_gym.app.cli import main
+from rbl_gym.studies import replay
 from rbl_gym.studio import Studio
 from rbl_gym.studio.watch.frames import Frame
 from rbl_gym.studio.watch.live import Disturbances, stage_of_scene
-from rbl_gym.studio.watch.program import LIVE, live_program, program_of, room_of
-from rbl_gym.studio.watch.view import ellipsoid, link_lines
+from rbl_gym.studio.watch.program import (
+    LIVE,
+    Program,
+    env_program,
+    live_program,
+    program_of,
+    recorded_program,
+    room_of,
+)
+from rbl_gym.studio.watch.view import ellipsoid, letterbox, link_lines
 from rbl_gym.worlds import scenes
 from tests.helpers import ROOT
 from tests.test_studio_page import ARGUMENTS, CHROMIUM, until
+from tests.test_studio_watch import random_policy
 
 pytest.importorskip("viser", reason="needs the extra studio")
 
@@ -153,6 +164,8 @@ def test_the_command_watches_buildings_and_recordings(tmp_path, monkeypatch):
         (["--ranges", "r.csv", "--anchors", "4"], "--anchors must be a file"),
         (["uwb_room", "--ranges", "r.csv"], "must be left out"),
         (["uwb_room", "--watch", "--filter", "kalmann"], "filter must be one of"),
+        (["--env", "RBL/Nothing-v0"], "--env RBL/Nothing-v0"),
+        (["--policy", "none.npz"], "none.npz"),
     ],
 )
 def test_the_command_says_what_is_wrong(options, says, capsys):
@@ -182,3 +195,53 @@ def test_in_a_browser_a_filter_breaks_and_the_robust_one_holds(served):
     assert np.linalg.norm(told[0]) == pytest.approx(0.5)
     errors = np.array([[t.position_m for t in f.tracks] for f in page.frames[3:]])
     assert errors[:, 1].mean() < errors[:, 0].mean()
+
+
+def test_the_command_plays_environments_and_policies(tmp_path, monkeypatch):
+    opened = asked(tmp_path, monkeypatch, "--env", "RBL/AnchorSelection-v0", "--filter", "uc-kf")
+    program: Program = opened.page.program
+    assert program.filters == ("iekf", "uc-kf")
+    opened.stop()
+    policy = random_policy("auv_buoys", tmp_path)
+    opened = asked(tmp_path, monkeypatch, "--policy", policy, "--reference", "ring")
+    for _ in range(4):
+        opened.page.step()
+    opened.page.settle()
+    assert [len(frame.anchors) for frame in opened.page.frames] == [0, 1, 2, 3, 4]
+    assert opened.page.status == ""
+    opened.stop()
+
+
+@pytest.mark.parametrize("aspect", [0.5, 2.0, 3.0])
+def test_a_picture_keeps_its_proportions(aspect):
+    picture = np.zeros((40, 80, 3), np.uint8)
+    found = letterbox(picture, aspect)
+    assert found.shape[1] / found.shape[0] == pytest.approx(aspect, abs=0.02)
+    assert (found == 0).all(axis=-1).sum() == 40 * 80
+
+
+def test_environments_that_are_no_rooms_are_shown_as_pictures():
+    env = gym.make("rbl_gym:RBL/PlanarNetwork-v0", render_mode="rgb_array")
+    opened = studio.show(env_program(env), options=OPTIONS)
+    opened.page.step()
+    opened.page.settle()
+    assert (opened.page.status, len(opened.page.frames)) == ("", 2)
+    opened.stop()
+
+
+def test_a_recording_is_shown_with_its_track():
+    folder = ROOT / "examples" / "log"
+    files = {name: str(folder / f"{name}.csv") for name in ("ranges", "anchors", "tags")}
+    log = recordings.read_recording(**files)
+    log = log._replace(**{name: getattr(log, name)[:10] for name in ("times", "ranges", "links")})
+    track = replay.track_recording(log, replay.Settings.of(filter="iekf"))
+    opened = studio.show(log, track, options=OPTIONS)
+    opened.page.step()
+    opened.page.settle()
+    frame = opened.page.frames[1]
+    assert frame.truth is None
+    np.testing.assert_array_equal(frame.tracks[0].belief.translation, track.translation[1])
+    assert recorded_program(log, {"a": track}).filters == ("a",)
+    opened.stop()
+    with pytest.raises(ValueError, match="what must be"):
+        studio.show("uwb_room", options=OPTIONS)

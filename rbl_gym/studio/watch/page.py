@@ -50,7 +50,11 @@ class WatchPage:
         self._start()
         panels = scene_view.PANEL + (CHARTS_WIDTH if program.filters else 0)
         scene_view.set_camera(server, program.room, panels)
-        scene_view.draw_room(server, program.room, _FLOOR)
+        if self.frames[0].picture is None:
+            scene_view.draw_room(server, program.room, _FLOOR)
+            for index, zone in enumerate(program.room.zones):
+                edges = scene_view.prism_edges(zone.polygon, zone.low_m, zone.high_m)
+                scene_view.lines(server.scene, f"/zones/{index}", edges, scene_view.RACK, 1)
         extent = scene_view.extent_of(program.room)
         self._view = WatchView(server.scene, extent, program.tags)
         actions = {
@@ -67,6 +71,9 @@ class WatchPage:
         self._panel = WatchPanel(server.gui, program, actions)
         self._worker = Worker(self._failed)
         self._worker.post(lambda: self._show(True))
+        if self.frames[0].picture is not None:
+            # It is fitted to the window.
+            server.on_client_connect(lambda _: self._worker.post(lambda: self._show(True)))
 
     # --- what the page asks for -------------------------------------------------------------
 
@@ -219,7 +226,7 @@ class WatchPage:
         self._drawn = now
         frame = self.frames[self.at]
         with self._server.atomic():
-            self._view.show(frame, self.frames[: self.at + 1], self._links)
+            self._view.show(frame, self.frames[: self.at + 1], self._links, self._aspect())
             self._panel.show(self.frames, self.at, self._playing, self.status)
             if whole or now - self._charted > 1 / _CHARTS_HZ:
                 self._charted = now
@@ -230,6 +237,11 @@ class WatchPage:
                 for client in self._server.get_clients().values():
                     client.camera.position, client.camera.look_at = position, centre
         self._server.flush()
+
+    def _aspect(self) -> float | None:
+        """Width of the first browser's window over its height; None: no browser is open."""
+        cameras = [client.camera for client in self._server.get_clients().values()]
+        return cameras[0].image_width / cameras[0].image_height if cameras else None
 
     def _failed(self, error: Exception) -> None:
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):

@@ -65,7 +65,6 @@ class WatchPanel:
         self._play.on_click(lambda _: actions["play"]())
         move = gui.add_button_group("", ("Step", "Restart"))
         move.on_click(lambda _: actions[move.value.lower()]())
-        self._picture: Any = None
         self._time = gui.add_slider("Epoch", 0, 1, 1, 0)
         _input(self._time, lambda: actions["seek"](int(self._time.value)))
         speed = gui.add_button_group("Speed", ("0.5x", "1x", "4x", "max"))
@@ -157,7 +156,7 @@ class WatchPanel:
             ),
             legend=uplot.Legend(show=False),
             cursor=uplot.Cursor(show=False),
-            height=190,
+            height=160,
             padding=(8, 10, 0, 0),
         )  # fmt: skip
 
@@ -182,11 +181,6 @@ class WatchPanel:
     def show(self, frames: Sequence[Frame], at: int, playing: bool, status: str) -> None:
         """Show a frame, and those before it in the charts."""
         self._table.content = headline(self._program.title, frames[: at + 1])
-        picture = frames[at].picture
-        if picture is not None and self._picture is None:
-            self._picture = self._gui.add_image(picture, format="jpeg")
-        elif picture is not None:
-            self._picture.image = picture
         icon, label = ("player-pause", "Pause") if playing else ("player-play", "Play")
         if self._play.label != label:
             self._play.label, self._play.icon = label, icon
@@ -205,8 +199,8 @@ class WatchPanel:
 
     def chart(self, frames: Sequence[Frame]) -> None:
         """Show the last of these frames in the charts."""
-        shown = frames[-_CHARTED:]
-        for chart, (least, of) in zip(self._charts, CHARTS.values(), strict=True):
+        shown = frames[-_CHARTED:] if self._charts else ()
+        for chart, (least, of) in zip(self._charts, CHARTS.values(), strict=False):
             chart.data = self._curves(shown, least, of)[0]
 
     def name_filters(self, labels: tuple[str, ...]) -> None:

@@ -30,6 +30,14 @@ from rbl_gym.studio.watch.played import (
 from rbl_gym.studio.watch.recorded import recorded_frames, track_all
 from rbl_gym.worlds.scene import Scene
 
+__all__ = [
+    "Program",
+    "env_program",
+    "live_program",
+    "program_of",
+    "recorded_program",
+]
+
 # Room around anchors and track of a recording, metres.
 _MARGIN_M = 0.5
 

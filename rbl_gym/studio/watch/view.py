@@ -77,6 +77,14 @@ def link_lines(
     return {name: pairs[kinds == number] for number, name in enumerate(LINKS)}
 
 
+def letterbox(picture: np.ndarray, aspect: float) -> np.ndarray:
+    """A picture (height, width, 3) with white beside it, so that it has an aspect ratio."""
+    height, width = picture.shape[:2]
+    missing = max(0, round(width / aspect) - height), max(0, round(height * aspect) - width)
+    sides = [(size // 2, size - size // 2) for size in missing]
+    return np.pad(picture, [*sides, (0, 0)], constant_values=255)
+
+
 class WatchView:
     """Draws frames.
 
@@ -99,8 +107,17 @@ class WatchView:
         self._bodies: list[str] = []
         self._places: dict[str, FloatArray] = {}
 
-    def show(self, frame: Frame, way: Sequence[Frame], which: int) -> None:
-        """Draw a frame, the frames before it as ways, and links as a filter takes them."""
+    def show(
+        self, frame: Frame, way: Sequence[Frame], which: int, aspect: float | None = None
+    ) -> None:
+        """Draw a frame, the frames before it as ways, and links as a filter takes them.
+
+        `aspect`: width of the window over its height, for pictures; None: not known.
+        """
+        if frame.picture is not None:
+            picture = frame.picture if aspect is None else letterbox(frame.picture, aspect)
+            self._scene.set_background_image(picture, format="png")
+            return
         self._show_anchors("/anchors", frame.anchors, ANCHOR, labels=True)
         wrong = frame.told[np.abs(frame.told - frame.anchors).max(axis=1) > 1e-6]
         self._show_anchors("/told", wrong, WRONG)
