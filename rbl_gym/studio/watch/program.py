@@ -84,6 +84,13 @@ LIVE, RECORDED = ("iekf", "iekf-robust"), ("iekf-log",)
 def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:
     """The program of what `rbl_gym.studio.show` is given, but for problems.
 
+    Parameters
+    ----------
+    what, beside
+        As of `rbl_gym.studio.show`.
+    seed
+        Of an episode.
+
     Raises
     ------
     ValueError
@@ -109,7 +116,19 @@ def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:
 
 
 def live_program(stage: Stage, filters: tuple[str, ...], room: Problem, seed: int = 0) -> Program:
-    """A simulated episode with filters side by side."""
+    """A simulated episode with filters side by side.
+
+    Parameters
+    ----------
+    stage
+        Where it is played.
+    filters
+        Their labels.
+    room
+        What is drawn around the body.
+    seed
+        Of the episode.
+    """
 
     def start(labels: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
         return frames(stage, [filter_named(label) for label in labels], seed, disturb)
@@ -121,7 +140,13 @@ def live_program(stage: Stage, filters: tuple[str, ...], room: Problem, seed: in
 def recorded_program(
     recording: Recording, tracks: Mapping[str, Track], settings: Settings | None = None
 ) -> Program:
-    """A recording with its tracks."""
+    """A recording with its tracks.
+
+    Parameters
+    ----------
+    recording, tracks, settings
+        As of `recorded_frames`.
+    """
 
     def start(labels: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
         return recorded_frames(recording, tracks, settings)
@@ -145,7 +170,9 @@ def env_program(
         Scalar, raw or wrapped.
     filters
         Labels of filters beside the environment's own; None: where it has none, ``"iekf"``.
-    seed, act
+    seed
+        Of the episode.
+    act
         As of `env_frames`.
     """
     # It refuses what cannot be shown before it is reset.
