@@ -1,1 +1,1 @@
-"""Environments: measurements out, anchor commands in; they know no estimator."""
+"""Environments: they produce measurements and take anchor commands, without any estimator."""

@@ -1,4 +1,4 @@
-"""RBL/BaseStation-v0: one rigid body, one base station that sees where its tags are."""
+"""RBL/BaseStation-v0: one base station measures angles to the tags of one rigid body."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 
 ANGLE_STD_RAD = math.radians(0.1)
-# What the info of a reset holds besides.
+# Additional keys in the info of a reset.
 _PRIOR = ("prior_rotation", "prior_translation", "prior_covariance", "scene")
-# The world, as changes of a scene; it keeps the body on the station's side y > 0.
+# The world, as overrides of a scene; the body stays on the station's side, y > 0.
 WORLD: dict[str, Any] = {
     "name": "drone_yard",
     "volume": {"low": [-12, 8, 2], "high": [12, 30, 12]},
@@ -41,12 +41,13 @@ WORLD: dict[str, Any] = {
 
 
 def world(scene: Mapping[str, Any] | None) -> Scene:
-    """The scene that `WORLD` and these changes of it make.
+    """Return the scene given by `WORLD` and these overrides.
 
     Raises
     ------
     ValueError
-        If it is not of one base station, or has links or obstacles that angles do not know.
+        If the scene does not have exactly one base station, or if it has links or obstacles, which
+        do not apply to angles.
     """
     changes = {} if scene is None else scene
     if not isinstance(changes, Mapping):
@@ -55,7 +56,7 @@ def world(scene: Mapping[str, Any] | None) -> Scene:
 
 
 def checked_world(found: Scene) -> Scene:
-    """The scene, or a ValueError as of `world`."""
+    """Return the scene; raises ValueError as `world` does."""
     if found.n_anchors != 1:
         raise ValueError(f"scene must have n_anchors = 1, got {found.n_anchors}")
     if found.links != LinkModel() or found.weakens:
@@ -64,7 +65,7 @@ def checked_world(found: Scene) -> Scene:
 
 
 def family_of_worlds(members: Any) -> SceneFamily:
-    """The family of worlds that changes of `WORLD` make, with laws; or a ValueError."""
+    """Return the family of worlds given by overrides of `WORLD` with laws; may raise ValueError."""
     changes = families.members_of(members)
     for index, change in enumerate(changes):
         if not isinstance(change, Mapping):
@@ -82,8 +83,8 @@ def family_of_worlds(members: Any) -> SceneFamily:
 class BaseStationVectorEnv(BatchEnv):
     """`num_envs` independent `BaseStationEnv` worlds; seeding and autoreset as `BatchEnv`.
 
-    Made by ``gym.make_vec("rbl_gym:RBL/BaseStation-v0", num_envs=64)``; arguments as
-    `BaseStationEnv`.
+    Created by ``gym.make_vec("rbl_gym:RBL/BaseStation-v0", num_envs=64)``. The arguments are those
+    of `BaseStationEnv`.
     """
 
     def __init__(
@@ -138,17 +139,17 @@ class BaseStationVectorEnv(BatchEnv):
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode, of a family those of the longest."""
+        """Number of steps of an episode; of a family, the largest number."""
         return self._longest
 
     @property
     def scene(self) -> Scene:
-        """The scene; of a family that of world 0 now."""
+        """The scene; of a family, the present scene of world 0."""
         return self._scene if self.family is None else self._scene_of(0)
 
     @property
     def world(self) -> Any:
-        """The scene; of a family those of the worlds now, side by side."""
+        """The scene; of a family, the present scenes of all worlds, stacked."""
         return self._episodes.stack if isinstance(self._episodes, FamilyStore) else self._scene
 
     def _scene_of(self, row: int) -> Scene:
@@ -184,7 +185,8 @@ class BaseStationVectorEnv(BatchEnv):
         return reward, np.zeros(self.num_envs, dtype=np.bool_)
 
     def _measure(self, rows: np.ndarray | slice, step: Any) -> None:
-        """Angles of some worlds at their epochs, and what they tell after `step` seconds."""
+        """Measure the angles of some worlds at their epochs; return also the bound after `step`
+        seconds."""
         self._at = self._episodes.motion_at(self._epochs)
         rotation, translation, twist = (field[rows] for field in self._at)
         station, std = self._stations[rows], self.noise.std_rad
@@ -206,7 +208,7 @@ class BaseStationVectorEnv(BatchEnv):
 
     @property
     def _seen(self) -> simulation.Motion:
-        """All worlds as they were measured last."""
+        """Return the last measurements of all worlds."""
         assert self._at is not None
         return self._at
 
@@ -236,19 +238,21 @@ class BaseStationVectorEnv(BatchEnv):
 
 
 class BaseStationEnv(ScalarEnv):
-    """A rigid body moves; one base station measures directions to its tags: where is it?
+    """A rigid body moves; one base station measures directions to its tags. Estimate its pose.
 
     ## Description
-    A body carries N tags at known places. At every epoch a base station at a known place
-    measures, for every tag, the angle alpha of its direction to the x axis and beta to the z
-    axis (`rbl_gym.measurements.bearing`; the station's axes are the world's). Distances are not measured: the
-    size of the body tells them, the worse the farther it is. Within a step: the station moves,
-    the body moves, angles are taken, the bound and the reward follow.
+    A body carries N tags at known positions in its frame. At every epoch a base station at a known
+    position measures two angles for every tag: alpha between the direction to the tag and the x
+    axis, and beta between it and the z axis (`rbl_gym.measurements.bearing`). The station's axes
+    are the world's axes. Distances are not measured. They follow from the known size of the body,
+    less accurately the farther the body is. Order within a step: the station moves, the body moves,
+    angles are measured, the bound and the reward are computed.
 
     ## Action space
-    ``Box(-1, 1, (3,), float32)``: velocity of the base station in units of its limit (3 m/s; cut
-    to length 1); zero keeps it. Its place is projected onto the scene's anchor region. A scene
-    with ``anchor_speed_m_s`` 0: ``Discrete(1)``.
+    ``Box(-1, 1, (3,), float32)``: velocity of the base station in units of its speed limit (3 m/s;
+    longer vectors are cut to length 1). Zero keeps the station where it is. Its position is
+    projected onto the scene's anchor region. In a scene with ``anchor_speed_m_s`` 0:
+    ``Discrete(1)``.
 
     ## Observation space
     A ``Dict``, all float64:
@@ -256,23 +260,24 @@ class BaseStationEnv(ScalarEnv):
     | key | shape | meaning |
     |---|---|---|
     | `angles` | (2, N) | alpha and beta of every tag, radians on [0, pi] |
-    | `station` | (3,) | place of the base station at this epoch, metres |
+    | `station` | (3,) | position of the base station at this epoch, metres |
     | `twist` | (6,) | known angular velocity (rad/s) and velocity (m/s) of the interval that ends at this epoch |
 
     ## Reward
-    ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square tag
-    error in metres at the true pose. ``"none"``: 0.
+    ``reward="bound"``: ``-log b``, where b is the posterior Cramer-Rao bound of the root mean
+    square tag error in metres at the true pose. ``reward="none"``: 0.
 
     ## Info
-    `rotation`, `translation`: the true pose; `epoch`; `score_m`: b (with ``reward="bound"``). Of
-    a reset the prior (`prior_rotation`, `prior_translation`, `prior_covariance`), which refers to
-    epoch 0 before its update.
+    `rotation`, `translation`: the true pose. `epoch`: the epoch. `score_m`: b, with
+    ``reward="bound"``. The info of a reset also has the prior (`prior_rotation`,
+    `prior_translation`, `prior_covariance`). It refers to epoch 0 before the measurements of that
+    epoch.
 
     ## Episode end
     Never terminates; truncates after `scene.steps` steps (100 of 0.1 s).
 
     ## Rendering
-    ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, of the bound.
+    ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the bound.
 
     ## Arguments
     ```python
@@ -281,14 +286,14 @@ class BaseStationEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/BaseStation-v0", angle_std_rad=0.01)
     env = gym.make("rbl_gym:RBL/BaseStation-v0", scene={"steps": 50, "anchor_speed_m_s": 0})
     ```
-    The wrapper `EstimatePose` runs the iterated EKF on the angles.
-    `scene`: changes of the world (`WORLD`), see `rbl_gym.worlds.scenes.get`; its noise of ranges is not
-    used. `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``.
-    `scenes` in place of `scene`: a list of such changes, or one, with laws
-    (`rbl_gym.worlds.families.SceneFamily`); every reset draws a world, as
-    ``scenes={"speed_m_s": {"uniform": [1, 4]}}``. All bodies have one number of tags. The
-    observation then has `tags` (N, 3), metres, body frame; `info["scene"]` of the reset is JSON,
-    the overrides that were drawn.
+    The wrapper `EstimatePose` runs the iterated EKF on the angles. `scene`: overrides of the
+    default world (`WORLD`), see `rbl_gym.worlds.scenes.get`. Its range noise is not used.
+    `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``. `scenes`,
+    instead of `scene`: such overrides with laws, or a list of them
+    (`rbl_gym.worlds.families.SceneFamily`). Every reset draws a world, for example
+    ``scenes={"speed_m_s": {"uniform": [1, 4]}}``. All bodies must have the same number of tags. The
+    observation then also has `tags` (N, 3), metres, body frame. `info["scene"]` of the reset has
+    the drawn overrides as JSON.
 
     ## Version history
     * v0: first version.
@@ -310,7 +315,7 @@ class BaseStationEnv(ScalarEnv):
 
     @property
     def family(self) -> SceneFamily | None:
-        """What every reset draws a world of; None: there is one."""
+        """The family from which every reset draws a world; None if there is only one world."""
         return self._batch.family
 
     @property
@@ -320,5 +325,5 @@ class BaseStationEnv(ScalarEnv):
 
     @property
     def noise(self) -> bearing.AngleNoise:
-        """Law of the angles."""
+        """Noise law of the angles."""
         return self._batch.noise

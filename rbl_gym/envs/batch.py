@@ -1,7 +1,8 @@
-"""Many worlds in arrays: seeding, autoreset and infos of native vector environments, once for all.
+"""Many worlds in arrays: seeding, autoreset and infos of the native vector environments.
 
-A `BatchEnv` fills in four methods on arrays with a leading axis of worlds. `ScalarEnv` is the
-same code with one world, so that the scalar environment and world i of a vector cannot differ.
+Subclasses of `BatchEnv` implement four methods on arrays with a leading axis of worlds. `ScalarEnv`
+runs the same code with one world. The scalar environment and world i of a vector environment
+therefore always agree.
 """
 
 from __future__ import annotations
@@ -23,34 +24,34 @@ from rbl_gym import rendering
 from rbl_gym.checks import BoolArray, FloatArray, as_array, check_count, check_one_of
 
 Observation = Any
-# More than any machine holds.
+# More environments than any machine holds.
 MOST_ENVS = 10**8
 
 
 class StatedLength:
-    """An environment whose `spec` tells the length of its episodes.
+    """An environment whose `spec` states the length of its episodes.
 
-    The length depends on the arguments of ``make``. A `max_episode_steps` of the registration
-    would be the same for all, and a `TimeLimit` that cuts the longer ones.
+    The length depends on the arguments of ``make``. A `max_episode_steps` in the registration would
+    be the same for all of them, and its `TimeLimit` would cut the longer episodes.
     """
 
     _spec: EnvSpec | None = None
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode."""
+        """Number of steps of an episode."""
         raise NotImplementedError
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What ``make`` made this from, with the length of its episodes."""
+        """The specification from which ``make`` made this, with the length of its episodes."""
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        """Keep a specification, and state the length in it."""
+        """Store a specification and set the episode length in it."""
         if spec is not None:
-            # `make_vec` repeats as an argument what the specification has as a field.
+            # `make_vec` passes fields of the specification again as arguments.
             kwargs = dict(spec.kwargs)
             kwargs.pop("max_episode_steps", None)
             spec = dataclasses.replace(spec, max_episode_steps=self.episode_steps, kwargs=kwargs)
@@ -58,19 +59,19 @@ class StatedLength:
 
 
 class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """Worlds in arrays; a subclass says what they are.
+    """Base class of environments with many worlds in arrays.
 
-    Seeding: ``reset(seed=s)`` seeds world i with ``s + i``, a list gives each its own. Every
-    world has a generator of its own and draws from it as the scalar environment does, so that
-    world i equals the scalar environment seeded with its seed, episode after episode.
+    Seeding: ``reset(seed=s)`` seeds world i with ``s + i``. A list gives each world its own seed.
+    Every world has its own generator and draws from it as the scalar environment does. World i
+    therefore equals the scalar environment with the same seed in all episodes.
 
-    Autoreset: ``"NextStep"`` (default): the step after an episode's end resets, ignores its
-    action and rewards 0. ``"SameStep"``: the ending step already returns the next episode's
-    first observation, and `info` holds ``final_obs`` and ``final_info``. ``"Disabled"``: call
-    ``reset(options={"reset_mask": mask})``.
+    Autoreset: with ``"NextStep"`` (default) the step after the end of an episode resets the world,
+    ignores its action and returns reward 0. With ``"SameStep"`` the last step already returns the
+    first observation of the next episode, and `info` has ``final_obs`` and ``final_info``. With
+    ``"Disabled"`` the user calls ``reset(options={"reset_mask": mask})``.
 
-    `_configure` is called by subclasses at the end of their ``__init__``; before it those that
-    are to be rendered make their `film`.
+    Subclasses call `_configure` at the end of their ``__init__``. Subclasses with rendering make
+    their `film` before that.
     """
 
     single_observation_space: gym.Space[Any]
@@ -110,40 +111,40 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode."""
+        """Number of steps of an episode."""
         return self.steps_limit
 
-    # --- what a world is --------------------------------------------------------------------
+    # --- methods of a subclass -------------------------------------------------------------------
 
     def _restart(
         self, chosen: np.ndarray, generators: Sequence[np.random.Generator]
     ) -> dict[str, np.ndarray] | None:
-        """Start new episodes of the worlds with these indices.
+        """Start new episodes in the worlds with these indices.
 
-        May return infos of these worlds that only the start of an episode has."""
+        May return infos of these worlds that exist only at the start of an episode."""
         raise NotImplementedError
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """Step the worlds of the mask; rewards, and whether they terminated, of all worlds.
+        """Step the worlds of the mask; return rewards and terminations of all worlds.
 
-        At least one moves."""
+        At least one world is stepped."""
         raise NotImplementedError
 
     def _observe(self) -> Observation:
-        """Observations of all worlds; what is returned is the caller's.
+        """Return observations of all worlds; the caller may keep and change them.
 
-        Asked for once after each `_restart` or `_advance`, as `_inform`."""
+        Called once after each `_restart` or `_advance`, as is `_inform`."""
         raise NotImplementedError
 
     def _inform(self) -> dict[str, np.ndarray]:
-        """Infos of all worlds; what is returned is the caller's."""
+        """Return infos of all worlds; the caller may keep and change them."""
         raise NotImplementedError
 
     def _shot(self) -> tuple[Any, Any]:
-        """What a film keeps of an epoch, and the beliefs where the worlds have their own."""
+        """Return what the film stores of an epoch, and the beliefs if the worlds have their own."""
         raise NotImplementedError
 
-    # --- Gymnasium's side -------------------------------------------------------------------
+    # --- the Gymnasium interface -----------------------------------------------------------------
 
     def reset(
         self,
@@ -151,7 +152,7 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start all episodes, or with ``options={"reset_mask": mask}`` those of the mask."""
+        """Start all episodes, or those of the mask in ``options={"reset_mask": mask}``."""
         mask = reset_mask(options, self.num_envs)
         seeds = seeds_of(seed, self.num_envs)
         if not self._generators:
@@ -169,7 +170,7 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
     def step(
         self, actions: ArrayLike
     ) -> tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Step every world; see the autoreset mode for those whose episode is over."""
+        """Step every world; the autoreset mode says what happens after the end of an episode."""
         if not self._generators:
             raise gym.error.ResetNeeded("call reset() before step()")
         checked = check_actions("actions", actions, self.single_action_space, self.num_envs)
@@ -204,7 +205,7 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         return self._observe(), reward, terminated, truncated, info
 
     def render(self) -> Any:
-        """A frame of every world, (height, width, 3) of uint8."""
+        """Return a frame of every world, (height, width, 3), uint8."""
         return rendering.picture(self.film, self.num_envs)
 
     def _shoot(self) -> None:
@@ -212,7 +213,7 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
             self.film.take(self._epochs, *self._shot())
 
     def _begin(self, mask: BoolArray) -> dict[str, np.ndarray]:
-        """Start new episodes where the mask says; infos of their start with their masks."""
+        """Start new episodes in the worlds of the mask; return their start infos with masks."""
         chosen = np.flatnonzero(mask)
         self._epochs[chosen] = 0
         self._done[chosen] = False
@@ -226,7 +227,7 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
         return info
 
     def _masked_info(self, where: BoolArray | None = None) -> dict[str, Any]:
-        """Infos with Gymnasium's masks ``_key`` beside them; zeros outside of `where`."""
+        """Return infos with Gymnasium's masks ``_key``; values outside of `where` are zero."""
         info: dict[str, Any] = {}
         for name, value in self._inform().items():
             if where is not None:
@@ -241,21 +242,22 @@ class BatchEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright: ignore[repor
 def check_actions(
     name: str, actions: ArrayLike, space: gym.Space[Any], num_envs: int | None = None
 ) -> np.ndarray:
-    """Actions of a space, of `num_envs` worlds where given, as a finite array; or a ValueError.
+    """Return actions of a space, for `num_envs` worlds if given, as a finite array.
 
-    Those of a box are float64 and may lie outside of it.
+    Raises ValueError for anything else. Actions of a box are float64 and may lie outside of the
+    box.
     """
     shape = space.shape or ()
     shape = shape if num_envs is None else (num_envs, *shape)
     array = actions if isinstance(actions, np.ndarray) else as_array(name, actions)
-    # Learners hand on binary choices as floating-point zeros and ones.
+    # Learners pass binary choices as floating-point zeros and ones.
     whole = isinstance(space, gym.spaces.Discrete)
     if array.shape != shape or array.dtype.kind not in ("iub" if whole else "fiub"):
         kind = "integers" if whole else "numbers"
         raise ValueError(
             f"{name} must be {kind} of shape {shape}, got {array.shape} of {array.dtype}"
         )
-    # Mostly one product tells that all are finite; it may overflow.
+    # One product usually shows that all values are finite. It may overflow.
     if array.dtype.kind == "f" and not (
         math.isfinite(np.vdot(array, array)) or np.isfinite(array).all()
     ):
@@ -264,7 +266,7 @@ def check_actions(
         return array.astype(np.float64)
     if not whole and array.dtype == np.int8 and not np.count_nonzero(array & ~1):
         return array.copy()
-    # Before the cast: a narrow type would wrap large numbers round into the space.
+    # Check before the cast: a narrow type would wrap large numbers into the space.
     if isinstance(space, gym.spaces.Discrete):
         legal = (array >= space.start) & (array < space.start + space.n)
     else:
@@ -275,7 +277,7 @@ def check_actions(
 
 
 def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
-    """Which worlds ``options={"reset_mask": mask}`` resets, all without it; or a ValueError."""
+    """Return the worlds that ``options={"reset_mask": mask}`` resets; all worlds without a mask."""
     check_options(options, ("reset_mask",))
     if not options:
         return np.ones(num_envs, dtype=np.bool_)
@@ -289,7 +291,7 @@ def reset_mask(options: dict[str, Any] | None, num_envs: int) -> BoolArray:
 
 
 def check_options(options: Any, known: tuple[str, ...] = ()) -> None:
-    """A ValueError on options of a reset that are no dict, or have a key that is not known."""
+    """Raise ValueError if options of a reset are not a dict or have an unknown key."""
     if options is None:
         return
     if not isinstance(options, Mapping):
@@ -304,7 +306,7 @@ def check_options(options: Any, known: tuple[str, ...] = ()) -> None:
 
 
 def seeds_of(seed: int | Sequence[int | None] | None, num_envs: int) -> list[int | None]:
-    """A seed for each world: s, s + 1, ... of a number, a list as it is; or a ValueError."""
+    """Return a seed for each world: s, s + 1, ... for a number s; a list is returned unchanged."""
     if seed is None:
         return [None] * num_envs
     if isinstance(seed, int | np.integer):
@@ -323,7 +325,7 @@ def _seed(seed: Any) -> int | None:
 
 
 def _rows_as_objects(observation: Observation, where: BoolArray) -> np.ndarray:
-    """Gymnasium's ``final_obs``: an object array with the observation of each ended world."""
+    """Return Gymnasium's ``final_obs``: an object array with the observations of ended worlds."""
     rows = np.full(len(where), None, dtype=object)
     for i in np.flatnonzero(where):
         rows[i] = _row(observation, int(i))

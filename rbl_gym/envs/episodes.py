@@ -14,14 +14,14 @@ from rbl_gym.worlds.families import SceneFamily, padded
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.worlds.stacked import StackedScenes
 
-# Worlds that are drawn and built together: what they need on the way fits the cache.
+# Number of worlds drawn and built together, so that intermediate arrays fit the cache.
 _BLOCK = 256
 
 
 class EpisodeStore:
-    """The running episodes of B worlds: arrays (T + 1, B, ...), an epoch of all worlds together.
+    """The running episodes of B worlds: arrays (T + 1, B, ...), contiguous in the worlds.
 
-    They are written anew by every reset, not made anew: fresh memory is slow.
+    A reset overwrites the arrays and does not allocate new ones, because fresh memory is slow.
     """
 
     def __init__(self, scene: Scene, num_envs: int) -> None:
@@ -33,15 +33,15 @@ class EpisodeStore:
 
     @property
     def empty(self) -> bool:
-        """Whether no episode was ever begun."""
+        """Whether no episode has begun yet."""
         return not self._timed
 
     def begin(
         self, worlds: np.ndarray, generators: Sequence[np.random.Generator]
     ) -> dict[str, FloatArray]:
-        """New episodes of some worlds, each from its own generator.
+        """Draw new episodes of some worlds, each from its own generator.
 
-        Returns the fields of `simulation.Episode` that have no time axis, of these worlds.
+        Returns the fields of `simulation.Episode` without a time axis, of these worlds.
         """
         starts: list[Any] = []
         for first in range(0, len(worlds), _BLOCK):
@@ -54,7 +54,7 @@ class EpisodeStore:
             starts.append(episode[len(simulation.Epoch._fields) :])
         names = simulation.Episode._fields[len(simulation.Epoch._fields) :]
         return {
-            # Copies: what is not random may be a view of the scene's own.
+            # Copies: fields that are not random may be views of the scene's arrays.
             name: np.concatenate(parts)
             for name, parts in zip(names, zip(*starts, strict=True), strict=True)
         }
@@ -72,13 +72,13 @@ class EpisodeStore:
                 stored[:, rows] = np.swapaxes(field, 0, 1)
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
-        """All worlds, each at its epoch (B,); random numbers not to be written to."""
+        """Return the epochs (B,) of all worlds; the random numbers must not be written to."""
         where = self._where(epochs)
         random = (None if field is None else field[where] for field in self._timed[3:])
         return simulation.Epoch(*self.motion_at(epochs), *random)  # pyright: ignore[reportArgumentType]
 
     def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
-        """The motion of all worlds, each at its epoch (B,); copies."""
+        """Return copies of the motion of all worlds at their epochs (B,)."""
         where = self._where(epochs)
         return simulation.Motion(*(np.array(field[where]) for field in self._timed[:3]))  # pyright: ignore[reportOptionalSubscript]
 
@@ -89,16 +89,16 @@ class EpisodeStore:
 
 
 class FamilyStore:
-    """The running episodes of B worlds, each with a scene of its own: an `EpisodeStore` of those.
+    """The running episodes of B worlds with different scenes, see `EpisodeStore`.
 
-    World i draws its scene, then its episode, as the scalar environment does.
+    World i draws its scene, then its episode, in the same order as the scalar environment.
 
     Parameters
     ----------
     family, num_envs
         The family, and B.
     in_turn
-        Whether the worlds have the members of the family in turn, and draw none.
+        Whether worlds take the members of the family in turn instead of drawing them.
 
     Attributes
     ----------
@@ -119,7 +119,8 @@ class FamilyStore:
     def begin(
         self, worlds: np.ndarray, generators: Sequence[np.random.Generator]
     ) -> dict[str, np.ndarray]:
-        """New episodes of some worlds; as `EpisodeStore.begin`, and the drawn overrides."""
+        """Draw new episodes of some worlds, as `EpisodeStore.begin`; return also the drawn
+        overrides."""
         drawn, starts, scenes = [], [], []
         for world, generator in zip(worlds.tolist(), generators, strict=True):
             member = world % len(self._family.members) if self._in_turn else None
@@ -153,18 +154,18 @@ class FamilyStore:
                 self._survey[:steps, world, :m] = fields.survey
 
     def motion_at(self, epochs: np.ndarray) -> simulation.Motion:
-        """The motion of all worlds, each at its epoch (B,); copies."""
+        """Return copies of the motion of all worlds at their epochs (B,)."""
         where = epochs, np.arange(len(epochs))
         return simulation.Motion(*(field[where] for field in self._timed[:3]))
 
     def at(self, epochs: np.ndarray) -> simulation.Epoch:
-        """All worlds, each at its epoch (B,); random numbers not to be written to."""
+        """Return the epochs (B,) of all worlds; the random numbers must not be written to."""
         where = epochs, np.arange(len(epochs))
         survey = None if self._survey is None else self._survey[where]
         return simulation.Epoch(*(field[where] for field in self._timed), survey=survey)
 
 
 def rows_of(worlds: np.ndarray) -> slice | np.ndarray:
-    """Indices in ascending order, as a slice where they are neighbours."""
+    """Return ascending indices, as a slice if they are contiguous."""
     first, last = worlds[0], worlds[-1]
     return slice(first, last + 1) if last - first + 1 == len(worlds) else worlds

@@ -1,4 +1,4 @@
-"""RBL/PlanarNetwork-v0: nodes that see each other's bearing, moved so that they know themselves."""
+"""RBL/PlanarNetwork-v0: nodes measure each other's bearings and move to estimate orientations."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from rbl_gym.rendering import network as rendering
 
 REWARDS = ("bound", "none")
 LENGTHS = ("none", "one", "all")
-# Of an orientation that nothing is known of: uniform on the circle.
+# Standard deviation of an unknown orientation, uniform on the circle.
 PRIOR_STD_RAD = math.pi / math.sqrt(3)
-# Of the length that is known, as a share of the square's side: exact as far as anyone can see,
-# and no wall for an iteration.
+# Standard deviation of the known length, as a fraction of the square's side: small enough to be
+# practically exact, and large enough for iterations to converge.
 _KNOWN = 1e-4
-# A millionth of a radian and of the side are as sharp as bounds in double precision can be.
+# Bounds below a millionth of a radian and of the side are not reliable in double precision.
 _SHARPEST = 1e-6
-# Lengths beyond the longest link, in standard deviations: the end of the observation space.
+# Limit of the observation space: the longest link plus this many standard deviations.
 _TAIL = 8.0
-# Layouts that are tried for one whose nodes are connected at the start.
+# Number of layouts tried to find one that is connected at the start.
 _TRIES = 64
-# The bound inverts n x n matrices.
+# Limit of n: the bound inverts n x n matrices.
 MOST_NODES = 10_000
 
 
 def _ring(low: float, high: float) -> tuple[float, float]:
-    """Mean and standard deviation of the distance of points spread evenly over a ring."""
+    """Return mean and standard deviation of the distance of points spread evenly over a ring."""
     high = max(high, 1.001 * low)
     mean = 2 / 3 * (high**3 - low**3) / (high**2 - low**2)
     return mean, math.sqrt((high**2 + low**2) / 2 - mean**2)
@@ -45,8 +45,8 @@ def _ring(low: float, high: float) -> tuple[float, float]:
 class PlanarNetworkVectorEnv(BatchEnv):
     """`num_envs` independent `PlanarNetworkEnv` networks of equal n in arrays.
 
-    Made by ``gym.make_vec("rbl_gym:RBL/PlanarNetwork-v0", num_envs=64)``. Arguments as
-    `PlanarNetworkEnv`; seeding and autoreset as `BatchEnv`.
+    Created by ``gym.make_vec("rbl_gym:RBL/PlanarNetwork-v0", num_envs=64)``. The arguments are
+    those of `PlanarNetworkEnv`. Seeding and autoreset work as in `BatchEnv`.
     """
 
     render_fps = 10
@@ -117,7 +117,7 @@ class PlanarNetworkVectorEnv(BatchEnv):
         self._measure(chosen, generators)
 
     def _layout(self, generator: np.random.Generator) -> FloatArray:
-        """Uniform in the square, of a connected graph if one comes up in time."""
+        """Draw positions uniformly in the square, with a connected graph if one is found in time."""
         positions = np.zeros((self.n_nodes, 2))
         for _ in range(_TRIES):
             positions = generator.uniform(0, self.side_m, (self.n_nodes, 2))
@@ -127,13 +127,13 @@ class PlanarNetworkVectorEnv(BatchEnv):
         return positions
 
     def _links_of(self, positions: FloatArray) -> tuple[BoolArray, FloatArray]:
-        """Who sees whom (..., n, n), and what stands between them (..., n, n, 2)."""
+        """Return which nodes see each other (..., n, n), and their displacements (..., n, n, 2)."""
         apart = positions[..., None, :, :] - positions[..., :, None, :]
         distance = np.linalg.norm(apart, axis=-1)
         return (distance <= self.radius_m) & (distance >= self.blind_m), apart
 
     def _measure(self, rows: np.ndarray, generators: Sequence[np.random.Generator]) -> None:
-        """Links, bearings and the bound of some worlds."""
+        """Measure links, bearings and the bound of some worlds."""
         links, apart = self._links_of(self._positions[rows])
         toward = np.arctan2(apart[..., 1], apart[..., 0])
         size = (self.n_nodes, self.n_nodes)
@@ -158,9 +158,9 @@ class PlanarNetworkVectorEnv(BatchEnv):
     def _measured(
         self, links: BoolArray, distance: FloatArray, generators: Sequence[np.random.Generator]
     ) -> FloatArray:
-        """Lengths (..., n, n) as they are observed, 0 where none is."""
+        """Return the observed lengths (..., n, n), 0 where no length is measured."""
         if self.lengths == "one":
-            # The longest link of node 0 bears the shape's errors best.
+            # Use the longest link of node 0: it gives the smallest errors of scale.
             other = np.where(links[:, 0], distance[:, 0], 0.0).argmax(axis=-1)
             known = np.zeros(links.shape, dtype=np.bool_)
             worlds = np.arange(len(links))
@@ -169,7 +169,7 @@ class PlanarNetworkVectorEnv(BatchEnv):
         size = (self.n_nodes, self.n_nodes)
         normals = np.array([np.triu(g.standard_normal(size), 1) for g in generators])
         noisy = distance + self.length_std_m * (normals + normals.swapaxes(-1, -2))
-        # A length is above 0: 0 says that there is none.
+        # A measured length is positive: 0 means no length.
         return np.where(links, np.clip(noisy, 1e-9, self._longest), 0.0)
 
     def _advance(self, actions: np.ndarray, moving: BoolArray) -> tuple[FloatArray, BoolArray]:
@@ -202,49 +202,51 @@ class PlanarNetworkVectorEnv(BatchEnv):
 
 
 class PlanarNetworkEnv(ScalarEnv):
-    """Where do the nodes of a network go, so that each learns how it is turned?
+    """Move the nodes of a network so that each of them learns its orientation.
 
     ## Description
-    n nodes in a square, each turned by an angle that nobody knows. Nodes within sensing radius
-    (and not nearer than the blind zone) measure each other's bearing in their own frames, with
-    noise. Orientations relative to node 0 follow from the bearings of each edge
-    (`rbl_gym.networks.sensing`); the more edges, and the better they tie the network together,
-    the more exact. Nodes move without turning.
+    n nodes lie in a square, each with an unknown orientation. Nodes within the sensing radius (and
+    not nearer than the blind zone) measure each other's bearing in their own frames, with noise.
+    Orientations relative to node 0 follow from the bearings of each edge
+    (`rbl_gym.networks.sensing`). They become more exact with more edges and with better connected
+    networks. Nodes move without turning.
 
     ## Action space
-    ``Box(-1, 1, (2 n,))``: displacement of each node in its OWN frame, times `step_m`: (ahead,
-    left) of node 0, then of node 1, and so on. Nodes stay in the square.
+    ``Box(-1, 1, (2 n,))``: displacement of each node in its OWN frame, in units of `step_m`:
+    (forward, left) of node 0, then of node 1, and so on. Nodes stay in the square.
 
     ## Observation space
-    ``Dict``: `bearings` (n, n) float64 in [-pi, pi], entry (i, j) of node j in the frame of node
-    i, 0 where there is no link; `links` (n, n) int8, 1 where i and j see each other. With
-    `lengths` also `lengths` (n, n) float64, symmetric, metres, 0 where there is none:
-    ``lengths="one"``, the exact length of one link, the longest of node 0; ``lengths="all"``,
-    those of all links, with noise of their own. Bearings and a length give the scale, and so
-    the places.
+    ``Dict``: `bearings` (n, n) float64 in [-pi, pi], entry (i, j) is the bearing of node j in the
+    frame of node i, 0 without a link. `links` (n, n) int8 is 1 where i and j see each other. With
+    the argument `lengths` also `lengths` (n, n) float64, symmetric, metres, 0 without a length.
+    ``lengths="one"`` gives the exact length of one link, the longest of node 0. ``lengths="all"``
+    gives those of all links, with their own noise. Bearings and a length determine the scale, and
+    with it the positions.
 
     ## Reward
-    ``-log b``, b the Cramer-Rao bound of the root mean square orientation error in radians of
-    all nodes but node 0, from the bearings of this epoch alone and a prior of pi / sqrt(3) (that
-    of a uniform angle). With `lengths`, b is the bound of the pose in metres: of a point 1 m
-    away from its node, in the frame of node 0, from the bearings and lengths of this epoch and
-    what is known of any link, that it is between `blind_m` and `radius_m` long.
-    ``reward="none"``: 0.
+    ``-log b``, where b is the Cramer-Rao bound of the root mean square orientation error in radians
+    of all nodes except node 0. It uses the bearings of this epoch alone and a prior with the
+    standard deviation pi / sqrt(3) of a uniform angle. With `lengths`, b is the bound of the pose
+    error in metres: that of a point 1 m away from its node, in the frame of node 0. It uses the
+    bearings and lengths of this epoch and the known limits of every link length, `blind_m` and
+    `radius_m`. ``reward="none"``: 0.
 
     ## Starting state
-    Uniform in the square, redrawn until the network is connected (64 times at most); uniform
-    orientations, that of node 0 is the reference.
+    Positions are uniform in the square, drawn again until the network is connected (at most 64
+    times). Orientations are uniform; that of node 0 is the reference.
 
     ## Episode end
-    Truncates after `steps`.
+    Never terminates; truncates after `steps` steps.
 
     ## Info
-    `positions` (n, 2) and `orientations` (n,), the truth, in a frame that is turned like node 0;
-    `score_rad`, the bound of the orientations, and with `lengths` `score_m`, that of the poses.
+    `positions` (n, 2) and `orientations` (n,): the truth, in a frame with the orientation of node
+    0. `score_rad`: the bound of the orientations. With `lengths` also `score_m`: the bound of the
+    poses.
 
     ## Rendering
-    ``render_mode="rgb_array"``: nodes, links and headings, with the orientations of
-    `EstimateNetwork` (with `lengths` the places, too); without it the bound.
+    ``render_mode="rgb_array"``: nodes, links and headings, with the orientations estimated by
+    `EstimateNetwork` (with `lengths` also the positions). Without this wrapper the frame shows the
+    bound.
 
     ## Arguments
     ```python
@@ -252,9 +254,11 @@ class PlanarNetworkEnv(ScalarEnv):
 
     env = gym.make("rbl_gym:RBL/PlanarNetwork-v0", n_nodes=20, radius_m=3.0)
     ```
-    `n_nodes`; `side_m` of the square; `radius_m` and `blind_m` of sensing; `bearing_std_rad`;
-    `lengths`, ``"none"``, ``"one"`` or ``"all"``, and with ``"all"`` their `length_std_m`;
-    `step_m`, the longest displacement on an axis; `reward`; `steps`.
+    `n_nodes`: number of nodes. `side_m`: side of the square. `radius_m`, `blind_m`: sensing radius
+    and blind zone. `bearing_std_rad`: standard deviation of a bearing. `lengths`: ``"none"``,
+    ``"one"`` or ``"all"``; with ``"all"``, `length_std_m` is their standard deviation. `step_m`:
+    longest displacement along an axis. `reward`: ``"bound"`` or ``"none"``. `steps`: length of an
+    episode.
 
     ## Version history
     * v0: first version.
@@ -284,7 +288,7 @@ class PlanarNetworkEnv(ScalarEnv):
 
     @property
     def n_nodes(self) -> int:
-        """How many nodes."""
+        """Number of nodes."""
         return self._batch.n_nodes
 
     @property
@@ -294,5 +298,5 @@ class PlanarNetworkEnv(ScalarEnv):
 
     @property
     def sensing(self) -> Sensing:
-        """What an estimator may know beside the observation."""
+        """What an estimator may know besides the observation."""
         return self._batch.sensing

@@ -1,4 +1,4 @@
-"""RBL/AnchorPlacement-v0: place M anchors for a work region, one after the other or at once."""
+"""RBL/AnchorPlacement-v0: place M anchors for a work region, one by one or all at once."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from rbl_gym.geometry.regions import Region
 from rbl_gym.placement.problem import Context, information_of_fixed, score_of_checked
 from rbl_gym.rendering import placement as rendering
 
-# Signs by which a problem may be mirrored: neither, x, y, both.
+# Mirror signs of a problem: neither, x, y, both.
 _MIRRORS = ((1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1))
-# The axes that may be mirrored.
+# Axes that may be mirrored.
 _LEVEL = np.array([1.0, 1.0, 0.0])
 MODES = ("sequential", "one-shot", "mounts")
-# Score from which the shaped reward of the mounts counts, metres.
+# Initial score of the shaped reward with ``mode="mounts"``, metres.
 EMPTY_SCORE_M = 3.0
 
 
 class AnchorPlacementVectorEnv(BatchEnv):
     """`num_envs` independent `AnchorPlacementEnv` problems in arrays.
 
-    Made by ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64, scene=...)``. Arguments
-    as `AnchorPlacementEnv`; seeding and autoreset as `BatchEnv`.
+    Created by ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64, scene=...)``. The
+    arguments are those of `AnchorPlacementEnv`. Seeding and autoreset work as in `BatchEnv`.
     """
 
     render_fps = 2
@@ -61,14 +61,14 @@ class AnchorPlacementVectorEnv(BatchEnv):
         self.single_observation_space = spaces.Box(-1.0, 1.0, (size,), np.float32)
         steps = 1 if mode == "one-shot" else self.task.n_anchors
         self.film = rendering.film_of(render_mode, self.task)
-        # An episode terminates by itself with the last anchor.
+        # An episode terminates with the last anchor.
         self._configure(num_envs, render_mode, steps + 1, max_episode_steps, autoreset_mode)
         self._placements = steps
         uniforms = np.zeros((num_envs, placement.context_uniforms(self.task)))
         self._contexts = placement.build_contexts(self.task, uniforms)
-        # Signs of the axes by which each problem is shown mirrored.
+        # Mirror signs of the axes as each problem is observed.
         self._signs = np.ones((num_envs, 3))
-        # What the observation shows, in its own type.
+        # The observed problem, in the type of the observation.
         self._view = _View(self.task)
         self._features = self._view.features(self._contexts).astype(np.float32)
         self._actions = np.zeros((num_envs, self.task.n_anchors, 3), np.float32)
@@ -86,7 +86,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode: one for each anchor that is placed by itself."""
+        """Number of steps of an episode: one for each anchor that is placed separately."""
         return min(self._placements, self.steps_limit)
 
     def _shot(self) -> tuple[Any, None]:
@@ -131,7 +131,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
         if self.mode == "mounts":
             rows = np.flatnonzero(moving)
             return self._mount(actions, rows, self._epochs[rows] - 1, complete), complete
-        # One-shot: all anchors of a world; else the next one.
+        # One-shot: all anchors of a world; otherwise the next one.
         rows, step = self._places(moving)
         new = rows if self.mode == "one-shot" else (rows, step)
         placed = np.minimum(np.maximum(actions[rows], -1.0), 1.0)
@@ -152,10 +152,10 @@ class AnchorPlacementVectorEnv(BatchEnv):
         return reward, complete
 
     def _places(self, moving: BoolArray) -> tuple[Any, Any]:
-        """Indices of the worlds of the mask, and of the anchor that each places."""
+        """Return indices of the worlds of the mask, and of the anchor that each places."""
         epochs = self._epochs
         if self.num_envs == 1 or (moving.all() and (epochs == epochs[0]).all()):
-            # Views are quicker than copies.
+            # Views are faster than copies.
             return slice(None), epochs[0] - 1
         rows = np.flatnonzero(moving)
         return rows, epochs[rows] - 1
@@ -163,14 +163,14 @@ class AnchorPlacementVectorEnv(BatchEnv):
     def _mount(
         self, actions: np.ndarray, rows: np.ndarray, step: np.ndarray, complete: BoolArray
     ) -> FloatArray:
-        """Anchors on mounts; the reward is the drop of the log score."""
-        # Action k is that of the k-th mount in the observation.
+        """Place anchors on mounts; return the decrease of the log score as reward."""
+        # Action k is the k-th mount of the observation.
         chosen = self._shown()[rows, actions[rows].astype(int)]
         anchors = self._mounts[chosen]
         self._anchors[rows, step] = anchors
         self._taken[rows, chosen] = True
         problems = Context(*(field[rows] for field in self._contexts))
-        # Information is a sum over the anchors: each step adds its own.
+        # Information is a sum over the anchors: each step adds that of its anchor.
         self._information[rows] += placement.information(self.task, problems, anchors[:, None])
         log_score = self._log_score.copy()
         log_score[rows] = np.log(placement.score_of(self.task, self._information[rows]))
@@ -179,7 +179,7 @@ class AnchorPlacementVectorEnv(BatchEnv):
         return reward
 
     def _shown(self) -> np.ndarray:
-        """Which mount (B, 57) stands at each place of the observation."""
+        """Return the mount (B, 57) at each entry of the observation."""
         which = (self._signs[:, :2] < 0) @ np.array([1, 2])
         return self._mirrored[which]
 
@@ -208,9 +208,9 @@ class AnchorPlacementVectorEnv(BatchEnv):
         return info
 
     def action_masks(self) -> BoolArray:
-        """Mounts (B, 57) that are free, in the order of the actions; only with ``mode="mounts"``.
+        """Return the free mounts (B, 57) in the order of the actions; only with ``mode="mounts"``.
 
-        As sb3-contrib's ``MaskablePPO`` asks for.
+        Used by ``MaskablePPO`` of sb3-contrib.
         """
         if self.mode != "mounts":
             raise ValueError(f"mode must be 'mounts' for action masks, got {self.mode!r}")
@@ -218,48 +218,48 @@ class AnchorPlacementVectorEnv(BatchEnv):
 
 
 class AnchorPlacementEnv(ScalarEnv):
-    """Where do the anchors go, so that a body in this work region is well localized?
+    """Place anchors so that a body in a given work region is localized well.
 
     ## Description
-    Every episode draws a problem: a work region, a box inside the scene's volume, and in rooms
-    up to two racks that block sight, besides the obstacles that the scene has. The agent places M
+    Every episode draws a problem: a work region, which is a box inside the scene's volume, and in
+    rooms up to two racks that block sight, in addition to the scene's obstacles. The agent places M
     anchors on the scene's legal surfaces. The score of a layout is the root mean square tag error
-    in metres, position and orientation together, that the Cramer-Rao bound promises over 32
-    fixed poses in the region (`rbl_gym.placement.score`).
+    in metres, from position and orientation together, that the Cramer-Rao bound gives over 32 fixed
+    poses in the region (`rbl_gym.placement.score`).
 
     ## Action space
-    ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
-    surfaces (`Region.place`). ``"one-shot"``: ``Box(-1, 1, (3 M,))``, all at once.
-    ``"mounts"`` (rooms): ``Discrete(57)``, one of the mount points of
-    `rbl_gym.placement.mounts`; one that is taken already adds a second anchor there.
+    ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal surfaces
+    (`Region.place`). ``mode="one-shot"``: ``Box(-1, 1, (3 M,))``, all anchors at once.
+    ``mode="mounts"`` (rooms only): ``Discrete(57)``, one of the mount points of
+    `rbl_gym.placement.mounts`. A mount that is already taken gets a second anchor.
 
     ## Observation space
-    ``Box(-1, 1, (n,), float32)``, in order: the region's centre and size, scaled to the volume
-    (6); of each rack its place and half size, scaled to the room (6 each); sequential: the
-    actions so far (3 M); with ``sight=True`` and in mounts: the share of the poses that each
-    mount of `rbl_gym.placement.mounts` sees (57); mounts: whether it is taken (57); except in
-    one-shot the one-hot number of the next anchor (M). Where the
-    legal space and the volume have one centre, problems are shown mirrored in x and y, so that
-    the region lies towards +x and +y, racks in the order of x, and actions are mirrored back;
-    ``mirror=False`` shows them as they are.
+    ``Box(-1, 1, (n,), float32)``, in this order: centre and size of the region, scaled to the
+    volume (6); position and half size of each rack, scaled to the room (6 each); sequential: the
+    actions so far (3 M); with ``sight=True`` and in mounts: the fraction of the poses that each
+    mount of `rbl_gym.placement.mounts` sees (57); mounts: whether each mount is taken (57); except
+    in one-shot: the one-hot number of the next anchor (M). If the legal space and the volume have
+    the same centre, problems are observed mirrored in x and y, so that the region lies towards +x
+    and +y. Racks are then in the order of x, and actions are mirrored back. ``mirror=False`` turns
+    this off.
 
     ## Reward
-    ``-log score`` with the last anchor, 0 before. ``"mounts"``: the drop of the log score with
-    every anchor, from that of 3 m. ``gym.make(..., reward="filter")`` pays what a filter reaches
-    instead (the wrapper `FilterReward`).
+    ``-log score`` with the last anchor, 0 before. ``mode="mounts"``: the decrease of the log score
+    with every anchor, starting from a score of 3 m. ``gym.make(..., reward="filter")`` rewards the
+    accuracy of a filter instead (the wrapper `FilterReward`).
 
     ## Episode end
-    Terminates with the last anchor; `env.spec.max_episode_steps` says how many steps that is. (In
-    an environment made from that spec Gymnasium's `TimeLimit` truncates the same step too.)
+    Terminates with the last anchor. `env.spec.max_episode_steps` gives the number of steps. (In an
+    environment made from that spec Gymnasium's `TimeLimit` also truncates at that step.)
 
     ## Info
-    `anchors` (M, 3), zeros where not yet placed; `region` (centre and half size, metres),
-    `racks` (K, 6), the scene's own obstacles first; `score_m` of the complete layout, 0 before;
-    mounts: `action_mask` (57), which `action_masks()` gives as booleans.
+    `anchors` (M, 3): positions, zeros for anchors not yet placed. `region`: centre and half size,
+    metres. `racks` (K, 6): the scene's own obstacles first. `score_m`: score of the complete
+    layout, 0 before. mounts: `action_mask` (57); `action_masks()` gives it as booleans.
 
     ## Rendering
-    ``render_mode="rgb_array"``: the problem and its anchors in space and in plan, the expected
-    tag error at the poses of the region, and its root mean square by the number of anchors.
+    ``render_mode="rgb_array"``: the problem and its anchors in 3-D and in plan, the expected tag
+    error at the poses of the region, and its root mean square against the number of anchors.
 
     ## Arguments
     ```python
@@ -297,15 +297,15 @@ class AnchorPlacementEnv(ScalarEnv):
         return self._batch.task
 
     def action_masks(self) -> BoolArray:
-        """Mounts (57,) that are free, in the order of the actions; only with ``mode="mounts"``.
+        """Return the free mounts (57,) in the order of the actions; only with ``mode="mounts"``.
 
-        As sb3-contrib's ``MaskablePPO`` asks for.
+        Used by ``MaskablePPO`` of sb3-contrib.
         """
         return self._batch.action_masks()[0]
 
 
 def check_sight(sight: bool, task: placement.PlacementTask) -> bool:
-    """Whether the sight of the mount points is observed: only where racks can block it."""
+    """Return whether the mounts' sight is observed: only if racks can block it."""
     if not isinstance(sight, bool):
         raise ValueError(f"sight must be True or False, got {sight!r:.80}")
     if sight and not task.racks and not task.scene.obstruction:
@@ -314,7 +314,7 @@ def check_sight(sight: bool, task: placement.PlacementTask) -> bool:
 
 
 def observation_size(task: placement.PlacementTask, mode: str, sight: bool) -> int:
-    """Length of the observation."""
+    """Return the length of the observation."""
     size = 6 + 6 * task.racks
     if mode != "one-shot":
         size += task.n_anchors
@@ -325,9 +325,9 @@ def observation_size(task: placement.PlacementTask, mode: str, sight: bool) -> i
 
 
 def is_symmetric(task: placement.PlacementTask) -> bool:
-    """Whether legal space and volume have one centre in x and y: problems may be mirrored."""
+    """Return whether problems may be mirrored: legal space and volume share their x-y centre."""
     centres = [_centre(region)[:2] for region in (task.scene.volume, task.scene.anchor_region)]
-    # Obstacles that always stand there would have to be mirrored as well.
+    # Permanent obstacles would have to be mirrored as well.
     return bool(np.allclose(*centres, atol=1e-9)) and not task.scene.weakens
 
 
@@ -337,14 +337,14 @@ def _centre(region: Region) -> FloatArray:
 
 
 def mirrored_mounts(task: placement.PlacementTask, mounts: FloatArray) -> np.ndarray:
-    """Indices (4, 57) of the mounts mirrored in neither, x, y, both."""
+    """Return indices (4, 57) of the mounts mirrored in neither, x, y, both."""
     middle = _centre(task.scene.anchor_region) * [1, 1, 0]
     moved = middle + np.array(_MIRRORS)[:, None] * (mounts - middle)
     return np.abs(moved[:, :, None] - mounts).sum(axis=-1).argmin(axis=-1)
 
 
 class _View:
-    """How a task shows its problems, of B worlds: mirrored, and scaled to [-1, 1]."""
+    """How a task presents the problems of B worlds: mirrored, and scaled to [-1, 1]."""
 
     def __init__(self, task: placement.PlacementTask) -> None:
         self._own = len(task.scene.obstacles)
@@ -352,23 +352,23 @@ class _View:
         self._middle = _centre(task.scene.anchor_region) * _LEVEL
         low, high = task.scene.volume.bounds()
         half = np.maximum(0.5 * (high - low), 1e-9)
-        # Of the region: the half size is between none and that of the volume.
+        # Of the region: the half size lies between zero and that of the volume.
         self._shift = np.concatenate([self._centre, 0.5 * half])
         self._scale = np.concatenate([half, 0.5 * half])
-        # Of a rack: it stands on the floor.
+        # Racks stand on the floor.
         floor, ceiling = task.scene.anchor_region.bounds()
         room = 0.5 * (ceiling - floor)
         self._rack_shift = np.concatenate([floor + room, np.zeros(3)])
         self._rack_scale = np.concatenate([room, room])
 
     def signs(self, context: Context) -> FloatArray:
-        """Signs (B, 3) of the axes that bring the region's centre towards +x and +y."""
+        """Return the signs (B, 3) of the axes that move the region's centre towards +x and +y."""
         signs = np.where(context.centre < self._centre, -1.0, 1.0)
         signs[..., 2] = 1.0
         return signs
 
     def mirrored(self, context: Context, signs: FloatArray) -> Context:
-        """The problem mirrored by signs (B, 3), its racks in the order of falling x."""
+        """Return the problem mirrored by signs (B, 3), with its racks in descending order of x."""
         centre, racks = self._middle + signs * (context.centre - self._middle), context.racks
         if not racks.shape[-2]:
             return Context(centre, context.half, racks)
@@ -380,7 +380,7 @@ class _View:
         return Context(centre, context.half, racks)
 
     def features(self, context: Context) -> FloatArray:
-        """A problem as numbers (B, 6 + 6 K) of [-1, 1]: region, then the racks that it drew."""
+        """Return a problem as numbers (B, 6 + 6 K) in [-1, 1]: the region, then the drawn racks."""
         region = np.concatenate([context.centre, context.half], axis=-1)
         parts = [(region - self._shift) / self._scale]
         drawn = context.racks[..., self._own :, :]

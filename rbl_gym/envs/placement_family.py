@@ -1,4 +1,4 @@
-"""RBL/AnchorPlacement-v0 with `scenes=`: every episode places anchors in another world."""
+"""RBL/AnchorPlacement-v0 with `scenes=`: every episode places anchors in a different world."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from rbl_gym.rendering import placement as rendering
 class PlacementFamilyVectorEnv(BatchEnv):
     """`num_envs` independent `PlacementFamilyEnv` in arrays; seeding and autoreset as `BatchEnv`.
 
-    Made by ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64, scenes=...)``.
+    Created by ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64, scenes=...)``.
     """
 
     render_fps = 2
@@ -78,7 +78,7 @@ class PlacementFamilyVectorEnv(BatchEnv):
         self._score_m = np.zeros(num_envs)
         self._log_score = np.zeros(num_envs)
         if self.sight:
-            # The same for all rooms: they have their mounts at the same parts of the walls.
+            # The same for all rooms: their mounts are at the same fractions of the walls.
             self._mirrored = mirrored_mounts(corners[0], shown)
             self._mounts = np.zeros((num_envs, self._n_mounts, 3))
             self._seen = np.zeros((num_envs, self._n_mounts))
@@ -91,16 +91,16 @@ class PlacementFamilyVectorEnv(BatchEnv):
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode, of the worlds with most anchors."""
+        """Number of steps of an episode, in the worlds with most anchors."""
         return min(self._longest, self.steps_limit)
 
     @property
     def tasks(self) -> tuple[placement.PlacementTask, ...]:
-        """The tasks of the worlds now."""
+        """The present tasks of the worlds."""
         return tuple(self.stack.tasks)
 
     def problem(self, world: int) -> Context:
-        """The problem of a world now."""
+        """Return the present problem of a world."""
         return self.stack.problem(world)
 
     def _task_of(self, world: int) -> placement.PlacementTask:
@@ -126,7 +126,7 @@ class PlacementFamilyVectorEnv(BatchEnv):
         return {"scene": told}
 
     def _show(self, world: int) -> None:
-        """What the observation has of a problem that has just begun."""
+        """Write the constant part of the observation of problems that have just begun."""
         one, problem = self.stack.tasks[world], self.stack.problem(world)
         if self.sight:
             self._mounts[world] = placement.mounts(one)
@@ -150,7 +150,7 @@ class PlacementFamilyVectorEnv(BatchEnv):
         complete = moving & (self._epochs == last)
         step = self._epochs[rows] - 1
         if self.mode == "mounts":
-            # Action k is that of the k-th mount in the observation.
+            # Action k is the k-th mount of the observation.
             which = self._order()[rows, actions[rows].astype(int)]
             self._anchors[rows, step] = self._mounts[rows, which]
             self._taken[rows, which] = True
@@ -170,7 +170,7 @@ class PlacementFamilyVectorEnv(BatchEnv):
         return reward, complete
 
     def _place(self, rows: np.ndarray, step: np.ndarray, actions: np.ndarray) -> None:
-        """The next anchor of the worlds of some rows, or all of them."""
+        """Place the next anchor, or all anchors, of the worlds of some rows."""
         placed = np.clip(actions, -1.0, 1.0).reshape(len(rows), -1, 3)
         anchors = self.stack.place(rows, self._signs[rows, None] * placed)
         if self.mode == "one-shot":
@@ -180,7 +180,7 @@ class PlacementFamilyVectorEnv(BatchEnv):
             self._actions[rows, step], self._anchors[rows, step] = placed[:, 0], anchors[:, 0]
 
     def _order(self) -> np.ndarray:
-        """Which mount (B, 57) stands at each place of the observation."""
+        """Return the mount (B, 57) at each entry of the observation."""
         return self._mirrored[(self._signs[:, :2] < 0) @ np.array([1, 2])]
 
     def _observe(self) -> np.ndarray:
@@ -210,9 +210,9 @@ class PlacementFamilyVectorEnv(BatchEnv):
         return info
 
     def action_masks(self) -> BoolArray:
-        """Mounts (B, 57) that are free, in the order of the actions; only with ``mode="mounts"``.
+        """Return the free mounts (B, 57) in the order of the actions; only with ``mode="mounts"``.
 
-        As sb3-contrib's ``MaskablePPO`` asks for.
+        Used by ``MaskablePPO`` of sb3-contrib.
         """
         if self.mode != "mounts":
             raise ValueError(f"mode must be 'mounts' for action masks, got {self.mode!r}")
@@ -220,26 +220,25 @@ class PlacementFamilyVectorEnv(BatchEnv):
 
 
 class PlacementFamilyEnv(ScalarEnv):
-    """`AnchorPlacementEnv` with `scenes` in place of `scene`: what differs.
+    """`AnchorPlacementEnv` with `scenes` instead of `scene`; this page lists the differences.
 
-    Every reset draws a world: its scene, the number of anchors, the racks. M and K are the most
-    anchors and boxes of the family; `scenes` is as `TaskFamily` takes it.
+    Every reset draws a world: its scene, the number of anchors, the racks. M and K are the largest
+    numbers of anchors and boxes in the family. `scenes` is as in `TaskFamily`.
 
     ## Observation space
     ``Box(-1, 1, (n,), float32)``, in order: the region's centre and size, scaled to the volume of
-    the drawn scene (6); of each of the scene's own obstacles and the racks its place and half size,
-    scaled to the scene, and a 1, zeros where there is none (7 K); what kind of world it is
-    (18, see `rbl_gym.placement.families.described`); 1 for the anchors that are placed in this
-    world (M); the rest as in `AnchorPlacementEnv`: actions so far (3 M), sight and taken mounts (57
-    each), one-hot number of the next anchor (M).
-    ``mode="mounts"`` and `sight` need rooms in all scenes.
+    the drawn scene (6); for each of the scene's own obstacles and the racks its position and half
+    size, scaled to the scene, and a 1; zeros for unused rows (7 K); a description of the world (18,
+    see `rbl_gym.placement.families.described`); 1 for every anchor of this world (M). The rest is
+    as in `AnchorPlacementEnv`: actions so far (3 M), sight and taken mounts (57 each), one-hot
+    number of the next anchor (M). ``mode="mounts"`` and `sight` need rooms in all scenes.
 
     ## Episode end
     Terminates with the last anchor of the drawn world.
 
     ## Info
-    That of `AnchorPlacementEnv`, padded with zeros, with `anchor_mask` (M,) and `rack_mask` (K,);
-    at reset `scene`, the overrides that were drawn, as JSON.
+    As in `AnchorPlacementEnv`, padded with zeros, with `anchor_mask` (M,) and `rack_mask` (K,). The
+    info of a reset also has `scene`, the drawn overrides as JSON.
     """
 
     batch_class = PlacementFamilyVectorEnv
@@ -261,7 +260,7 @@ class PlacementFamilyEnv(ScalarEnv):
 
     @property
     def family(self) -> TaskFamily:
-        """What every reset draws a task of."""
+        """The family from which every reset draws a task."""
         return self._batch.family
 
     @property
@@ -270,25 +269,25 @@ class PlacementFamilyEnv(ScalarEnv):
         return self._batch.tasks[0]
 
     def action_masks(self) -> BoolArray:
-        """Mounts (57,) that are free, in the order of the actions; only with ``mode="mounts"``.
+        """Return the free mounts (57,) in the order of the actions; only with ``mode="mounts"``.
 
-        As sb3-contrib's ``MaskablePPO`` asks for.
+        Used by ``MaskablePPO`` of sb3-contrib.
         """
         return self._batch.action_masks()[0]
 
 
-# --- how a problem is shown -------------------------------------------------------------------
+# --- observation of a problem ----------------------------------------------------------------
 
 
 def _middles(one: placement.PlacementTask) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:
-    """Middles of the volume and of the legal space, and the signs of what is not mirrored."""
+    """Return centres of the volume and of the legal space, and the signs without mirroring."""
     regions = one.scene.volume, one.scene.anchor_region
     a, b = (0.5 * np.add(*region.bounds()) for region in regions)
     return (a, b), np.ones(3)
 
 
 def _mirrored(problem: Context, middle: FloatArray, signs: FloatArray) -> Context:
-    """A problem mirrored about a middle, its racks in the order of falling x."""
+    """Return a problem mirrored about a centre, with its racks in descending order of x."""
     racks = problem.racks.copy()
     racks[:, :3] = middle + signs * (racks[:, :3] - middle)
     racks = racks[np.argsort(-racks[:, 0], kind="stable")]
@@ -296,7 +295,7 @@ def _mirrored(problem: Context, middle: FloatArray, signs: FloatArray) -> Contex
 
 
 def _scaled_region(one: placement.PlacementTask, problem: Context) -> FloatArray:
-    """Centre and half size of the region (6,), scaled to the volume."""
+    """Return centre and half size of the region (6,), scaled to the volume."""
     low, high = one.scene.volume.bounds()
     half = np.maximum(0.5 * (high - low), 1e-9)
     centre = (problem.centre - 0.5 * (low + high)) / half
@@ -304,7 +303,7 @@ def _scaled_region(one: placement.PlacementTask, problem: Context) -> FloatArray
 
 
 def _scaled_boxes(one: placement.PlacementTask, boxes: FloatArray) -> FloatArray:
-    """Boxes (K, 6) scaled to the box around the volume and the legal space."""
+    """Return boxes (K, 6) scaled to the box around the volume and the legal space."""
     corners = np.array([one.scene.volume.bounds(), one.scene.anchor_region.bounds()])
     low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
     half = np.maximum(0.5 * (high - low), 1e-9)

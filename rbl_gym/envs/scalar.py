@@ -11,15 +11,14 @@ from numpy.typing import ArrayLike
 from rbl_gym import rendering
 from rbl_gym.envs.batch import BatchEnv, Observation, StatedLength, check_actions, check_options
 
-# The index of the only world, and the mask of it moving.
+# Index of the only world, and its mask.
 _FIRST, _ALONE = np.zeros(1, dtype=np.intp), np.ones(1, dtype=np.bool_)
 
 
 class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """One world of a `BatchEnv`, as a scalar environment.
 
-    A subclass names its `batch_class`; its ``__init__`` hands the arguments on to
-    `_configure`.
+    A subclass sets its `batch_class`. Its ``__init__`` passes the arguments to `_configure`.
     """
 
     batch_class: ClassVar[Any]
@@ -39,16 +38,16 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode."""
+        """Number of steps of an episode."""
         return self._batch.episode_steps
 
     @property
     def film(self) -> rendering.Film | None:
-        """What the frames are drawn from, with a render mode."""
+        """The source of the frames, if there is a render mode."""
         return self._batch.film
 
     def render(self) -> Any:
-        """A frame, (height, width, 3) of uint8."""
+        """Return a frame, (height, width, 3), uint8."""
         return rendering.picture(self.film)
 
     def reset(
@@ -66,8 +65,8 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
         return _first(batch._observe()), info
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One step."""
-        # What `BatchEnv.step` does, without the masks of many worlds.
+        """Take one step."""
+        # As `BatchEnv.step`, without the masks of many worlds.
         batch = self._batch
         if not batch._generators or batch._done[0]:
             raise gym.error.ResetNeeded("the episode is over or never began: call reset()")
@@ -83,12 +82,12 @@ class ScalarEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncom
 
 
 def _first(observation: Observation) -> Observation:
-    """The observation of the first world, not copied."""
+    """Return the observation of the first world, not copied."""
     if isinstance(observation, dict):
         return {key: value[0] for key, value in observation.items()}
     return observation[0]
 
 
 def _scalars(info: dict[str, Any]) -> dict[str, Any]:
-    """Infos of the one world: numbers as Python's own."""
+    """Return infos of the only world, with Python numbers."""
     return {key: value.item(0) if value.ndim == 1 else value[0] for key, value in info.items()}

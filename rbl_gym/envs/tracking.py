@@ -1,4 +1,4 @@
-"""RBL/Tracking-v0: one rigid body among anchors that measure ranges to its tags."""
+"""RBL/Tracking-v0: anchors measure ranges to the tags of one rigid body."""
 
 from __future__ import annotations
 
@@ -20,64 +20,69 @@ from rbl_gym.worlds.families import SceneFamily
 from rbl_gym.worlds.scene import Scene
 
 REWARDS = ("bound", "none")
-# Bound of what a family observes: its scenes have bounds of their own.
+# Bound of the observations of a family, whose scenes have different bounds.
 _FAR = 1e9
 
-# Not a `ScalarEnv` of one world, as the other environments: a whole episode is made, and with fixed
-# anchors measured, in one go at reset, which makes an epoch several times as fast. The tests hold
-# it and world i of the vector environment to each other.
+# Unlike the other environments, this is not a `ScalarEnv` of one world. A whole episode is drawn at
+# reset, and with fixed anchors also measured, which makes an epoch several times as fast. A test
+# compares it with world i of the vector environment.
 
 
 class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """A rigid body moves; anchors measure noisy ranges to its tags; where is it, and how turned?
+    """A rigid body moves; anchors measure noisy ranges to its tags. Estimate its pose.
 
     ## Description
-    A body carries N tags at known places. At every epoch M anchors at known places measure
-    ranges to the tags. The environment emits the measurements and what else an estimator may
-    know; it knows no estimator itself. Within a step: anchors move, the body moves, ranges
-    are taken, the bound and the reward follow.
+    A body carries N tags at known positions in its frame. At every epoch M anchors at known
+    positions measure ranges to the tags. The environment returns the measurements and everything
+    else that an estimator may know. It contains no estimator. Order within a step: the anchors
+    move, the body moves, ranges are measured, the bound and the reward are computed.
 
     ## Action space
-    Anchors that move (`scene.anchor_speed_m_s` > 0): ``Box(-1, 1, (3 M,), float32)``, a
-    velocity per anchor in units of the speed limit (cut to length 1); zero keeps them. The
-    place is projected onto the scene's anchor region. Fixed anchors: ``Discrete(1)``.
+    Movable anchors (`scene.anchor_speed_m_s` > 0): ``Box(-1, 1, (3 M,), float32)``, a velocity per
+    anchor in units of the speed limit (longer vectors are cut to length 1). Zero keeps an anchor
+    where it is. Positions are projected onto the scene's anchor region. Fixed anchors:
+    ``Discrete(1)``.
 
     ## Observation space
     A ``Dict``:
 
     | key | shape | type | meaning |
     |---|---|---|---|
-    | `ranges` | (M, N) | float64 | metres, 0 where there is no link; with `links.offset` in the scene any sign |
+    | `ranges` | (M, N) | float64 | metres, 0 without a link; with `links.offset` in the scene of
+    either sign |
     | `links` | (M, N) | int8 | 1 where a range was measured |
-    | `anchors` | (M, 3) | float64 | places of the anchors at this epoch, metres |
+    | `anchors` | (M, 3) | float64 | positions of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
-    | `quality` | (M,) | float64 | share of a link's information that an anchor's sight of the body leaves: 1 in sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
-    | `inertial` | (S, 6) | float64 | readings of the inertial sensor in that interval, in the body frame: angular velocity (rad/s) and specific force (m/s^2) of S samples; zeros at epoch 0. Only in scenes with such a sensor |
+    | `quality` | (M,) | float64 | fraction of the nominal information of an anchor's links: 1 in
+    line of sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
+    | `inertial` | (S, 6) | float64 | S samples of the inertial sensor in that interval, body frame:
+    angular velocity (rad/s) and specific force (m/s^2); zeros at epoch 0. Only in scenes with an
+    inertial sensor |
 
     ## Reward
-    ``reward="bound"``: ``-log b``, b the posterior Cramer-Rao bound of the root mean square
-    tag error in metres, at the true pose: how good any estimator could be with these anchors
-    and all of their ranges.
-    ``reward="none"``: 0, and no bound is computed: the quick way where a wrapper gives the reward.
+    ``reward="bound"``: ``-log b``, where b is the posterior Cramer-Rao bound of the root mean
+    square tag error in metres, at the true pose. It is the accuracy that an estimator can reach at
+    best with these anchors and all of their ranges. ``reward="none"``: 0, and no bound is computed.
+    This is the fast choice if a wrapper gives the reward.
 
     ## Starting state
-    Start pose, way-points, turn rate, and anchors that the scene leaves open are drawn at
-    reset. `info` of the reset holds the prior (`prior_rotation`, `prior_translation`,
-    `prior_covariance`), which refers to epoch 0 before its update.
+    A reset draws the start pose, way-points, turn rate, and the anchors that the scene does not
+    fix. The info of a reset has the prior (`prior_rotation`, `prior_translation`,
+    `prior_covariance`). It refers to epoch 0 before the measurements of that epoch.
 
     ## Info
-    `rotation`, `translation`: the true pose; `nlos`: which ranges came over a reflected path
-    (where ranges are observed); `epoch`; `score_m`: b (with ``reward="bound"``). With an inertial
-    sensor `velocity` (3,), m/s, and `inertial_bias` (6,).
+    `rotation`, `translation`: the true pose. `nlos`: which ranges came over a reflected path (only
+    if ranges are observed). `epoch`: the epoch. `score_m`: b, with ``reward="bound"``. With an
+    inertial sensor also `velocity` (3,), m/s, and `inertial_bias` (6,).
 
     ## Episode end
-    Never terminates; truncates after `scene.steps` steps (`env.spec.max_episode_steps` says how
-    many). The `max_episode_steps` of ``gym.make`` can only shorten that.
+    Never terminates; truncates after `scene.steps` steps (`env.spec.max_episode_steps`). The
+    `max_episode_steps` of ``gym.make`` can only shorten an episode.
 
     ## Rendering
-    ``render_mode="rgb_array"``: anchors, body and path in space, the body close up with the 95 %
-    region of its position, and errors against three standard deviations; (540, 960, 3). Beliefs
-    are those of `EstimatePose`; without it the region is that of the bound.
+    ``render_mode="rgb_array"``: anchors, body and path in 3-D, a close-up of the body with the 95 %
+    region of its position, and errors against three standard deviations; (540, 960, 3). Beliefs are
+    those of `EstimatePose`. Without this wrapper the region is that of the bound.
 
     ## Arguments
     ```python
@@ -90,14 +95,14 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         reward="none",
     )
     ```
-    ``scene={"links": {"offset": "tag"}}``: the ranges of a tag have an unknown offset in common
-    (time differences); see `rbl_gym.measurements.offsets`. ``scene={"survey_std_m": 0.05}``:
-    anchors are told where they were surveyed, off by 5 cm on every axis; `info["anchors"]` are
-    the true ones, and the bound is that of who knows how good the survey is.
-    `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
+    ``scene={"links": {"offset": "tag"}}``: all ranges of a tag share an unknown offset (time
+    differences), see `rbl_gym.measurements.offsets`. ``scene={"survey_std_m": 0.05}``: observed
+    anchor positions are surveyed, with errors of standard deviation 5 cm on every axis.
+    `info["anchors"]` has the true positions. The bound then accounts for the known accuracy of the
+    survey. `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
     `rbl_gym.worlds.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
 
-    `scenes`, in place of `scene`: a family of scenes, of which every reset draws one, see
+    `scenes`, instead of `scene`: a family of scenes. Every reset draws one of them, see
     `rbl_gym.worlds.families.SceneFamily`:
     ```python
     env = gym.make(
@@ -112,13 +117,14 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         ],
     )
     ```
-    M and N are then the most anchors and tags of the family. Rows beyond those of the drawn scene
-    are zeros, and their links 0. The observation has three more keys: `anchor_mask` (M,) and
-    `tag_mask` (N,), int8, 1 for those that there are; `tags` (N, 3), metres, body frame. `quality`
-    is there if any scene has obstacles. `info["scene"]` of the reset is JSON: the overrides that
-    were drawn. `env.unwrapped.scene` is the scene of the episode. Actions move the anchors that there
-    are; if no scene of the family moves its anchors, the action is ``Discrete(1)``. Families have
-    no inertial sensor and no `links.offset`; with `survey_std_m` they have ``reward="none"`` only.
+    M and N are then the largest numbers of anchors and tags in the family. Rows beyond those of the
+    drawn scene are zeros, and their links 0. The observation has three more keys: `anchor_mask`
+    (M,) and `tag_mask` (N,), int8, 1 for existing anchors and tags; `tags` (N, 3), metres, body
+    frame. It has `quality` if any scene has obstacles. `info["scene"]` of the reset has the drawn
+    overrides as JSON. `env.unwrapped.scene` is the scene of the episode. Actions move only existing
+    anchors. If no scene of the family has movable anchors, the action space is ``Discrete(1)``.
+    Families support no inertial sensor and no `links.offset`. With `survey_std_m` they support only
+    ``reward="none"``.
 
     ## Version history
     * v0: first version.
@@ -147,13 +153,13 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode: the scene's, of a family those of the longest."""
+        """Number of steps of an episode: the scene's; of a family, the largest number."""
         return (self.family or self.scene).steps
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode; the measurements are those of epoch 0. `options` must be empty."""
+        """Start an episode and measure epoch 0; `options` must be empty."""
         check_options(options)
         super().reset(seed=seed)
         drawn = None
@@ -166,7 +172,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self._anchors = episode.anchors.copy()
         self._measured: dict[str, np.ndarray] | None = None
         if self.scene.anchor_speed_m_s == 0:
-            # No action can change what anchors that stand still will measure.
+            # No action can change what fixed anchors will measure.
             self._measured = observed(self.scene, simulation.whole(episode), episode.anchors[None])
         self._information: FloatArray | None = None
         observation, info, _ = self._observe()
@@ -202,7 +208,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
             observation = observed(self.scene, at, self._anchors)
         else:
             observation = {key: field[k] for key, field in self._measured.items()}
-        # An epoch is told once: views of the episode are the caller's.
+        # Each epoch is returned once: the caller may keep views of the episode.
         info: dict[str, Any] = {
             "rotation": at.rotation,
             "translation": at.translation,
@@ -238,11 +244,11 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self.film.take([self._epoch], shot)  # pyright: ignore[reportOptionalMemberAccess]
 
     def render(self) -> Any:
-        """The world, the body close up, and its errors (or the bound): an RGB frame, uint8."""
+        """Return an RGB frame, uint8: the world, the body close up, and its errors (or the bound)."""
         return rendering.picture(self.film)
 
     def _carry_bound(self, at: simulation.Epoch, links: np.ndarray) -> float:
-        """Score of the posterior Cramer-Rao bound of this epoch, from that of the one before."""
+        """Return the posterior Cramer-Rao bound of this epoch from that of the previous one."""
         assert self._episode is not None
         self._information, score = scene_bounds.posterior_step(
             self.scene, at, self._anchors, links.view(np.bool_), self._information,
@@ -252,7 +258,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
 
 def check_reward(reward: Any, family: SceneFamily | None) -> str:
-    """The reward, or a ValueError where the worlds have no such bound."""
+    """Return the reward; raises ValueError if the worlds have no such bound."""
     check_one_of("reward", reward, REWARDS)
     if reward == "bound" and family is not None and family.is_surveyed:
         raise ValueError(
@@ -263,7 +269,7 @@ def check_reward(reward: Any, family: SceneFamily | None) -> str:
 
 
 def observed(scene: Scene, at: simulation.Epoch, anchors: FloatArray) -> dict[str, np.ndarray]:
-    """What an epoch tells: ranges and links with `nlos`, behind obstacles `quality`."""
+    """Return the measurements of an epoch: ranges, links, `nlos`; with obstacles also `quality`."""
     quality = simulation.link_quality(scene, at, anchors) if scene.weakens else None
     measured = simulation.measure_epoch(scene, at, anchors, quality)
     told: dict[str, np.ndarray] = {
@@ -277,10 +283,10 @@ def observed(scene: Scene, at: simulation.Epoch, anchors: FloatArray) -> dict[st
 
 
 def check_action(action: ArrayLike, size: int) -> FloatArray:
-    """An action as a finite vector of its size, or a ValueError."""
+    """Return an action as a finite vector of its size; raises ValueError for anything else."""
     if isinstance(action, np.ndarray) and action.shape == (size,) and action.dtype.kind == "f":
         array = action.astype(np.float64)
-        # The quick way out; a sum of squares that overflows goes the long way.
+        # Fast path: only a sum of squares that overflows needs the full check.
         if math.isfinite(array.dot(array)):
             return array
     array = check_array("action", action, (size,))
@@ -290,12 +296,12 @@ def check_action(action: ArrayLike, size: int) -> FloatArray:
 
 
 def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
-    """Whether an action is the only one of fixed anchors: zeros of this shape."""
+    """Return whether an action is the only one of fixed anchors: zeros of this shape."""
     return action.shape == shape and action.dtype.kind in "iub" and not np.count_nonzero(action)
 
 
 def worlds_of(scene: Any, family: Any) -> tuple[SceneFamily | None, Scene]:
-    """The family that `scenes` names, None without one, and a scene: the first of the family."""
+    """Return the family given by `scenes` (None without one) and a scene: the first of the family."""
     if family is None:
         return None, scenes.get(scene)
     if scene != "uwb_room":
@@ -305,7 +311,7 @@ def worlds_of(scene: Any, family: Any) -> tuple[SceneFamily | None, Scene]:
 
 
 def observation_space(scene: Scene | SceneFamily) -> spaces.Dict:
-    """Finite bounds of a scene's observations."""
+    """Return the observation space of a scene, with finite bounds."""
     if isinstance(scene, SceneFamily):
         return spaces.Dict(
             {
@@ -320,15 +326,15 @@ def observation_space(scene: Scene | SceneFamily) -> spaces.Dict:
     if scene.anchors is not None:
         low = np.minimum(low, np.min(scene.anchors, axis=0))
         high = np.maximum(high, np.max(scene.anchors, axis=0))
-    # check_env wants room between the bounds; a water surface has none.
+    # check_env requires different bounds; those of a water surface are equal.
     low, high = np.where(high > low, low, low - 1), np.where(high > low, high, high + 1)
     low, high = low - 6 * scene.survey_std_m, high + 6 * scene.survey_std_m
     twist = np.abs(scene.twist)
-    # Ten standard deviations of the drawn turn rate; an orbit of 1 m is the tightest.
+    # Ten standard deviations of the drawn turn rate; the tightest orbit has a radius of 1 m.
     twist[:3] = np.maximum(twist[:3], max(10 * scene.spin_rad_s, np.pi / scene.dt, scene.speed_m_s))
     twist[3:] = np.maximum(twist[3:], scene.speed_m_s) + 1e-9
     if scene.inertial is not None:
-        # The twist is told with the process noise in it.
+        # The observed twist includes the process noise.
         twist += 10 * scene.process.std() / math.sqrt(scene.dt)
     low, high = np.tile(low, (scene.n_anchors, 1)), np.tile(high, (scene.n_anchors, 1))
     keys: dict[str, spaces.Space[Any]] = {
@@ -347,7 +353,7 @@ def observation_space(scene: Scene | SceneFamily) -> spaces.Dict:
 
 
 def action_space(scene: Scene | SceneFamily) -> spaces.Space[Any]:
-    """Velocities of movable anchors, or the one action of fixed ones."""
+    """Return the action space: velocities of movable anchors, or the one action of fixed ones."""
     if scene.anchor_speed_m_s > 0:
         return spaces.Box(-1.0, 1.0, (3 * scene.n_anchors,), np.float32)
     return spaces.Discrete(1)

@@ -1,4 +1,4 @@
-"""RBL/Tracking-v0, many bodies at once: the native vector environment on the scalar one's core."""
+"""RBL/Tracking-v0 with many bodies: the native vector environment."""
 
 from __future__ import annotations
 
@@ -23,33 +23,32 @@ from rbl_gym.worlds import scene_bounds, simulation
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.worlds.stacked import StackedScenes
 
-# What only the start of an episode tells.
+# Keys that only the info of a reset has.
 _TOLD = ("prior_rotation", "prior_translation", "prior_covariance", "scene")
 
 
 class TrackingVectorEnv(BatchEnv):
     """`num_envs` independent `TrackingEnv` worlds in arrays with a leading axis.
 
-    Made by ``gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=1024, scene=...)``. Observations,
-    rewards and infos are those of the scalar environment, stacked; its docstring describes
-    them. `info` keys have Gymnasium's boolean masks ``_key`` beside them. Seeding and autoreset
-    as `BatchEnv`.
+    Created by ``gym.make_vec("rbl_gym:RBL/Tracking-v0", num_envs=1024, scene=...)``. Observations,
+    rewards and infos are those of the scalar environment, stacked; see its docstring. `info` also
+    has Gymnasium's boolean masks ``_key``. Seeding and autoreset work as in `BatchEnv`.
 
     Parameters
     ----------
     num_envs
-        How many.
+        Number of worlds.
     scene, reward, render_mode
         As `TrackingEnv`.
     scenes
-        As `TrackingEnv`: each world draws a scene of its own at every reset.
+        As `TrackingEnv`: each world draws its own scene at every reset.
     max_episode_steps
-        Truncate after so many steps, if fewer than the scene's.
+        Truncate after this many steps, if fewer than the scene's.
     autoreset_mode
         ``"NextStep"`` (default), ``"SameStep"`` or ``"Disabled"``, see `BatchEnv`.
     """
 
-    # Whether the worlds have the members of a family in turn, and draw none.
+    # Whether worlds take the members of a family in turn instead of drawing them.
     _in_turn = False
 
     def __init__(
@@ -87,12 +86,12 @@ class TrackingVectorEnv(BatchEnv):
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode, of a family those of the longest."""
+        """Number of steps of an episode; of a family, the largest number."""
         return self._longest
 
     @property
     def world(self) -> Scene | StackedScenes:
-        """The scene; of a family those of the worlds now, side by side."""
+        """The scene; of a family, the present scenes of all worlds, stacked."""
         return self._episodes.stack if isinstance(self._episodes, FamilyStore) else self.scene
 
     def _scene_of(self, world: int) -> Scene:
@@ -116,7 +115,8 @@ class TrackingVectorEnv(BatchEnv):
         terminated = np.zeros(self.num_envs, dtype=np.bool_)
         self._seen = None
         if (self.family or self.scene).anchor_speed_m_s > 0:
-            # All at once: those that reset in this step get their anchors from the new episode.
+            # All worlds at once: those that reset in this step get their anchors from the new
+            # episode.
             if isinstance(self._episodes, FamilyStore):
                 moved = self._episodes.stack.move_anchors(self._anchors, actions)
             else:
@@ -131,9 +131,9 @@ class TrackingVectorEnv(BatchEnv):
         return -np.log(self._score_m), terminated
 
     def _look(self) -> tuple[simulation.Epoch, dict[str, np.ndarray]]:
-        """All worlds at their epochs and what was measured there, once for all who ask.
+        """Return all worlds at their epochs and their measurements, computed once for all callers.
 
-        In memory that `_observe` and `_inform` give away.
+        The arrays are new, and `_observe` and `_inform` hand them to the caller.
         """
         if self._seen is None:
             at = self._episodes.at(self._epochs)
@@ -178,7 +178,7 @@ class TrackingVectorEnv(BatchEnv):
         return rendering.shot(links, self._anchors, at.rotation, at.translation, bound), None
 
     def _carry_bound(self, rows: np.ndarray, *, started: bool) -> None:
-        """The posterior Cramer-Rao bound of the worlds that started or stepped."""
+        """Update the posterior Cramer-Rao bound of the worlds that started or stepped."""
         at, told = self._look()
         anchors, links = self._anchors, told["links"].view(np.bool_)
         information, prior = self._information, self._prior_covariance
@@ -203,7 +203,7 @@ class TrackingVectorEnv(BatchEnv):
         previous: FloatArray | None,
         prior: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
-        """`scene_bounds.posterior_step` of some worlds; of a family, of alike bodies together."""
+        """Return `scene_bounds.posterior_step` of some worlds; a family is split by number of tags."""
         if not isinstance(self._episodes, FamilyStore):
             return scene_bounds.posterior_step(self.scene, at, anchors, links, previous, prior)
         stack = self._episodes.stack.rows(rows)
