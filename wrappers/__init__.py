@@ -1,4 +1,4 @@
-"""Gymnasium wrappers: observation to belief to reward."""
+"""Gymnasium wrappers: from observations to beliefs to rewards."""
 
 from rbl_gym.wrappers.estimate import EstimatePose
 from rbl_gym.wrappers.estimate_network import EstimateNetwork, VectorEstimateNetwork

@@ -1,8 +1,9 @@
-"""Environments that are a stack of wrappers inside and one environment outside.
+"""Environments made of a stack of wrappers, which look like one environment.
 
-A task shows a policy a flat view of a belief and takes its actions. What makes the belief are an
-environment and `EstimatePose`, or their vector twins. The stack is `inner`; `unwrapped` and `spec`
-are the task's own, so that checkers, specifications and ``make_vec`` see one environment.
+The policy of a task observes a flat view of a belief and returns the task's actions. The belief
+comes from an environment and `EstimatePose`, or their vector forms. This stack is `inner`.
+`unwrapped` and `spec` are the task's own, so that checkers, specifications and ``make_vec`` see one
+environment.
 """
 
 from __future__ import annotations
@@ -27,18 +28,18 @@ from rbl_gym.wrappers.observations import Seen, Viewer, ViewLike, viewer_of
 
 
 class Task(StatedLength):
-    """What scalar and vector tasks share. Arrays have leading axes (B,) in the vector form.
+    """Base of scalar and vector tasks. In the vector form arrays have leading axes (B,).
 
-    A subclass fills in `_command` and `_show`, and `_price` where actions cost something.
+    A subclass implements `_command` and `_show`, and `_price` if actions have a cost.
 
     Attributes
     ----------
     inner
-        The stack: its observation is that of `EstimatePose`, a dict with the belief.
+        The stack. Its observation is that of `EstimatePose`, a dict with the belief.
     scene
-        The world; of a family the first of its scenes.
+        The scene; of a family, the first of its scenes.
     family
-        What every reset draws a scene of; None: there is one scene.
+        The family from which every reset draws a scene; None if there is only one scene.
     seen
         The last observation of `inner`, None before the first reset.
     """
@@ -47,36 +48,36 @@ class Task(StatedLength):
     scene: Scene
     family: SceneFamily | None = None
     seen: dict[str, np.ndarray] | None = None
-    # What shows the belief; None: the task's own view of it.
+    # The view of the belief; None means the task's own view.
     _viewer: Viewer | None = None
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode."""
+        """Number of steps of an episode."""
         return self.inner.unwrapped.episode_steps
 
     @property
     def film(self) -> rendering.Film | None:
-        """What the frames are drawn from, with a render mode."""
+        """The source of the frames, if there is a render mode."""
         return self.inner.unwrapped.film
 
     @property
     def belief(self) -> PoseBelief:
-        """The filter's belief now."""
+        """The present belief of the filter."""
         return _belief_of(self._told())
 
     @property
     def anchors(self) -> FloatArray:
-        """Places of the anchors now, (..., M, 3)."""
+        """Present positions of the anchors, (..., M, 3)."""
         return self._told()["anchors"]
 
     @property
     def twist(self) -> FloatArray:
-        """Known twist (..., 6) of the interval that ended now."""
+        """Known twist (..., 6) of the interval that ends at this epoch."""
         return self._told()["twist"]
 
     def render(self) -> Any:
-        """A frame, (height, width, 3) of uint8, of a vector one for each world."""
+        """Return a frame, (height, width, 3), uint8; a vector form returns one for each world."""
         return self.inner.render()
 
     def _told(self) -> dict[str, np.ndarray]:
@@ -85,29 +86,29 @@ class Task(StatedLength):
         return self.seen
 
     def _command(self, action: Any) -> Any:
-        """The action of `inner`, or a ValueError."""
+        """Return the action of `inner`; raises ValueError for an invalid action."""
         raise NotImplementedError
 
     def _show(self, observation: dict[str, np.ndarray], world: Any) -> np.ndarray:
-        """The policy's view of an observation of `inner`, made in a `Scene` or `StackedScenes`."""
+        """Return the policy's view of an observation of `inner` in a `Scene` or `StackedScenes`."""
         raise NotImplementedError
 
     def _look_by(self, observation: ViewLike, hides_obstacles: bool = False) -> None:
-        """How the policy sees the belief; ``"flat"``: as the task has it."""
+        """Set how the policy observes the belief; ``"flat"`` is the task's own view."""
         if isinstance(observation, str) and observation == "flat":
             return
         self._viewer = viewer_of(observation)
         self._viewer.hides_obstacles = hides_obstacles
 
     def _space_of(self, own: spaces.Space[Any], inner: Any) -> spaces.Space[Any]:
-        """The space of what the policy sees of one world, `own` if the task's own view."""
+        """Return the observation space of one world; `own` is that of the task's own view."""
         if self._viewer is None:
             return own
         below = getattr(inner, "single_observation_space", inner.observation_space)
         return self._viewer.space_of(inner, scene_of(inner), below)
 
     def _view_of(self, observation: dict[str, np.ndarray], world: Any) -> Any:
-        """What the policy sees of an observation of `inner`; the caller's."""
+        """Return the policy's view of an observation of `inner`; the caller may keep it."""
         if self._viewer is None:
             return self._show(observation, world)
         shown = self._viewer(Seen(observation, _belief_of(observation), world))
@@ -116,17 +117,17 @@ class Task(StatedLength):
         return shown
 
     def _shown(self) -> Any:
-        """What the policy sees now."""
+        """Return the present view of the policy."""
         return self._view_of(self._told(), self.world)
 
     @property
     def world(self) -> Any:
-        """The scene of this episode; of many worlds with their own, these side by side."""
+        """The scene of this episode; of a family in the vector form, the stacked scenes."""
         env = self.inner.unwrapped
         return getattr(env, "world", env.scene)
 
     def _price(self, info: dict[str, Any]) -> Any:
-        """What the step that these infos are of costs."""
+        """Return the cost of the step with these infos."""
         return 0.0
 
 
@@ -154,7 +155,7 @@ class TaskEnv(Task, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVar
         return self._shown(), info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """One step of the world and of its filter."""
+        """Step the world and its filter."""
         self.seen, reward, *ended, info = self.inner.step(self._command(action))
         return self._shown(), float(reward - self._price(info)), *ended, info
 
@@ -181,7 +182,7 @@ class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIn
         return self._shown(), info
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """One step of every world and of its filter."""
+        """Step every world and its filter."""
         world = self.world
         self.seen, reward, *ended, info = self.inner.step(self._command(actions))
         price = self._price(info)
@@ -194,6 +195,6 @@ class VectorTaskEnv(Task, VectorEnv[Any, Any, Any]):  # pyright: ignore[reportIn
         return self._shown(), reward - price, *ended, info
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the stack, where there is one: a refused constructor is closed by `__del__` too."""
+        """Close the stack if there is one: `__del__` also closes after a failed constructor."""
         if self.inner is not None:
             self.inner.close(**kwargs)

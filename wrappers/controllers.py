@@ -1,8 +1,8 @@
-"""Reference policies of the tasks with a filter in the loop: what learned ones are measured by.
+"""Reference policies of the tasks with a filter in the loop, to compare learned ones with.
 
-A controller is a function ``(env, rng) -> actions`` of a vector environment with one scene; it
-reads the belief and the model, never the truth. Only `greedy_with_map` knows where the racks
-stand. Those in `MOBILE` and `SELECTION` take families of scenes too.
+A controller is a function ``(env, rng) -> actions`` of a vector environment with one scene. It
+reads the belief and the model, never the truth. Only `greedy_with_map` knows the positions of the
+racks. Those in `MOBILE` and `SELECTION` also accept families of scenes.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ __all__ = [
 ]  # fmt: skip
 
 # Radius of ring and orbit in units of the vehicle's depth, and the angle between two craft (more
-# are spread evenly): tuned on the task's own worlds. Two craft see the vehicle from one side
-# only, and do best close above it, where they go around it fastest.
+# than two are spread evenly). These were tuned on the task's own worlds. Two craft see the vehicle
+# from one side only. They do best close above it, where they circle it fastest.
 RING_DEPTHS, ORBIT_DEPTHS = 0.9, 0.9
 PAIR_RING_DEPTHS, PAIR_ORBIT_DEPTHS, PAIR_ANGLE = 0.25, 0.14, 2.6
-# Receding horizon: steps ahead, samples, elites, rounds.
+# Receding horizon: steps ahead, samples, elites, iterations.
 _HORIZON, _SAMPLES, _ELITES, _ROUNDS = 6, 64, 8, 3
 
 
@@ -34,24 +34,24 @@ _HORIZON, _SAMPLES, _ELITES, _ROUNDS = 6, 64, 8, 3
 
 
 def random_velocities(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Uniform actions."""
+    """Return uniform actions."""
     return rng.uniform(-1, 1, (env.num_envs, 2 * env.scene.n_anchors))
 
 
 def ring(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Keep a ring about the estimate, about as wide as the vehicle is deep."""
+    """Keep a ring around the estimate, about as wide as the vehicle is deep."""
     pair = env.scene.n_anchors == 2
     return _towards(env, _around(env, PAIR_RING_DEPTHS if pair else RING_DEPTHS, 0.0))
 
 
 def orbit(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Circle the estimate as fast as the craft go."""
+    """Circle the estimate at full speed."""
     pair = env.scene.n_anchors == 2
     return _towards(env, _around(env, PAIR_ORBIT_DEPTHS if pair else ORBIT_DEPTHS, 1.0))
 
 
 def _around(env: MobileAnchorsVectorEnv, depths: float, ahead: float) -> FloatArray:
-    """Targets (B, M, 2) on a ring about the estimate, see `on_ring`."""
+    """Return targets (B, M, 2) on a ring around the estimate, see `on_ring`."""
     reach = np.full(env.num_envs, env.scene.anchor_speed_m_s * env.scene.dt)
     centre = env.belief.translation + env.twist[:, 3:] * (env.scene.dt, env.scene.dt, 0.0)
     return on_ring(centre, env.anchors, reach, depths, ahead)
@@ -60,18 +60,18 @@ def _around(env: MobileAnchorsVectorEnv, depths: float, ahead: float) -> FloatAr
 def on_ring(
     centre: FloatArray, craft: FloatArray, reach_m: FloatArray, depths: float, ahead: float
 ) -> FloatArray:
-    """Targets (B, M, 2) of craft on a ring, in the order of their bearings.
+    """Return targets (B, M, 2) of craft on a ring, in the order of their bearings.
 
     Parameters
     ----------
     centre
-        Of the ring (B, 3), at the vehicle's depth.
+        Centre of the ring (B, 3), at the vehicle's depth.
     craft, reach_m
-        Places (B, M, 3), and how far each goes in a step (B,).
+        Positions (B, M, 3), and the longest move in a step (B,).
     depths
         Radius in units of the vehicle's depth.
     ahead
-        How many steps of travel along the ring the targets lie before the craft.
+        How many steps along the ring the targets are ahead of the craft.
     """
     n_craft = craft.shape[-2]
     radius = depths * np.maximum(np.abs(centre[:, 2]), 10.0)[:, None]
@@ -79,7 +79,7 @@ def on_ring(
     angle = np.arctan2(gap[..., 1], gap[..., 0])
     rank = np.argsort(np.argsort(angle, axis=-1), axis=-1)
     slot = (PAIR_ANGLE if n_craft == 2 else 2 * np.pi / n_craft) * rank
-    # The turn of the ring that fits the craft best.
+    # The rotation of the ring that fits the craft best.
     turn = np.angle(np.exp(1j * (angle - slot)).mean(axis=-1))[:, None]
     place = turn + slot + ahead * reach_m[:, None] / radius
     around = radius[..., None] * np.stack([np.cos(place), np.sin(place)], axis=-1)
@@ -87,22 +87,22 @@ def on_ring(
 
 
 def _towards(env: MobileAnchorsVectorEnv, targets: FloatArray) -> np.ndarray:
-    """Actions that bring the craft to targets (B, M, 2), or as near as one step allows."""
+    """Return actions that move craft to targets (B, M, 2), or as close as one step allows."""
     reach = env.scene.anchor_speed_m_s * env.scene.dt
     return _ordered(env, (targets - env.anchors[..., :2]) / reach)
 
 
 def _ordered(env: MobileAnchorsVectorEnv, velocity: FloatArray) -> np.ndarray:
-    """Actions (B, 2 M) of velocities (B, M, 2) of the craft by number, in units of the limit."""
+    """Return actions (B, 2 M) of velocities (B, M, 2) by craft number, in units of the limit."""
     length = np.linalg.norm(velocity, axis=-1, keepdims=True)
     velocity = velocity / np.maximum(length, 1.0)
     return np.take_along_axis(velocity, env.order[..., None], axis=1).reshape(env.num_envs, -1)
 
 
 def receding_horizon(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """Plan six steps ahead by the cross-entropy method on the predicted bound, do the first.
+    """Plan six steps ahead by the cross-entropy method on the predicted bound; do the first.
 
-    The vehicle is predicted by its present twist; the plan is a velocity of each craft at each
+    The vehicle is predicted with its present twist. A plan is a velocity of each craft at each
     step. The orbit is among the first samples.
     """
     n, n_anchors = env.num_envs, env.scene.n_anchors
@@ -123,7 +123,7 @@ def receding_horizon(env: MobileAnchorsVectorEnv, rng: np.random.Generator) -> n
 
 
 def _predicted(env: MobileAnchorsVectorEnv) -> list[tuple[FloatArray, FloatArray]]:
-    """Poses (B, 1, ...) of the next steps if the twist stays what it is."""
+    """Return poses (B, 1, ...) of the next steps, with the present twist."""
     pose = env.belief.rotation[:, None], env.belief.translation[:, None]
     poses = []
     for _ in range(_HORIZON):
@@ -135,7 +135,7 @@ def _predicted(env: MobileAnchorsVectorEnv) -> list[tuple[FloatArray, FloatArray
 def _plan_cost(
     env: MobileAnchorsVectorEnv, plans: FloatArray, poses: list[tuple[FloatArray, FloatArray]]
 ) -> FloatArray:
-    """Mean log b (B, S) of plans (B, S, H, M, 2) along the predicted poses."""
+    """Return the mean log b (B, S) of plans (B, S, H, M, 2) along the predicted poses."""
     scene, tags = env.scene, np.asarray(env.scene.tags)
     information = np.linalg.inv(env.belief.covariance)[:, None]
     anchors = np.broadcast_to(env.anchors[:, None], (*plans.shape[:2], *env.anchors.shape[1:]))
@@ -158,13 +158,13 @@ def _plan_cost(
 
 
 def random_anchors(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """k of them, or in the priced form each with probability 1/2."""
+    """Choose k random anchors, or in the priced form each with probability 1/2."""
     scores = rng.uniform(-1, 1, (env.num_envs, env.scene.n_anchors))
     return scores if env.mode == "top-k" else (scores > 0).astype(np.int8)
 
 
 def nearest(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """The k nearest to the estimate."""
+    """Choose the k anchors nearest to the estimate."""
     distance = np.linalg.norm(env.anchors - env.belief.translation[:, None], axis=-1)
     scores = 1 - 2 * np.argsort(np.argsort(distance, axis=-1), axis=-1) / env.scene.n_anchors
     if env.mode == "top-k":
@@ -173,18 +173,18 @@ def nearest(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarr
 
 
 def greedy_blind(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """One after the other where it helps the predicted belief most, as if nothing blocked sight."""
+    """Choose anchors greedily by the predicted belief, as if nothing blocked sight."""
     return greedy(env, np.ones((env.num_envs, env.scene.n_anchors)))
 
 
 def greedy_with_map(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> np.ndarray:
-    """As `greedy_blind`, with the racks known."""
+    """As `greedy_blind`, with known racks."""
     _, translation = propagate(env.belief.rotation, env.belief.translation, env.twist, env.scene.dt)
     return greedy(env, env.scene.obstruction.share(env.anchors, translation[:, None])[:, 0])
 
 
 def greedy(env: AnchorSelectionVectorEnv, quality: FloatArray) -> np.ndarray:
-    """Actions that choose greedily, links weighted by `quality` (B, M)."""
+    """Return actions that choose greedily, with links weighted by `quality` (B, M)."""
     scene, tags = env.scene, np.asarray(env.scene.tags)
     rows = np.arange(env.num_envs)
     pose = propagate(env.belief.rotation, env.belief.translation, env.twist, scene.dt)

@@ -1,8 +1,8 @@
-"""What a policy for any number of craft sees: each craft in a frame of its own.
+"""Observation of a policy for any number of craft: each craft in its own frame.
 
-The frame of a craft has its first axis level from the predicted vehicle to the craft and its third
-upwards. Turning the whole scene about the vertical, or numbering the craft in another order,
-changes nothing that a craft sees.
+The first axis of a craft's frame is horizontal and points from the predicted vehicle to the craft.
+The third axis points up. The observation does not change if the scene turns about the vertical or
+if the craft are numbered in another order.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from rbl_gym.wrappers import controllers
 
 __all__ = ["craft_tokens"]
 
-# Numbers of a craft, and of a pair.
+# Numbers of features of a craft, and of a pair.
 OWN, PAIR = 41, 5
 _UPPER = np.triu_indices(6, 1)
 
 
 class CraftTokens(NamedTuple):
-    """Arrays with leading axes (B, M): what each of M craft sees.
+    """Observations of M craft: arrays with leading axes (B, M).
 
     Attributes
     ----------
@@ -31,11 +31,11 @@ class CraftTokens(NamedTuple):
     pairs
         (B, M, M, `PAIR`): entry i, j is craft j in the frame of craft i.
     others
-        (B, M, M): 1 where j is another craft than i and both are there.
+        (B, M, M): 1 if j is another craft than i and both exist.
     frames
-        (B, M, 2, 2): from level world axes to the craft's.
+        (B, M, 2, 2): from horizontal world axes to the craft's.
     orbit
-        (B, M, 2): level velocity of the orbit in the craft's frame, in units of the limit.
+        (B, M, 2): horizontal velocity of the orbit in the craft's frame, in units of the limit.
     """
 
     own: FloatArray
@@ -55,20 +55,20 @@ def craft_tokens(
     reach_m: FloatArray,
     dt: FloatArray | float,
 ) -> CraftTokens:
-    """What each craft sees.
+    """Return the observation of each craft.
 
     Parameters
     ----------
     rotation, translation, covariance
         Of the belief: (B, 3, 3), (B, 3), (B, 6, 6).
     twist
-        Known twist (B, 6) of the interval that ended now.
+        Known twist (B, 6) of the interval that ends at this epoch.
     craft, mask
-        Places (B, M, 3), and 1 for those that are there (B, M).
+        Positions (B, M, 3), and 1 for existing craft (B, M).
     reach_m
-        How far they go in a step (B,), metres.
+        Longest move in a step (B,), metres.
     dt
-        Seconds of a step, one or (B,).
+        Duration of a step in seconds, a number or (B,).
     """
     batch, m = mask.shape
     step = twist * np.broadcast_to(dt, batch)[:, None]
@@ -122,7 +122,7 @@ def _orbit(
     mask: np.ndarray,
     reach_m: FloatArray,
 ) -> FloatArray:
-    """Velocities (B, M, 2) of `controllers.orbit`, 0 of craft that are not there."""
+    """Return velocities (B, M, 2) of `controllers.orbit`, 0 for craft that do not exist."""
     velocity = np.zeros((*mask.shape, 2))
     counts = mask.sum(axis=-1).astype(int)
     for n in np.unique(counts).tolist():

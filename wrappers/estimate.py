@@ -27,42 +27,43 @@ _FIGURES = metrics.Figures._fields
 
 
 class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Turns measurements into a pose belief, and the belief into the reward.
+    """Estimate a pose belief from the measurements, and compute the reward from the belief.
 
-    Wraps an environment whose observation has `ranges`, `links`, `anchors` and `twist` (in
-    scenes with obstacles `quality`, in those with an inertial sensor `inertial`, which
-    ``"iekf-imu"`` reads), and whose unwrapped form has a `scene`
-    (`RBL/Tracking-v0`); or `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter
-    ``"iekf"``). For vector environments: `VectorEstimatePose`.
+    Wraps an environment whose unwrapped form has a `scene` (`RBL/Tracking-v0`) and whose
+    observation has `ranges`, `links`, `anchors` and `twist`. In scenes with obstacles it also reads
+    `quality`, and with an inertial sensor the filter ``"iekf-imu"`` reads `inertial`. It also wraps
+    observations with `angles`, `station` and `twist` (`RBL/BaseStation-v0`, filter ``"iekf"``). For
+    vector environments use `VectorEstimatePose`.
 
-    The environment is left as it is: what stands below the wrapper sees the environment's own
-    reward, what stands above sees the wrapper's. Where nobody needs the former, an environment
-    made with ``reward="none"`` saves the time that it takes.
+    The wrapped environment does not change: wrappers below this one see its own reward, wrappers
+    above see this one's reward. If the environment's own reward is not needed, ``reward="none"``
+    saves its computing time.
 
     Parameters
     ----------
     env
         The environment.
     filter
-        Name of a filter (`rbl_gym.estimators.names`); or a dict of its `name` and options, as
-        ``{"name": "iekf", "robust": True}``.
+        Name of a filter (`rbl_gym.estimators.names`), or a dict with its `name` and options, for
+        example ``{"name": "iekf", "robust": True}``.
     options
-        Its options, a JSON-able dict, for instance ``{"robust": True}``.
+        Options of the filter, a JSON-able dict, for example ``{"robust": True}``.
     reward
-        ``"belief"``: ``-log b`` of the posterior belief, b its root mean square tag error in
-        metres (`rbl_gym.bounds.score`). ``"error"``: minus the real root mean square tag
-        error in metres. Others, options, and a function of one's own: `rewards.reward_of`.
+        ``"belief"``: ``-log b``, where b is the root mean square tag error in metres expected by
+        the posterior belief (`rbl_gym.bounds.score`). ``"error"``: minus the actual root mean
+        square tag error in metres. For other rewards, options and custom functions see
+        `rewards.reward_of`.
     observation
-        ``"dict"``: the environment's, with `belief_rotation` (3, 3), `belief_translation`
-        (3,), `belief_covariance` (6, 6) added. ``"flat"``: one float32 vector for a policy, see
-        `observations.flat`. ``"tokens"``: a token for each anchor, tag and obstacle, see
-        `observations.tokens`. Or a function of one's own: `observations.viewer_of`.
+        ``"dict"``: the environment's observation, with `belief_rotation` (3, 3),
+        `belief_translation` (3,) and `belief_covariance` (6, 6). ``"flat"``: one float32 vector for
+        a policy, see `observations.flat`. ``"tokens"``: a token for each anchor, tag and obstacle,
+        see `observations.tokens`. For custom functions see `observations.viewer_of`.
 
     Info
     ----
     `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees` (6 degrees of freedom) and
-    `score_m` (b of the belief), beside what the environment says; its own `score_m`, b of the
-    bound, is `bound_m` here.
+    `score_m` (b of the belief), in addition to the environment's info. The environment's own
+    `score_m`, b of the bound, is renamed to `bound_m`.
 
     Examples
     --------
@@ -96,7 +97,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._named = named_filter(filter, options)
         self._family = family_of(env)
         if self._family is not None:
-            # Options that a scene of the family refuses are refused now.
+            # Check now the options that a scene of the family does not accept.
             self._scene = next((s for s in self._family.corners if s.weakens), self._scene)
         self._filter = make_filter(env, self._scene, *self._named)
         self._state: Any = None
@@ -105,7 +106,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start the filter from the environment's prior and give it the first epoch."""
+        """Start the filter from the environment's prior and update it with the first epoch."""
         observation, info = self.env.reset(seed=seed, options=options)
         if self._family is not None:
             self._scene = scene_of(self.env)
@@ -138,7 +139,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def _judged(
         self, belief: PoseBelief, info: dict[str, Any]
     ) -> tuple[dict[str, Any], metrics.Figures]:
-        """The infos with the errors against the true pose, and these."""
+        """Return the infos with the errors against the true pose, and these errors."""
         figures = metrics.judge(*belief[:3], info["rotation"], info["translation"], self._tags)
         if self._rendered:
             rendering.tell(self.env, rendering.Pose(*belief[:3]), single=True)
@@ -151,7 +152,7 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 def scene_of(env: Any) -> Scene:
-    """The scene of an environment, or a ValueError."""
+    """Return the scene of an environment; raises ValueError without one."""
     unwrapped = env.unwrapped
     scene = getattr(unwrapped, "scene", None)
     if not isinstance(scene, Scene):
@@ -163,12 +164,12 @@ def scene_of(env: Any) -> Scene:
 
 
 def family_of(env: Any) -> SceneFamily | None:
-    """The family of scenes that an environment draws from; None where it has one scene."""
+    """Return the family of scenes of an environment; None if it has only one scene."""
     return getattr(env.unwrapped, "family", None)
 
 
 def unpadded(observation: Mapping[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
-    """What a filter reads of the anchors and tags of a scene of a family."""
+    """Return the observation of a scene of a family without its padding."""
     if "angles" in observation:
         return measured_of(observation)
     told = {
@@ -188,7 +189,7 @@ def unpadded(observation: Mapping[str, np.ndarray], scene: Scene) -> dict[str, n
 
 
 def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of an environment's infos in which b of its bound is `bound_m`, not `score_m`."""
+    """Return a copy of an environment's infos with `score_m` of its bound renamed to `bound_m`."""
     told = dict(info)
     for name, bound in (("score_m", "bound_m"), ("_score_m", "_bound_m")):
         if name in told:
@@ -199,7 +200,7 @@ def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
 def named_filter(
     filter: FilterLike, options: Mapping[str, Any] | None
 ) -> tuple[str, Mapping[str, Any] | None]:
-    """Name and options of a filter that is given by its name, or by a dict of both."""
+    """Return name and options of a filter given by its name, or by a dict with both."""
     if not isinstance(filter, Mapping):
         return filter, options
     if options is not None:
@@ -212,7 +213,7 @@ def named_filter(
 
 
 def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:
-    """A named filter that knows the scene's tags, and the laws of what `env` measures."""
+    """Return a named filter for the scene's tags and the laws of the measurements of `env`."""
     told = check_options_of(options)
     law = getattr(env.unwrapped, "noise", scene.noise)
     if isinstance(law, AngleNoise):
@@ -230,7 +231,7 @@ def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | 
 
 
 def inertial_options(name: str, scene: Scene) -> dict[str, Any]:
-    """What a filter is told that asks for an inertial sensor, in a scene that has one."""
+    """Return options for a filter with an inertial sensor, if the scene has one."""
     if scene.inertial is None:
         return {}
     asked = inspect.signature(factory_of(name)).parameters
@@ -239,7 +240,7 @@ def inertial_options(name: str, scene: Scene) -> dict[str, Any]:
 
 
 def check_reads(name: str, filter: Filter, scene: Scene) -> None:
-    """A ValueError where a filter reads an inertial sensor that the scene does not have."""
+    """Raise ValueError if a filter needs an inertial sensor that the scene does not have."""
     if reads(filter) == "inertial" and scene.inertial is None:
         raise ValueError(
             f"filter {name!r} reads an inertial sensor, scene {scene.name!r} has none: give it "
@@ -248,7 +249,7 @@ def check_reads(name: str, filter: Filter, scene: Scene) -> None:
 
 
 def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Options of a filter as a dict, or a ValueError."""
+    """Return options of a filter as a dict; raises ValueError for anything else."""
     if options is None:
         return {}
     if not isinstance(options, Mapping) or not all(isinstance(key, str) for key in options):
@@ -262,21 +263,21 @@ def check_options_of(options: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def check_takes_obstacles(name: str, filter: Filter, scene: Scene) -> None:
-    """A ValueError where obstacles give every epoch its own law and the filter takes none."""
+    """Raise ValueError if obstacles vary the noise law and the filter does not support that."""
     if scene.weakens:
         check_takes_noise(name, filter, "the scene's obstacles give every epoch its own noise")
 
 
 def measured_of(observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What a filter reads of an observation."""
+    """Return the part of an observation that a filter reads."""
     keys = "ranges", "links", "quality", "anchors", "angles", "station", "twist", "inertial"
     return {key: observation[key] for key in keys if key in observation}
 
 
 def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], scene: Scene) -> Any:
-    """The filter's state after the measurements of an epoch, with their `quality` if it is told.
+    """Return the filter's state after the measurements of an epoch, with `quality` if observed.
 
-    The quality makes the law of the epoch, which the filter is given as `noise`.
+    The quality determines the noise law of the epoch, which the filter gets as `noise`.
     """
     if "angles" in observation:
         return filter.update(state, observation["angles"], observation["station"])
@@ -296,7 +297,7 @@ def update(filter: Filter, state: Any, observation: Mapping[str, np.ndarray], sc
 def _variance(
     scene: StackedScenes, observation: Mapping[str, np.ndarray], links: BoolArray
 ) -> FloatArray:
-    """Variances (B, M, N) of an epoch of many worlds, 1 where nothing was measured."""
+    """Return variances (B, M, N) of an epoch of many worlds, 1 for missing ranges."""
     variance = scene.noise.variance(observation["ranges"], links)
     if "quality" in observation:
         variance = variance / np.where(links, observation["quality"][..., None], 1.0)

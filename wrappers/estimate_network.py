@@ -1,4 +1,4 @@
-"""EstimateNetwork: observations of a network become beliefs over its poses, by cycle consensus."""
+"""EstimateNetwork: estimate the poses of a network by cycle consensus."""
 
 from __future__ import annotations
 
@@ -28,52 +28,52 @@ from rbl_gym.rendering import tell
 from rbl_gym.rendering.network import Headings
 
 REWARDS = ("belief", "error")
-# Sets the wrapper's own randomness apart from that of the environment with the same seed.
+# Separates the wrapper's random numbers from those of the environment with the same seed.
 _STREAM = 1
 
 
 class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Turns bearings into orientations, with lengths into poses, and scores the estimate.
+    """Estimate orientations from bearings, and poses if lengths are observed; compute rewards.
 
-    Wraps `RBL/PlanarNetwork-v0`; its own reward is replaced. For vector environments:
-    `VectorEstimateNetwork`. Each epoch is estimated from its own measurements: orientations by
-    the cycle consensus, (14), summed up along a tree; where lengths are observed, both by
-    maximum likelihood from there. The last estimate says which multiple of 2 pi a cycle sums
-    to, so that long cycles do not slip.
+    Wraps `RBL/PlanarNetwork-v0` and replaces its reward. For vector environments use
+    `VectorEstimateNetwork`. Each epoch is estimated from its own measurements. Cycle consensus,
+    (14), summed along a tree, gives the orientations. If lengths are observed, maximum likelihood
+    starts there and gives both orientations and positions. The last estimate determines to which
+    multiple of 2 pi the angles of a cycle sum, so that long cycles do not slip.
 
     Parameters
     ----------
     env
         The environment.
     reward
-        ``"error"``: minus the real root mean square error. ``"belief"``: ``-log`` of the one
-        that the belief expects. Of the orientations, in radians; where lengths are observed,
-        of the poses, in metres: of a point 1 m away from its node.
+        ``"error"``: minus the actual root mean square error. ``"belief"``: ``-log`` of the error
+        that the belief expects. Errors are those of the orientations in radians. If lengths are
+        observed, they are those of the poses in metres: the error of a point 1 m away from its
+        node.
     cycles, kappa, order
-        Of `estimators.cycle_iteration`: the cycles by name, the step or its rule, and
-        ``"synchronous"`` or ``"asynchronous"``. A step too large for the cycles of an epoch is
-        an error of that epoch.
+        As in `estimators.cycle_iteration`: the cycles by name, the step or its rule, and
+        ``"synchronous"`` or ``"asynchronous"``. A step that is too large for the cycles of an epoch
+        raises an error in that epoch.
     steps
-        The most steps of the iteration in an epoch. Where they are too few, the residuals are
-        larger than the noise, and the belief is wider.
+        Maximum number of iterations in an epoch. If it is too small, residuals are larger than the
+        noise, and the belief is wider.
 
     Observation
     -----------
-    The environment's, with `orientations` (n,) relative to node 0, radians in [-pi, pi], and
-    `orientation_std` (n,). Where lengths are observed, also `positions` (n, 2) in the frame of
-    node 0, metres, and `pose_covariance` (n, 3, 3) of each node's orientation, x and y: with
-    them a node's pose is the belief.
+    The environment's observation, with `orientations` (n,) relative to node 0, radians in [-pi,
+    pi], and `orientation_std` (n,). If lengths are observed, also `positions` (n, 2) in the frame
+    of node 0, metres, and `pose_covariance` (n, 3, 3) of each node's orientation, x and y.
 
     All variances are scaled by max(1, chi-square per degree of freedom of the residuals), and
-    end at those of the prior. A node that has no path to node 0 keeps its last estimate (0
-    before the first) and has the standard deviations of its prior.
+    limited to those of the prior. A node without a path to node 0 keeps its last estimate (0 before
+    the first) and has the standard deviations of its prior.
 
     Info
     ----
-    `orientation_error_rad` (root mean square over all nodes but node 0) and `belief_rad`, what
-    the belief expects it to be; `chi_square` (per degree of freedom; 0 without one);
-    `consensus_steps` and `consensus_converged`; with lengths `position_error_m`, `pose_error_m`
-    and `belief_m`, what is expected of the latter; beside what the environment says.
+    `orientation_error_rad` (root mean square over all nodes but node 0) and `belief_rad`, its value
+    expected by the belief; `chi_square` per degree of freedom (0 without degrees of freedom);
+    `consensus_steps` and `consensus_converged`; with lengths `position_error_m`, `pose_error_m` and
+    `belief_m`, the expected pose error. The environment's info is kept.
 
     Examples
     --------
@@ -113,7 +113,7 @@ class EstimateNetwork(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start without an estimate and give it the first epoch."""
+        """Start without an estimate and estimate the first epoch."""
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = _generator(seed)
@@ -190,7 +190,7 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
         return self._estimate(observation, info, fresh), info
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Step the worlds, estimate, reward; worlds that begin anew forget their estimate."""
+        """Step the worlds, estimate, reward; worlds that restart discard their estimate."""
         observation, _, terminated, truncated, info = self.env.step(actions)
         ended, same_step = (
             terminated | truncated,
@@ -206,7 +206,7 @@ class VectorEstimateNetwork(VectorWrapper, RecordConstructorArgs):
         return observation, reward, terminated, truncated, info
 
     def _end(self, info: dict[str, Any], ended: BoolArray) -> FloatArray:
-        """Estimate the last epoch of the worlds that ended; their rewards."""
+        """Estimate the last epoch of the worlds that ended; return their rewards."""
         final, last = info["final_obs"], info["final_info"]
         for world in np.flatnonzero(ended):
             run = _run(final[world], self._theta[world], self._options, self._rngs[world])
@@ -285,7 +285,7 @@ def _shown(found: NetworkBelief) -> Headings:
 
 
 def _judge(found: NetworkBelief, truth: dict[str, Any]) -> dict[str, FloatArray]:
-    """Figures (...) of estimates and beliefs over all nodes but node 0."""
+    """Return errors (...) of estimates and beliefs over all nodes except node 0."""
     error = proj(found.orientations - truth["orientations"])[..., 1:] ** 2
     variance = np.diagonal(found.covariance[..., 1:, :, :], axis1=-2, axis2=-1)
     figures = {
@@ -297,7 +297,8 @@ def _judge(found: NetworkBelief, truth: dict[str, Any]) -> dict[str, FloatArray]
         places = truth["positions"] - truth["positions"][..., :1, :]
         away = ((found.positions - places)[..., 1:, :] ** 2).sum(axis=-1)
         figures["position_error_m"] = np.sqrt(away.mean(axis=-1))
-        # Of a point 1 m away from its node: a turn moves it as many metres as it has radians.
+        # Error of a point 1 m away from its node: a rotation error in radians moves it by as many
+        # metres.
         figures["pose_error_m"] = np.sqrt((away + error).mean(axis=-1))
         figures["belief_m"] = np.sqrt(variance.sum(axis=-1).mean(axis=-1))
     return figures
@@ -306,13 +307,13 @@ def _judge(found: NetworkBelief, truth: dict[str, Any]) -> dict[str, FloatArray]
 def _rewarded(reward: str, info: dict[str, Any]) -> Any:
     of_poses = "pose_error_m" in info
     if reward == "belief":
-        # Zeros stand where a world has no last epoch.
+        # Worlds without a last epoch have zeros.
         return -np.log(np.maximum(info["belief_m" if of_poses else "belief_rad"], 1e-300))
     return -np.asarray(info["pose_error_m" if of_poses else "orientation_error_rad"])
 
 
 def _farthest(sensing: Sensing) -> float:
-    """A coordinate that no estimate passes, twice the square's side."""
+    """Return a limit for the coordinates of estimates, twice the square's side."""
     return 2 * math.sqrt(6) * sensing.prior_std_m
 
 

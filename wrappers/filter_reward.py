@@ -1,4 +1,4 @@
-"""A layout paid by how well a filter tracks with it, in place of the bound."""
+"""Reward a layout by how well a filter tracks with it, instead of by the bound."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from rbl_gym.wrappers.estimate import FilterLike, make_filter, named_filter
 from rbl_gym.wrappers.filter_tracks import check_determined, track_error
 
 REWARDS = ("bound", "filter")
-# What the infos tell of a layout.
+# Keys of the infos that describe a layout.
 _TOLD = ("region", "racks", "anchors", "rack_mask", "anchor_mask")
 
 
 def filter_of(env: Any, task: PlacementTask, name: str, options: Any) -> Filter:
-    """The filter of a task, or a ValueError where its scene does not do."""
+    """Return the filter of a task; raises ValueError if it does not suit the scene."""
     filter = make_filter(env, task.scene, name, options)
     if reads(filter) != "twist":
         raise ValueError(f"filter must be one that is told the twist, got {name!r}")
@@ -36,7 +36,7 @@ def filter_of(env: Any, task: PlacementTask, name: str, options: Any) -> Filter:
 
 
 class _Judge:
-    """How well a named filter tracks with complete layouts, in one task or in a family of them."""
+    """Tracking errors of a named filter with complete layouts, in a task or a family of tasks."""
 
     def __init__(self, env: Any, name: FilterLike, options: Mapping[str, Any] | None) -> None:
         self._env, self._named = env, named_filter(name, options)
@@ -48,7 +48,7 @@ class _Judge:
             check_determined(task, name, filter_of(env, task, name, options))
 
     def errors(self, tasks: Sequence[PlacementTask], info: Mapping[str, Any]) -> FloatArray:
-        """Errors (R,) of the filter in layouts (R, ...) of these tasks, as the infos tell them."""
+        """Return errors (R,) of the filter for layouts (R, ...) of these tasks, as in the infos."""
         if self._one is not None:
             return _errors(tasks[0], self._one, info)
         found = []
@@ -64,7 +64,7 @@ class _Judge:
 
 
 def _tasks_of(env: Any) -> Sequence[Any]:
-    """The tasks of the worlds of a placement environment, or a ValueError."""
+    """Return the tasks of the worlds of a placement environment; may raise ValueError."""
     tasks = getattr(env.unwrapped, "tasks", None)
     if tasks is None:
         tasks = [getattr(env.unwrapped, "task", None)]
@@ -77,28 +77,29 @@ def _tasks_of(env: Any) -> Sequence[Any]:
 
 
 class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Pays the layout of `RBL/AnchorPlacement-v0` by how well a filter tracks with it.
+    """Reward the layouts of `RBL/AnchorPlacement-v0` by how well a filter tracks with them.
 
-    With the last anchor the reward is ``-log`` of the root mean square tag error in metres over
-    8 tracks of 20 epochs through the work region, 0 before; in every mode. The body moves between
-    way-points in the region at the scene's speed, with the scene's process noise, and the filter
-    starts from the scene's initial uncertainty. The tracks and the noise are drawn from a
-    generator that the problem's own numbers seed: the same layout of the same problem has the
-    same reward, another problem other tracks.
+    In every mode the reward with the last anchor is ``-log`` of the root mean square tag error in
+    metres over 8 tracks of 20 epochs through the work region, and 0 before. The body moves between
+    way-points in the region at the scene's speed, with the scene's process noise. The filter starts
+    from the scene's initial uncertainty. Tracks and noise are drawn from a generator seeded with
+    the numbers of the problem. The same layout of the same problem has the same reward; another
+    problem has other tracks.
 
-    ``gym.make("rbl_gym:RBL/AnchorPlacement-v0", reward="filter", filter="iekf")`` makes it.
+    ``gym.make("rbl_gym:RBL/AnchorPlacement-v0", reward="filter", filter="iekf")`` creates it.
 
     Parameters
     ----------
     env
         The environment.
     filter, options
-        Name of a filter and its options, as `EstimatePose`. One that the anchors cannot
-        determine is refused: the filters of the Kalman family on the water's surface, say.
+        Name of a filter and its options, as in `EstimatePose`. Raises ValueError for a filter that
+        the anchors cannot determine, for example the linear Kalman filters with all anchors on the
+        water's surface.
 
     Info
     ----
-    `tag_error_m`, that error with the last anchor, 0 before; `score_m` stays the bound's.
+    `tag_error_m`: this error with the last anchor, 0 before. `score_m` is still that of the bound.
 
     Examples
     --------
@@ -131,7 +132,7 @@ class FilterReward(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, {**info, "tag_error_m": 0.0}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Place an anchor; the last one is paid."""
+        """Place an anchor; the last one gives the reward."""
         observation, _, terminated, truncated, info = self.env.step(action)
         error, reward = 0.0, 0.0
         if terminated:
@@ -160,12 +161,12 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
     ) -> tuple[Any, dict[str, Any]]:
         """Start episodes."""
         observation, info = self.env.reset(seed=seed, options=options)
-        # Worlds that go on have not placed their last anchor, or are over and keep its error.
+        # Worlds that continue have not placed their last anchor, or are over and keep its error.
         self._error_m = np.where(info["score_m"] > 0, self._error_m, 0.0)
         return observation, self._told(info)
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Place anchors; the last one of each world is paid."""
+        """Place anchors; the last one of each world gives the reward."""
         tasks = _tasks_of(self.env)
         observation, _, terminated, truncated, info = self.env.step(actions)
         error, reward = np.zeros(self.num_envs), np.zeros(self.num_envs)
@@ -190,13 +191,13 @@ class VectorFilterReward(VectorWrapper, RecordConstructorArgs):
 
 
 def _errors(task: PlacementTask, filter: Filter, info: Mapping[str, np.ndarray]) -> FloatArray:
-    """Errors (...) of the filter in complete layouts, as the infos describe them."""
+    """Return errors (...) of the filter for complete layouts, as described by the infos."""
     region = info["region"]
     context = Context(region[..., :3], region[..., 3:], info["racks"])
     return track_error(task, context, info["anchors"], filter)
 
 
-# --- what the id makes ------------------------------------------------------------------------
+# --- factories of the environment id ----------------------------------------------------------
 
 
 def anchor_placement(
@@ -206,7 +207,7 @@ def anchor_placement(
     options: Mapping[str, Any] | None = None,
     **arguments: Any,
 ) -> gym.Env[Any, Any]:
-    """`RBL/AnchorPlacement-v0`: `AnchorPlacementEnv`, with ``reward="filter"`` in `FilterReward`.
+    """Create `RBL/AnchorPlacement-v0`: `AnchorPlacementEnv`, or `FilterReward` around it.
 
     Parameters
     ----------
@@ -220,7 +221,7 @@ def anchor_placement(
     Raises
     ------
     ValueError
-        On a reward, or a filter, that does not go with the scene.
+        If the reward or the filter does not suit the scene.
     """
     form = PlacementFamilyEnv if arguments.get("scenes") is not None else AnchorPlacementEnv
     env = form(**_worlds(arguments))
@@ -234,7 +235,7 @@ def anchor_placement_vector(
     options: Mapping[str, Any] | None = None,
     **arguments: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """`anchor_placement` of many problems, with `AnchorPlacementVectorEnv`."""
+    """Create `anchor_placement` with many problems, from `AnchorPlacementVectorEnv`."""
     drawn = arguments.get("scenes") is not None
     form = PlacementFamilyVectorEnv if drawn else AnchorPlacementVectorEnv
     envs = form(**_worlds(arguments))
@@ -243,7 +244,7 @@ def anchor_placement_vector(
 
 
 def _worlds(arguments: dict[str, Any]) -> dict[str, Any]:
-    """The arguments with `scene` or `scenes`, or a ValueError where both are given."""
+    """Return the arguments with `scene` or `scenes`; raises ValueError if both are given."""
     scene, scenes = arguments.get("scene", "auv_buoys"), arguments.get("scenes")
     if scenes is not None and scene != "auv_buoys":
         raise ValueError(f"scene must not be given beside scenes, got {scene!r:.80}")
@@ -262,5 +263,5 @@ def _is_filtered(reward: str, filter: Any, options: Any) -> bool:
     return False
 
 
-# Where Gymnasium looks for render modes.
+# Gymnasium reads the render modes here.
 anchor_placement.metadata = AnchorPlacementEnv.metadata  # pyright: ignore[reportFunctionMemberAccess]

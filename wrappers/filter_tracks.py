@@ -1,4 +1,4 @@
-"""How well a filter tracks with a layout: tracks through a work region, and errors along them."""
+"""Tracking errors of a filter with a layout, along tracks through a work region."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from rbl_gym.wrappers.estimate import update
 __all__ = ["Tracks", "track_error", "tracks"]
 
 TRACKS, EPOCHS = 8, 20
-# A filter is tried on so many random layouts, on so many tracks each, from two priors of which one
-# has `_WIDER` times the standard deviations of the other. What a layout determines forgets the
-# prior: measured ratios at the end are 0.9 to 1.2, and above 1.6 of what it does not determine.
+# A filter is tried on this many random layouts, on this many tracks each, from two priors. The
+# standard deviations of one are `_WIDER` times those of the other. If a layout determines the pose,
+# the filter forgets the prior: measured ratios at the end are 0.9 to 1.2. They are above 1.6 for
+# what a layout does not determine.
 _LAYOUTS, _TRIED_TRACKS, _WIDER, _FORGOTTEN = 4, 2, 2.0, 1.4
 
 
@@ -35,7 +36,7 @@ class Tracks(NamedTuple):
     twists
         Known twist (..., 20, 6) of the interval that ends at each epoch; 0 at the first.
     prior_rotation, prior_translation
-        Mean (..., 3, 3) and (..., 3) of the prior.
+        Prior mean (..., 3, 3) and (..., 3).
     normals, uniforms
         Random numbers of the ranges (..., 20, M, N) and of the links (..., 20, 2, M, N).
     """
@@ -50,17 +51,17 @@ class Tracks(NamedTuple):
 
 
 def tracks(task: PlacementTask, context: Context) -> Tracks:
-    """The 8 tracks of each problem (...,): the same problem has the same tracks.
+    """Draw the 8 tracks of each problem (...,): the same problem has the same tracks.
 
     The body moves at the scene's speed and spin between way-points that are uniform in the work
-    region, with the scene's process noise. All randomness comes from a generator seeded by the
-    numbers of the problem, so that layouts of one problem are compared on the same tracks.
+    region, with the scene's process noise. All random numbers come from a generator seeded with the
+    numbers of the problem. Layouts of one problem are therefore compared on the same tracks.
     """
     scene, links = task.scene, (task.n_anchors, len(task.scene.tags))
     batch = context.centre.shape[:-1]
     travel = scene.speed_m_s * scene.dt * (EPOCHS - 1)
     smallest = 0.15 * float(np.linalg.norm(np.ptp(scene.volume.bounds(), axis=0)))
-    # Legs average above a quarter of the region's extent.
+    # The average length of a leg is more than a quarter of the region's extent.
     n_points = 8 + math.ceil(16 * travel / smallest)
     shapes = ((13,), (EPOCHS - 1, 6), (EPOCHS, *links))
     sizes = [math.prod(shape) for shape in shapes]
@@ -96,7 +97,7 @@ def tracks(task: PlacementTask, context: Context) -> Tracks:
 
 
 def _generators(context: Context) -> Iterator[tuple[tuple[int, ...], np.random.Generator]]:
-    """Of each problem its index in the batch, and the generator that its numbers seed."""
+    """Yield the index of each problem in the batch, and the generator seeded with its numbers."""
     batch = context.centre.shape[:-1]
     for at in np.ndindex(batch):
         numbers = [np.ravel(field[at]) for field in context]
@@ -106,9 +107,10 @@ def _generators(context: Context) -> Iterator[tuple[tuple[int, ...], np.random.G
 def track_error(
     task: PlacementTask, context: Context, anchors: FloatArray, filter: Filter
 ) -> FloatArray:
-    """Root mean square tag error (...) of a filter over the tracks of each problem, metres.
+    """Return the root mean square tag error (...) of a filter over each problem's tracks, metres.
 
-    A layout that the filter refuses (coincident anchors, say) counts as one that gives no range.
+    A layout that the filter does not accept (for example with coincident anchors) counts as a
+    layout without ranges.
 
     Parameters
     ----------
@@ -119,12 +121,12 @@ def track_error(
     anchors
         Their layouts (..., M, 3), metres.
     filter
-        The filter; it knows the scene's tags, noise and process.
+        The filter, made with the scene's tags, noise and process.
 
     Raises
     ------
     ValueError
-        On wrong shapes or numbers that are not finite.
+        If shapes do not fit or numbers are not finite.
     """
     context = placement.checked_context(context)
     anchors = check_array("anchors", anchors, (task.n_anchors, 3))
@@ -168,18 +170,18 @@ def follow(
     wider: float = 1.0,
     measures: bool = True,
 ) -> Iterator[PoseBelief]:
-    """Beliefs (..., 8) of a filter at every epoch of the tracks.
+    """Return the beliefs (..., 8) of a filter at every epoch of the tracks.
 
     Parameters
     ----------
     task, context, anchors
         The family of problems, problems (...,) of it, and their layouts (..., M, 3).
     filter
-        The filter; it knows the scene's tags, noise and process.
+        The filter, made with the scene's tags, noise and process.
     course
-        Of `tracks`.
+        The tracks, from `tracks`.
     wider
-        The prior has so many times the scene's initial standard deviations.
+        Factor on the scene's initial standard deviations.
     measures
         Whether there are ranges.
     """
@@ -210,17 +212,18 @@ def follow(
 
 
 def check_determined(task: PlacementTask, name: str, filter: Filter) -> None:
-    """A ValueError where no layout lets the filter find the pose without the prior.
+    """Raise ValueError if no layout lets the filter find the pose without the prior.
 
-    The filter follows the tracks through the whole volume, without racks, from two priors of
-    which one is twice as wide, on random layouts. What it finds out by itself ends alike.
+    The filter follows the tracks through the whole volume, without racks, on random layouts. It
+    starts from two priors, one of them twice as wide. Quantities determined by the ranges end with
+    the same variance.
     """
     scene, rng = task.scene, np.random.default_rng(0)
     free = placement.whole_volume(task)._replace(racks=np.empty((0, 6)))
     context = Context(*(np.broadcast_to(field, (_LAYOUTS, *field.shape)) for field in free))
     anchors = scene.anchor_region.draw(rng.random((_LAYOUTS, task.n_anchors, 3)))
     course = Tracks(*(field[:, :_TRIED_TRACKS] for field in tracks(task, context)))
-    # What is asked is how wide the belief is, not where: every track starts from its true pose.
+    # This checks the width of the belief, not its mean: every track starts from its true pose.
     course = course._replace(
         prior_rotation=course.rotation[..., 0, :, :],
         prior_translation=course.translation[..., 0, :],

@@ -1,4 +1,4 @@
-"""What `EstimatePose` shows: a dict, a flat vector, tokens, or a view of one's own."""
+"""Observations of `EstimatePose`: a dict, a flat vector, tokens, or a custom view."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from rbl_gym.worlds.scene import Scene
 __all__ = ["OBSERVATIONS", "Seen", "flat", "tokens", "viewer_of"]
 
 OBSERVATIONS = ("dict", "flat", "tokens")
-# Observations of policies are of order one; what is far outside says no more than that.
+# Observations of policies are of order one. Values far outside carry no more information.
 _LIMIT = 10.0
-# Beliefs and views of one's own have no bounds; these are finite and never met.
+# Beliefs and custom views have no bounds. These bounds are finite and never reached.
 _FAR = 1e9
-# Entries of the tokens.
+# Numbers of features of the tokens.
 _BODY, _ANCHOR, _TAG, _BOX = 26, 6, 4, 6
 
 
 class Seen(NamedTuple):
-    """An epoch as a view sees it. In a vector environment every array has a leading axis (B,).
+    """An epoch as input of a view. In a vector environment every array has a leading axis (B,).
 
     Attributes
     ----------
     observation
-        The environment's: `ranges`, `links`, `anchors`, `twist` and so on; of drawn worlds padded,
-        with `anchor_mask`, `tag_mask` and `tags`.
+        The environment's observation: `ranges`, `links`, `anchors`, `twist` and so on. Those of
+        drawn worlds are padded, with `anchor_mask`, `tag_mask` and `tags`.
     belief
         The belief after the epoch.
     scene
-        The world: a `Scene`, of many drawn ones a `StackedScenes` with the same attributes.
+        The world: a `Scene`, or a `StackedScenes` with the same attributes for many drawn worlds.
     """
 
     observation: Mapping[str, np.ndarray]
@@ -54,14 +54,15 @@ ViewLike = str | View
 
 
 def flat(seen: Seen) -> np.ndarray:
-    """Belief and anchors as one float32 vector (..., 21 + 4 M), relative and of order one.
+    """Return belief and anchors as a float32 vector (..., 21 + 4 M), relative and of order one.
 
-    Of drawn worlds (..., 21 + 5 M): the mask of the anchors is the end of it.
+    For drawn worlds the shape is (..., 21 + 5 M), and the anchor mask comes last.
 
-    In order: estimated position scaled to the scene's volume (3); twist over pi/10 a step and
-    over the speed (6); log standard deviations of the pose error (6); the first two columns
-    of the estimated rotation (6); anchors relative to the estimate over the scene's extent (3
-    M); log of their distances over that extent (M). Cut to +-10.
+    In this order: estimated position scaled to the scene's volume (3); angular velocity divided by
+    pi/10 per step and velocity divided by the speed (6); log standard deviations of the pose error
+    (6); the first two columns of the estimated rotation (6); anchor positions relative to the
+    estimate divided by the scene's extent (3 M); log of their distances divided by the extent (M).
+    Entries are cut to +-10.
     """
     relative, far = _anchors(seen)
     masks = [seen.observation["anchor_mask"]] if "anchor_mask" in seen.observation else []
@@ -72,22 +73,21 @@ def flat(seen: Seen) -> np.ndarray:
 
 
 def tokens(seen: Seen, n_boxes: int = 0) -> dict[str, np.ndarray]:
-    """A token for the body, and one for each anchor, tag and obstacle, with masks; float32.
+    """Return tokens of the body and of each anchor, tag and obstacle, with masks; float32.
 
-    Made for policies with attention: what is padded has a token of zeros and a mask of 0. All
-    entries are relative, of order one and cut to +-10.
+    For policies with attention. Padded rows are tokens of zeros with a mask of 0. All entries are
+    relative, of order one and cut to +-10.
 
-    - `body` (..., 26): the first 21 entries of `flat`; half sizes of the volume over the scene's
-      extent (3); decimal logarithms over 4 of that extent in metres and of the body's radius over
-      it.
-    - `anchor_tokens` (..., M, 6): place relative to the estimate over the extent (3); log of the
-      distance over it; share of the tags that were measured; `quality`, 1 where there is none.
-      With the memory of `SelectAnchors` two more: what the last choice told (1: it saw the body,
-      -1: it did not, 0: never chosen) and ``exp(-steps since then / 10)``.
-    - `tag_tokens` (..., N, 4): place on the body, turned as the belief is, over the body's radius
-      (3); share of the anchors that measured it.
-    - `obstacle_tokens` (..., K, 6), where the scenes have obstacles: centre relative to the
-      estimate, and half size, over the extent.
+    - `body` (..., 26): the first 21 entries of `flat`; half sizes of the volume divided by the
+      scene's extent (3); log10(extent in metres) / 4 and log10(body radius / extent) / 4.
+    - `anchor_tokens` (..., M, 6): position relative to the estimate divided by the extent (3); log
+      of the distance divided by the extent; fraction of the tags that were measured; `quality`, 1
+      without it. With the memory of `SelectAnchors` two more: the result of the last choice (1: in
+      sight, -1: not in sight, 0: never chosen) and ``exp(-steps since then / 10)``.
+    - `tag_tokens` (..., N, 4): position on the body, rotated by the belief and divided by the
+      body's radius (3); fraction of the anchors that measured it.
+    - `obstacle_tokens` (..., K, 6), if the scenes have obstacles: centre relative to the estimate,
+      and half size, divided by the extent.
     - `anchor_mask` (..., M), `tag_mask` (..., N), `obstacle_mask` (..., K), int8.
 
     Parameters
@@ -95,7 +95,7 @@ def tokens(seen: Seen, n_boxes: int = 0) -> dict[str, np.ndarray]:
     seen
         The epoch.
     n_boxes
-        The most obstacles of a scene; 0: none are shown.
+        Largest number of obstacles of a scene; with 0 there are no obstacle tokens.
     """
     told, belief, scene = seen
     batch, extent = belief.translation.shape[:-1], scene.scales.extent
@@ -140,7 +140,7 @@ def tokens(seen: Seen, n_boxes: int = 0) -> dict[str, np.ndarray]:
 
 
 def _body(seen: Seen) -> list[FloatArray]:
-    """Place, twist, log standard deviations, two columns of the rotation: 21 entries."""
+    """Return position, twist, log standard deviations, two columns of the rotation: 21 entries."""
     told, belief, scene = seen
     middle, half, _, rates = scene.scales
     std = np.sqrt(np.diagonal(belief.covariance, axis1=-2, axis2=-1))
@@ -154,7 +154,7 @@ def _body(seen: Seen) -> list[FloatArray]:
 
 
 def _anchors(seen: Seen) -> tuple[FloatArray, FloatArray]:
-    """Anchors relative to the estimate (..., M, 3), and the logs of their distances (..., M)."""
+    """Return relative anchor positions (..., M, 3), and the logs of their distances (..., M)."""
     told, belief, scene = seen
     extent = scene.scales.extent
     anchors = told["station"][..., None, :] if "station" in told else told["anchors"]
@@ -164,7 +164,7 @@ def _anchors(seen: Seen) -> tuple[FloatArray, FloatArray]:
 
 
 def _boxes(scene: Any, n_boxes: int, batch: tuple[int, ...]) -> tuple[FloatArray, np.ndarray]:
-    """The obstacles (..., K, 6) of the scenes, and their mask (..., K)."""
+    """Return the obstacles (..., K, 6) of the scenes, and their mask (..., K)."""
     own = scene.obstruction.boxes
     boxes = np.zeros((*batch, n_boxes, 6))
     boxes[..., : own.shape[-2], :] = own
@@ -179,20 +179,20 @@ def _cut(entries: FloatArray) -> np.ndarray:
 
 
 def viewer_of(observation: ViewLike) -> Viewer:
-    """What shows an epoch as the argument `observation` says.
+    """Return the viewer for the argument `observation`.
 
     Parameters
     ----------
     observation
-        A name of `OBSERVATIONS`. Or ``"module:function"``, or a function of a `Seen`, which
-        returns an array, or a dict of arrays, with the leading axes of the belief. Its space is its
-        attribute `space` (a Gymnasium space, of one world), and without one is found by calling it
-        once: boxes of the shapes and types that it returns.
+        A name of `OBSERVATIONS`, or ``"module:function"``, or a function of a `Seen`. A function
+        returns an array, or a dict of arrays, with the leading axes of the belief. Its attribute
+        `space` is the Gymnasium space of one world. Without this attribute the function is called
+        once, and the space has boxes of the shapes and types that it returns.
 
     Raises
     ------
     ValueError
-        On an unknown name, a path that cannot be imported, anything else.
+        If the name is unknown, the path cannot be imported, or the type is wrong.
     """
     if callable(observation):
         return Viewer("own", observation)
@@ -207,7 +207,7 @@ def viewer_of(observation: ViewLike) -> Viewer:
 
 
 def imported(name: str, path: str) -> Callable[..., Any]:
-    """The function of ``"module:function"``, or a ValueError that calls the argument by `name`."""
+    """Return the function of ``"module:function"``; a ValueError names the argument `name`."""
     module, _, attribute = path.partition(":")
     try:
         found = getattr(importlib.import_module(module), attribute)
@@ -220,16 +220,16 @@ def imported(name: str, path: str) -> Callable[..., Any]:
 
 @dataclass
 class Viewer:
-    """Shows the epochs of an environment; `space_of` is asked first.
+    """Converts the epochs of an environment to observations; call `space_of` first.
 
     Attributes
     ----------
     kind
         A name of `OBSERVATIONS`, or ``"own"``.
     function
-        The view of one's own.
+        The custom view.
     hides_obstacles
-        Whether tokens have no obstacles.
+        Whether to leave obstacle tokens out.
     """
 
     kind: str
@@ -239,7 +239,7 @@ class Viewer:
     space: spaces.Space[Any] | None = None
 
     def space_of(self, env: Any, scene: Any, inner: spaces.Space[Any]) -> spaces.Space[Any]:
-        """The space of what is shown of one world of `env`, whose own space is `inner`."""
+        """Return the observation space of one world of `env`, whose own space is `inner`."""
         keys = set(inner.keys()) if isinstance(inner, spaces.Dict) else set()
         needed = {"angles", "station"} if "angles" in keys else {"ranges", "links", "anchors"}
         if not isinstance(inner, spaces.Dict) or not {*needed, "twist"} <= keys:
@@ -265,7 +265,7 @@ class Viewer:
         return self.space
 
     def __call__(self, seen: Seen) -> Any:
-        """What is shown of an epoch, of the caller."""
+        """Return the observation of an epoch; the caller may keep it."""
         if self.kind == "flat":
             return flat(seen)
         if self.kind == "tokens":
@@ -330,7 +330,7 @@ def _space_of_tokens(m: int, n: int, k: int, memory: bool) -> spaces.Dict:
 
 
 def _example(env: Any, inner: spaces.Dict) -> Seen:
-    """The first epoch of a copy of the environment, of one world."""
+    """Return the first epoch of a copy of the environment, of one world."""
     world = copy.deepcopy(env.unwrapped)
     observation, info = world.reset(seed=0)
     scene = world.scene
@@ -346,7 +346,7 @@ def _example(env: Any, inner: spaces.Dict) -> Seen:
 
 
 def _box_like(value: Any) -> spaces.Box:
-    """A box for arrays as this one: numbers with a point become float32."""
+    """Return a box for arrays like this one: floating-point numbers become float32."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiub":
         raise ValueError(f"observation must return numbers, got {value!r:.80}")
@@ -357,7 +357,7 @@ def _box_like(value: Any) -> spaces.Box:
 
 
 def _fitted(name: str, value: Any, batch: tuple[int, ...], space: Any) -> np.ndarray:
-    """A copy of what a view returned, in the type of its space; or a ValueError."""
+    """Return a view's result as a copy in the type of its space; may raise ValueError."""
     array = np.array(value)
     shape = (*batch, *space.shape)
     if array.shape != shape:

@@ -1,4 +1,4 @@
-"""What a step of `EstimatePose` pays: named rewards, and rewards of one's own."""
+"""Rewards of `EstimatePose`: named rewards and custom functions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["REWARDS", "Outcome", "reward_of"]
 
 
 class Outcome(NamedTuple):
-    """A step as a reward sees it. In a vector environment every array has a leading axis (B,).
+    """A step as input of a reward. In a vector environment every array has a leading axis (B,).
 
     Attributes
     ----------
@@ -31,10 +31,10 @@ class Outcome(NamedTuple):
     rotation, translation
         The true pose: (..., 3, 3) and (..., 3), metres.
     bound_m
-        b of the posterior Cramer-Rao bound (...), metres; None where the environment does not
-        compute it (``reward="none"``).
+        b of the posterior Cramer-Rao bound (...), metres; None if the environment does not compute
+        it (``reward="none"``).
     action
-        What `step` was given.
+        The argument of `step`.
     observation
         The environment's observation: `ranges`, `links`, `anchors`, `twist` and so on.
     scene
@@ -56,17 +56,17 @@ RewardLike = str | Mapping[str, Any] | Reward
 
 
 def belief(outcome: Outcome) -> FloatArray:
-    """``-log b`` of the belief, b its root mean square tag error in metres."""
+    """Return ``-log b``, b the root mean square tag error expected by the belief, metres."""
     return -np.log(outcome.figures.score_m)
 
 
 def error(outcome: Outcome) -> FloatArray:
-    """Minus the real root mean square tag error, metres."""
+    """Return minus the actual root mean square tag error, metres."""
     return -outcome.figures.tag_error_m
 
 
 def worst_tag(outcome: Outcome) -> FloatArray:
-    """``-log`` of the expected error of the tag that the belief knows least, metres."""
+    """Return ``-log`` of the largest expected tag error of the belief, metres."""
     J = bounds.tag_jacobian(outcome.belief.rotation, outcome.scene.body)
     P = outcome.belief.covariance[..., None, :, :]
     squares = np.einsum("...nia,...nab,...nib->...n", J, P, J)
@@ -76,7 +76,7 @@ def worst_tag(outcome: Outcome) -> FloatArray:
 def requirement(
     outcome: Outcome, position_m: float = math.inf, rotation_deg: float = math.inf
 ) -> FloatArray:
-    """1 where the real errors are within both limits, else 0."""
+    """Return 1 if the actual errors are within both limits, otherwise 0."""
     figures = outcome.figures
     within = (figures.position_error_m <= position_m) & (
         figures.rotation_error_rad <= math.radians(rotation_deg)
@@ -93,19 +93,19 @@ REWARDS: dict[str, Callable[..., FloatArray]] = {
 
 
 def reward_of(reward: RewardLike) -> Reward:
-    """The reward function of a name, a dict, a dotted path or a function.
+    """Return the reward function of a name, a dict, a dotted path or a function.
 
     Parameters
     ----------
     reward
-        A name of `REWARDS`. Or a dict: ``{"kind": NAME, ...}`` with the options of that reward
-        and `action_price`, which is subtracted times the sum of the squares of the action. Or
+        A name of `REWARDS`. Or a dict ``{"kind": NAME, ...}`` with the options of that reward and
+        `action_price`: this price times the sum of squares of the action is subtracted. Or
         ``"module:function"``. Or a function of an `Outcome` that returns a number for each world.
 
     Raises
     ------
     ValueError
-        On an unknown name or option, a path that cannot be imported, anything else.
+        If the name or an option is unknown, the path cannot be imported, or the type is wrong.
     """
     if callable(reward):
         return reward
@@ -157,7 +157,7 @@ def _with_options(options: dict[str, Any]) -> Reward:
 
 
 def paid_of(reward: Reward, outcome: Outcome) -> FloatArray | float:
-    """What a reward gives for a step: finite numbers, one for each world; or a ValueError."""
+    """Return the rewards of a step, a finite number for each world; may raise ValueError."""
     value: Any = reward(outcome)
     one_world = isinstance(value, float) and isinstance(outcome.figures.score_m, float)
     if one_world and math.isfinite(value):

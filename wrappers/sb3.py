@@ -1,4 +1,4 @@
-"""A native vector environment as one of stable-baselines3's, which refuses Gymnasium's own."""
+"""A native vector environment in the form of stable-baselines3, which rejects Gymnasium's own."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ __all__ = ["Sb3VecEnv"]
 class Sb3VecEnv(VecEnv):
     """Adapter of a `gymnasium.vector.VectorEnv` with autoreset mode SAME_STEP.
 
-    Where an episode ends, its info dict holds ``terminal_observation``,
-    ``TimeLimit.truncated`` and ``episode`` (return ``r``, length ``l``, seconds ``t``: what
-    stable-baselines3's Monitor writes), and the infos of the last step. The dicts of the other
-    worlds stay empty: a dict for every world and step costs more than the step.
+    At the end of an episode its info dict has ``terminal_observation``, ``TimeLimit.truncated`` and
+    ``episode`` (return ``r``, length ``l``, seconds ``t``, as stable-baselines3's Monitor writes
+    them), and the infos of the last step. The dicts of the other worlds are empty, because a dict
+    for every world and step would cost more time than the step.
 
     Parameters
     ----------
     envs
-        For instance ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64,
+        For example ``gym.make_vec("rbl_gym:RBL/AnchorPlacement-v0", num_envs=64,
         autoreset_mode="SameStep")``.
 
     Raises
     ------
     ValueError
-        If the environment resets in another way.
+        If the environment has another autoreset mode.
 
     Examples
     --------
@@ -55,7 +55,7 @@ class Sb3VecEnv(VecEnv):
     def reset(self) -> Any:
         """Start all episodes, with the seeds of `seed` if any were given.
 
-        Options (`set_options`) are refused: the worlds have none of their own.
+        Options (`set_options`) raise ValueError: the worlds have no options.
         """
         if any(self._options):
             raise ValueError(f"options must be empty, got {self._options!r:.80}")
@@ -68,7 +68,7 @@ class Sb3VecEnv(VecEnv):
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for `step_wait`."""
+        """Store the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -97,30 +97,30 @@ class Sb3VecEnv(VecEnv):
         self.envs.close()
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seeds of the worlds at the next reset: s, s + 1, ...; None draws s at random."""
+        """Return seeds of the worlds at the next reset: s, s + 1, ...; None draws s at random."""
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         self._seeds = [seed + i for i in range(self.num_envs)]
         return self._seeds
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """The attribute of the one vector environment, once for each index."""
+        """Return the attribute of the vector environment, once for each index."""
         return [getattr(self.envs, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refused: the worlds have no attributes of their own."""
+        """Not supported: the worlds have no attributes of their own."""
         raise NotImplementedError("the worlds of a native vector environment share attributes")
 
     def env_method(
         self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any
     ) -> list[Any]:
-        """``action_masks`` of each world; anything else is refused, the worlds have no methods."""
+        """Return ``action_masks`` of each world; other names raise an error."""
         if method_name == "action_masks":
             masks = self.envs.action_masks()  # pyright: ignore[reportAttributeAccessIssue]
             return [masks[i] for i in self._get_indices(indices)]
         raise NotImplementedError("the worlds of a native vector environment share methods")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Whether the worlds' infos hold what Monitor writes; no other wrapper is there."""
+        """Return whether the infos contain the data of Monitor; there is no other wrapper."""
         is_monitor = wrapper_class.__name__ == "Monitor"
         return [is_monitor] * len(list(self._get_indices(indices)))

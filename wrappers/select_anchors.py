@@ -1,4 +1,4 @@
-"""SelectAnchors: the action says which anchors measure."""
+"""SelectAnchors: the action chooses the anchors that measure."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.batch import check_actions
 from rbl_gym.wrappers.estimate import scene_of
 
-# The age of what was never learned, in steps.
+# Age of an unknown quality, in steps.
 _NEVER = 1e6
 
 
 class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Only the anchors that the action chooses measure, and all of them stand still.
+    """Only the anchors chosen by the action measure, and all anchors stay where they are.
 
-    Wraps `RBL/Tracking-v0`, below `EstimatePose`. The action is ``MultiBinary(M)``. Links of the
-    other anchors are 0, and so are their ranges; their `quality` is 1, for it is learned with a
-    range. At reset nothing was chosen yet, and nothing is measured.
+    Wraps `RBL/Tracking-v0`, below `EstimatePose`. The action space is ``MultiBinary(M)``. Links and
+    ranges of the other anchors are 0. Their `quality` is 1, because it is only known with a range.
+    At reset no anchor is chosen, and nothing is measured.
 
     Parameters
     ----------
     env
         The environment.
     memory
-        Whether the observation also has `known` (M,), the quality that the last choice of each
-        anchor told: 1 in sight, 0 where it gave no range; and `age` (M,), the steps since then.
-        Before its first choice an anchor has `known` 0 and `age` 1e6.
+        Whether the observation also has `known` (M,) and `age` (M,). `known` is the quality of each
+        anchor when it was chosen last: 1 in sight, 0 if it gave no range. `age` is the number of
+        steps since then. Before its first choice an anchor has `known` 0 and `age` 1e6.
 
     Info
     ----
@@ -68,14 +68,14 @@ class SelectAnchors(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode: its first epoch has no range."""
+        """Start an episode; its first epoch has no ranges."""
         observation, info = self.env.reset(seed=seed, options=options)
         if self._memory is not None:
             self._memory.forget(...)
         return self._selected(observation, info, np.zeros(self._n_anchors, dtype=np.bool_)), info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step the environment; `action` (M,) says which anchors measure."""
+        """Step the environment; `action` (M,) chooses the anchors that measure."""
         chosen = check_actions("action", action, self.action_space).view(np.bool_)
         observation, reward, terminated, truncated, info = self.env.step(self._still)
         if self._memory is not None:
@@ -109,12 +109,12 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start episodes: their first epoch has no range."""
+        """Start episodes; their first epoch has no ranges."""
         observation, info = self.env.reset(seed=seed, options=options)
         return self._selected(observation, info, self._chosen), info
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Step the worlds; `actions` (B, M) say which anchors measure."""
+        """Step the worlds; `actions` (B, M) choose the anchors that measure."""
         space = self.single_action_space
         chosen = check_actions("actions", actions, space, self.num_envs).view(np.bool_)
         observation, *result, info = self.env.step(self._still)
@@ -130,7 +130,7 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
         return self._selected(observation, info, chosen), *result, info
 
     def _selected(self, observation: Any, info: dict[str, Any], chosen: BoolArray) -> Any:
-        """The selection of the worlds that went on; those that began have chosen nothing."""
+        """Return the selection of the worlds that continue; worlds that start have none."""
         began = info.get("_prior_rotation", np.zeros(self.num_envs, dtype=np.bool_))
         self._chosen = chosen = chosen & ~began[:, None]
         if self._memory is not None:
@@ -142,17 +142,17 @@ class VectorSelectAnchors(VectorWrapper, RecordConstructorArgs):
 
 
 class _Memory:
-    """What the choices of each anchor told last; arrays (..., M)."""
+    """The last observed quality of each anchor; arrays (..., M)."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.known, self.age = np.zeros(shape), np.full(shape, _NEVER)
 
     def forget(self, where: Any) -> None:
-        """Begin anew in some worlds."""
+        """Reset the memory of some worlds."""
         self.known[where], self.age[where] = 0.0, _NEVER
 
     def learn(self, observation: Mapping[str, np.ndarray], chosen: BoolArray) -> None:
-        """A step of all worlds, in which the chosen anchors (..., M) measured."""
+        """Update with a step of all worlds, in which the chosen anchors (..., M) measured."""
         quality = observation["links"].any(axis=-1) * observation.get("quality", 1.0)
         if "anchor_mask" in observation:
             chosen = chosen & observation["anchor_mask"].astype(np.bool_)
@@ -160,7 +160,7 @@ class _Memory:
         self.age = np.where(chosen, 0.0, np.minimum(self.age + 1, _NEVER))
 
     def row(self, world: int) -> _Memory:
-        """That of one world."""
+        """Return the memory of one world."""
         one = _Memory(self.known.shape[1:])
         one.known, one.age = self.known[world], self.age[world]
         return one
@@ -173,14 +173,14 @@ def _is_flag(memory: Any) -> bool:
 
 
 def _with_memory(space: Any) -> spaces.Dict:
-    """The space of an observation with a memory."""
+    """Return the space of an observation with a memory."""
     m = space["links"].shape[0]
     known, age = spaces.Box(0.0, 1.0, (m,), np.float64), spaces.Box(0.0, _NEVER, (m,), np.float64)
     return spaces.Dict({**space.spaces, "known": known, "age": age})
 
 
 def _final(observation: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:
-    """What the steps led to: of ended worlds the final observations."""
+    """Return the observations after the steps: for ended worlds the final observations."""
     if "final_obs" not in info:
         return observation
     last = info["_final_obs"]
@@ -194,7 +194,7 @@ def _final(observation: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str
 def select(
     observation: dict[str, np.ndarray], chosen: BoolArray, memory: _Memory | None = None
 ) -> dict[str, np.ndarray]:
-    """An observation with the links (..., M, N) of the chosen anchors (..., M), and the memory."""
+    """Return an observation with only the links of the chosen anchors (..., M), and the memory."""
     each = chosen[..., None]
     selected = observation.copy()
     selected["ranges"] = observation["ranges"] * each
@@ -207,5 +207,5 @@ def select(
 
 
 def _zeros(space: spaces.Space[Any]) -> np.ndarray:
-    """The action that leaves the anchors where they are."""
+    """Return the action that does not move the anchors."""
     return np.zeros(space.shape or (), dtype=space.dtype)

@@ -1,4 +1,4 @@
-"""RBL/AnchorSelection-v0: which anchors range now, with a filter in the loop."""
+"""RBL/AnchorSelection-v0: choose the anchors that measure, with a filter in the loop."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from rbl_gym.wrappers.task_worlds import (
 from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
 SELECTIONS = ("top-k", "priced", "subset")
-# More than a policy can tell apart.
+# Limit of the number of subsets.
 _MOST_SUBSETS = 10_000
 
 
 class _AnchorSelection(Task):
-    """Choices and their price: what scalar and vector forms share."""
+    """Choices and their price, for scalar and vector forms."""
 
     def _configure(self, mode: str, k: int, price: float, scene: Any, scenes: Any) -> None:
         found = family_of_task(scenes, scene, "hall", steps=50)
@@ -55,7 +55,7 @@ class _AnchorSelection(Task):
         corners = np.array([one.volume.bounds() for one in worlds])
         low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
         self._centre = 0.5 * (low + high)
-        # In a volume without height, deviations count by what the prior leaves open.
+        # In a volume without height, use the standard deviations of the prior as the scale.
         prior = max(one.initial_translation_m for one in worlds)
         self._half = np.maximum(0.5 * (high - low), prior)
         self._extent_m = max(float(one.scales.extent) for one in worlds)
@@ -72,11 +72,11 @@ class _AnchorSelection(Task):
 
     @property
     def _remembers(self) -> bool:
-        """Whether the observation has what the anchors told last."""
+        """Return whether the observation has the memory of the anchors."""
         return self.family is not None or self._viewer is not None
 
     def _choice(self, action: np.ndarray) -> np.ndarray:
-        """Which anchors (..., M) an action chooses, int8; ties go to the lower number."""
+        """Return the anchors (..., M) that an action chooses, int8; ties go to the lower number."""
         there = None if self.family is None else self._told()["anchor_mask"]
         if self._subsets is not None:
             chosen = self._subsets[action]
@@ -91,14 +91,14 @@ class _AnchorSelection(Task):
         return chosen
 
     def subset_of(self, chosen: BoolArray) -> np.ndarray:
-        """The action (...) of ``mode="subset"`` that chooses these k anchors (..., M)."""
+        """Return the action (...) of ``mode="subset"`` that chooses these k anchors (..., M)."""
         alike = self._subsets == np.asarray(chosen, dtype=np.int8)[..., None, :]
         return alike.all(axis=-1).argmax(axis=-1)
 
     def action_masks(self) -> BoolArray:
-        """Which actions choose only anchors that there are, as sb3-contrib's ``MaskablePPO`` asks.
+        """Return the actions that choose only existing anchors, for sb3-contrib's ``MaskablePPO``.
 
-        ``mode="subset"``: (..., n), of each action. ``"priced"``: (..., 2 M), of each anchor
+        ``mode="subset"``: (..., n), one entry per action. ``"priced"``: (..., 2 M), for each anchor
         whether it may be left out (always) and whether it may be chosen.
 
         Raises
@@ -171,37 +171,37 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
 
 
 class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
-    """Twelve anchors on the walls of a hall, racks between: which ones range to the body now?
+    """Twelve anchors on the walls of a hall with racks. Choose which ones measure ranges now.
 
     ## Description
-    A body with six tags drives through a hall. At every step the policy chooses anchors, the
-    body moves, the chosen anchors measure, and a filter updates. Racks block sight: a
-    range without it carries 2 % of the information. The receiver learns a link's quality with
-    the range; the policy does not see the racks and has to learn where they are.
+    A body with six tags drives through a hall. At every step the policy chooses anchors, the body
+    moves, the chosen anchors measure, and a filter updates its belief. Racks block sight: a blocked
+    range carries 2 % of the information. The receiver measures the quality of a link together with
+    the range. The policy does not observe the racks and has to learn where they are.
 
     ## Action space
-    ``mode="top-k"``: ``Box(-1, 1, (12,))``, scores; the `k` highest are chosen.
-    ``"priced"``: ``MultiBinary(12)``, any number, each at its `price`.
-    ``"subset"``: ``Discrete(220)``, one of the subsets of `k` anchors, in lexical order.
-    `action_masks()` of the last two says which actions choose only anchors that there are; an
-    action that chooses others too chooses the rest.
+    ``mode="top-k"``: ``Box(-1, 1, (12,))``, scores; the anchors with the `k` highest are chosen.
+    ``"priced"``: ``MultiBinary(12)``, any number of anchors, each for the `price`. ``"subset"``:
+    ``Discrete(220)``, one of the subsets of `k` anchors, in lexical order. In the last two modes
+    `action_masks()` returns which actions choose only existing anchors. Other anchors in an action
+    are ignored.
 
     ## Observation space
-    ``Box(-10, 10, (18,), float32)``: estimated place (scaled to the hall's volume), commanded
-    velocity (over the speed), log standard deviations of the pose error over the prior's (6),
-    first two columns of the estimated rotation (6).
+    ``Box(-10, 10, (18,), float32)``: estimated position (scaled to the hall's volume), commanded
+    velocity (divided by the speed), log of the pose error's standard deviations divided by those of
+    the prior (6), first two columns of the estimated rotation (6).
 
     ## Reward
-    ``-log b`` of the belief after every step, or another `reward`; ``"priced"``: minus `price` for
-    each anchor.
+    ``-log b`` of the belief after every step, or another `reward`. ``mode="priced"``: minus `price`
+    for each chosen anchor.
 
     ## Episode end
-    Truncates after 50 steps of 0.2 s.
+    Never terminates; truncates after 50 steps of 0.2 s.
 
     ## Info
-    `chosen` (12); that of `EstimatePose`: `score_m`, real errors `rotation_error_rad`,
-    `position_error_m`, `tag_error_m`, `nees`; and that of `RBL/Tracking-v0`: `epoch`, the true
-    `rotation` and `translation`, `nlos`.
+    `chosen` (12): the chosen anchors. Those of `EstimatePose`: `score_m`, actual errors
+    `rotation_error_rad`, `position_error_m`, `tag_error_m`, and `nees`. Those of `RBL/Tracking-v0`:
+    `epoch`, the true `rotation` and `translation`, `nlos`.
 
     ## Rendering
     ``render_mode="rgb_array"``: as `RBL/Tracking-v0`, with the beliefs of the filter.
@@ -216,16 +216,17 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     ```
     `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`.
 
-    `scenes`: a family of such in its place, see `RBL/Tracking-v0`. M is then the largest number of
-    anchors; those that a drawn scene does not have cannot be chosen. The observation has 21 + 6 M
-    entries: those above, the place scaled to the volume of the drawn scene; half sizes of that
-    volume (3) and the anchors relative to the estimate (3 M), both over the extent of the largest
-    scene; and M each: what the last choice of an anchor told (1: it saw the body, -1: it did not,
-    0: never chosen), ``exp(-steps since then / 10)``, and 1 if there is such an anchor.
+    `scenes`, instead of `scene`: a family of scenes, see `RBL/Tracking-v0`. M is then the largest
+    number of anchors. Anchors that a drawn scene does not have cannot be chosen. The observation
+    has 21 + 6 M entries: first those above, with the position scaled to the volume of the drawn
+    scene; then the half sizes of that volume (3) and the anchors relative to the estimate (3 M),
+    both divided by the extent of the largest scene; then for each anchor (M each) the result of its
+    last choice (1: in sight, -1: not in sight, 0: never chosen), ``exp(-steps since then / 10)``,
+    and 1 if the anchor exists.
 
-    `filter`, `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options`
-    say else. `observation`: ``"flat"`` is the above; the others are those of `EstimatePose`,
-    with the memory of `SelectAnchors`; tokens show no racks.
+    `filter`, `options`, `reward`: as `EstimatePose`. By default ``"iekf"`` has 2 iterations.
+    `observation`: ``"flat"`` is the above. The others are those of `EstimatePose`, with the memory
+    of `SelectAnchors`; tokens do not include the racks.
 
     ## Version history
     * v0: first version.
@@ -257,7 +258,7 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
 
 
 def _subsets(m: int, k: int) -> np.ndarray:
-    """The subsets of k of M anchors, (n, M), int8."""
+    """Return the subsets of k of M anchors, (n, M), int8."""
     count = math.comb(m, k)
     if count > _MOST_SUBSETS:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Several bodies among the same anchors, each tracked by a filter of its own."""
+"""Several bodies with the same anchors, each tracked by its own filter."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from rbl_gym.wrappers.observations import ViewLike, viewer_of
 from rbl_gym.wrappers.rewards import RewardLike
 from rbl_gym.wrappers.vector_estimate import VectorEstimatePose
 
-# What the bodies of a world have in common, and what they must agree in.
+# Keys that the bodies of a world share, and fields in which they must agree.
 _SHARED = ("anchors", "anchor_mask")
 _ALIKE = ("n_anchors", "anchors", "anchor_region", "anchor_speed_m_s", "dt", "steps")
-# How the rewards of the bodies become one.
+# How to combine the rewards of the bodies.
 COMBINATIONS = {"mean": np.mean, "worst": np.min, "sum": np.sum}
 
 
@@ -103,12 +103,12 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
 
     @property
     def _left_out(self) -> tuple[str, ...]:
-        """Masks that are all ones: there is one number of anchors, and tokens alone tell it."""
+        """Masks that are all ones are left out: only tokens contain the number of anchors."""
         return ("anchor_mask",) if self._kind == "dict" else ()
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode."""
+        """Number of steps of an episode."""
         return self.inner.unwrapped.episode_steps
 
     @property
@@ -128,7 +128,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         return self._grouped(observation), self._informed(info)
 
     def _seeds(self, seed: int | None) -> list[int | None]:
-        """Seeds of the bodies of a world."""
+        """Return seeds of the bodies of a world."""
         if seed is None:
             return [None] * self.n_bodies
         return np.random.SeedSequence(seed).generate_state(self.n_bodies).tolist()
@@ -145,7 +145,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         return self._grouped(observation), together, *ended, self._informed(info)  # pyright: ignore[reportReturnType]
 
     def _grouped(self, observation: Any) -> Any:
-        """Observations (B K, ...) as those of B worlds."""
+        """Return observations (B K, ...) as those of B worlds."""
         if not isinstance(observation, dict):
             return observation.reshape(self.observation_space.shape)
         return {
@@ -158,7 +158,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         return field.reshape(self.num_envs, self.n_bodies, *field.shape[1:])
 
     def _informed(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Infos (B K, ...) as those of B worlds: (B, K, ...), their masks (B,)."""
+        """Return infos (B K, ...) as those of B worlds: (B, K, ...), with masks (B,)."""
         told: dict[str, Any] = {}
         for key, field in info.items():
             if key == "final_info":
@@ -172,7 +172,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         return told
 
     def _final(self, rows: np.ndarray) -> np.ndarray:
-        """Gymnasium's ``final_obs``: an object array with the observation of each ended world."""
+        """Return Gymnasium's ``final_obs``: an object array with the last observations."""
         final = np.full(self.num_envs, None, dtype=object)
         for world in range(self.num_envs):
             group = rows[world * self.n_bodies : (world + 1) * self.n_bodies]
@@ -189,7 +189,7 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         return final
 
     def render(self) -> Any:
-        """A frame of every world: its bodies beside one another."""
+        """Return a frame of every world, with its bodies side by side."""
         frames = self.inner.render()
         k = self.n_bodies
         if frames is None:
@@ -197,48 +197,47 @@ class SharedAnchorsVectorEnv(StatedLength, VectorEnv[Any, Any, Any]):  # pyright
         return tuple(np.hstack(frames[i : i + k]) for i in range(0, len(frames), k))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the stack, where there is one."""
+        """Close the stack if there is one."""
         if self.inner is not None:
             self.inner.close(**kwargs)
 
 
 class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
-    """Several bodies among the same anchors: where do the anchors go, so that all are known well?
+    """Several bodies share the same anchors. Move the anchors so that all bodies are known well.
 
     ## Description
-    K bodies move among M anchors. Each has its own tags, speed and noise, and a filter tracks each
-    of them. An action moves the anchors for all of them.
+    K bodies move among M anchors. Each body has its own tags, speed and noise, and is tracked by
+    its own filter. An action moves the anchors for all bodies.
 
     ## Action space
     As `RBL/Tracking-v0`.
 
     ## Observation space
-    ``observation="dict"``: that of `EstimatePose`, with an axis of K bodies before the others of
-    `ranges`, `links`, `twist`, `quality`, `belief_rotation`, `belief_translation`,
-    `belief_covariance`; besides `tags` (K, N, 3), metres, body frame, and `tag_mask` (K, N), 1
-    for the tags that a body has. `anchors` (M, 3) are those of all.
-    ``"flat"``: the flat observations of the bodies one after the other, float32. ``"tokens"``, and
-    a function of one's own: as `EstimatePose`, with an axis of K bodies before the others; vectors
-    stand one after the other.
+    ``observation="dict"``: that of `EstimatePose`, with a leading axis of K bodies for `ranges`,
+    `links`, `twist`, `quality`, `belief_rotation`, `belief_translation` and `belief_covariance`.
+    Also `tags` (K, N, 3), metres, body frame, and `tag_mask` (K, N), 1 for the tags of a body.
+    `anchors` (M, 3) are shared. ``"flat"``: the concatenated flat observations of the bodies,
+    float32. ``"tokens"`` and custom functions: as `EstimatePose`, with a leading axis of K bodies;
+    vectors are concatenated.
 
     ## Reward
-    Each body has the `reward` of `EstimatePose`; ``combine="mean"``, ``"worst"`` or ``"sum"`` over
-    the bodies.
+    Each body has the `reward` of `EstimatePose`. ``combine="mean"``, ``"worst"`` or ``"sum"``
+    combines them.
 
     ## Starting state
-    As `RBL/Tracking-v0`, of each body. Anchors that are drawn around a body are drawn around the
-    first.
+    As `RBL/Tracking-v0`, for each body. Anchors that are drawn around a body are drawn around the
+    first one.
 
     ## Info
-    That of `EstimatePose` with an axis of K bodies: `rotation`, `translation`, `nlos`, `score_m`,
-    `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees`; `epoch`. At reset `prior_...`
-    and `scene`, for each body the overrides that make its scene, as JSON.
+    Those of `EstimatePose` with an axis of K bodies: `rotation`, `translation`, `nlos`, `score_m`,
+    `rotation_error_rad`, `position_error_m`, `tag_error_m`, `nees`; also `epoch`. At reset also
+    `prior_...` and `scene`, the scene overrides of each body as JSON.
 
     ## Episode end
-    Truncates after the scene's steps.
+    Never terminates; truncates after the steps of the scene.
 
     ## Rendering
-    ``render_mode="rgb_array"``: the frames of the bodies beside one another.
+    ``render_mode="rgb_array"``: the frames of the bodies side by side.
 
     ## Arguments
     ```python
@@ -251,8 +250,9 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
         combine="worst",
     )
     ```
-    `scene`: a name or a dict of overrides. `bodies`: overrides of it for each body; they must agree
-    in everything that concerns anchors and time. `filter`, `options`, `reward`: as `EstimatePose`.
+    `scene`: a name or a dict of overrides. `bodies`: overrides of the scene for each body. They
+    must agree in everything that concerns anchors and time. `filter`, `options`, `reward`: as
+    `EstimatePose`.
 
     ## Version history
     * v0: first version.
@@ -285,7 +285,7 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
 
     @property
     def episode_steps(self) -> int:
-        """Steps of an episode."""
+        """Number of steps of an episode."""
         return self._one.episode_steps
 
     @property
@@ -310,7 +310,7 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
         return _first(observation), float(reward[0]), *ended, _first_of_infos(info)
 
     def render(self) -> Any:
-        """The frames of the bodies beside one another, (height, K width, 3) of uint8."""
+        """Return the frames of the bodies side by side, (height, K width, 3), uint8."""
         frames = self._one.render()
         return None if frames is None else frames[0]
 
@@ -320,7 +320,7 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
 
 
 def family_of_bodies(scene: Any, bodies: Any) -> SceneFamily:
-    """The scenes of the bodies as a family, or a ValueError where they cannot share anchors."""
+    """Return the scenes of the bodies as a family, after a check that they can share anchors."""
     base = {"name": scene} if isinstance(scene, str) else scene
     if not isinstance(base, Mapping):
         raise ValueError(f"scene must be a name or a dict of overrides, got {scene!r:.80}")
@@ -347,14 +347,14 @@ def family_of_bodies(scene: Any, bodies: Any) -> SceneFamily:
 
 
 def _first(observation: Any) -> Any:
-    """The observation of the only world."""
+    """Return the observation of the only world."""
     if isinstance(observation, dict):
         return {key: field[0] for key, field in observation.items()}
     return observation[0]
 
 
 def _first_of_infos(info: dict[str, Any]) -> dict[str, Any]:
-    """The infos of the only world."""
+    """Return the infos of the only world."""
     return {
         key: field.item(0) if field.ndim == 1 else field[0]
         for key, field in info.items()

@@ -1,4 +1,4 @@
-"""What a policy remembers of links that had sight or not, and what it asks of a link to come."""
+"""Memory of which links were in line of sight, and queries about future links."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from rbl_gym.checks import BoolArray, FloatArray
 
 __all__ = ["forgotten", "remember", "sight_tokens"]
 
-# Numbers of a question, and of an event beside it.
+# Numbers of features of a query, and of an event with it.
 QUERY, EVENT = 10, 15
-# Events that are kept of each anchor, and how far the body moves between two of them, metres.
+# Number of events kept for each anchor, and the distance between two of them, metres.
 KEPT, _APART_M = 4, 2.0
 
 
 class SightMemory(NamedTuple):
-    """Events of each anchor, the newest first: arrays (B, M, KEPT) but `place` (B, M, KEPT, 3).
+    """Events of each anchor, the newest first: arrays (B, M, KEPT), `place` (B, M, KEPT, 3).
 
     Attributes
     ----------
     place
-        Where the body was.
+        Position of the body.
     sight
-        1: the anchor saw it; -1: it did not; 0: there is no such event.
+        1: the body was in sight of the anchor; -1: it was not; 0: no event.
     age
         Steps since then.
     """
@@ -35,7 +35,7 @@ class SightMemory(NamedTuple):
 
 
 def forgotten(batch: int, anchors: int) -> SightMemory:
-    """A memory without events."""
+    """Return a memory without events."""
     shape = (batch, anchors, KEPT)
     return SightMemory(np.zeros((*shape, 3)), np.zeros(shape), np.zeros(shape))
 
@@ -43,21 +43,21 @@ def forgotten(batch: int, anchors: int) -> SightMemory:
 def remember(
     memory: SightMemory, chosen: BoolArray, place: FloatArray, sight: FloatArray
 ) -> SightMemory:
-    """The memory after a step.
+    """Return the memory after a step.
 
-    The newest event of an anchor takes the place of the one before, unless that says something
-    else or was far from the one before it.
+    A new event replaces the newest one of an anchor, unless their results differ or the newest one
+    was far from the one before it.
 
     Parameters
     ----------
     memory
-        Before the step.
+        Memory before the step.
     chosen
         Anchors that measured (B, M).
     place
-        Of the body (B, 3).
+        Position of the body (B, 3).
     sight
-        1 or -1 (B, M); read where `chosen`.
+        1 or -1 (B, M); only read where `chosen` is true.
     """
     memory = SightMemory(*(field.copy() for field in memory))
     memory.age[:] += 1
@@ -76,24 +76,24 @@ def remember(
 def sight_tokens(
     anchors: FloatArray, body: FloatArray, memory: SightMemory, middle: FloatArray, half: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Questions whether anchors will see the body, and the events that may answer them.
+    """Return queries whether anchors will see the body, and the events that help to answer them.
 
-    Lengths are told in a level frame whose origin is the anchor and whose first axis goes to the
+    Lengths are in a horizontal frame. Its origin is the anchor, and its first axis points to the
     body.
 
     Parameters
     ----------
     anchors, body
-        Places (B, M, 3) and (B, 3).
+        Positions (B, M, 3) and (B, 3).
     memory
-        What was learned so far.
+        The events so far.
     middle, half
         Of the body's volume: centre and half sizes (B, 3).
 
     Returns
     -------
-    Questions (B, M, `QUERY`), events (B, M, M KEPT, `EVENT`), and 1 (B, M, M KEPT) for those that
-    there are.
+    Queries (B, M, `QUERY`), events (B, M, M KEPT, `EVENT`), and their mask (B, M, M KEPT), 1 for
+    existing events.
     """
     batch, m = anchors.shape[:2]
     events = m * KEPT
@@ -126,7 +126,7 @@ def sight_tokens(
         )
 
     (x, y), (x0, y0) = framed(place), framed(source)
-    # Where the two sights cross, or come nearest to it, and by how much one is above the other.
+    # Where the two lines of sight cross or are closest, and their vertical distance there.
     across = y - y0
     crosses = np.abs(across) > 1e-3
     share = np.clip(np.where(crosses, -y0 / np.where(crosses, across, 1.0), 0.5), 0.0, 1.0)

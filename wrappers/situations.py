@@ -1,4 +1,4 @@
-"""What a controller reads of a vector environment, of worlds that share a scene."""
+"""Inputs of a controller from a vector environment, for worlds that share a scene."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Situation(NamedTuple):
 
 
 def situations(env: Any) -> Iterator[tuple[np.ndarray, Situation]]:
-    """Rows of the worlds of an environment that share a scene, and what is known there.
+    """Return the worlds of an environment grouped by scene, with what is known of them.
 
     A scalar environment is one row.
     """
@@ -45,7 +45,7 @@ def situations(env: Any) -> Iterator[tuple[np.ndarray, Situation]]:
         alike.setdefault(scene, []).append(row)
     choice = [getattr(env, name, None) for name in ("mode", "k", "price")]
     if choice[0] == "subset":
-        # The same choice, told in another way.
+        # The same choice in another form.
         choice[0] = "top-k"
     for scene, found in alike.items():
         rows, m = np.array(found), scene.n_anchors
@@ -64,7 +64,7 @@ def situations(env: Any) -> Iterator[tuple[np.ndarray, Situation]]:
 
 
 def action_of(env: Any, scores: np.ndarray) -> np.ndarray:
-    """The action of scores (..., M) of the anchors, in the form that the environment takes."""
+    """Return the action for scores (..., M) of the anchors, in the form of the environment."""
     if env.mode == "priced":
         return (scores > 0).astype(np.int8)
     if env.mode == "top-k":
@@ -76,14 +76,15 @@ def action_of(env: Any, scores: np.ndarray) -> np.ndarray:
 
 
 def in_each_scene(controller: Controller) -> Controller:
-    """A controller of worlds that share a scene, as one of worlds that may have their own.
+    """Make a controller for one scene work for worlds with different scenes.
 
-    Craft that a scene does not have stand still, and anchors have the lowest score.
+    Craft that a scene does not have do not move, and anchors that it does not have get the lowest
+    score.
     """
 
     @functools.wraps(controller)
     def act(env: Any, rng: np.random.Generator) -> np.ndarray:
-        # Of the craft, velocities of two axes.
+        # For craft: velocities along two axes.
         columns = 2 if hasattr(env, "order") else 1
         shape = env.num_envs, columns * env.anchors.shape[1]
         actions = np.full(shape, 0.0 if columns == 2 else -1.0)

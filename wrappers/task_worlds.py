@@ -12,22 +12,22 @@ from rbl_gym.worlds.families import SceneFamily, family
 from rbl_gym.worlds.scene import Scene
 from rbl_gym.wrappers.estimate import FilterLike, check_options_of, named_filter
 
-# An observation is of order one; what is far outside says no more than that.
+# Observations are of order one. Values far outside carry no more information.
 LIMIT = 10.0
-# Iterations of the iterated EKF; two are as good as four here, and faster.
+# Iterations of the iterated EKF. Two are as accurate as four here, and faster.
 _ITERATIONS = 2
 
 
 def world_of(scene: Any, **defaults: Any) -> Scene:
-    """The scene; `defaults` stand where it says nothing of its own."""
+    """Return the scene; `defaults` apply to fields that it does not set."""
     changes = {"name": scene} if isinstance(scene, str) else scene
     return scenes.get({**defaults, **changes} if isinstance(changes, Mapping) else changes)
 
 
 def family_of_task(value: Any, scene: Any, usual: Any, **defaults: Any) -> SceneFamily | None:
-    """The family that `scenes` names, None without one; `defaults` stand where a member says none.
+    """Return the family of `scenes` (None without one); `defaults` apply to fields not set.
 
-    A `scene` other than the `usual` one is refused beside it.
+    Raises ValueError if it comes with a `scene` other than the `usual` one.
     """
     if value is None:
         return None
@@ -38,13 +38,13 @@ def family_of_task(value: Any, scene: Any, usual: Any, **defaults: Any) -> Scene
 
 
 def made_of(task: Any) -> dict[str, Any]:
-    """Arguments of the environment of a task."""
+    """Return the arguments of the environment of a task."""
     worlds = {"scene": task.scene} if task.family is None else {"scenes": task.family}
     return {**worlds, "reward": "none"}
 
 
 class Usual:
-    """What is usual in a scene, or the most in those of a family: variances of the prior, speed."""
+    """Usual values of a scene, or the largest of a family: variances of the prior, speed."""
 
     def __init__(self, *worlds: Scene) -> None:
         self.variance = np.max([np.diagonal(one.prior_covariance) for one in worlds], axis=0)
@@ -55,12 +55,12 @@ class Usual:
 def filter_of_task(
     filter: FilterLike, options: Mapping[str, Any] | None
 ) -> tuple[FilterLike, Mapping[str, Any] | None]:
-    """Filter and options, the tasks' own where none are given."""
+    """Return filter and options; the task's own if none are given."""
     name, told = named_filter(filter, options)
     usual = {"iterations": _ITERATIONS} if isinstance(name, str) and name == "iekf" else {}
     return name, {**usual, **check_options_of(told)}
 
 
 def worlds_of(batch: tuple[int, ...]) -> tuple[np.ndarray, ...]:
-    """Indices that stand before those (B, M) of each world's anchors."""
+    """Return indices to put before those (B, M) of each world's anchors."""
     return tuple(np.arange(n)[:, None] for n in batch)

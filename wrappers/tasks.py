@@ -1,7 +1,8 @@
-"""RBL/MobileAnchors-v0: craft that move for the belief of a filter in the loop.
+"""RBL/MobileAnchors-v0: craft move to improve the belief of a filter in the loop.
 
-`RBL/Tracking-v0`, `EstimatePose`, and a policy's view of both: the policy sees the belief, not the
-ranges, and is paid for how good the belief says it is. So is `rbl_gym.wrappers.selection`.
+`RBL/Tracking-v0`, `EstimatePose`, and a policy's view of both. The policy observes the belief, not
+the ranges, and its reward is the accuracy of the belief. `rbl_gym.wrappers.selection` works the
+same way.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ DIFFICULTIES: dict[str, dict[str, Any]] = {
     "easy": {"n_anchors": 3, "anchor_speed_m_s": 4.0},
     "hard": {"n_anchors": 2, "anchor_speed_m_s": 2.0},
 }
-# What the view of the craft is made of, in the order of its arguments.
+# Inputs of the view of the craft, in the order of its arguments.
 _CRAFT_VIEW = ("belief_translation", "belief_rotation", "belief_covariance", "twist", "anchors")
 
 
 class _MobileAnchors(Task):
-    """Craft in the order of the observation: what scalar and vector forms share."""
+    """Craft in the order of the observation, for scalar and vector forms."""
 
     # Numbers (..., M) of the craft in the order of the last observation.
     order: np.ndarray
@@ -71,7 +72,7 @@ class _MobileAnchors(Task):
         )
 
     def _velocities(self, level: FloatArray) -> FloatArray:
-        """Actions of the world (..., 3 M) of level velocities (..., 2 M) in order."""
+        """Return actions of the world (..., 3 M) from ordered horizontal velocities (..., 2 M)."""
         batch, m = level.shape[:-1], self._n_craft
         velocity = np.zeros((*batch, m, 3))
         # Action k is that of the k-th craft in the observation.
@@ -80,7 +81,7 @@ class _MobileAnchors(Task):
 
     def _view_of(self, observation: dict[str, np.ndarray], world: Any) -> Any:
         if self._viewer is not None and observation is self.seen:
-            # Craft stand in the order of their numbers.
+            # Craft are in the order of their numbers.
             count = np.arange(self._n_craft)
             self.order = np.broadcast_to(count, observation["anchors"].shape[:-1])
         return super()._view_of(observation, world)
@@ -136,34 +137,34 @@ class MobileAnchorsVectorEnv(_MobileAnchors, VectorTaskEnv):
 
 
 class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
-    """Surface craft range to a diving vehicle: where do they go, so that its pose is known well?
+    """Surface craft range to a diving vehicle. Move the craft so that its pose is known well.
 
     ## Description
-    M craft on the water measure ranges to the tags of a vehicle that dives through way-points;
-    a filter knows the commanded twist and the noise law and tracks its pose.
-    ``difficulty="easy"``: three craft at up to 4 m/s. ``"hard"``: two at up to 2 m/s, where no
-    static layout works and the craft must orbit.
+    M craft on the water measure ranges to the tags of a vehicle that dives through way-points. A
+    filter knows the commanded twist and the noise law, and tracks the pose. ``difficulty="easy"``:
+    three craft with up to 4 m/s. ``difficulty="hard"``: two craft with up to 2 m/s. Then no static
+    layout works, and the craft must orbit.
 
     ## Action space
-    ``Box(-1, 1, (2 M,))``: level velocity of each craft in units of its limit (cut to length
-    1), in the order in which the observation lists them.
+    ``Box(-1, 1, (2 M,))``: horizontal velocity of each craft in units of its limit (longer vectors
+    are cut to length 1), in the order of the observation.
 
     ## Observation space
-    ``Box(-10, 10, (15 + 3 M,), float32)``: estimated depth (50 m), commanded level velocity
-    (over the speed), log standard deviations of the pose error over the prior's (6), first two
-    columns of the estimated rotation (6), craft relative to the estimate (100 m), log of their
-    distances (100 m). Craft are sorted by bearing from the estimate; ``sort_craft=False``
-    keeps their numbers.
+    ``Box(-10, 10, (15 + 3 M,), float32)``: estimated depth (in 50 m), commanded horizontal velocity
+    (divided by the speed), log of the pose error's standard deviations divided by those of the
+    prior (6), first two columns of the estimated rotation (6), craft relative to the estimate (in
+    100 m), log of their distances (in 100 m). Craft are sorted by bearing from the estimate;
+    ``sort_craft=False`` keeps the order of their numbers.
 
     ## Reward
     ``-log b`` of the belief after every step (`rbl_gym.bounds.score`), or another `reward`.
 
     ## Episode end
-    Truncates after 100 steps of 2 s.
+    Never terminates; truncates after 100 steps of 2 s.
 
     ## Info
-    That of `EstimatePose`: `score_m` (b of the belief), real errors `rotation_error_rad`,
-    `position_error_m`, `tag_error_m`, `nees` (6 degrees of freedom); and that of
+    Those of `EstimatePose`: `score_m` (b of the belief), actual errors `rotation_error_rad`,
+    `position_error_m`, `tag_error_m`, and `nees` (6 degrees of freedom). Those of
     `RBL/Tracking-v0`: `epoch`, the true `rotation` and `translation`, `nlos`.
 
     ## Rendering
@@ -177,15 +178,15 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     ```
     `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`; the anchors must move.
 
-    `scenes`: a family of such in its place, see `RBL/Tracking-v0`, as
+    `scenes`: a family of scenes instead of `scene`, see `RBL/Tracking-v0`, for example
     ``scenes=[{"name": "auv_craft", "n_anchors": {"integers": [2, 5]}}]``. M is then the largest
-    number of craft, and its difficulty stands where a scene says nothing of its own. Entries of
-    craft that are not there are 0. The observation has 1 + M more entries: how far the craft of the
-    drawn scene go in a step (10 m), and 1 for the craft that are there.
+    number of craft. The `difficulty` sets what a scene does not set itself. Entries of missing
+    craft are 0. The observation has 1 + M more entries: the longest move of a craft of the drawn
+    scene in a step (in 10 m), and 1 for existing craft.
 
-    `filter`, `options`, `reward`: as `EstimatePose`; ``"iekf"`` has 2 iterations unless `options`
-    say else. `observation`: ``"flat"`` is the above; the others are those of `EstimatePose`, the
-    craft in the order of their numbers.
+    `filter`, `options`, `reward`: as `EstimatePose`. By default ``"iekf"`` has 2 iterations.
+    `observation`: ``"flat"`` is the above. The others are those of `EstimatePose`, with the craft
+    in the order of their numbers.
 
     ## Version history
     * v0: first version.

@@ -35,7 +35,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
 
     Parameters, observations, rewards and infos are those of `EstimatePose`, stacked. Wraps the
     native vector environments (`TrackingVectorEnv`, `BaseStationVectorEnv`) in every autoreset
-    mode; worlds that reset get a new state from their prior, the others keep theirs.
+    mode. Worlds that reset get a new state from their prior; the others keep theirs.
 
     Examples
     --------
@@ -88,7 +88,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         return self._present(observation), info
 
     def step(self, actions: Any) -> tuple[Any, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Step the worlds; predict and update those that go on, start those that begin."""
+        """Step the worlds; predict and update those that continue, start those that reset."""
         observation, _, terminated, truncated, info = self.env.step(actions)
         info = with_bound(info)
         fresh = info.get("_prior_rotation", np.zeros(self.num_envs, dtype=np.bool_))
@@ -125,7 +125,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
     def _begin(
         self, observation: dict[str, np.ndarray], info: dict[str, Any], fresh: BoolArray
     ) -> None:
-        """States of new episodes, from the priors in `info`, updated with their first ranges."""
+        """Return states of new episodes: priors of `info`, updated with the first ranges."""
         if self._varied:
             self._scene = self.env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
             self._parts = self._parted()
@@ -139,7 +139,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         self._put(states, fresh)
 
     def _parted(self) -> list[_Part]:
-        """All worlds, those together that one filter tracks."""
+        """Return all worlds, grouped by filter."""
         every = np.arange(self.num_envs)
         if not self._varied or self._stacks:
             return [_Part(every, self._scene, make_filter(self.env, self._scene, *self._named))]
@@ -152,7 +152,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         ]
 
     def _parts_of(self, where: BoolArray) -> list[_Part]:
-        """The parts of the worlds of a mask."""
+        """Return the parts of the worlds of a mask."""
         if where.all():
             return self._parts
         if self._stacks:
@@ -163,7 +163,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         return [part for part in chosen if len(part.rows)]
 
     def _put(self, states: list[Any], where: BoolArray) -> None:
-        """Take over the states of the parts of some worlds, and their beliefs."""
+        """Store the states of the parts of some worlds, and their beliefs."""
         parts = self._parts_of(where)
         rows = [part.rows for part in parts]
         beliefs = [part.filter.belief(one) for part, one in zip(parts, states, strict=True)]
@@ -171,7 +171,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         self._belief = _joined(self._belief, rows, beliefs, self.num_envs)
 
     def _figures(self, info: Mapping[str, Any]) -> metrics.Figures:
-        """Errors of the beliefs against the true poses of the infos."""
+        """Return errors of the beliefs against the true poses of the infos."""
         assert self._belief is not None
         belief, truth = self._belief[:3], (info["rotation"], info["translation"])
         if not self._varied:
@@ -187,7 +187,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
         return metrics.Figures(*figures)
 
     def _finish(self, info: dict[str, Any], figures: metrics.Figures, last: BoolArray) -> None:
-        """The last beliefs of ended episodes into copies of `final_obs` and `final_info`."""
+        """Write the last beliefs of ended episodes to copies of `final_obs` and `final_info`."""
         assert self._belief is not None
         info["final_obs"] = info["final_obs"].copy()
         info["final_info"] = with_bound(info["final_info"])
@@ -213,7 +213,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
 def _reached(
     observation: dict[str, np.ndarray], info: dict[str, Any], last: BoolArray
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Observations and truth that the steps led to: those of ended worlds are the final ones."""
+    """Return observations and truth after the steps: those of ended worlds are the final ones."""
     if not last.any():
         return observation, info
     final, ended = info["final_obs"][last], with_bound(info["final_info"])
@@ -227,14 +227,14 @@ def _reached(
 
 
 class _Part(NamedTuple):
-    """Worlds that one filter tracks: their indices, their scene or scenes, the filter."""
+    """Worlds tracked by one filter: their indices, their scene or scenes, the filter."""
 
     rows: np.ndarray
     scene: Any
     filter: Filter
 
     def measured(self, observation: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """What the filter reads of these worlds."""
+        """Return the filter's inputs of these worlds."""
         told = measured_of(observation)
         if len(self.rows) < len(told["twist"]):
             told = {key: value[self.rows] for key, value in told.items()}
@@ -243,7 +243,7 @@ class _Part(NamedTuple):
 
 
 def _takes_stacks(env: Any, scene: Any, filter: str, options: Mapping[str, Any] | None) -> bool:
-    """Whether a filter takes tags and noise of each world; others track alike worlds together."""
+    """Return whether a filter accepts tags and noise per world; others group equal worlds."""
     try:
         make_filter(env, scene, filter, options)
     except ValueError:
@@ -252,14 +252,14 @@ def _takes_stacks(env: Any, scene: Any, filter: str, options: Mapping[str, Any] 
 
 
 def _rows(state: Any, rows: np.ndarray) -> Any:
-    """A state of some worlds."""
+    """Return the state of some worlds."""
     if len(rows) == len(state[0]):
         return state
     return type(state)(*(None if field is None else field[rows] for field in state))
 
 
 def _joined(old: Any, rows: list[np.ndarray], parts: list[Any], count: int) -> Any:
-    """The state of all `count` worlds, with some rows from the `parts`."""
+    """Return the state of all `count` worlds, with some rows from the `parts`."""
     if len(parts) == 1 and len(rows[0]) == count:
         return parts[0]
     if len({tuple(np.shape(field)[1:] for field in part) for part in parts}) > 1:

@@ -1,4 +1,4 @@
-"""What the policies of the learning tasks see, of arrays with any leading axes."""
+"""Observations of the learning tasks, as functions of arrays with any leading axes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rbl_gym.worlds.scene import Scene
 
 
 def _belief(rotation: FloatArray, covariance: FloatArray, prior_variance: FloatArray) -> FloatArray:
-    """(..., 12): log standard deviations, less that of their usual size; two columns of Q."""
+    """Return (..., 12): log standard deviations minus their usual values; two columns of Q."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     spread = 0.5 * np.log(np.maximum(variance, 1e-24) / prior_variance) + 1.0
     return np.concatenate([spread, rotation[..., 0], rotation[..., 1]], axis=-1)
@@ -31,24 +31,24 @@ def mobile_anchors(
     sort: bool,
     limits: FloatArray,
 ) -> tuple[np.ndarray, FloatArray]:
-    """The numbers (..., M) of the craft in their order, and the view (..., 15 + 3 M).
+    """Return the numbers (..., M) of the craft in order, and the view (..., 15 + 3 M).
 
     Parameters
     ----------
     translation, rotation, covariance
-        Of the belief.
+        Mean and covariance of the belief.
     twist
         Known twist (..., 6).
     anchors
         Craft (..., M, 3).
     prior_variance
-        (6,), the usual size of the belief's variances.
+        Usual variances (6,) of the belief.
     speed
-        The usual size of the velocity.
+        Usual speed.
     sort
-        Whether by the bearing from the estimate, so that equal situations look equal.
+        Whether to sort by the bearing from the estimate, so that equal situations look equal.
     limits
-        (15 + 3 M,), all of one size, to which entries are cut.
+        Limits (15 + 3 M,) of the entries, all equal; entries are cut to them.
     """
     gap = (anchors - translation[..., None, :]) / 100
     order = np.argsort(np.arctan2(gap[..., 1], gap[..., 0]), axis=-1, kind="stable")
@@ -78,7 +78,7 @@ def anchor_selection(
     half: FloatArray,
     limits: FloatArray,
 ) -> FloatArray:
-    """The view (..., 18); `centre` and `half` (3,) scale the place, the others as above."""
+    """Return the view (..., 18); `centre` and `half` (3,) scale the position, the rest as above."""
     parts = [
         (translation - centre) / half,
         twist[..., 3:] / speed,
@@ -87,11 +87,11 @@ def anchor_selection(
     return np.clip(np.concatenate(parts, axis=-1), -limits, limits)
 
 
-# --- worlds drawn anew: arrays for the most anchors, and their masks --------------------------
+# --- drawn worlds: arrays for the largest number of anchors, and their masks ------------------
 
 
 def reach_of_craft(world: Any) -> FloatArray:
-    """How far the craft of a `Scene` or of `StackedScenes` go in a step (...), metres."""
+    """Return the longest move of a craft in a step (...), metres, of `Scene` or `StackedScenes`."""
     if isinstance(world, Scene):
         return np.asarray(world.anchor_speed_m_s * world.dt)
     return world.arrays.speed * world.arrays.dt
@@ -103,18 +103,18 @@ def padded_craft(
     mask: np.ndarray,
     reach_m: FloatArray,
 ) -> tuple[np.ndarray, FloatArray]:
-    """Order (..., M) and view (..., 16 + 4 M) of the craft that there are.
+    """Return order (..., M) and view (..., 16 + 4 M) of the existing craft.
 
     Parameters
     ----------
     view
         `mobile_anchors` of `told`.
     told
-        Its first arguments; the last of them are the craft (..., M, 3).
+        The first arguments of `mobile_anchors`; the last of them are the craft (..., M, 3).
     mask
-        (..., M), 1 for those that there are.
+        (..., M), 1 for existing craft.
     reach_m
-        How far they go in a step (...).
+        Longest move in a step (...).
     """
     m, counts = mask.shape[-1], mask.sum(axis=-1)
     order = np.broadcast_to(np.arange(m), mask.shape).copy()
@@ -125,7 +125,7 @@ def padded_craft(
         rows = counts == count
         *belief, anchors = (field[rows] for field in told)
         order[rows, :count], seen = view(*belief, anchors[:, :count])
-        # Places, then distances: each part is padded by itself.
+        # Positions, then distances: each part is padded separately.
         flat[rows, : 15 + 2 * count] = seen[:, : 15 + 2 * count]
         flat[rows, 15 + 2 * m : 15 + 2 * m + count] = seen[:, 15 + 2 * count :]
     return order, flat
@@ -134,7 +134,7 @@ def padded_craft(
 def padded_selection(
     flat: FloatArray, observation: Mapping[str, np.ndarray], half: FloatArray, extent_m: float
 ) -> FloatArray:
-    """The view (..., 21 + 6 M): `anchor_selection`, the volume, the anchors and what they told."""
+    """Return the view (..., 21 + 6 M): `anchor_selection`, volume, anchors and their memory."""
     mask = observation["anchor_mask"]
     gap = observation["anchors"] - observation["belief_translation"][..., None, :]
     heard = np.exp(-observation["age"] / 10)

@@ -185,8 +185,7 @@ class BaseStationVectorEnv(BatchEnv):
         return reward, np.zeros(self.num_envs, dtype=np.bool_)
 
     def _measure(self, rows: np.ndarray | slice, step: Any) -> None:
-        """Measure the angles of some worlds at their epochs; return also the bound after `step`
-        seconds."""
+        """Measure angles of some worlds at their epochs, `step` seconds after the last ones."""
         self._at = self._episodes.motion_at(self._epochs)
         rotation, translation, twist = (field[rows] for field in self._at)
         station, std = self._stations[rows], self.noise.std_rad

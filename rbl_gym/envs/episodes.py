@@ -19,7 +19,7 @@ _BLOCK = 256
 
 
 class EpisodeStore:
-    """The running episodes of B worlds: arrays (T + 1, B, ...), contiguous in the worlds.
+    """The running episodes of B worlds: arrays (T + 1, B, ...), epoch by epoch.
 
     A reset overwrites the arrays and does not allocate new ones, because fresh memory is slow.
     """
@@ -119,8 +119,7 @@ class FamilyStore:
     def begin(
         self, worlds: np.ndarray, generators: Sequence[np.random.Generator]
     ) -> dict[str, np.ndarray]:
-        """Draw new episodes of some worlds, as `EpisodeStore.begin`; return also the drawn
-        overrides."""
+        """Draw new episodes as `EpisodeStore.begin`; return also the drawn overrides."""
         drawn, starts, scenes = [], [], []
         for world, generator in zip(worlds.tolist(), generators, strict=True):
             member = world % len(self._family.members) if self._in_turn else None

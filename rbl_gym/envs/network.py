@@ -117,7 +117,7 @@ class PlanarNetworkVectorEnv(BatchEnv):
         self._measure(chosen, generators)
 
     def _layout(self, generator: np.random.Generator) -> FloatArray:
-        """Draw positions uniformly in the square, with a connected graph if one is found in time."""
+        """Draw uniform positions in the square, with a connected graph if one is found in time."""
         positions = np.zeros((self.n_nodes, 2))
         for _ in range(_TRIES):
             positions = generator.uniform(0, self.side_m, (self.n_nodes, 2))

@@ -244,7 +244,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         self.film.take([self._epoch], shot)  # pyright: ignore[reportOptionalMemberAccess]
 
     def render(self) -> Any:
-        """Return an RGB frame, uint8: the world, the body close up, and its errors (or the bound)."""
+        """Return an RGB frame, uint8: the world, a close-up, and the errors (or the bound)."""
         return rendering.picture(self.film)
 
     def _carry_bound(self, at: simulation.Epoch, links: np.ndarray) -> float:
@@ -301,7 +301,7 @@ def are_zeros(action: np.ndarray, shape: tuple[int, ...]) -> bool:
 
 
 def worlds_of(scene: Any, family: Any) -> tuple[SceneFamily | None, Scene]:
-    """Return the family given by `scenes` (None without one) and a scene: the first of the family."""
+    """Return the family of `scenes` (None without one) and a scene, the first of the family."""
     if family is None:
         return None, scenes.get(scene)
     if scene != "uwb_room":

@@ -203,7 +203,7 @@ class TrackingVectorEnv(BatchEnv):
         previous: FloatArray | None,
         prior: FloatArray,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return `scene_bounds.posterior_step` of some worlds; a family is split by number of tags."""
+        """Return `scene_bounds.posterior_step` of some worlds, by number of tags in a family."""
         if not isinstance(self._episodes, FamilyStore):
             return scene_bounds.posterior_step(self.scene, at, anchors, links, previous, prior)
         stack = self._episodes.stack.rows(rows)
