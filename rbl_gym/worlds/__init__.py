@@ -1,1 +1,1 @@
-"""Worlds: the scene, the named scenes, overrides, and the simulation of episodes."""
+"""Worlds: scenes, named scenes, overrides, families, and the simulation of episodes."""

@@ -1,4 +1,4 @@
-"""Families of scenes: a list of scenes, or scenes with fields that are drawn anew."""
+"""Families of scenes: lists of scenes, or scenes with fields drawn from laws."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ __all__ = ["SceneFamily", "family"]
 
 @dataclass(frozen=True, eq=False)
 class SceneFamily:
-    """Scenes of which one is drawn for every episode.
+    """A family of scenes; every episode draws one of them.
 
     Parameters
     ----------
     members
-        One of them is drawn, each as likely as the others: a name, a `Scene`, or a dict of
-        overrides (`rbl_gym.worlds.scenes.get`). In a dict any value, at any depth, may be a law
-        to draw it by:
+        Members, drawn with equal probability. Each is a name, a `Scene`, or a dict of overrides
+        (`rbl_gym.worlds.scenes.get`). In a dict any value, at any depth, may be a law from which it
+        is drawn:
 
         - ``{"uniform": [low, high]}`` and ``{"log-uniform": [low, high]}``: a number;
-        - ``{"integers": [low, high]}``: a whole number, both ends included;
-        - ``{"choice": [a, b, ...]}``: one of these values, each as likely as the others;
-        - ``{"repeat": {"count": [low, high], "of": value}}``: a list of so many values, a whole
-          number drawn as by `integers`.
+        - ``{"integers": [low, high]}``: an integer, both ends included;
+        - ``{"choice": [a, b, ...]}``: one of these values, with equal probability;
+        - ``{"repeat": {"count": [low, high], "of": value}}``: a list with a drawn
+          number of values, as by `integers`.
 
-        Lists, choices and repeated values may hold laws too.
+        Lists, choices and repeated values may themselves contain laws.
 
     Raises
     ------
     ValueError
-        On an empty list, a law that is none, or a scene that cannot be made.
+        If the list is empty, a law is invalid, or a scene is invalid.
     """
 
     members: tuple[Any, ...]
@@ -65,7 +65,7 @@ class SceneFamily:
 
     @functools.cached_property
     def corners(self) -> tuple[Scene, ...]:
-        """A scene of every choice and of both ends of all integers; other numbers in the middle."""
+        """Scenes with all choices and both ends of all integers; other numbers are midpoints."""
         found: list[Scene] = []
         for index, member in enumerate(self.members):
             found += [_made(index, one) for one in laws.corners(member, f"scenes[{index}]")]
@@ -73,37 +73,37 @@ class SceneFamily:
 
     @functools.cached_property
     def n_anchors(self) -> int:
-        """The most anchors of a scene."""
+        """Largest number of anchors of a scene."""
         return max(scene.n_anchors for scene in self.corners)
 
     @functools.cached_property
     def n_tags(self) -> int:
-        """The most tags of a body."""
+        """Largest number of tags of a body."""
         return max(len(scene.tags) for scene in self.corners)
 
     @functools.cached_property
     def n_boxes(self) -> int:
-        """The most obstacles of a scene."""
+        """Largest number of obstacles of a scene."""
         return max(len(scene.obstacles) for scene in self.corners)
 
     @property
     def steps(self) -> int:
-        """Steps of the longest episode."""
+        """Number of steps of the longest episode."""
         return max(scene.steps for scene in self.corners)
 
     @property
     def anchor_speed_m_s(self) -> float:
-        """The highest speed of an anchor; 0: they are fixed in all scenes."""
+        """Highest speed of an anchor; 0 if anchors are fixed in all scenes."""
         return max(scene.anchor_speed_m_s for scene in self.corners)
 
     @functools.cached_property
     def is_surveyed(self) -> bool:
-        """Whether anchors of any scene are off by their survey."""
+        """Whether any scene has survey errors of its anchors."""
         return any(scene.survey_std_m > 0 for scene in self.corners)
 
     @functools.cached_property
     def fields(self) -> dict[str, tuple[tuple[int, ...], type]]:
-        """Shapes and types of what `RBL/Tracking-v0` observes of any of the scenes."""
+        """Return shapes and types of what `RBL/Tracking-v0` observes in any of the scenes."""
         m, n = self.n_anchors, self.n_tags
         fields: dict[str, tuple[tuple[int, ...], type]] = {
             "anchors": ((m, 3), np.float64),
@@ -119,7 +119,7 @@ class SceneFamily:
         return fields
 
     def padded(self, told: Mapping[str, np.ndarray], scene: Scene) -> dict[str, np.ndarray]:
-        """What a scene of the family observes, in arrays of the family's shapes, and its masks."""
+        """Return the observation of a scene, padded to the family's shapes, with its masks."""
         told = {
             **told,
             "tags": scene.body,
@@ -133,10 +133,10 @@ class SceneFamily:
     def draw(
         self, rng: np.random.Generator, index: int | None = None
     ) -> tuple[Scene, dict[str, Any]]:
-        """A scene, and the overrides that make it (`rbl_gym.worlds.scenes.get` takes them).
+        """Draw a scene; return it with its overrides (for `rbl_gym.worlds.scenes.get`).
 
-        Of the member with this index; None: of any. A member that is a `Scene` is told by its name
-        alone.
+        `member` is the index of the member to draw from; None draws the member too. The overrides
+        of a member that is a `Scene` are only its name.
         """
         if index is None:
             index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
@@ -146,14 +146,14 @@ class SceneFamily:
 
 
 def family(value: Any) -> SceneFamily:
-    """The family of a list of scenes, of one scene with laws, or of one scene alone."""
+    """Return the family of a list of scenes, of one scene with laws, or of one scene."""
     if isinstance(value, SceneFamily):
         return value
     return SceneFamily(members_of(value))
 
 
 def members_of(value: Any) -> tuple[Any, ...]:
-    """The members of a family: of a list those in it, of one scene this; or a ValueError."""
+    """Return the members of a family; a single scene is one member. May raise ValueError."""
     if isinstance(value, str | Mapping | Scene):
         return (value,)
     if not isinstance(value, Sequence):
@@ -166,7 +166,7 @@ def members_of(value: Any) -> tuple[Any, ...]:
 
 
 def padded(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The array in the corner of zeros of a shape, a copy."""
+    """Return a copy of the array, padded with zeros at the end of every axis."""
     result = np.zeros(shape, array.dtype)
     result[tuple(slice(size) for size in array.shape)] = array
     return result

@@ -1,11 +1,11 @@
-"""How a body with an inertial sensor moves: smoothly.
+"""Smooth motion of a body with an inertial sensor.
 
-A scene's nominal motion is a polyline flown at constant speed: at its corners no sensor could
-follow. With an inertial sensor the body flies the uniform cubic B-spline that a pose every second
-(or every epoch, where these are longer apart) pulls on: it rounds the corners, and what is a
-constant twist stays one. The process noise does not move the body, whose jumps no sensor would
-read either; it is the error of the twist that is told: true mean twist of the interval less white
-noise, so that filters which are told the twist find the law that they know.
+The nominal motion of a scene is a polyline at constant speed. No sensor could follow its corners.
+With an inertial sensor the body therefore follows a uniform cubic B-spline. Its control poses are
+those of the nominal motion every second (or every epoch, if epochs are longer). The spline rounds
+the corners and keeps a constant twist constant. The process noise does not move the body, because
+no sensor could measure such jumps. It is the error of the known twist: the true mean twist of the
+interval minus white noise. Filters that use the known twist therefore have the correct noise law.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from rbl_gym.measurements import inertial
 from rbl_gym.motion import smooth
 from rbl_gym.worlds.scene import Scene
 
-# Seconds between the poses that pull on the curve.
+# Time between control poses of the spline, seconds.
 _KNOT_S = 1.0
 
 
 class InertialTrack(NamedTuple):
-    """An episode's motion at epochs 0 ... T, with leading axes.
+    """The motion of an episode at epochs 0 ... T, with leading axes.
 
     Attributes
     ----------
     rotation, translation, velocity
         (..., T + 1, 3, 3), (..., T + 1, 3), (..., T + 1, 3).
     twists
-        (..., T, 6) as they are told, of the interval that ends at each epoch from 1 on.
+        Known twists (..., T, 6) of the interval that ends at each epoch, from epoch 1.
     readings
         (..., T + 1, S, 6), of the interval that ends at each epoch; zeros at epoch 0.
     bias
@@ -49,7 +49,7 @@ class InertialTrack(NamedTuple):
 
 
 def normals_of(scene: Scene) -> int:
-    """How many standard normals an episode needs for its sensor: start, noise and walks."""
+    """Return how many standard normals the sensor of an episode needs: start, noise and walks."""
     if scene.inertial is None:
         return 0
     return 6 + 12 * (scene.steps * scene.inertial.samples(scene.dt) + 1)
@@ -58,7 +58,7 @@ def normals_of(scene: Scene) -> int:
 def fly(
     scene: Scene, trajectory: motion.Trajectory, process: FloatArray, normals: FloatArray
 ) -> InertialTrack:
-    """The motion along a nominal trajectory, and what the sensor reads of it.
+    """Return the smooth motion along a nominal trajectory, and the readings of the sensor.
 
     `process` (..., T, 6) and `normals` (..., `normals_of`) are standard normals.
     """
@@ -92,7 +92,7 @@ def fly(
 def _poses(
     trajectory: motion.Trajectory, dt: float, steps: int
 ) -> tuple[float, tuple[FloatArray, FloatArray]]:
-    """Seconds between the poses that pull on the curve, and they, two more than the motion has."""
+    """Return the time between control poses, and the poses, two more than the motion has."""
     held = max(1, round(_KNOT_S / dt))
     path = motion.simulate(trajectory, dt, motion.ProcessNoise())
     batch = path.translation.shape[:-2]

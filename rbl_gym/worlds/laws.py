@@ -1,4 +1,4 @@
-"""Laws by which values of a scene are drawn, in dicts and lists as JSON holds them."""
+"""Laws for values of a scene, in dicts and lists as in JSON."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ import numpy as np
 
 from rbl_gym.checks import check_array, check_count, check_number
 
-# More copies than any scene has boxes or anchors.
+# Limit of copies, larger than any number of boxes or anchors of a scene.
 _MOST_COPIES = 10_000
-# Every combination of choices and ends of integers is tried when a family is made, up to so many.
+# Limit of the combinations of choices and ends of integers that are checked for a family.
 _MOST_CORNERS = 10_000
 
 
 class _Law(NamedTuple):
-    """A kind of law: functions of what stands behind its name."""
+    """A kind of law: functions of its parameters."""
 
     check: Callable[[str, Any], None]
     draw: Callable[[Any, np.random.Generator], Any]
-    # Values that stand for all of them, and how many these are.
+    # Representative values, and their number.
     ends: Callable[[Any], Iterator[Any]]
     count: Callable[[Any], int]
 
 
 def check(value: Any, path: str) -> None:
-    """A ValueError that names the law in a nested value that is none."""
+    """Raise ValueError for an invalid law in a nested value."""
     law = _law_of(value)
     if law is not None:
         kind = next(iter(value))
@@ -39,7 +39,7 @@ def check(value: Any, path: str) -> None:
 
 
 def draw(value: Any, rng: np.random.Generator) -> Any:
-    """The nested value with a number in place of each law, drawn in the order of the value."""
+    """Return the nested value with a number for each law, drawn in the order of the value."""
     law = _law_of(value)
     if law is not None:
         return law.draw(next(iter(value.values())), rng)
@@ -51,7 +51,7 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
 
 
 def ends(value: Any) -> Iterator[Any]:
-    """Nested values with every choice and both ends of integers; other numbers in the middle."""
+    """Yield the nested values with all choices and both ends of integers; else midpoints."""
     law = _law_of(value)
     if law is not None:
         yield from law.ends(next(iter(value.values())))
@@ -67,7 +67,7 @@ def ends(value: Any) -> Iterator[Any]:
 
 
 def count_of_ends(value: Any) -> int:
-    """How many `ends` there are."""
+    """Return the number of `ends`."""
     law = _law_of(value)
     if law is not None:
         return law.count(next(iter(value.values())))
@@ -75,7 +75,7 @@ def count_of_ends(value: Any) -> int:
 
 
 def corners(value: Any, path: str) -> list[Any]:
-    """All `ends` of a value that is checked first; `path` is how errors call it."""
+    """Return all `ends` of a value after checking it; `path` is its name in errors."""
     check(value, path)
     count = count_of_ends(value)
     if count > _MOST_CORNERS:
@@ -86,14 +86,14 @@ def corners(value: Any, path: str) -> list[Any]:
 
 
 def _items(value: Any) -> list[tuple[Any, Any]]:
-    """What stands in a dict or a list, by keys."""
+    """Return the items of a dict or a list, by keys."""
     if isinstance(value, Mapping):
         return list(value.items())
     return list(enumerate(value)) if isinstance(value, list | tuple) else []
 
 
 def _law_of(value: Any) -> _Law | None:
-    """The law that a dict with one key of `_LAWS` is; None of what is none."""
+    """Return the law given by a dict with one key of `_LAWS`; None for other values."""
     if isinstance(value, Mapping) and len(value) == 1:
         return _LAWS.get(next(iter(value)))
     return None

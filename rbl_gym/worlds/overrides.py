@@ -1,4 +1,4 @@
-"""Frozen dataclasses changed by plain dicts, as JSON and TOML hold them."""
+"""Change frozen dataclasses with plain dicts, as in JSON and TOML."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from rbl_gym.checks import check_one_of
 from rbl_gym.geometry.regions import REGIONS, Box
 from rbl_gym.measurements.noise_laws import NOISE_FORMS, NOISE_LAWS
 
-# Fields that take a name or a dict as they are.
+# Fields whose value is a name or a dict.
 _READ_BY_THEMSELVES = ("inertial",)
 
 
 def replace(base: Any, changes: Mapping[str, Any], path: str) -> Any:
-    """A copy of a frozen dataclass with other fields; nested ones take mappings of their own.
+    """Return a copy of a frozen dataclass with changed fields; nested ones take mappings.
 
     Parameters
     ----------
     base
         The dataclass.
     changes
-        Name of a field -> its value, or a mapping of what changes in it. With the key ``"kind"``
-        the mapping says all of a region (`REGIONS`) or noise law (`NOISE_FORMS`).
+        Names of fields and their new values, or mappings with changes of nested fields. A mapping
+        with the key ``"kind"`` gives a complete region (`REGIONS`) or noise law (`NOISE_FORMS`).
     path
-        How errors call it.
+        Name of the dataclass in errors.
 
     Raises
     ------
     ValueError
-        On an unknown field or kind, or a value that its field refuses.
+        If a field or kind is unknown, or a value is invalid.
     """
     fields = {entry.name for entry in dataclasses.fields(base)}
     values = {}

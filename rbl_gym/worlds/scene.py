@@ -1,4 +1,4 @@
-"""The world as a frozen dataclass: numbers with units, checked when it is made."""
+"""The world as a frozen dataclass: numbers with units, checked when it is created."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ _FIELD_KINDS: dict[str, tuple[type, ...]] = {
     "prisms": (Prisms,),
     "gain": (Gain,),
 }
-# No less than this is left of a link where its noise is bounded.
+# Smallest information fraction of a link if its noise must be bounded.
 _LEAST_SHARE = 1e-6
 TRAJECTORIES = ("waypoints", "constant", "random-twist", "orbit", "lawn-mower")
 Points = tuple[tuple[float, float, float], ...]
 
 
 class FlatScales(NamedTuple):
-    """What is large in a scene, for observations of order one.
+    """Scales of a scene that bring observations to order one.
 
     Attributes
     ----------
     middle, half
-        Of the volume (..., 3), metres.
+        Centre and half size of the volume (..., 3), metres.
     extent
         Half the diagonal of the box around volume and anchors (...), metres.
     rates
-        Of a twist (..., 6): pi/10 in a step, and the body's speed.
+        Scales of a twist (..., 6): pi/10 per step, and the body's speed.
     """
 
     middle: FloatArray
@@ -62,75 +62,75 @@ class FlatScales(NamedTuple):
     rates: FloatArray
 
     def joined(self) -> FloatArray:
-        """All of them as one array (..., 13)."""
+        """Return all scales as one array (..., 13)."""
         return np.concatenate([self.middle, self.half, self.extent[..., None], self.rates], axis=-1)
 
     @classmethod
     def split(cls, joined: FloatArray) -> FlatScales:
-        """The inverse of `joined`."""
+        """Return the inverse of `joined`."""
         return cls(joined[..., :3], joined[..., 3:6], joined[..., 6], joined[..., 7:])
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A world to track a rigid body in. SI units; every standard deviation is per axis.
+    """A world in which a rigid body is tracked. SI units; standard deviations are per axis.
 
     Parameters
     ----------
     name
-        Under which it is registered.
+        Name in the registry.
     volume
-        Where the body moves.
+        Region in which the body moves.
     anchor_region, n_anchors, anchors
-        Where anchors may stand, how many, and their places (M, 3) at the start of every
-        episode; `anchors` None draws them anew in the region at every reset.
+        Region of the anchors, their number, and their positions (M, 3) at the start of every
+        episode. With `anchors` None every reset draws them in the region.
     anchor_start_m
-        Anchors that are drawn start within so much of the body on every axis; None: anywhere
-        in their region.
+        Largest initial distance on every axis between the body and drawn anchors; None: anywhere in
+        their region.
     anchor_speed_m_s
-        Limit on the anchors' speed; 0: they are fixed.
+        Speed limit of the anchors; 0 for fixed anchors.
     survey_std_m
-        Standard deviation per axis of the anchors' surveyed places about the true ones: constant
-        over an episode. Observations and filters are told the surveyed ones.
+        Standard deviation per axis of the errors of surveyed anchor positions. They are constant
+        over an episode. Observations and filters have the surveyed positions.
     tags
-        Places (N, 3) on the body, in the body frame.
+        Positions (N, 3) in the body frame.
     noise, links
-        The range law and what else happens to a link.
+        Noise law of the ranges, and model of the links.
     obstacles, blocked_information
-        Boxes (K, 6) that block sight, centre and half size; a link without line of sight from
-        the anchor to the body's origin keeps this share of its information: its noise is
-        stronger. 0: it gives no range.
+        Boxes (K, 6) that block sight, centre and half size; a link without line of sight from the
+        anchor to the body's origin has this fraction of its nominal information, that is stronger
+        noise. With 0 it gives no range.
     prisms
-        Obstacles that are polygons in the plan between two heights, such as walls; they come with
-        the files of buildings.
+        Obstacles that are polygons in plan between two heights, such as walls. They come from
+        building files.
     gain
-        How far and how wide an anchor reaches; this too comes with files.
+        Reach and field of view of an anchor, also from building files.
     fixed
-        Places (F, 3) of the first anchors, where the others are drawn or placed.
+        Positions (F, 3) of the first anchors, if the others are drawn or placed.
     process
-        Noise of the motion: standard deviations after 1 s.
+        Process noise: standard deviations after 1 s.
     dt, steps
-        Seconds between epochs, steps of an episode.
+        Seconds between epochs, and number of steps of an episode.
     trajectory, speed_m_s, spin_rad_s, twist
-        ``"waypoints"``: straight lines between points uniform in the volume.
-        ``"constant"``: the same `twist` (6) at every step. ``"random-twist"``: a new direction
-        and turn axis every 10 steps, at `speed_m_s` and `spin_rad_s`. ``"orbit"``: a level
-        circle about the volume's centre, its radius 0.35 of the shorter side, nose first.
-        ``"lawn-mower"``: lanes along x, a fifth of the volume apart. On way-points and lanes
-        the body turns at a rate drawn once an episode with standard deviation `spin_rad_s`.
+        ``"waypoints"``: straight lines between points uniform in the volume. ``"constant"``: the
+        same `twist` (6) at every step. ``"random-twist"``: a new direction and rotation axis every
+        10 steps, at `speed_m_s` and `spin_rad_s`. ``"orbit"``: a horizontal circle around the
+        volume's centre with a radius of 0.35 of the shorter side, nose first. ``"lawn-mower"``:
+        lanes along x, a fifth of the volume apart. On way-points and lanes each episode draws a
+        turn rate with standard deviation `spin_rad_s`.
     start_rotation, start_translation, start_volume
-        Pose at the start; None: drawn (uniform on SO(3), uniform in the start volume, which
-        None takes to be the volume).
+        Initial pose. None draws it, uniform on SO(3) and uniform in the start volume. With
+        `start_volume` None that is the volume.
     initial_rotation_rad, initial_translation_m
         Standard deviations of the prior.
     prior
-        ``"drawn"``: the prior mean is drawn around the true pose at epoch 0. ``"start"``: the
-        prior is exact one step before epoch 0, as wide as stated, and predicted once (the
-        tracking paper).
+        ``"drawn"``: the prior mean is drawn around the true pose at epoch 0. ``"start"``: the prior
+        mean is exact one step before epoch 0, has the given standard deviations, and is predicted
+        once (the tracking paper).
     inertial
-        Inertial sensor on the body, which is then read between epochs: an `InertialSensor`, a
-        name or a dict as `measurements.inertial.sensor` takes it; None: there is none. With one
-        the body moves smoothly, as `worlds.inertial_motion` describes.
+        Inertial sensor on the body, with readings between epochs: an `InertialSensor`, or a name or
+        a dict as in `measurements.inertial.sensor`. None: no sensor. With a sensor the body moves
+        smoothly, see `worlds.inertial_motion`.
     """
 
     name: str
@@ -231,7 +231,7 @@ class Scene:
             raise ValueError(f"reference_tag must be below {len(self.tags)} tags, got {reference}")
 
     def _check_trajectory(self) -> None:
-        """An orbit and a lawn-mower bring their own start, and need a volume to be in."""
+        """Check the trajectory: orbit and lawn-mower define their start and need a volume."""
         if self.trajectory not in ("orbit", "lawn-mower"):
             return
         stated = "start_translation" if self.start_translation is not None else None
@@ -245,25 +245,25 @@ class Scene:
 
     @functools.cached_property
     def obstruction(self) -> Obstacles:
-        """The obstacles, and what they leave of a link."""
+        """The obstacles, and the information of blocked links."""
         boxes = np.array(self.obstacles).reshape(-1, 6)
         return Obstacles(boxes, self.blocked_information, self.prisms)
 
     @functools.cached_property
     def weakens(self) -> bool:
-        """Whether anything takes information from links: then they have a `quality`."""
+        """Whether anything reduces the information of links; links then have a `quality`."""
         return bool(self.obstruction) or bool(self.gain)
 
     @functools.cached_property
     def body(self) -> FloatArray:
-        """The tags as an array (N, 3), not to be written to."""
+        """The tags as a read-only array (N, 3)."""
         body = np.array(self.tags)
         body.flags.writeable = False
         return body
 
     @functools.cached_property
     def prior_covariance(self) -> FloatArray:
-        """Pose covariance (6, 6) of the prior, not to be written to."""
+        """Pose covariance (6, 6) of the prior, read-only."""
         std = [self.initial_rotation_rad] * 3 + [self.initial_translation_m] * 3
         covariance = np.diag(np.square(std))
         covariance.flags.writeable = False
@@ -271,7 +271,7 @@ class Scene:
 
     @functools.cached_property
     def scales(self) -> FlatScales:
-        """What is large in it."""
+        """Scales that bring observations to order one."""
         low, high = self.volume.bounds()
         corners = np.array([low, high, *self.anchor_region.bounds()])
         extent = np.linalg.norm(np.ptp(corners, axis=0)) / 2
@@ -282,28 +282,29 @@ class Scene:
 
     @functools.cached_property
     def speed_std_m_s(self) -> float:
-        """Standard deviation of the body's velocity per axis, where nothing else is known of it."""
+        """Standard deviation per axis of the body's velocity, without further knowledge."""
         speed = max(self.speed_m_s, float(np.linalg.norm(self.twist[3:])))
         return max(speed / math.sqrt(3), 1e-3)
 
     @property
     def steps_of_motion(self) -> int:
-        """Steps of an episode, one more where the prior is older than epoch 0."""
+        """Number of motion steps of an episode, one more if the prior is older than epoch 0."""
         return self.steps + (self.prior == "start")
 
     @functools.cached_property
     def n_waypoints(self) -> int:
-        """Points that an episode draws in the volume, the start among them."""
+        """Number of points that an episode draws in the volume, including the start."""
         if self.trajectory != "waypoints":
             return 1
         extent = max(float(np.linalg.norm(np.ptp(self.volume.bounds(), axis=0))), 1e-9)
-        # Legs average above a quarter of the extent: four times as many as that calls for, and 8.
+        # Legs average more than a quarter of the extent: draw four times the resulting number, and
+        # 8.
         travelled = self.speed_m_s * self.dt * self.steps_of_motion
         return 8 + int(np.ceil(16 * travelled / extent))
 
     @functools.cached_property
     def range_limit_m(self) -> float:
-        """What no measurement of this scene exceeds, but for offsets (measurements are clipped)."""
+        """Limit of all measurements of this scene without offsets (measurements are clipped)."""
         duration = self.steps * self.dt
         places = (*(self.anchors or ()), *filter(None, [self.start_translation]))
         corners = np.array([*self.volume.bounds(), *self.anchor_region.bounds(), *places])
@@ -322,7 +323,7 @@ class Scene:
 
     @property
     def range_bounds_m(self) -> tuple[float, float]:
-        """Between which all ranges lie: with offsets they may be negative."""
+        """Lower and upper limit of all ranges: with offsets they may be negative."""
         if self.links.offset is None:
             return 0.0, self.range_limit_m
         offset = 6 * self.links.offset_std_m

@@ -24,19 +24,20 @@ def posterior_step(
     previous: FloatArray | None,
     prior_covariance: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Posterior Cramer-Rao information (..., n, n) at the true pose of an epoch, and its score.
+    """Return posterior Cramer-Rao information (..., n, n) at the true pose, and its score.
 
-    n is 6; in a scene with an inertial sensor 15, of what ranges and its readings tell: pose,
-    velocity, biases (`bounds.inertial`); 3 M more where anchors are off by their survey. From that
-    of the epoch before, or from the prior at epoch 0 (`previous` None). Links that gave nothing
-    tell nothing.
+    n is 6. In a scene with an inertial sensor it is 15, for ranges and its readings: pose,
+    velocity, biases (`bounds.inertial`). With survey errors of the anchors it is larger by 3 M. The
+    recursion starts from the information of the previous epoch, or from the prior at epoch 0
+    (`previous` None). Links without ranges contribute nothing.
 
     Parameters
     ----------
     scene, at, anchors, links
-        The world at an epoch, where the anchors stand (..., M, 3), what measured (..., M, N).
+        The world at an epoch, the anchor positions (..., M, 3), the links that measured (..., M,
+        N).
     previous, prior_covariance
-        Information (..., n, n) after the epoch before, and the prior at epoch 0.
+        Information (..., n, n) after the previous epoch, and the prior covariance at epoch 0.
 
     Returns
     -------
@@ -48,7 +49,7 @@ def posterior_step(
         If the information is singular or not finite.
     """
     law = ranging.numbers_of(scene.noise, scene.body.shape[-2])
-    assert law is not None  # the laws of scenes have numbers
+    assert law is not None  # all laws of scenes have variances
     if scene.inertial is not None or scene.links.offset is not None or scene.survey_std_m > 0:
         return _joint_step(scene, at, anchors, links, previous, prior_covariance)
     information, score = posterior.step_of_ranges(
@@ -76,7 +77,7 @@ def _joint_step(
     previous: FloatArray | None,
     prior_covariance: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """`posterior_step` with further states, or with offsets of the ranges."""
+    """Return `posterior_step` with further states, or with offsets of the ranges."""
     unknown = bounds.Nuisances(scene.links.offset, scene.survey_std_m)
     count = unknown.count(scene.n_anchors, len(scene.tags))
     states = 6 if scene.inertial is None else 15
@@ -97,23 +98,23 @@ def _joint_step(
 
 
 def _motion_of(scene: Scene, at: simulation.Epoch) -> Motion:
-    """The motion that led to an epoch."""
+    """Return the motion that led to an epoch."""
     if scene.inertial is None:
         return bounds.KnownTwist(at.twist, scene.dt, scene.process)
     assert at.readings is not None
     assert at.bias is not None
-    # As the true motion has them, but for the white noise, which the bound hardly sees.
+    # As the true motion, except for the white noise, which hardly changes the bound.
     felt = at.readings - at.bias[..., None, :]
     steps = np.full(felt.shape[-2], scene.dt / felt.shape[-2])
     return bounds.InertialMotion(felt, steps, scene.inertial)
 
 
 def information_size(scene: Scene) -> int:
-    """Rows of the information that `posterior_step` carries along."""
+    """Return the size of the information that `posterior_step` propagates."""
     states = 6 if scene.inertial is None else 15
     return states + 3 * scene.n_anchors * (scene.survey_std_m > 0)
 
 
 def pose_covariance(information: FloatArray) -> FloatArray:
-    """The bound (..., 6, 6) of the pose, from information about it and what else there is."""
+    """Return the pose bound (..., 6, 6) from information about the pose and other states."""
     return np.linalg.inv(information)[..., :6, :6]

@@ -14,19 +14,19 @@ SUFFIXES = (".json", ".toml")
 
 
 def read_scenes(path: str | Path) -> Any:
-    """A family from a file: what `scenes=` of an environment takes.
+    """Read a family from a file, for `scenes=` of an environment.
 
     Parameters
     ----------
     path
-        JSON: a list of scenes, or one. TOML: one, or ``scenes = [...]`` alone. A scene is a name
-        or a table of overrides with the key ``name``, whose values may be laws; see
+        JSON: a list of scenes, or one scene. TOML: one scene, or only ``scenes = [...]``. A scene
+        is a name or a table of overrides with the key ``name``. Its values may be laws, see
         `rbl_gym.worlds.families.SceneFamily`.
 
     Raises
     ------
     ValueError
-        On a file that cannot be read, naming line and column, or holds no scenes.
+        If the file cannot be read (with line and column) or has no scenes.
     """
     found = _parsed(path)
     if isinstance(found, Mapping) and set(found) == {"scenes"}:
@@ -43,13 +43,13 @@ def read_scenes(path: str | Path) -> Any:
 
 
 def read_scene(name: str) -> Any:
-    """What `scene=` of an environment takes: a name as it is, a file with overrides as a dict.
+    """Return the value of `scene=` for an environment: a name, or a file's overrides as a dict.
 
     Parameters
     ----------
     name
-        Of a scene, or of a JSON or TOML file with a table of overrides and the key ``name``.
-        Files without that key are left to the environment.
+        Name of a scene, or of a JSON or TOML file with a table of overrides and the key ``name``.
+        Names of files without that key are returned unchanged, for the environment.
     """
     if not name.endswith(SUFFIXES):
         return name

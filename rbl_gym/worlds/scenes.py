@@ -1,6 +1,6 @@
-"""Named worlds, and overrides from plain dicts.
+"""Named scenes, and overrides from plain dicts.
 
-`get` turns a name, or a JSON-able dict of overrides with the key ``"name"``, into a `Scene`.
+`get` returns the `Scene` of a name, or of a JSON-able dict of overrides with the key ``"name"``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rbl_gym.worlds.scene import Scene
 
 __all__ = ["SCENES", "get"]
 
-# Who reads files, by their suffixes: entry points, as Gymnasium's, of packages above this one.
+# Readers of files, by suffix. They are entry points, as in Gymnasium, of packages above this one.
 READERS = {
     ".toml": "rbl_gym.placement.file_scenes:scene_of_file",
     ".json": "rbl_gym.placement.file_scenes:scene_of_file",
@@ -33,7 +33,7 @@ READERS = {
 
 
 def _per_step(translation_m: float, rotation_deg: float, dt: float) -> ProcessNoise:
-    """Process noise stated as standard deviations of one step of `dt` seconds."""
+    """Return process noise given by standard deviations per step of `dt` seconds."""
     return ProcessNoise(math.radians(rotation_deg) / dt**0.5, translation_m / dt**0.5)
 
 
@@ -48,7 +48,7 @@ SCENES: dict[str, Scene] = {
             anchors=((0, 0, 0.4), (10, 0, 2.8), (10, 8, 0.4), (0, 8, 2.8), (5, 0, 0.4), (5, 4, 3)),
             tags=as_tuples(bodies.octahedron(0.8)),
             noise=RangeNoise(0.10, 0.0),
-            blocked_information=0.01,  # behind the racks that placement draws
+            blocked_information=0.01,  # behind the racks drawn by placement
             process=_per_step(0.03, 1.5, 0.1),
             dt=0.1,
             speed_m_s=1.0,
@@ -150,7 +150,7 @@ SCENES: dict[str, Scene] = {
             volume=Box((0, 0, 0), (0, 0, 0)),
             anchor_region=Box((-1000, -1000, -1000), (1000, 1000, 1000)),
             n_anchors=4,
-            # One draw from the cube, the same for all trials, as the paper's figures need it.
+            # One draw from the cube for all trials, as in the paper's figures.
             anchors=(
                 (738.506, -150.447, 822.880),
                 (165.416, 353.081, 912.661),
@@ -166,7 +166,7 @@ SCENES: dict[str, Scene] = {
             twist=(*[math.radians(1.0)] * 3, 1.0, 1.0, 1.0),  # 1_3 deg/s and 1_3 m/s
             start_rotation=as_tuples(np.eye(3)),
             start_translation=(0.0, 0.0, 0.0),
-            # 100 I12 of the paper: pose information .02 and .01, that is 50 and 100.
+            # 100 I12 of the paper: pose information of .02 and .01, that is 50 and 100.
             initial_rotation_rad=math.sqrt(50.0),
             initial_translation_m=10.0,
             prior="start",
@@ -177,7 +177,7 @@ SCENES: dict[str, Scene] = {
             anchor_region=Box((0, 0, 0), (100, 100, 100)),
             n_anchors=10,
             tags=as_tuples(bodies.icassp2013()),
-            # A reference range of 80 dB: a standard deviation of 1e-4 of the range.
+            # A reference range of 80 dB: a standard deviation of 1e-4 times the range.
             noise=RangeNoise(0.0, 1e-4, reference_tag=0),
             process=ProcessNoise(),
             dt=1.0,
@@ -194,29 +194,28 @@ SCENES: dict[str, Scene] = {
 
 
 def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
-    """A scene by its name, or a named one with overrides.
+    """Return the scene of a name, or a named scene with overrides.
 
     Parameters
     ----------
     scene
-        A name of `SCENES`; or a mapping with the key ``"name"`` and fields of `Scene` to
-        change. Nested fields take mappings of their own: ``{"name": "uwb_room", "steps": 50,
-        "links": {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``. A region or noise of
-        another kind is named by ``"kind"`` (``"box"``, ``"walls"``, ``"shell"``; a name of
+        A name of `SCENES`, or a mapping with the key ``"name"`` and fields of `Scene` to change.
+        Nested fields take mappings: ``{"name": "uwb_room", "steps": 50, "links":
+        {"drop_probability": 0.1}, "noise": {"floor_m": 0.2}}``. The key ``"kind"`` selects another
+        kind of region or noise (``"box"``, ``"walls"``, ``"shell"``; a name of
         `noise_laws.NOISE_FORMS`: ``"range"``, ``"squared-range"``, ``"reference-range"`` with its
-        `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`, `kappa` and `snr`). Another
-        number of anchors than the scene has, without their places, draws them anew in the region
-        at every reset. ``"stretch": [x, y, z]`` then multiplies volume, anchor region (boxes and
-        walls), anchors and obstacles along the axes. A name that ends in ``.toml`` or ``.json`` is
-        the path of a building file (docs/building_files.md), see
-        `rbl_gym.placement.file_scenes.scene_of_file`. ``"layout": "layout.csv"``: the anchors
-        stand where a file of ``rbl-gym place`` says.
+        `db`, ``"time-of-arrival"`` with `speed_m_s`, `n_samples`, `kappa` and `snr`). If only the
+        number of anchors changes, every reset draws their positions in the region. ``"stretch": [x,
+        y, z]`` finally multiplies volume, anchor region (boxes and walls), anchors and obstacles
+        along the axes. A name that ends in ``.toml`` or ``.json`` is the path of a building file
+        (docs/building_files.md), see `rbl_gym.placement.file_scenes.scene_of_file`. ``"layout":
+        "layout.csv"`` reads the anchor positions from a file of ``rbl-gym place``.
 
     Raises
     ------
     ValueError
-        On an unknown name or field, or a value that its field refuses; of a file it names the file
-        and the line.
+        If a name or field is unknown, or a value is invalid. Errors in a file have its name and the
+        line.
     """
     if isinstance(scene, Scene):
         return scene
@@ -242,7 +241,7 @@ def get(scene: str | Mapping[str, Any] | Scene) -> Scene:
 
 
 def _named(name: Any) -> Scene:
-    """A scene by its name or by the path of its file."""
+    """Return a scene by its name or by the path of its file."""
     suffix = PurePath(name).suffix.lower() if isinstance(name, str) else ""
     if suffix in READERS and name not in SCENES:
         return _entry_point(READERS[suffix])(name)
@@ -255,7 +254,7 @@ def _entry_point(name: str) -> Any:
 
 
 def _stretched(scene: Scene, stretch: Any) -> Scene:
-    """The scene with all places multiplied along the axes; what is on the body stays."""
+    """Return the scene with all positions scaled along the axes; the body does not change."""
     factors = check_array("scene.stretch", stretch, (3,))
     if factors.ndim != 1 or not (factors > 0).all():
         raise ValueError(f"scene.stretch must be three positive numbers, got {stretch!r:.80}")

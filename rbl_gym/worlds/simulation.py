@@ -1,7 +1,7 @@
-"""Episodes of a scene: what the environment and the Monte-Carlo experiments share.
+"""Episodes of a scene, for the environments and the Monte-Carlo experiments.
 
-An episode's randomness is drawn at once from one Generator, in a fixed order; everything after
-is arithmetic on arrays with leading batch axes.
+All random numbers of an episode are drawn at once from one Generator, in a fixed order. Everything
+after that is arithmetic on arrays with leading batch axes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Draws(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """All of an episode that does not depend on actions, with leading batch axes.
+    """The part of an episode that does not depend on actions, with leading batch axes.
 
     Attributes
     ----------
@@ -44,21 +44,21 @@ class Episode(NamedTuple):
         Known twist of the interval that ends at each epoch, (..., T + 1, 6); zero at epoch 0
         unless the prior is older than it.
     normals, uniforms
-        Random numbers of the ranges (..., T + 1, M, N); of the links (..., T + 1, 2, M, N) or
-        None where they need none.
+        Random numbers of the ranges (..., T + 1, M, N), and of the links (..., T + 1, 2, M, N),
+        None if the links need none.
     velocity, readings, bias
-        Of a scene with an inertial sensor, else None: true velocity (..., T + 1, 3); readings
-        (..., T + 1, S, 6) of the interval that ends at each epoch, zero at epoch 0; the sensor's
-        biases (..., T + 1, 6) at the epochs.
+        None without an inertial sensor. Otherwise true velocity (..., T + 1, 3); readings (..., T +
+        1, S, 6) of the interval that ends at each epoch, zero at epoch 0; the sensor's biases (...,
+        T + 1, 6) at the epochs.
     offsets
-        Where ranges have offsets, else None: their standard normals (..., T + 1, 1 or M, 1 or N).
+        Standard normals (..., T + 1, 1 or M, 1 or N) of the range offsets; None without offsets.
     survey
-        Where anchors are off by their survey, else None: by how much the surveyed place of each is
-        off (..., T + 1, M, 3), the same at all epochs.
+        Errors (..., T + 1, M, 3) of the surveyed anchor positions, the same at all epochs; None
+        without survey errors.
     prior_rotation, prior_translation, prior_covariance
-        Belief at epoch 0 before its update: (..., 3, 3), (..., 3), (..., 6, 6).
+        Belief at epoch 0 before its measurements: (..., 3, 3), (..., 3), (..., 6, 6).
     anchors
-        At epoch 0, (..., M, 3).
+        Positions at epoch 0, (..., M, 3).
     """
 
     rotation: FloatArray
@@ -78,7 +78,7 @@ class Episode(NamedTuple):
 
 
 class Epoch(NamedTuple):
-    """An episode at one epoch: the first ten fields of `Episode` without their time axis."""
+    """An episode at one epoch: the first ten fields of `Episode` without the time axis."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -93,7 +93,7 @@ class Epoch(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """True poses at one epoch and the known twist that led there: three fields of `Epoch`."""
+    """True poses at one epoch and the known twist before it: three fields of `Epoch`."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -102,12 +102,12 @@ class Motion(NamedTuple):
 
 # Standard normals of an episode besides those of steps and ranges: rotation, spin, prior.
 _START_NORMALS = 4 + 3 + 6
-# Steps for which a random twist is held.
+# Number of steps for which a random twist is constant.
 _HOLD = 10
 
 
 def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Draws:
-    """The random numbers of an episode: one call for normals, one for uniforms."""
+    """Draw the random numbers of an episode: one call for normals, one for uniforms."""
     return Draws(
         rng.standard_normal((*batch, sum(_normal_sizes(scene)))),
         rng.random((*batch, sum(_uniform_sizes(scene)))),
@@ -115,7 +115,7 @@ def draw(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) ->
 
 
 def empty_draws(scene: Scene, count: int) -> Draws:
-    """Room for the random numbers of `count` episodes, (count, n) and (count, m)."""
+    """Return arrays for the random numbers of `count` episodes, (count, n) and (count, m)."""
     return Draws(
         np.empty((count, sum(_normal_sizes(scene)))),
         np.empty((count, sum(_uniform_sizes(scene)))),
@@ -123,14 +123,14 @@ def empty_draws(scene: Scene, count: int) -> Draws:
 
 
 def draw_each(draws: Draws, rows: Iterable[int], generators: Iterable[np.random.Generator]) -> None:
-    """`draw` into some rows, each by its own generator: what a vector environment resets with."""
+    """Apply `draw` to some rows, each with its own generator, for vector environments."""
     for row, generator in zip(rows, generators, strict=True):
         generator.standard_normal(out=draws.normals[row])
         generator.random(out=draws.uniforms[row])
 
 
 def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None]:
-    """Views of the draws: `normals` and `uniforms` of an `Episode`."""
+    """Return views of the draws: `normals` and `uniforms` of an `Episode`."""
     normals = _split(draws.normals, _normal_sizes(scene))[2]
     return _by_epoch(scene, normals, _split(draws.uniforms, _uniform_sizes(scene))[3])
 
@@ -138,7 +138,7 @@ def of_ranges(scene: Scene, draws: Draws) -> tuple[FloatArray, FloatArray | None
 def _by_epoch(
     scene: Scene, normals: FloatArray, uniforms: FloatArray
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Random numbers of the ranges and the links, with axes of epochs and links."""
+    """Return random numbers of ranges and links, with axes of epochs and links."""
     batch, shape = normals.shape[:-1], (scene.n_anchors, len(scene.tags))
     normals = normals.reshape((*batch, scene.steps + 1, *shape))
     if not scene.links.is_random:
@@ -147,14 +147,14 @@ def _by_epoch(
 
 
 def draw_episode(scene: Scene, rng: np.random.Generator, batch: tuple[int, ...] = ()) -> Episode:
-    """An episode of a scene, or a batch of independent ones.
+    """Draw an episode of a scene, or a batch of independent ones.
 
-    Anchors that the scene leaves open are drawn anew for every episode of the batch.
+    Anchors that the scene does not fix are drawn for every episode of the batch.
 
     Parameters
     ----------
     scene, rng, batch
-        The world, the source of all randomness, and the leading axes.
+        The world, the source of all random numbers, and the shape of the leading axes.
     """
     return build_episode(scene, draw(scene, rng, batch))
 
@@ -164,7 +164,7 @@ def _links(scene: Scene) -> int:
 
 
 def _normal_sizes(scene: Scene) -> tuple[int, int, int, int, int, int, int]:
-    """Normals of start, process, ranges, random twists, inertial sensor, offsets, the survey."""
+    """Return numbers of normals: start, process, ranges, twists, sensor, offsets, survey."""
     held = -(-scene.steps_of_motion // _HOLD) * 6 if scene.trajectory == "random-twist" else 0
     ranges, felt = (scene.steps + 1) * _links(scene), inertial_motion.normals_of(scene)
     offsets = (scene.steps + 1) * scene.links.n_offsets(scene.n_anchors, len(scene.tags))
@@ -173,14 +173,14 @@ def _normal_sizes(scene: Scene) -> tuple[int, int, int, int, int, int, int]:
 
 
 def _uniform_sizes(scene: Scene) -> tuple[int, int, int, int]:
-    """Uniforms of the way-points, the orbit's phase, the anchors, the links."""
+    """Return numbers of uniforms: way-points, phase of the orbit, anchors, links."""
     anchors = 3 * scene.n_anchors if scene.anchors is None else 0
     links = 2 * (scene.steps + 1) * _links(scene) if scene.links.is_random else 0
     return 3 * scene.n_waypoints, int(scene.trajectory == "orbit"), anchors, links
 
 
 def build_episode(scene: Scene, draws: Draws) -> Episode:
-    """The episodes that these random numbers make; batched over their leading axes."""
+    """Return the episodes of these random numbers, batched over their leading axes."""
     batch = draws.normals.shape[:-1]
     start, process, ranges, held, felt, common, surveyed = _split(
         draws.normals, _normal_sizes(scene)
@@ -203,7 +203,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
     covariance = scene.prior_covariance
     rotation, translation = path.rotation[..., 0, :, :], path.translation[..., 0, :]
     if scene.prior == "start":
-        # The same for all episodes of a constant twist: its leading axes are few or none.
+        # A constant twist is the same for all episodes: it has few leading axes or none.
         first = trajectory.twists[..., 0, :]
         prior = motion.propagate(rotation, translation, first, scene.dt)
         covariance = bounds.predict_covariance(covariance, first, scene.dt, scene.process)
@@ -231,7 +231,7 @@ def build_episode(scene: Scene, draws: Draws) -> Episode:
         offsets = common.reshape((*batch, scene.steps + 1, *shape))
     survey = None
     if scene.survey_std_m > 0:
-        # Cut at six standard deviations, so that the space of the observations stays finite.
+        # Cut at six standard deviations, so that the observation space stays finite.
         survey = scene.survey_std_m * np.clip(surveyed, -6.0, 6.0)
         survey = survey.reshape((*batch, 1, scene.n_anchors, 3))
         survey = np.broadcast_to(survey, (*batch, scene.steps + 1, scene.n_anchors, 3))
@@ -246,7 +246,7 @@ def _split(block: FloatArray, sizes: tuple[int, ...]) -> list[FloatArray]:
 def _trajectory(
     scene: Scene, start: FloatArray, places: FloatArray, phase: FloatArray, held: FloatArray
 ) -> motion.Trajectory:
-    """The scene's nominal motion; way-points and the start are uniform in its volume."""
+    """Return the scene's nominal motion; way-points and the start are uniform in its volume."""
     batch, steps = start.shape[:-1], scene.steps_of_motion
     if scene.start_rotation is None:
         rotation = rotations.from_quaternion(start[..., :4])
@@ -279,24 +279,24 @@ def _trajectory(
 
 
 def epoch_of(episode: Episode, epoch: int) -> Epoch:
-    """Views of an episode at one epoch, the same for the whole batch."""
+    """Return views of an episode at one epoch, the same for the whole batch."""
     at = (slice(None),) * (episode.rotation.ndim - 3) + (epoch,)
     fields = episode[: len(Epoch._fields)]
     return Epoch(*[None if field is None else field[at] for field in fields])  # pyright: ignore[reportArgumentType]
 
 
 def whole(episode: Episode) -> Epoch:
-    """All epochs of an episode at once: the time axis is the last of the batch's."""
+    """Return all epochs of an episode at once: the time axis is the last batch axis."""
     return Epoch(*episode[: len(Epoch._fields)])  # pyright: ignore[reportArgumentType]
 
 
 def measure_epoch(
     scene: Scene, at: Epoch, anchors: FloatArray, quality: FloatArray | None = None
 ) -> ranging.Measurement:
-    """Ranges (..., M, N) of an epoch to the anchors where they stand then (..., M, 3).
+    """Measure the ranges (..., M, N) of an epoch to anchors at positions (..., M, 3).
 
-    `at` is of an episode of the `scene`; `quality` (`link_quality`): where known already, or of
-    other obstacles than the scene's.
+    `at` is an epoch of an episode of `scene`. `quality` (`link_quality`) may be given if it is
+    already known, or to use other obstacles than the scene's.
     """
     normals = at.normals
     if quality is None and scene.weakens:
@@ -307,7 +307,7 @@ def measure_epoch(
     ranges, distances = ranging.sample(
         at.rotation, at.translation, scene.body, anchors, normals, scene.noise, longest
     )
-    # A range of zero has no variance under a proportional law: such a reading is no reading.
+    # A range of zero has no variance under a proportional law, so it is not a measurement.
     if scene.links.never_fails:
         links, nlos = ranges > 0, np.zeros(ranges.shape, dtype=np.bool_)
     else:
@@ -326,12 +326,12 @@ def measure_epoch(
 
 
 def surveyed(at: Epoch, anchors: FloatArray) -> FloatArray:
-    """Places (..., M, 3) of the anchors as observers are told them; a copy."""
+    """Return the surveyed anchor positions (..., M, 3), a copy."""
     return anchors.copy() if at.survey is None else anchors + at.survey
 
 
 def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
-    """Share (..., M) of its information that sight, range and view of each anchor leave a link."""
+    """Return the information fraction (..., M) of each anchor's links: sight, reach and view."""
     centre = at.translation[..., None, :]
     if not scene.gain:
         return scene.obstruction.share(anchors, centre)[..., 0, :]
@@ -342,15 +342,15 @@ def link_quality(scene: Scene, at: Epoch, anchors: FloatArray) -> FloatArray:
 
 
 def shares(scene: Scene, at: Epoch, anchors: FloatArray, links: BoolArray) -> Any:
-    """Share (..., M, N) of its information that each link has: none where it gave no range."""
+    """Return the information fraction (..., M, N) of each link, 0 without a range."""
     return links * link_quality(scene, at, anchors)[..., None] if scene.weakens else links
 
 
 def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> FloatArray:
-    """Anchors after one step of the commanded velocities.
+    """Return the anchors after one step of the commanded velocities.
 
-    `action` (..., 3 M) holds a velocity per anchor in units of the scene's limit; a longer
-    one than 1 is cut to 1, and the place is projected onto the anchors' region.
+    `action` (..., 3 M) has a velocity per anchor in units of the scene's limit. Longer velocities
+    are cut to length 1, and positions are projected onto the anchors' region.
     """
     velocity = action.reshape((*action.shape[:-1], scene.n_anchors, 3))
     moved = _move(anchors, velocity, scene.anchor_speed_m_s * scene.dt)
@@ -359,7 +359,7 @@ def move_anchors(scene: Scene, anchors: FloatArray, action: FloatArray) -> Float
 
 @compiled("epoch:move")
 def _move(places: FloatArray, velocity: FloatArray, reach: float) -> FloatArray:
-    """Places (..., M, 3) after a step of `reach` along velocities of length 1 at the most."""
+    """Return positions (..., M, 3) after a step of `reach` along velocities of length up to 1."""
     length = np.linalg.norm(velocity, axis=-1, keepdims=True)
     longest = np.asarray(reach)[..., None, None]
     return velocity * (longest / np.maximum(length, 1.0)) + places

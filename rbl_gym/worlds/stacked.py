@@ -1,8 +1,8 @@
-"""Many scenes of a family side by side, as arrays: what an epoch of a vector environment needs.
+"""Many scenes of a family as arrays: the data for an epoch of a vector environment.
 
-`StackedScenes` has the attributes of a `Scene` that `simulation.measure_epoch`, the posterior
-bound and the filters ask for, with a leading axis (B,). Anchors and tags that a scene does not have
-are padded; their links never measure.
+`StackedScenes` has those attributes of a `Scene` that `simulation.measure_epoch`, the posterior
+bound and the filters use, with a leading axis (B,). Missing anchors and tags of a scene are padded;
+their links never measure.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from rbl_gym.worlds import simulation
 from rbl_gym.worlds.families import SceneFamily, padded
 from rbl_gym.worlds.scene import FlatScales, Scene
 
-# Where boxes stand that a scene does not have: without a size, they block nothing.
+# Missing boxes are here: they have no size and block nothing.
 _NOWHERE = np.array([1e12, 1e12, 1e12, 0.0, 0.0, 0.0])
 
 
 class StackedLinks(NamedTuple):
-    """Link models of many worlds: the fields of a `LinkModel` that decide about a link.
+    """Link models of many worlds: those fields of a `LinkModel` that determine a link.
 
-    The first three are (B, 1, 1). `reach_m` (B, M, N) is -1 where there is no anchor or no tag.
+    The first three are (B, 1, 1). `reach_m` (B, M, N) is -1 for missing anchors or tags.
     """
 
     drop_probability: FloatArray
@@ -68,16 +68,16 @@ class _Arrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StackedScenes:
-    """Scenes of B worlds side by side.
+    """The stacked scenes of B worlds.
 
     Parameters
     ----------
     family
-        That they are drawn from.
+        The family from which the scenes are drawn.
     scenes
-        B of them.
+        The B scenes.
     arrays
-        Their numbers.
+        Numbers of the scenes.
     """
 
     family: SceneFamily
@@ -89,12 +89,12 @@ class StackedScenes:
 
     @classmethod
     def of(cls, family: SceneFamily, scenes: Sequence[Scene]) -> StackedScenes:
-        """Scenes of a family side by side."""
+        """Stack scenes of a family."""
         rows = [_numbers(family, scene) for scene in scenes]
         return cls(family, tuple(scenes), _Arrays(*map(np.stack, zip(*rows, strict=True))))
 
     def replaced(self, rows: np.ndarray, scenes: Sequence[Scene]) -> StackedScenes:
-        """The stack with other scenes in some rows."""
+        """Return the stack with other scenes in some rows."""
         new, kept = StackedScenes.of(self.family, scenes).arrays, list(self.scenes)
         fields = []
         for old, field in zip(self.arrays, new, strict=True):
@@ -106,43 +106,43 @@ class StackedScenes:
         return StackedScenes(self.family, tuple(kept), _Arrays(*fields))
 
     def rows(self, where: np.ndarray) -> StackedScenes:
-        """The scenes of some rows, a mask or indices."""
+        """Return the scenes of some rows, a mask or indices."""
         chosen = np.arange(len(self.scenes))[where]
         arrays = _Arrays(*(field[chosen] for field in self.arrays))
         return StackedScenes(self.family, tuple(self.scenes[i] for i in chosen), arrays)
 
     def with_tags(self, count: int) -> StackedScenes:
-        """The scenes with the first tags only: all that their bodies have."""
+        """Return the scenes with only the first tags, for bodies with this number of tags."""
         arrays = self.arrays._replace(
             body=self.arrays.body[:, :count], reach=self.arrays.reach[:, :, :count]
         )
         return StackedScenes(self.family, self.scenes, arrays)
 
-    # --- what a scene has -----------------------------------------------------------------
+    # --- attributes of a scene ------------------------------------------------------------
 
     @property
     def n_anchors(self) -> int:
-        """The most anchors of a scene of the family."""
+        """Largest number of anchors of a scene of the family."""
         return self.family.n_anchors
 
     @property
     def body(self) -> FloatArray:
-        """Tags (B, N, 3); the first one stands in for those that a body does not have."""
+        """Tags (B, N, 3); missing tags of a body repeat its first tag."""
         return self.arrays.body
 
     @property
     def tags(self) -> FloatArray:
-        """As `body`."""
+        """Same as `body`."""
         return self.arrays.body
 
     @property
     def dt(self) -> FloatArray:
-        """(B,), seconds."""
+        """Duration of a step (B,), seconds."""
         return self.arrays.dt
 
     @property
     def range_limit_m(self) -> FloatArray:
-        """(B,), metres."""
+        """Range limits (B,), metres."""
         return self.arrays.range_limit_m
 
     @property
@@ -152,22 +152,22 @@ class StackedScenes:
 
     @property
     def blocked_information(self) -> FloatArray:
-        """(B, 1, 1)."""
+        """Information fractions of blocked links (B, 1, 1)."""
         return self.arrays.blocked
 
     @property
     def gain(self) -> Gain:
-        """The same of all."""
+        """Reach and view of the anchors, the same in all scenes."""
         return self.scenes[0].gain
 
     @property
     def anchor_region(self) -> Region:
-        """Where anchors may stand: of all the same, where their view is limited."""
+        """Region of the anchors; the same in all scenes if their view is limited."""
         return self.scenes[0].anchor_region
 
     @functools.cached_property
     def obstruction(self) -> Obstacles:
-        """The boxes of all of them, (B, K, 6)."""
+        """The boxes of all scenes, (B, K, 6)."""
         prisms, blocked = self.scenes[0].prisms, self.arrays.blocked
         if len(prisms):
             blocked = blocked[:, 0, 0]
@@ -175,31 +175,31 @@ class StackedScenes:
 
     @functools.cached_property
     def noise(self) -> StackedNoise:
-        """The laws of all of them."""
+        """The noise laws of all scenes."""
         return StackedNoise(self.arrays.laws)
 
     @functools.cached_property
     def process(self) -> ProcessNoise:
-        """Noise of the motion of each."""
+        """The process noise of each scene."""
         std = self.arrays.process
         return ProcessNoise(std[:, :3], std[:, 3:])  # pyright: ignore[reportArgumentType]
 
     @functools.cached_property
     def links(self) -> StackedLinks:
-        """What else happens to the links of each."""
+        """The link models of each scene."""
         drop, nlos = self.arrays.drop, self.arrays.nlos
         random = bool(drop.any() or nlos.any())
         return StackedLinks(drop, nlos, self.arrays.bias, self.arrays.reach, random)
 
     @property
     def scales(self) -> FlatScales:
-        """`Scene.scales` of each, (B, ...)."""
+        """`Scene.scales` of each scene, (B, ...)."""
         return FlatScales.split(self.arrays.scales)
 
-    # --- what differs in kind -------------------------------------------------------------
+    # --- groups of scenes -----------------------------------------------------------------
 
     def move_anchors(self, anchors: FloatArray, action: FloatArray) -> FloatArray:
-        """`simulation.move_anchors` of each, anchors (B, M, 3), actions (B, 3 M)."""
+        """Return `simulation.move_anchors` of each, for anchors (B, M, 3) and actions (B, 3 M)."""
         moved = anchors.copy()
         for scene, rows in self._alike("anchor_region", "anchor_speed_m_s", "dt", "n_anchors"):
             if scene.anchor_speed_m_s > 0:
@@ -209,13 +209,13 @@ class StackedScenes:
         return moved
 
     def bodies(self) -> Iterator[tuple[int, BoolArray]]:
-        """Numbers of tags that there are, and the mask (B,) of the worlds that have so many."""
+        """Return each number of tags, with the mask (B,) of the worlds that have it."""
         counts = self.arrays.tag_mask.sum(axis=-1)
         for count in np.unique(counts).tolist():
             yield count, counts == count
 
     def _alike(self, *names: str) -> Iterator[tuple[Scene, np.ndarray]]:
-        """Scenes that are alike in some fields: one of them, and the rows of all."""
+        """Group scenes that agree in some fields: one scene, and the rows, of each group."""
         found: dict[Any, list[int]] = {}
         for row, scene in enumerate(self.scenes):
             found.setdefault(tuple(getattr(scene, name) for name in names), []).append(row)
@@ -224,7 +224,7 @@ class StackedScenes:
 
 
 def _numbers(family: SceneFamily, scene: Scene) -> tuple[Any, ...]:
-    """The numbers of a scene in the order of `_Arrays`."""
+    """Return the numbers of a scene in the order of `_Arrays`."""
     m, n, links = scene.n_anchors, len(scene.tags), scene.links
     anchor_mask = padded(np.ones(m, np.int8), (family.n_anchors,))
     tag_mask = padded(np.ones(n, np.int8), (family.n_tags,))
