@@ -1,1 +1,1 @@
-"""Measurements: ranges with their noise laws and links, angles of arrival, link biases."""
+"""Model measurements: ranges with noise laws and links, angles of arrival, link biases."""

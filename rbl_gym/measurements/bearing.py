@@ -1,9 +1,9 @@
-"""Directions of arrival at a single base station: alpha to its x axis, beta to its z axis.
+"""Model directions of arrival at one base station: alpha to its x axis, beta to its z axis.
 
-The base station's axes are the world's. Angles (..., 2, N) hold alpha and beta of N tags, in
-radians on [0, pi]; positions (..., N, 3) are relative to the base station unless a station is
-named. The two angles leave the sign of y open: a position and its mirror image across the
-station's xz plane look the same.
+The axes of the base station are those of the world frame. Angles (..., 2, N) hold alpha and beta of
+N tags, in radians on [0, pi]; positions (..., N, 3) are relative to the base station unless a
+station is given. The two angles do not determine the sign of y: a position and its mirror image
+across the xz plane of the station have the same angles.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ __all__ = [
     "seen", "simulate",
 ]  # fmt: skip
 
-# What the angles cannot tell apart.
+# The reflection that leaves the angles unchanged.
 MIRROR = np.array([1.0, -1.0, 1.0])
-# As near to the station (m) no direction is one: its gradient counts as zero.
+# Closer to the station (m) the direction is undefined: its gradient is set to zero.
 _NOWHERE = 1e-50
 _AXES = (0, 2)
 
@@ -54,46 +54,48 @@ class AngleNoise:
         check_number("std_rad", self.std_rad, low=1e-300)
 
     def variance(self, angles: FloatArray) -> FloatArray:
-        """Variance of each angle [rad^2], of the shape of the angles."""
+        """Return the variance of each angle [rad^2], with the shape of the angles."""
         return np.full(angles.shape, self.std_rad**2)
 
     def sample(self, true_angles: FloatArray, normals: FloatArray) -> FloatArray:
-        """Noisy angles, folded back into [0, pi]."""
+        """Return noisy angles, folded back into [0, pi]."""
         return fold(true_angles + self.std_rad * normals)
 
 
 def fold(angles: FloatArray) -> FloatArray:
-    """Angles of any size as angles to an axis, on [0, pi]."""
+    """Fold angles of any size to angles to an axis, on [0, pi]."""
     return np.abs(angles - 2 * np.pi * np.round(angles / (2 * np.pi)))
 
 
 def angles(positions: ArrayLike, station: ArrayLike | None = None) -> FloatArray:
-    """Angles (..., 2, N) of positions (..., N, 3) seen from a station (..., 3), None: the origin.
+    """Return angles (..., 2, N) of positions (..., N, 3) from a station (..., 3), None: the origin.
 
-    By atan2: accurate near 0 and pi too, where the arc cosine loses half of the digits.
+    They are computed by atan2, which is also accurate near 0 and pi, where the arc cosine loses
+    half of the digits.
     """
     return np.moveaxis(seen(np.moveaxis(_relative(positions, station), -1, 0)), 0, -2)
 
 
 def jacobian(positions: ArrayLike, station: ArrayLike | None = None) -> FloatArray:
-    """Derivative (..., 2, N, 3) of the angles by the positions.
+    """Return the derivative (..., 2, N, 3) of the angles by the positions.
 
-    On an axis its own angle has no derivative (it rises whichever way the tag leaves): zero.
+    On an axis its own angle has no derivative, because it increases in all directions. It is set to
+    zero there.
     """
     _, gradient = linearize(np.moveaxis(_relative(positions, station), -1, 0))
     return np.moveaxis(gradient, (0, 1), (-3, -1))
 
 
 def seen(x: FloatArray) -> FloatArray:
-    """Angles (2, ...) at places (3, ...), components first."""
+    """Return angles (2, ...) at positions (3, ...), components first."""
     return np.stack([np.arctan2(across, along) for along, across in _along_and_across(x)])
 
 
 def linearize(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Angles (2, ...) and their gradients (2, 3, ...) at places (3, ...), components first.
+    """Return angles (2, ...) and gradients (2, 3, ...) at positions (3, ...), components first.
 
-    The gradient of the angle to the axis e is ``(x (e x) / a - e a) / |x|^2``, a the distance
-    from the axis; it is made of quotients of at most 1, which no place overflows.
+    The gradient of the angle to the axis e is ``(x (e x) / a - e a) / |x|^2``, with the
+    distance a from the axis. It is computed from quotients of at most 1, so no position overflows.
     """
     near = _nearness(x)
     found, gradient = np.empty((2, *near.shape)), np.empty((2, *x.shape))
@@ -108,10 +110,11 @@ def linearize(x: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def curvature(x: FloatArray, weights: FloatArray) -> FloatArray:
-    """Sum (3, 3, ...) of the angles' second derivatives at places (3, ...), weights (2, ...).
+    """Return the sum (3, 3, ...) of second derivatives at positions (3, ...), weights (2, ...).
 
-    In the cylinder about the axis e, u the unit vector away from it, h along and a across: the
-    angle is ``atan2(a, h)``, and the circle about the axis adds ``h / (a |x|^2)`` across both.
+    In cylindrical coordinates about the axis e, with h along it, a across it and u the unit vector
+    away from it, the angle is ``atan2(a, h)``. The circle about the axis adds ``h / (a |x|^2)`` in
+    the direction perpendicular to both.
     """
     near = _nearness(x)
     total = np.zeros((3, *x.shape))
@@ -133,25 +136,25 @@ def curvature(x: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _along_and_across(x: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Of each axis that is looked along: the coordinate and the distance from it."""
+    """Return for each axis of the angles the coordinate along it and the distance from it."""
     return [(x[k], np.hypot(x[(k + 1) % 3], x[(k + 2) % 3])) for k in _AXES]
 
 
 def _nearness(x: FloatArray) -> FloatArray:
-    """One over the distance (...) of places (3, ...), 0 where there is no direction."""
+    """Return the inverse distance (...) of positions (3, ...), 0 if the direction is undefined."""
     return 1 / _safe(np.hypot(x[0], np.hypot(x[1], x[2])))
 
 
 def _safe(distance: FloatArray) -> FloatArray:
-    """Distances to divide by: infinite where there is no direction."""
+    """Return distances to divide by: infinite if the direction is undefined."""
     return np.where(distance > _NOWHERE, distance, np.inf)
 
 
 def directions(angles: FloatArray, sign: ArrayLike = 1.0) -> FloatArray:
-    """Unit vectors (..., N, 3) of angles (..., 2, N), with the sign of y (..., N) as told.
+    """Return unit vectors (..., N, 3) of angles (..., 2, N), with the given sign of y (..., N).
 
-    Angles no direction has (``cos^2 alpha + cos^2 beta > 1``: noise near y = 0) give the nearest
-    one with y = 0.
+    Angles that belong to no direction (``cos^2 alpha + cos^2 beta > 1``: noise near y = 0) give the
+    nearest direction with y = 0.
     """
     x, z = np.cos(angles[..., 0, :]), np.cos(angles[..., 1, :])
     planar = x * x + z * z
@@ -161,7 +164,7 @@ def directions(angles: FloatArray, sign: ArrayLike = 1.0) -> FloatArray:
 
 
 def information(positions: FloatArray, noise: AngleNoise) -> FloatArray:
-    """Fisher information (..., N, 3, 3) of the angles about the place of each tag."""
+    """Return the Fisher information (..., N, 3, 3) of the angles about the position of each tag."""
     found, J = linearize(np.moveaxis(positions, -1, 0))
     weight = 1 / noise.variance(found)
     return np.moveaxis(np.einsum("k...,ki...,kj...->ij...", weight, J, J), (0, 1), (-2, -1))
@@ -176,7 +179,7 @@ def sample(
     normals: FloatArray,
     std_rad: float,
 ) -> FloatArray:
-    """Noisy angles (..., 2, N) of bodies at given poses; behind doors: nothing is checked.
+    """Return noisy angles (..., 2, N) of bodies at given poses, without checks of the arguments.
 
     Parameters
     ----------
@@ -198,16 +201,16 @@ def simulate(
     rng: np.random.Generator,
     station: ArrayLike | None = None,
 ) -> FloatArray:
-    """Noisy angles (..., 2, N) of bodies at given poses.
+    """Simulate noisy angles (..., 2, N) of bodies at given poses.
 
     Parameters
     ----------
     tags, rotation, translation
         (..., N, 3), (..., 3, 3), (..., 3); metres.
     noise, rng
-        Law of the angles, and where its normals come from.
+        Noise law of the angles, and the source of randomness.
     station
-        Place (..., 3) of the base station; None: the origin.
+        Position (..., 3) of the base station; None: the origin.
     """
     if not isinstance(noise, AngleNoise):
         raise ValueError(f"noise must be an AngleNoise, got {noise!r:.80}")
@@ -217,9 +220,9 @@ def simulate(
 
 
 def check_angles(value: ArrayLike, n_tags: int, name: str = "angles") -> FloatArray:
-    """Angles (..., 2, N) on [0, pi], or a ValueError that says what is wrong.
+    """Return angles (..., 2, N) on [0, pi], or raise ValueError.
 
-    What noise takes over an end by less than a tenth of a radian is folded back.
+    Noisy angles outside [0, pi] by less than 0.1 rad are folded back.
     """
     checked = check_finite(name, check_shape(name, value, (2, n_tags)))
     wrong = (checked < -0.1) | (checked > np.pi + 0.1)

@@ -1,15 +1,15 @@
-"""Bias and deviation of ranges as functions of the direction in which a ray leaves a body.
+"""Model the bias and standard deviation of ranges as functions of the ray direction.
 
-Antennas are not alike in all directions, and bodies block their own radios: what a range has too
-much depends on the bearing of the ray at each end,
+Antennas are not isotropic, and bodies block their own radios. The bias of a range therefore
+depends on the bearing of the ray at each end,
 
     beta_mn = sum_k [a_m,2k-1 cos(k phi) + a_m,2k sin(k phi)]
             + sum_k [b_n,2k-1 cos(k psi) + b_n,2k sin(k psi)],
 
-phi the bearing of the tag in the frame of the anchors, psi that of the anchor in the frame of the
-body, both about z from x. The logarithm of the deviation is such a sum too. Constants are biases
-of links. The first harmonic of a tag is what a shift of the tag would add to its ranges: the two
-cannot be told apart.
+with phi the bearing of the tag in the frame of the anchors and psi that of the anchor in the frame
+of the body, both about z from x. The logarithm of the standard deviation is such a sum too.
+Constant terms are link biases. The first harmonic of a tag has the same effect as a shift of the
+tag: the two cannot be distinguished.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rbl_gym.checks import FloatArray
 
 __all__ = ["DirectionLaw", "direction_bias"]
 
-# Rays nearer to the vertical than this have no bearing (m).
+# Rays with a smaller horizontal length have no bearing (m).
 _LEAST_M = 1e-6
 
 
@@ -35,7 +35,7 @@ class DirectionLaw(NamedTuple):
     anchors, tags
         (M, 2 H) and (N, 2 H'), metres of bias.
     anchors_log_std, tags_log_std
-        Of the same shapes: the logarithm of the factor on the deviation of a range.
+        The same shapes: logarithm of the factor on the standard deviation of a range.
     """
 
     anchors: FloatArray
@@ -51,12 +51,12 @@ class DirectionLaw(NamedTuple):
         anchors_log_std: ArrayLike | None = None,
         tags_log_std: ArrayLike | None = None,
     ) -> DirectionLaw:
-        """A law of checked coefficients; deviations that are not given do not vary.
+        """Return a law with checked coefficients; standard deviations not given do not vary.
 
         Raises
         ------
         ValueError
-            On shapes that do not fit together.
+            If the shapes do not match.
         """
         fields = []
         for name, bias, log_std in (
@@ -79,7 +79,7 @@ class DirectionLaw(NamedTuple):
 
 class Directed(NamedTuple):
     """Bias (..., M, N), its derivative (..., M, N, 6) by the pose error (w, v), log of the factor
-    on the deviation (..., M, N).
+    on the standard deviation (..., M, N).
     """
 
     bias: FloatArray
@@ -94,12 +94,12 @@ def direction_bias(
     anchors: FloatArray,
     tags: FloatArray,
 ) -> Directed:
-    """What the directions of the rays add to the ranges at poses.
+    """Return the bias of ranges by ray direction at poses.
 
     Parameters
     ----------
     law
-        Of M anchors and N tags.
+        Law of M anchors and N tags.
     rotation, translation
         (..., 3, 3) and (..., 3).
     anchors, tags
@@ -109,11 +109,11 @@ def direction_bias(
     -------
     Directed
         Bias in metres; its derivative by the global pose error, ``Q' = exp(w) Q``, ``t' = t + v``;
-        logarithm of the factor on the deviation.
+        logarithm of the factor on the standard deviation.
     """
     arms = tags @ np.swapaxes(rotation, -1, -2)
     ray = (arms + translation[..., None, :])[..., None, :, :] - anchors[..., :, None, :]
-    # In the body's axes: from the tag to the anchor.
+    # In body axes: from the tag to the anchor.
     back = -ray @ rotation[..., None, :, :]
     out_bearing, out_over = _bearing(ray)
     bearing, over = _bearing(back)
@@ -121,7 +121,7 @@ def direction_bias(
     at_tag, slope_b = _sum(law.tags, bearing)
     log_std = _sum(law.anchors_log_std[:, None], out_bearing)[0]
     log_std = log_std + _sum(law.tags_log_std, bearing)[0]
-    # The place of a tag moves by w x (Q c) + v; the anchor as the body sees it by
+    # The position of a tag changes by w x (Q c) + v, that of the anchor in the body frame by
     # Q^T ((a - t) x w) - Q^T v.
     by_place = slope_a[..., None] * out_over
     to_anchor = (anchors - translation[..., None, :])[..., :, None, :]
@@ -132,14 +132,14 @@ def direction_bias(
 
 
 def _bearing(ray: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Bearings (...) of rays (..., 3), and their derivatives (..., 3) by the ray."""
+    """Return bearings (...) of rays (..., 3), and their derivatives (..., 3) by the ray."""
     x, y = ray[..., 0], ray[..., 1]
     squared = np.maximum(x**2 + y**2, _LEAST_M**2)
     return np.arctan2(y, x), np.stack([-y, x, np.zeros_like(x)], axis=-1) / squared[..., None]
 
 
 def _sum(coefficients: FloatArray, bearing: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Sums of harmonics of bearings (..., M, N), and their derivatives."""
+    """Return sums of harmonics of bearings (..., M, N), and their derivatives."""
     order = 1 + np.arange(coefficients.shape[-1] // 2)
     angle = bearing[..., None] * order
     cos, sin = np.cos(angle), np.sin(angle)

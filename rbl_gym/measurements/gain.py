@@ -1,4 +1,4 @@
-"""How far and how wide an anchor reaches: the share of a link's information by range and angle."""
+"""Model the coverage of an anchor: the share of link information by range and angle."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ __all__ = ["Gain"]
 
 @dataclass(frozen=True)
 class Gain:
-    """A limit of range and a field of view, both with a smooth edge; the default is neither.
+    """A maximum range and a field of view, both with a smooth edge; by default neither is limited.
 
-    Within an edge the share falls as ``x^2 (3 - 2 x)``, x from 1 where the edge begins to 0 at the
-    limit: linear in the range, and in the cosine of the angle to the mount's normal.
+    Within an edge the share falls as ``x^2 (3 - 2 x)``, with x from 1 at the start of the edge to 0
+    at the limit. x is linear in the range, or in the cosine of the angle to the normal of the
+    mount.
 
     Parameters
     ----------
     max_range_m
-        Beyond it a link tells nothing.
+        Maximum range; a longer link has no information.
     range_edge_m
-        Width of the edge before it; 0: none.
+        Width of the edge before it; 0: no edge.
     half_angle_rad
-        Farther from the normal of its mount an anchor does not see; pi: it sees everywhere.
+        Largest angle to the normal of the mount at which an anchor measures; pi: all directions.
     angle_edge_rad
-        Width of the edge before it; 0: none.
+        Width of the edge before it; 0: no edge.
     """
 
     max_range_m: float = math.inf
@@ -45,14 +46,14 @@ class Gain:
         check_number("angle_edge_rad", self.angle_edge_rad, low=0.0, high=self.half_angle_rad)
 
     def __bool__(self) -> bool:
-        """Whether anything is limited."""
+        """Return whether range or angle is limited."""
         return self.max_range_m < math.inf or self.half_angle_rad < math.pi
 
     @functools.cached_property
     def numbers(self) -> FloatArray:
-        """Limit and edge of the range; cosines at the limit of the angle and where its edge begins.
+        """Return limit and edge of the range, and the cosines at the limit and edge of the angle.
 
-        Without a limit of the angle both cosines are -2.
+        Without a limit of the angle, both cosines are -2.
         """
         cosines = (-2.0, -2.0)
         if self.half_angle_rad < math.pi:
@@ -61,14 +62,14 @@ class Gain:
         return np.array([self.max_range_m, self.range_edge_m, *cosines])
 
     def share(self, offsets: FloatArray, normals: FloatArray) -> FloatArray:
-        """Share (...) of its information that a link has.
+        """Return the share (...) of its information that a link has.
 
         Parameters
         ----------
         offsets
             (..., 3) from the anchor to the tag, metres.
         normals
-            (..., 3) of the anchor's mount, of unit length; zero: the anchor sees everywhere.
+            (..., 3) of the anchor's mount, of unit length; zero: all directions.
         """
         limit, edge, least, full = self.numbers.tolist()
         distance = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
@@ -83,14 +84,14 @@ class Gain:
         return share
 
 
-# Neither limit.
+# No limits.
 EVERYWHERE = Gain()
 
 
 def share_and_slope(
     numbers: FloatArray, offsets: FloatArray, normals: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """`Gain.share` (...) and its derivative (..., 3) by the offsets, of a gain's numbers."""
+    """Return `Gain.share` (...) and its derivative (..., 3) by the offsets, from `Gain.numbers`."""
     limit, edge, least, full = numbers.tolist()
     distance = np.sqrt((offsets**2).sum(axis=-1))
     share, slope = np.ones_like(distance), np.zeros_like(offsets)
@@ -110,7 +111,7 @@ def share_and_slope(
 
 
 def _step(inside: FloatArray, edge: float) -> tuple[FloatArray, FloatArray]:
-    """A smooth step from 0 to 1 over an edge, and its derivative."""
+    """Return a smooth step from 0 to 1 over an edge, and its derivative."""
     if not edge > 0:
         return np.where(inside >= 0, 1.0, 0.0), np.zeros_like(inside)
     x = np.clip(inside / edge, 0.0, 1.0)

@@ -1,8 +1,8 @@
-"""Inertial sensors: a gyroscope and an accelerometer on the body, their noise and their biases.
+"""Model inertial sensors: a gyroscope and an accelerometer on the body, with noise and biases.
 
 A reading (6,) is the angular velocity [rad/s], then the specific force [m/s^2], both in the body
-frame. The specific force is the acceleration less gravity: a body at rest reads ``+9.81 m/s^2``
-upwards. Each reading is that of a short interval, a sample, over which it counts as constant:
+frame. The specific force is the acceleration minus gravity: a body at rest reads ``+9.81 m/s^2``
+upwards. Each reading belongs to a short interval, a sample, in which it is taken as constant:
 
     gyroscope      w + b_g + n_g,               n_g white of density `gyro_noise`
     accelerometer  Q^T (a - g) + b_a + n_a,     n_a white of density `accel_noise`
@@ -41,12 +41,12 @@ GRAVITY_M_S2 = 9.80665
 
 @dataclass(frozen=True)
 class InertialSensor:
-    """A gyroscope and an accelerometer of three axes each; the defaults are a consumer's.
+    """A 3-axis gyroscope and a 3-axis accelerometer; the defaults are of consumer grade.
 
     Parameters
     ----------
     rate_hz
-        Samples a second.
+        Samples per second.
     gyro_noise, accel_noise
         Densities of the white noise: rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
     gyro_walk, accel_walk
@@ -54,12 +54,12 @@ class InertialSensor:
     gyro_bias_rad_s, accel_bias_m_s2
         Standard deviations of the biases at the start, per axis.
     gyro_limit_rad_s, accel_limit_m_s2
-        Largest reading of an axis; what is larger reads as that.
+        Largest reading of an axis; larger values are clipped.
 
     Raises
     ------
     ValueError
-        If a value is negative or not finite, or a density, a deviation or a limit zero.
+        If a value is negative or not finite, or a density, a standard deviation or a limit is zero.
     """
 
     rate_hz: float = 100.0
@@ -79,25 +79,25 @@ class InertialSensor:
 
     @functools.cached_property
     def prior_std(self) -> FloatArray:
-        """Standard deviations (6,) of the biases at the start; not to be written to."""
+        """Return the initial standard deviations (6,) of the biases; read-only."""
         return _fixed([self.gyro_bias_rad_s] * 3 + [self.accel_bias_m_s2] * 3)
 
     @functools.cached_property
     def numbers(self) -> FloatArray:
-        """What `motion.navigation` takes (5,): variances of white noises and walks after 1 s, g.
+        """Return arguments of `motion.navigation` (5,): variances of noises and walks after 1 s, g.
 
-        Not to be written to.
+        The array is read-only.
         """
         std = (self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk)
         return _fixed([*np.square(std), GRAVITY_M_S2])
 
     def samples(self, dt: float) -> int:
-        """Samples in an interval of `dt` seconds.
+        """Return the number of samples in an interval of `dt` seconds.
 
         Raises
         ------
         ValueError
-            If that is no whole number.
+            If it is not an integer.
         """
         count = round(self.rate_hz * dt)
         if count < 1 or abs(count / (self.rate_hz * dt) - 1) > 1e-6:
@@ -114,7 +114,7 @@ def _fixed(values: list[float]) -> FloatArray:
     return array
 
 
-# Data sheets: a phone's or a drone's sensor; one of fibre optics or the best micromechanics.
+# From data sheets: the sensor of a phone or drone; fibre-optic or the best MEMS sensors.
 SENSORS: dict[str, InertialSensor] = {
     "consumer": InertialSensor(),
     "tactical": InertialSensor(
@@ -131,18 +131,18 @@ SENSORS: dict[str, InertialSensor] = {
 
 
 def sensor(value: str | Mapping[str, Any] | InertialSensor) -> InertialSensor:
-    """An inertial sensor by its name, or by a mapping as JSON and TOML hold it.
+    """Return an inertial sensor from its name, or from a mapping as in JSON and TOML files.
 
     Parameters
     ----------
     value
-        A name of `SENSORS`; or fields of `InertialSensor` that differ from those of the one with
-        the name ``"kind"`` (without it: ``"consumer"``); or the sensor.
+        A name in `SENSORS`; or a mapping with the fields that differ from the sensor named by
+        ``"kind"`` (default ``"consumer"``); or an `InertialSensor`.
 
     Raises
     ------
     ValueError
-        On an unknown name or field, or a value that its field refuses.
+        If a name or field is unknown, or a value is invalid.
     """
     if isinstance(value, InertialSensor):
         return value
@@ -161,12 +161,13 @@ def sensor(value: str | Mapping[str, Any] | InertialSensor) -> InertialSensor:
 
 
 def specific_force(rotation: ArrayLike, acceleration: ArrayLike) -> FloatArray:
-    """What an accelerometer without errors reads (..., 3), in the body frame.
+    """Return the reading (..., 3) of an ideal accelerometer, in the body frame.
 
     Parameters
     ----------
     rotation, acceleration
-        (..., 3, 3), and (..., 3) in the world frame, m/s^2; the world's z axis points upwards.
+        (..., 3, 3), and (..., 3) in the world frame, m/s^2; the z axis of the world frame points
+        upwards.
     """
     rotation = check_array("rotation", rotation, (3, 3))
     force = check_array("acceleration", acceleration, (3,)) + np.array([0, 0, GRAVITY_M_S2])
@@ -174,14 +175,14 @@ def specific_force(rotation: ArrayLike, acceleration: ArrayLike) -> FloatArray:
 
 
 class InertialReadings(NamedTuple):
-    """Readings of a sensor, and what was wrong with them.
+    """Readings of a sensor, and their biases.
 
     Attributes
     ----------
     readings
-        (..., K, 6), rad/s and m/s^2, noisy, cut at the limits.
+        (..., K, 6), rad/s and m/s^2, noisy, clipped to the limits.
     bias
-        (..., K, 6), in each reading.
+        (..., K, 6), the bias of each reading.
     """
 
     readings: FloatArray
@@ -195,7 +196,7 @@ def simulate(
     rng: np.random.Generator,
     dt: float | None = None,
 ) -> InertialReadings:
-    """Readings of a body's motion.
+    """Simulate the readings of a moving body.
 
     Parameters
     ----------
@@ -203,16 +204,16 @@ def simulate(
         The sensor.
     turn_rate, force
         True angular velocity and `specific_force` (..., K, 3) in the body frame in the middle of
-        each sample, as of `motion.smooth`.
+        each sample, as from `motion.smooth`.
     rng
         Source of all randomness.
     dt
-        Seconds of a sample; None: ``1 / rate_hz``.
+        Duration of a sample, seconds; None: ``1 / rate_hz``.
 
     Raises
     ------
     ValueError
-        On wrong shapes or values, and on a sensor or a generator that is none.
+        If a shape or value is wrong, or the sensor or generator is invalid.
     """
     if not isinstance(sensor, InertialSensor):
         raise ValueError(f"sensor must be an InertialSensor, got {sensor!r:.80}")
@@ -231,11 +232,11 @@ def simulate(
 def disturbed(
     sensor: InertialSensor, felt: FloatArray, start: FloatArray, normals: FloatArray, dt: float
 ) -> InertialReadings:
-    """Readings of true ones (..., K, 6), from standard normals (..., 6) and (..., 2 K, 6)."""
+    """Add errors to true readings (..., K, 6), from standard normals (..., 6) and (..., 2 K, 6)."""
     count = felt.shape[-2]
     white, walk = (np.sqrt(np.repeat(pair, 3)) for pair in np.split(sensor.numbers[:4], 2))
     bias = np.cumsum(walk * np.sqrt(dt) * normals[..., count:, :], axis=-2)
-    # The first reading has the bias of the start.
+    # The first reading has the initial bias.
     bias = np.concatenate([np.zeros_like(bias[..., :1, :]), bias[..., :-1, :]], axis=-2)
     bias += (sensor.prior_std * start)[..., None, :]
     limit = np.repeat([sensor.gyro_limit_rad_s, sensor.accel_limit_m_s2], 3)
@@ -244,14 +245,14 @@ def disturbed(
 
 
 def turned(readings: ArrayLike, rotation: ArrayLike) -> FloatArray:
-    """Readings (..., 6) in other axes: of a sensor that does not sit as the body does.
+    """Rotate readings (..., 6) from the sensor frame to the body frame.
 
     Parameters
     ----------
     readings
-        (..., 6) in the sensor's frame.
+        (..., 6) in the sensor frame.
     rotation
-        (3, 3) from the sensor's frame to the body's.
+        (3, 3) from the sensor frame to the body frame.
     """
     readings = check_array("readings", readings, (6,))
     rotation = rotations.check_rotation("rotation", rotation)

@@ -1,7 +1,7 @@
-"""Biases of radio links: what cables, antennas and reflections add to a range, link by link.
+"""Model biases of radio links, caused by cables, antennas and reflections.
 
-A bias is a Gauss-Markov process: Gaussian, forgotten at the rate ``exp(-dt / time_s)``. Real ones
-are of two kinds, which add up: antenna delays that stay, and what moves as the body does.
+A bias is a Gauss-Markov process: Gaussian, with the correlation ``exp(-dt / time_s)``. Real biases
+are the sum of two kinds: constant antenna delays, and biases that change as the body moves.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ __all__ = ["LinkBias", "simulate_biases"]
 
 @dataclass(frozen=True)
 class LinkBias:
-    """Law of the links' biases: every link has its own, and one is common to all.
+    """Law of link biases: every link has its own bias, and all links share another one.
 
     Parameters
     ----------
     std_m
         Standard deviation of a link's bias, metres.
     time_s
-        Seconds after which the correlation has fallen to 1/e; None: it is constant.
+        Correlation time, seconds; None: the bias is constant.
     common_std_m
-        Standard deviation of what all links have in common, metres.
+        Standard deviation of the common bias of all links, metres.
     """
 
     std_m: float = 0.05
@@ -42,11 +42,11 @@ class LinkBias:
             check_number("time_s", self.time_s, low=1e-9)
 
     def covariance(self, links: int) -> FloatArray:
-        """Of the biases of so many links, (links, links), at any time."""
+        """Return the covariance (links, links) of the biases at any time."""
         return self.std_m**2 * np.eye(links) + self.common_std_m**2
 
     def decay(self, dt: float) -> float:
-        """Correlation over `dt` seconds."""
+        """Return the correlation over `dt` seconds."""
         return 1.0 if self.time_s is None else math.exp(-dt / self.time_s)
 
 
@@ -57,19 +57,19 @@ def simulate_biases(
     rng: np.random.Generator,
     batch: tuple[int, ...] = (),
 ) -> FloatArray:
-    """Biases (..., K, links) in metres at times (K,), drawn from the law.
+    """Simulate biases (..., K, links) in metres at times (K,).
 
     Parameters
     ----------
     law, times, links
-        `LinkBias`, seconds (K,) that do not decrease, and how many links there are.
+        `LinkBias`, seconds (K,) that do not decrease, and the number of links.
     rng, batch
         Source of the normals, and the leading axes.
 
     Raises
     ------
     ValueError
-        On times that decrease, and on a law, a number of links or a generator that is none.
+        If the times decrease, or the law, the number of links or the generator is invalid.
     """
     if not isinstance(law, LinkBias):
         raise ValueError(f"law must be a LinkBias, got {law!r:.80}")

@@ -1,6 +1,6 @@
 """Noise laws: the variance of a range, and of a squared range, as functions of the range.
 
-Where the variance is common to all tags of an anchor it comes back as (..., M, 1).
+If the variance is the same for all tags of an anchor, its shape is (..., M, 1).
 """
 
 from __future__ import annotations
@@ -23,20 +23,23 @@ __all__ = [
 
 
 class NoiseLaw(Protocol):
-    """What every noise law offers; ranges (..., M, N) in metres, links the mask beside them."""
+    """Interface of noise laws; ranges (..., M, N) in metres, links their mask."""
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance of each range [m^2], (..., M, N) or (..., M, 1) where common to the tags."""
+        """Return the variance of each range [m^2], (..., M, N).
+
+        (..., M, 1) if common to the tags.
+        """
         ...
 
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
     ) -> FloatArray:
-        """Variance of each squared range [m^4], (..., M, N) or (..., M, 1)."""
+        """Return the variance of each squared range [m^4], (..., M, N) or (..., M, 1)."""
         ...
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
-        """Noisy ranges from true distances and standard normals of the same shape."""
+        """Return noisy ranges from true distances and standard normals of the same shape."""
         ...
 
 
@@ -52,7 +55,7 @@ class RangeNoise:
         Growth of the standard deviation with the range, metres per metre.
     reference_tag
         None: ``r`` is each link's own range. An index: ``r`` is the range of that tag, for
-        all tags of an anchor, as the papers do (static paper, eq. (2)).
+        all tags of an anchor, as in the papers (static paper, eq. (2)).
 
     Raises
     ------
@@ -75,10 +78,11 @@ class RangeNoise:
 
     @classmethod
     def from_reference_range_db(cls, db: float, reference_tag: int | None = 0) -> RangeNoise:
-        """The static paper's law: a reference range of `db` decibels, 100 dB = 1 mm at 100 m.
+        """Return the law of the static paper for the reference range `db`: 100 dB = 1 mm at 100 m.
 
-        The standard deviation is ``10^(-db / 20)`` of the range, by default that of the first
-        tag for all tags of an anchor (its eq. (2)); ``reference_tag=None``: of each link.
+        The standard deviation is ``10^(-db / 20)`` times the range. By default this is the range of
+        the first tag, for all tags of an anchor (its eq. (2)). With ``reference_tag=None`` it is
+        the range of each link.
         """
         return cls(0.0, 10 ** (-check_number("db", db) / 20), reference_tag)
 
@@ -91,7 +95,7 @@ class RangeNoise:
         snr: float,
         reference_tag: int | None = 0,
     ) -> RangeNoise:
-        """The static paper's law from what makes it, its (1) and (2).
+        """Return the law of the static paper from its physical parameters, its (1) and (2).
 
         The variance of a range r is ``3 c^2 r^2 / (N_s kappa SNR)``; the reference range is
         ``10 log10(N_s kappa SNR / (3 c^2))`` dB.
@@ -99,9 +103,9 @@ class RangeNoise:
         Parameters
         ----------
         speed_m_s
-            Speed c of the wave, metres per second.
+            Propagation speed c, metres per second.
         n_samples
-            Samples N_s of a ranging.
+            Number of samples N_s per range.
         kappa
             The constant of the ranging method.
         snr
@@ -114,14 +118,14 @@ class RangeNoise:
         return cls(0.0, math.sqrt(3 / (n * k * ratio)) * c, reference_tag)
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        """Return the variance of the ranges [m^2]; see `NoiseLaw`."""
         r = self._scale(ranges, links)
         return self.floor_m**2 + (self.proportional * r) ** 2
 
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
     ) -> FloatArray:
-        """Variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
+        """Return the variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
         square = self._scale(ranges, links) ** 2
         if self.proportional == 0:
             return 4 * self.floor_m**2 * square
@@ -131,7 +135,7 @@ class RangeNoise:
         return variance
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
-        """Ranges with noise of this law, never below zero."""
+        """Return ranges with noise of this law, never below zero."""
         if self.proportional == 0:
             std: Any = math.sqrt(self.floor_m**2)
         else:
@@ -146,7 +150,7 @@ class RangeNoise:
 
     @functools.cached_property
     def numbers(self) -> FloatArray | None:
-        """The law as kernels take it (4,), `rbl_gym.kernels.noise_laws`; None: they cannot."""
+        """Return the law (4,) as used by `rbl_gym.kernels.noise_laws`; None: unsupported."""
         tag = -1 if self.reference_tag is None else self.reference_tag
         if self.reference_tag is not None and tag < 0:
             return None
@@ -160,12 +164,12 @@ class RangeNoise:
 
 @dataclass(frozen=True)
 class SquaredRangeNoise:
-    """The tracking paper's law: ``r^2 + n`` with ``n ~ N(0, (sigma_m |a_m - s_1|)^2)``.
+    """The law of the tracking paper: ``r^2 + n`` with ``n ~ N(0, (sigma_m |a_m - s_1|)^2)``.
 
     Parameters
     ----------
     sigma_m
-        Ratio of the squared range's standard deviation to the range of the first tag, metres.
+        Ratio of the standard deviation of the squared range to the range of the first tag, metres.
     """
 
     sigma_m: float = 0.0316
@@ -175,11 +179,11 @@ class SquaredRangeNoise:
 
     @functools.cached_property
     def numbers(self) -> FloatArray:
-        """As those of `RangeNoise`."""
+        """Return the law (4,) as `RangeNoise.numbers` does."""
         return np.array([1.0, self.sigma_m, 0.0, 0.0])
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance ``(sigma r_1 / 2 r)^2`` of the ranges [m^2], to first order; inf at zero."""
+        """Return the first-order variance ``(sigma r_1 / 2 r)^2`` of ranges [m^2]; inf at zero."""
         r = ranges if links is None else np.where(links, ranges, 1.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             return self.squared_range_variance(ranges, links) / (4 * r**2)
@@ -187,11 +191,11 @@ class SquaredRangeNoise:
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
     ) -> FloatArray:
-        """Variance of the squared ranges [m^4], (..., M, 1)."""
+        """Return the variance of the squared ranges [m^4], (..., M, 1)."""
         return (self.sigma_m * reference_range(ranges, 0, links)) ** 2
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
-        """Ranges with noise of this law; a negative square counts as zero."""
+        """Return ranges with noise of this law; negative squared ranges are set to zero."""
         squares = self.sigma_m * distances[..., :1] * normals
         squares += distances**2
         np.maximum(squares, 0.0, out=squares)
@@ -200,18 +204,18 @@ class SquaredRangeNoise:
 
 @dataclass(frozen=True, eq=False)
 class StackedNoise:
-    """Laws of many worlds side by side, each of its own kind.
+    """The laws of a batch of worlds, which may be of different kinds.
 
     Parameters
     ----------
     numbers
-        (..., 4), those of `RangeNoise.numbers` or `SquaredRangeNoise.numbers` in each row.
+        (..., 4), each row from `RangeNoise.numbers` or `SquaredRangeNoise.numbers`.
     """
 
     numbers: FloatArray
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance of the ranges [m^2], (..., M, N); see `NoiseLaw`."""
+        """Return the variance of the ranges [m^2], (..., M, N); see `NoiseLaw`."""
         squared, first, second = self._parts
         scale = self._scale(ranges, links)
         r = ranges if links is None else np.where(links, ranges, 1.0)
@@ -222,14 +226,14 @@ class StackedNoise:
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
     ) -> FloatArray:
-        """Variance of the squared ranges [m^4], (..., M, N); see `NoiseLaw`."""
+        """Return the variance of the squared ranges [m^4], (..., M, N); see `NoiseLaw`."""
         squared, first, second = self._parts
         scale = self._scale(ranges, links)
         of_ranges = 4 * scale**2 * (first**2 + (second * scale) ** 2)
         return np.where(squared, (first * scale) ** 2, of_ranges)
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
-        """Ranges with noise of these laws, never below zero."""
+        """Return ranges with noise of these laws, never below zero."""
         squared, first, second = self._parts
         scale = self._scale(distances, None)
         of_ranges = distances + np.sqrt(first**2 + (second * scale) ** 2) * normals
@@ -238,12 +242,12 @@ class StackedNoise:
 
     @property
     def _parts(self) -> tuple[BoolArray, FloatArray, FloatArray]:
-        """Whether a law is that of squared ranges, and its two parameters, (..., 1, 1)."""
+        """Return whether a law is that of squared ranges, and its two parameters, (..., 1, 1)."""
         kind, first, second, _ = np.moveaxis(self.numbers, -1, 0)[..., None, None]
         return kind == 1, first, second
 
     def _scale(self, ranges: FloatArray, links: BoolArray | None) -> FloatArray:
-        """The range (..., M, N) that tells a link's noise: its own, or that of the reference."""
+        """Return the range (..., M, N) that scales the noise: of the link or the reference tag."""
         reference, scale = self.numbers[..., 3, None, None], ranges
         for tag in np.unique(reference[reference >= 0]).astype(int).tolist():
             scale = np.where(reference == tag, reference_range(ranges, tag, links), scale)
@@ -252,12 +256,12 @@ class StackedNoise:
 
 @dataclass(frozen=True, eq=False)
 class LinkNoise:
-    """A standard deviation for every link, as radios report them.
+    """A standard deviation for every link, as reported by radios.
 
     Parameters
     ----------
     std_m
-        (..., M, N), metres; entries of links that are not measured do not matter.
+        (..., M, N), metres; entries of links that are not measured have no effect.
     """
 
     std_m: FloatArray
@@ -269,49 +273,49 @@ class LinkNoise:
         object.__setattr__(self, "std_m", std)
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        """Return the variance of the ranges [m^2]; see `NoiseLaw`."""
         return np.broadcast_to(self.std_m**2, np.broadcast_shapes(self.std_m.shape, ranges.shape))
 
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
     ) -> FloatArray:
-        """Variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
+        """Return the variance ``4 r^2 var(r)`` of the squared ranges [m^4], to first order."""
         return 4 * ranges**2 * self.std_m**2
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
-        """Ranges with noise of this law, never below zero."""
+        """Return ranges with noise of this law, never below zero."""
         return np.maximum(distances + self.std_m * normals, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class WeakenedNoise:
-    """A law of which the links of an anchor have only a share of the information.
+    """A noise law whose links have only a share of the information.
 
-    What a receiver knows that learns with a range how good the link is.
+    It models a receiver that knows the quality of the link of every range.
 
     Parameters
     ----------
     law
-        Of links with all of it.
+        The law of links with full information.
     share
-        (..., M), 0 to 1; where it is 0, the variance is inf.
+        (..., M), 0 to 1; 0 gives an infinite variance.
     """
 
     law: NoiseLaw
     share: FloatArray
 
     def variance(self, ranges: FloatArray, links: BoolArray | None = None) -> FloatArray:
-        """Variance of the ranges [m^2]; see `NoiseLaw`."""
+        """Return the variance of the ranges [m^2]; see `NoiseLaw`."""
         return self._weakened(self.law.variance(ranges, links))
 
     def squared_range_variance(
         self, ranges: FloatArray, links: BoolArray | None = None
     ) -> FloatArray:
-        """Variance of the squared ranges [m^4]; see `NoiseLaw`."""
+        """Return the variance of the squared ranges [m^4]; see `NoiseLaw`."""
         return self._weakened(self.law.squared_range_variance(ranges, links))
 
     def sample(self, distances: FloatArray, normals: FloatArray) -> FloatArray:
-        """Ranges with noise of this law, never below zero."""
+        """Return ranges with noise of this law, never below zero."""
         return self.law.sample(distances, normals / np.sqrt(self.share)[..., None])
 
     def _weakened(self, variance: FloatArray) -> FloatArray:
@@ -320,12 +324,12 @@ class WeakenedNoise:
 
 
 def numbers_of(noise: NoiseLaw, n_tags: int) -> FloatArray | None:
-    """The law of N tags as kernels take it, None where they know no such law.
+    """Return the law of N tags as used by the kernels; None if they do not support it.
 
     Raises
     ------
     ValueError
-        If there is no such reference tag.
+        If the reference tag does not exist.
     """
     numbers = getattr(noise, "numbers", None)
     if numbers is not None and numbers.ndim == 1 and numbers[3] >= n_tags:
@@ -334,7 +338,7 @@ def numbers_of(noise: NoiseLaw, n_tags: int) -> FloatArray | None:
 
 
 def law_of(numbers: FloatArray) -> NoiseLaw:
-    """The law that has these `numbers`; the laws of many worlds of (..., 4)."""
+    """Return the law with these `numbers` (4,), or the laws of many worlds (..., 4)."""
     if numbers.ndim > 1:
         return StackedNoise(numbers)
     kind, first, second, reference = numbers.tolist()
@@ -344,18 +348,18 @@ def law_of(numbers: FloatArray) -> NoiseLaw:
 
 
 def check_law(name: str, noise: Any) -> None:
-    """A ValueError where something does not offer what a `NoiseLaw` does."""
+    """Raise ValueError if an object does not have the methods of `NoiseLaw`."""
     methods = ("variance", "squared_range_variance", "sample")
     if not all(callable(getattr(noise, method, None)) for method in methods):
         raise ValueError(f"{name} must have {', '.join(methods)}, got {noise!r:.80}")
 
 
-# The laws of scenes by the names that scene files and overrides give them.
+# Noise laws by their names in scene files and overrides.
 NOISE_LAWS: dict[str, type[NoiseLaw]] = {
     "range": RangeNoise,
     "squared-range": SquaredRangeNoise,
 }
-# Other ways to say a law of these.
+# Other ways to specify one of these laws.
 NOISE_FORMS: dict[str, Callable[..., NoiseLaw]] = {
     **NOISE_LAWS,
     "reference-range": RangeNoise.from_reference_range_db,
@@ -364,15 +368,15 @@ NOISE_FORMS: dict[str, Callable[..., NoiseLaw]] = {
 
 
 def reference_range(ranges: FloatArray, tag: int, links: BoolArray | None = None) -> FloatArray:
-    """Range (..., M, 1) of the reference tag to every anchor.
+    """Return the range (..., M, 1) of the reference tag to every anchor.
 
-    Where that link is missing, the mean of the anchor's measured ranges stands in for it, and
-    1 where an anchor has no link at all (its weight is zero anyway).
+    If that link is missing, the mean of the measured ranges of the anchor is used instead. If an
+    anchor has no link, the value is 1; its weight is zero.
 
     Raises
     ------
     ValueError
-        If there is no such tag.
+        If the tag does not exist.
     """
     _check_reference(tag, ranges.shape[-1])
     reference = ranges[..., tag : tag + 1 or None]

@@ -1,8 +1,8 @@
-"""Odometry: speed and turn rate of a body in its own axes, with noise, scale and bias.
+"""Model odometry: velocity and turn rate of a body in its own axes, with noise, scale and bias.
 
-A reading is ``y = (1 + s) x + b + n`` of the body's twist x (turn rate, then speed): one scale of
-all turn rates and one of all speeds, a bias of each turn rate, white noise. What wheels cannot do,
-sideways and vertical speed, reads as zero, with a noise of its own.
+A reading is ``y = (1 + s) x + b + n`` with the twist x of the body (turn rate, then velocity): one
+scale error for all turn rates and one for all velocities, a bias of each turn rate, and white
+noise. Sideways and vertical velocity, which wheels cannot have, read as zero with their own noise.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ __all__ = ["OdometrySensor"]
 
 @dataclass(frozen=True)
 class OdometrySensor:
-    """What readings of odometry are worth.
+    """Error model of odometry readings.
 
-    Noise is white: what it adds to the way in 1 s, so that a reading that counts for dt seconds
-    has ``1 / sqrt(dt)`` times that, at whatever rate the sensor reads.
+    Noise is white. It is given as the error accumulated in 1 s. A reading over dt seconds has
+    ``1 / sqrt(dt)`` times this standard deviation, for any rate of the sensor.
 
     Parameters
     ----------
     speed_noise, slip_noise
-        Forwards, and sideways and vertical: by how much dead reckoning is off after 1 s (m).
+        Standard deviation of dead reckoning after 1 s (m): forwards, and sideways and vertical.
     turn_noise
-        The same of the rotation about each axis (rad).
+        The same for the rotation about each axis (rad).
     speed_scale_std, turn_scale_std
         Standard deviation of the scale errors, which are constant: 0.01 is one per cent.
     turn_bias_rad_s
-        Of the biases of the turn rates, which are constant, per axis.
+        Standard deviation of the constant biases of the turn rates, per axis.
 
     Raises
     ------
     ValueError
-        On a value that is negative or not finite, and noise that is not positive.
+        If a value is negative or not finite, or a noise is not positive.
     """
 
     speed_noise: float = 0.05
@@ -55,11 +55,11 @@ class OdometrySensor:
             check_number(field.name, getattr(self, field.name), low=low)
 
     def noise(self) -> FloatArray:
-        """What the noise of each axis (6,) adds in 1 s: turns (rad), then ways (m)."""
+        """Return the noise accumulated in 1 s on each axis (6,): rotation (rad), distance (m)."""
         return np.array([self.turn_noise] * 3 + [self.speed_noise] + [self.slip_noise] * 2)
 
     def calibration_std(self) -> FloatArray:
-        """Standard deviations (5,) of the scales of turn and speed, and of the biases."""
+        """Return standard deviations (5,) of the scales of turn rate and speed, and the biases."""
         return np.array([self.turn_scale_std, self.speed_scale_std, *[self.turn_bias_rad_s] * 3])
 
     def read(
@@ -69,23 +69,23 @@ class OdometrySensor:
         rng: np.random.Generator,
         calibration: ArrayLike | None = None,
     ) -> FloatArray:
-        """Readings (..., 6) of twists (..., 6) in the body frame, one every `dt` seconds.
+        """Simulate readings (..., 6) of twists (..., 6) in the body frame, one every `dt` seconds.
 
         Parameters
         ----------
         twists
             Turn rate (rad/s), then speed (m/s).
         dt
-            Seconds for which each reading counts.
+            Duration of each reading, seconds.
         rng
             Source of all randomness.
         calibration
-            (5,) scales and biases, as of `calibration_std`; None: drawn.
+            (5,) scales and biases, in the order of `calibration_std`; None: drawn.
 
         Raises
         ------
         ValueError
-            On wrong shapes and values.
+            If a shape or value is wrong.
         """
         twists = check_array("twists", twists, (6,))
         dt = check_number("dt", dt, low=1e-9)
@@ -98,7 +98,7 @@ class OdometrySensor:
 
 
 def expected(twist: FloatArray, calibration: FloatArray) -> FloatArray:
-    """Readings (..., 6) without noise of twists (..., 6), of scales and biases (..., 5)."""
+    """Return noise-free readings (..., 6) of twists (..., 6), for scales and biases (..., 5)."""
     scale = 1 + np.repeat(calibration[..., :2], 3, axis=-1)
     bias = np.concatenate([calibration[..., 2:], np.zeros(calibration[..., 2:].shape)], axis=-1)
     return scale * twist + bias

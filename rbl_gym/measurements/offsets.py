@@ -1,12 +1,12 @@
-"""Unknown offsets of ranges: pseudo-ranges, and differences of times of arrival.
+"""Model unknown offsets of ranges: pseudo-ranges, and time differences of arrival.
 
-A tag whose clock runs free, or whose time of sending nobody knows (uplink TDoA), gives ranges that
-are all longer by one unknown length; an anchor out of step with the others does so to all its
-ranges, and of passive receivers all ranges of an epoch are. A white offset is new at every epoch.
-Of a group of ranges ``r = d + c + noise`` with weights w the likeliest offset is the weighted mean
-of ``r - d``; what is left of the information is ``J^T (W - W 1 1^T W / 1^T W 1) J``: derivatives
-less their own weighted mean. A time difference to a reference anchor is the difference of two such
-ranges: the noise of the reference, common to all differences, is counted right by itself.
+All ranges of a tag share one unknown offset if its clock runs free or its time of transmission is
+unknown (uplink TDoA). All ranges of an anchor do if it is not synchronised with the others. With
+passive receivers, all ranges of an epoch do. A white offset is independent at every epoch. For a
+group of ranges ``r = d + c + noise`` with weights w, the most likely offset is the weighted mean
+of ``r - d``. The remaining information is ``J^T (W - W 1 1^T W / 1^T W 1) J``: derivatives minus
+their weighted mean. A time difference to a reference anchor is the difference of two such ranges.
+The noise of the reference, which all differences share, is thereby treated correctly.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from rbl_gym.checks import (
 
 __all__ = ["OFFSETS", "Clock", "centred", "common", "simulate_clocks"]
 
-# Over which axes of (..., M, N) the ranges with one offset lie.
+# The axes of (..., M, N) along which ranges share one offset.
 _AXES = {"tag": (-2,), "anchor": (-1,), "epoch": (-2, -1)}
 OFFSETS = tuple(_AXES)
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Law of offsets that last: clocks that drift, in metres of range (0.3 m are a nanosecond).
+    """Law of clock offsets with drift, in metres of range (0.3 m are a nanosecond).
 
     Parameters
     ----------
     offset
-        Whose clocks: ``"tag"``, ``"anchor"`` or ``"epoch"``, one for all.
+        One clock for each ``"tag"``, for each ``"anchor"``, or one for all (``"epoch"``).
     std_m, drift_m_s
-        Standard deviations at first: of the offset about a guess by the first ranges, and of its
-        drift (one part in 10^8 is 3 m/s).
+        Initial standard deviations: of the offset about the estimate from the first ranges, and of
+        its drift (one part in 10^8 is 3 m/s).
     walk_m, drift_walk_m_s
         Random walks of offset and drift: standard deviations after 1 s.
     """
@@ -62,7 +62,7 @@ class Clock:
             check_number(name, getattr(self, name), low=0.0)
 
     def transition(self, dt: float) -> tuple[FloatArray, FloatArray]:
-        """F and Q (2, 2) of offset and drift over `dt` seconds."""
+        """Return F and Q (2, 2) of offset and drift over `dt` seconds."""
         walk, wander = self.walk_m**2, self.drift_walk_m_s**2
         Q = [
             [walk * dt + wander * dt**3 / 3, wander * dt**2 / 2],
@@ -78,19 +78,19 @@ def simulate_clocks(
     rng: np.random.Generator,
     batch: tuple[int, ...] = (),
 ) -> FloatArray:
-    """Offsets (..., K, groups) in metres at times (K,), drawn from the law about zero.
+    """Simulate offsets (..., K, groups) in metres at times (K,), from the law about zero.
 
     Parameters
     ----------
     law, times, groups
-        `Clock`, seconds (K,) that do not decrease, and how many clocks there are.
+        `Clock`, seconds (K,) that do not decrease, and the number of clocks.
     rng, batch
         Source of the normals, and the leading axes.
 
     Raises
     ------
     ValueError
-        On times that decrease, and on a law, a number of groups or a generator that is none.
+        If the times decrease, or the law, the number of groups or the generator is invalid.
     """
     if not isinstance(law, Clock):
         raise ValueError(f"law must be a Clock, got {law!r:.80}")
@@ -110,36 +110,36 @@ def simulate_clocks(
 
 
 def check_offset(offset: str | None) -> str | None:
-    """The name of a kind of offset, or None: there is none; else a ValueError."""
+    """Return a valid kind of offset, None for no offset; raise ValueError for other values."""
     if offset is not None:
         check_one_of("offset", offset, OFFSETS)
     return offset
 
 
 def code_of(offset: str | None) -> int:
-    """The kind as kernels have it: 0 for none, else 1 by tag, 2 by anchor, 3 by epoch."""
+    """Return the code of the kind in kernels: 0 for none, 1 by tag, 2 by anchor, 3 by epoch."""
     return 0 if offset is None else 1 + OFFSETS.index(offset)
 
 
 def name_of(code: int) -> str | None:
-    """Inverse of `code_of`."""
+    """Return the kind of a code; inverse of `code_of`."""
     return (None, *OFFSETS)[int(code)]
 
 
 def group_shape(offset: str, anchors: int, tags: int) -> tuple[int, int]:
-    """Shape of the offsets of one epoch, broadcast against (M, N): (1, N), (M, 1) or (1, 1)."""
+    """Return the shape of the offsets of one epoch: (1, N), (M, 1) or (1, 1), as of (M, N)."""
     return {"tag": (1, tags), "anchor": (anchors, 1), "epoch": (1, 1)}[offset]
 
 
 def common(values: FloatArray, weights: FloatArray, offset: str) -> FloatArray:
-    """Weighted means of groups, of values (..., M, N); 0 where a group has no weight.
+    """Return the weighted means of groups of values (..., M, N); 0 if a group has no weight.
 
     Parameters
     ----------
     values, weights
         (..., M, N), which broadcast.
     offset
-        One of `OFFSETS`: which values are of one group.
+        One of `OFFSETS`: which values form a group.
 
     Returns
     -------
@@ -151,12 +151,12 @@ def common(values: FloatArray, weights: FloatArray, offset: str) -> FloatArray:
 
 
 def centred(values: FloatArray, weights: FloatArray, offset: str) -> FloatArray:
-    """Values (..., M, N) less the weighted mean of their group; arguments as `common`."""
+    """Return values (..., M, N) minus the weighted mean of their group; arguments: see `common`."""
     return values - common(values, weights, offset)
 
 
 def median(values: FloatArray, there: BoolArray, offset: str) -> FloatArray:
-    """Medians of groups, of the values (..., M, N) that are there: the lower one of two."""
+    """Return the medians of groups of the valid values (..., M, N); the lower one of two."""
     axes = axes_of(offset)
     values, there = np.broadcast_arrays(values, there)
     ordered = np.where(there, values, np.inf)
@@ -170,17 +170,17 @@ def median(values: FloatArray, there: BoolArray, offset: str) -> FloatArray:
 
 
 def columns(offset: str, anchors: int, tags: int) -> FloatArray:
-    """Which of the M N links have each of the G offsets: ones and zeros (M N, G)."""
+    """Return the incidence matrix (M N, G) of links and offsets: ones and zeros."""
     shape = group_shape(offset, anchors, tags)
     group = np.broadcast_to(np.arange(shape[0] * shape[1]).reshape(shape), (anchors, tags))
     return np.eye(shape[0] * shape[1])[group.ravel()]
 
 
 def axes_of(offset: str) -> tuple[int, ...]:
-    """Over which axes of (..., M, N) the links of one group lie."""
+    """Return the axes of (..., M, N) along which links form one group."""
     return _AXES[offset]
 
 
 def paired(links: BoolArray, offset: str) -> BoolArray:
-    """Which of the links (..., M, N) share their offset with another: one alone tells nothing."""
+    """Return which links (..., M, N) share their offset; single ones give no information."""
     return np.asarray(links & (links.sum(axis=_AXES[offset], keepdims=True) > 1))

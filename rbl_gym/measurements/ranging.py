@@ -1,7 +1,7 @@
-"""The range model: distances from anchors to tags, links that fail, simulated ranges.
+"""Model ranges: distances from anchors to tags, missing links, simulated ranges.
 
 Shapes: anchors (..., M, 3), tags (..., N, 3) in the body frame, ranges and links (..., M, N).
-The noise laws of `noise_laws` are handed on.
+The noise laws of `noise_laws` are also exported here.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ __all__ = [
 
 @dataclass(frozen=True)
 class LinkModel:
-    """What happens to a link besides noise; the default is that nothing does.
+    """Link errors besides noise; by default there are none.
 
     Parameters
     ----------
     drop_probability
-        Chance that a link gives no range at an epoch.
+        Probability that a link gives no range at an epoch.
     reach_m
         Distance beyond which there is no range; None: unlimited.
     nlos_probability
-        Chance that a range is taken over a reflected path.
+        Probability that a range is measured along a reflected path.
     nlos_bias_m
-        What a reflected path adds to the range, metres.
+        Bias of a range along a reflected path, metres.
     offset, offset_std_m
-        Whose ranges have an unknown offset in common, new at every epoch (`offsets`): ``"tag"``,
-        ``"anchor"`` or ``"epoch"``; None: nobody's. Its standard deviation, metres. Estimators
-        take it for altogether unknown.
+        Ranges of one ``"tag"``, ``"anchor"`` or ``"epoch"`` share an unknown offset, independent at
+        every epoch (`offsets`); None: there is no offset. Its standard deviation, metres;
+        estimators treat the offset as fully unknown.
     """
 
     drop_probability: float = 0.0
@@ -80,31 +80,31 @@ class LinkModel:
 
     @property
     def options(self) -> dict[str, str]:
-        """What an estimator is told of the links: ``offset``, where they have one."""
+        """Return the options of an estimator for these links: ``offset``, if they have one."""
         return {} if self.offset is None else {"offset": self.offset}
 
     def n_offsets(self, anchors: int, tags: int) -> int:
-        """How many offsets there are at an epoch."""
+        """Return the number of offsets of an epoch."""
         return 0 if self.offset is None else math.prod(self.offset_shape(anchors, tags))
 
     def offset_shape(self, anchors: int, tags: int) -> tuple[int, int]:
-        """Their shape, which broadcasts against (M, N)."""
+        """Return the shape of the offsets, which broadcasts against (M, N)."""
         assert self.offset is not None
         return offsets.group_shape(self.offset, anchors, tags)
 
     @functools.cached_property
     def never_fails(self) -> bool:
-        """Whether every link measures, without a bias."""
+        """Return whether every link gives a range without a bias."""
         return not self.is_random and self.reach_m is None
 
     @property
     def is_random(self) -> bool:
-        """Whether uniforms are needed to decide the links."""
+        """Return whether uniforms are needed to draw the links."""
         return self.drop_probability > 0 or self.nlos_probability > 0
 
 
 class Measurement(NamedTuple):
-    """One epoch of ranges (..., M, N) [m], 0 where `links` is False; `nlos`: biased ones."""
+    """One epoch of ranges (..., M, N) [m], 0 if `links` is False; `nlos`: biased ranges."""
 
     ranges: FloatArray
     links: BoolArray
@@ -113,37 +113,37 @@ class Measurement(NamedTuple):
 
 @checked(rotation=(3, 3), translation=(3,), tags=("N", 3))
 def tag_positions(rotation: ArrayLike, translation: ArrayLike, tags: ArrayLike) -> FloatArray:
-    """Tags in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
+    """Return tag positions in the world frame (..., N, 3): ``s_n = Q c_n + t``."""
     rotation, tags = np.asarray(rotation), np.asarray(tags)
     if tags.ndim == 2 and rotation.ndim > 2 and rotation.flags.f_contiguous:
-        # Memory that runs along the trials: one product of the tags with rows of all trials.
+        # If memory runs along the trials: one product of the tags with rows of all trials.
         columns = rotation.T.reshape(3, -1)
         turned = (tags @ columns).reshape((len(tags), *rotation.T.shape[1:]))
         turned += np.asarray(translation).T
         return np.moveaxis(turned.T, -1, -2)
     if tags.ndim == 2:
-        # Tags that all trials share: one matrix product in place of one for each trial.
+        # If all trials share the tags: one matrix product instead of one for each trial.
         turned = (rotation.reshape(-1, 3) @ tags.T).reshape((*rotation.shape[:-1], len(tags)))
         turned = np.swapaxes(turned, -1, -2)
     else:
         turned = tags @ np.swapaxes(rotation, -1, -2)
-    # One memory order whatever the way here: a sum over it gives the same last bits.
+    # One memory order in all cases, so that sums over it have the same last bits.
     return np.add(turned, np.asarray(translation)[..., None, :], order="C")
 
 
 @checked(anchors=("M", 3), positions=("N", 3))
 def distances(anchors: ArrayLike, positions: ArrayLike) -> FloatArray:
-    """Distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
+    """Return distances (..., M, N) from anchors (..., M, 3) to positions (..., N, 3)."""
     positions, anchors = np.asarray(positions), np.asarray(anchors)
     positions, anchors = positions[..., None, :, :], anchors[..., :, None, :]
-    # Summed axis by axis: the same last bits in every memory order.
+    # Summed axis by axis, for the same last bits in every memory order.
     if positions.ndim == anchors.ndim == 3:
         gap = np.subtract(positions, anchors, dtype=np.float64)
         gap *= gap
         squared = gap[..., 0] + gap[..., 1]
         squared += gap[..., 2]
         return np.sqrt(squared, out=squared)
-    # Of many worlds the three axes at once would not stay in the cache.
+    # For many worlds, all three axes at once do not fit in the cache.
     squared = np.subtract(positions[..., 0], anchors[..., 0], dtype=np.float64)
     squared *= squared
     gap = np.empty_like(squared)
@@ -161,18 +161,18 @@ def measure(
     link_model: LinkModel | None = None,
     uniforms: FloatArray | None = None,
 ) -> Measurement:
-    """One epoch of measurements from true distances and given random numbers; without offsets.
+    """Return one epoch of ranges from true distances and given random numbers, without offsets.
 
     Parameters
     ----------
     true_distances
         (..., M, N), metres.
     noise, link_model
-        The laws; without a link model every link measures.
+        Noise law and link model; without a link model every link gives a range.
     normals
         Standard normals (..., M, N).
     uniforms
-        Uniforms on [0, 1) of shape (..., 2, M, N), for drops and NLOS; needed where
+        Uniforms on [0, 1) of shape (..., 2, M, N), for drops and NLOS; required if
         ``link_model.is_random``.
     """
     return lose_links(noise.sample(true_distances, normals), true_distances, link_model, uniforms)
@@ -184,7 +184,7 @@ def lose_links(
     link_model: LinkModel | None = None,
     uniforms: FloatArray | None = None,
 ) -> Measurement:
-    """What a link model leaves of noisy ranges of all links; arguments as `measure`."""
+    """Apply a link model to noisy ranges of all links; arguments as in `measure`."""
     links = np.ones(ranges.shape, dtype=np.bool_)
     nlos = np.zeros(ranges.shape, dtype=np.bool_)
     if link_model is None or link_model.never_fails:
@@ -203,9 +203,9 @@ def lose_links(
 def with_offsets(
     measurement: Measurement, link_model: LinkModel, normals: FloatArray
 ) -> Measurement:
-    """Measured ranges with offsets of standard normals (..., 1 or M, 1 or N) added.
+    """Add offsets to ranges, from standard normals (..., 1 or M, 1 or N).
 
-    The normals are cut at six: six standard deviations are the most that an offset ever is.
+    The normals are clipped to +-6, so an offset has at most six standard deviations.
     """
     ranges, links, nlos = measurement
     added = link_model.offset_std_m * np.clip(normals, -6.0, 6.0)
@@ -221,9 +221,9 @@ def sample(
     noise: NoiseLaw,
     longest: FloatArray | float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Noisy ranges of all links (..., M, N) of bodies at given poses, and the true distances.
+    """Return noisy ranges (..., M, N) of all links at given poses, and the true distances.
 
-    No range is beyond the `longest`.
+    Ranges are clipped to `longest`.
     """
     numbers = numbers_of(noise, tags.shape[-2])
     if numbers is not None:
@@ -242,7 +242,7 @@ def _sample(
     law: FloatArray,
     longest: FloatArray | float,
 ) -> tuple[FloatArray, FloatArray]:
-    """`sample` of a law by its numbers."""
+    """Compute `sample` for a law given by its numbers."""
     true = kernel(distances)(anchors, kernel(tag_positions)(rotation, translation, tags))
     ranges = law_of(law).sample(true, normals)
     return np.minimum(ranges, np.asarray(longest)[..., None, None]), true
@@ -258,21 +258,21 @@ def simulate(
     rng: np.random.Generator,
     link_model: LinkModel | None = None,
 ) -> Measurement:
-    """Noisy ranges of bodies at given poses: `measure` with numbers drawn from `rng`.
+    """Simulate ranges of bodies at given poses: `measure` with random numbers from `rng`.
 
     Parameters
     ----------
     anchors, tags, rotation, translation
         (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3); metres.
     noise, link_model
-        Laws of the ranges, and of what happens to links (None: nothing).
+        Noise law of the ranges, and link model (None: every link gives a range).
     rng
         Source of all randomness.
 
     Raises
     ------
     ValueError
-        On wrong shapes, NaN, or laws and generators that are none.
+        If a shape is wrong, a value is NaN, or a law or generator is invalid.
     """
     check_law("noise", noise)
     check_generator("rng", rng)

@@ -1,7 +1,7 @@
-"""One track laid onto another: the rigid transform of least squares, as `evo` aligns.
+"""Align one track to another by the least-squares rigid transform, as `evo` does.
 
-A track and its truth are often given in two world frames. The transform between them is estimated
-from matched positions alone, without scale, as the tools that compare trajectories do.
+A track and its ground truth are often given in two world frames. The transform between them is
+estimated from matched positions alone, without scale, as in tools that compare trajectories.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from rbl_gym.geometry import rotations
 
 __all__ = ["ALIGNMENTS", "Alignment", "align_positions", "apply_alignment"]
 
-# What may be estimated: nothing, a shift, a shift and a turn about z, a shift and any turn.
+# What is estimated: nothing, a shift, a shift and a rotation about z, a shift and any rotation.
 ALIGNMENTS = ("none", "position", "yaw", "se3")
-# A spread below this share of the largest, or of the size of the coordinates, is none.
+# A spread below this share of the largest one, or of the coordinates, counts as zero.
 _FLAT, _ROUNDING = 1e-6, 1e-12
 
 
@@ -34,8 +34,8 @@ class Alignment(NamedTuple):
     turn_rad
         Angle of the rotation.
     shift_m
-        How far the centre of the source's positions is moved. Unlike `translation`, it does not
-        depend on where the origin lies.
+        Distance by which the centre of the source positions is moved. Unlike `translation`, it
+        does not depend on the origin.
     """
 
     rotation: FloatArray
@@ -45,7 +45,7 @@ class Alignment(NamedTuple):
 
 
 def align_positions(source: ArrayLike, target: ArrayLike, mode: str = "se3") -> Alignment:
-    """The rigid transform that takes positions nearest to others, without scale.
+    """Return the rigid transform that aligns positions to others in least squares, without scale.
 
     Minimises ``sum |R p_source + t - p_target|^2``.
 
@@ -54,14 +54,14 @@ def align_positions(source: ArrayLike, target: ArrayLike, mode: str = "se3") -> 
     source, target
         Matched positions (K, 3), metres.
     mode
-        ``"none"``: the identity. ``"position"``: a shift. ``"yaw"``: a shift and a turn about z,
-        for frames that agree about the vertical. ``"se3"``: a shift and any turn.
+        ``"none"``: the identity. ``"position"``: a shift. ``"yaw"``: a shift and a rotation about
+        z, for frames with the same vertical. ``"se3"``: a shift and any rotation.
 
     Raises
     ------
     ValueError
-        If the positions do not determine the transform: of a body that stands still, or, with
-        ``"se3"``, that moves along a line.
+        If the positions do not determine the transform: the body does not move or, with
+        ``"se3"``, it moves along a line.
 
     Notes
     -----
@@ -104,21 +104,21 @@ def align_positions(source: ArrayLike, target: ArrayLike, mode: str = "se3") -> 
 def apply_alignment(
     alignment: Alignment, rotation: ArrayLike | None, translation: ArrayLike
 ) -> tuple[FloatArray | None, FloatArray]:
-    """Poses in the target's world frame.
+    """Transform poses to the world frame of the target.
 
     Parameters
     ----------
     alignment
-        Of `align_positions`.
+        The result of `align_positions`.
     rotation
-        (..., 3, 3) in the source's world frame; None: positions alone.
+        (..., 3, 3) in the world frame of the source; None: only positions.
     translation
         (..., 3), metres.
 
     Returns
     -------
     rotation, translation
-        ``R Q`` and ``R p + t``, of the same shapes.
+        ``R Q`` and ``R p + t``, with the same shapes.
     """
     R = alignment.rotation
     moved = np.asarray(translation) @ R.T + alignment.translation

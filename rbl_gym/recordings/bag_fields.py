@@ -1,7 +1,7 @@
-"""Field paths: where a value stands in a message.
+"""Read values from a message by field paths.
 
 ``header.stamp.sec`` and ``covariance[0]`` name one value of a message, ``nodes[].distance`` one
-for each item of a list. ``{requester_id}.{antenna}`` is text put together from fields. ``=tag0``
+for each item of a list. ``{requester_id}.{antenna}`` is text composed of fields. ``=tag0``
 is the text ``tag0`` in every message, ``@topic`` the topic, ``@index`` the position in the list,
 ``@bag`` the time of recording in ns.
 """
@@ -16,7 +16,7 @@ _NAME = re.compile(r"[A-Za-z_]\w*(\[\d*\])?")
 
 
 class Received(NamedTuple):
-    """A message, its topic and when it was recorded."""
+    """A message, its topic and its time of recording."""
 
     message: Any
     topic: str
@@ -31,13 +31,13 @@ class EachItem(list[Any]):
 
 
 def getter(path: str) -> Getter:
-    """The function that takes the value at `path` out of a message.
+    """Return a function that reads the value at `path` from a message.
 
     Raises
     ------
     ValueError
-        If `path` is not a path. The function itself raises a KeyError that says which field is
-        missing and what is there.
+        If `path` is not a valid path. The returned function raises a KeyError that names the
+        missing field and those that exist.
     """
     if path.startswith("="):
         return lambda _: path[1:]
@@ -55,7 +55,7 @@ def getter(path: str) -> Getter:
 
 
 def rows(received: Received, getters: Iterable[Getter]) -> list[tuple[Any, ...]]:
-    """The values of a message, a tuple for each item where a path has ``[]``, else one tuple.
+    """Return the values of a message: one tuple per item if a path has ``[]``, else one tuple.
 
     Raises
     ------
@@ -129,12 +129,12 @@ def _walk(value: Any, parts: list[str]) -> Any:
 
 
 def names(fields: Iterable[str]) -> list[str]:
-    """Field names of a message type, without what the reader itself adds."""
+    """Return the field names of a message type, without those that the reader adds."""
     return [name for name in fields if not name.startswith("__")]
 
 
 def describe(value: Any, path: str = "") -> list[tuple[str, str]]:
-    """All field paths of a message with their values, as text."""
+    """Return all field paths of a message with their values, as text."""
     fields = getattr(value, "__dataclass_fields__", None)
     if fields is not None:
         prefix = f"{path}." if path else ""
@@ -150,7 +150,7 @@ def describe(value: Any, path: str = "") -> list[tuple[str, str]]:
 
 
 def text(value: Any) -> str:
-    """An id as text: numbers as they are, bytes (a MAC address) in hex."""
+    """Return an id as text: numbers unchanged, bytes (a MAC address) in hex."""
     if isinstance(value, str):
         return value.strip().strip("\0")
     if hasattr(value, "__len__"):

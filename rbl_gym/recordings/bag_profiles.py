@@ -1,9 +1,9 @@
-"""What is read of a bag: message types that are known, and tables that say more.
+"""Select what is read from a bag: known message types, and mapping tables.
 
 A *mapping* is a dictionary of tables, as a TOML file gives it: ``ranges``, ``truth``, ``imu`` and
-``odometry``, each with the topics and where in their messages the values stand
-(`rbl_gym.recordings.bag_fields`). What a table leaves open is filled in from the type of the
-message. The custom types are described at
+``odometry``, each with the topics and the field paths of the values
+(`rbl_gym.recordings.bag_fields`). Keys that a table leaves out are filled in from the message
+type. The custom types are described at
 
 - https://github.com/ntu-aris/uwb_driver, msg/UwbRange.msg (data set NTU VIRAL),
 - https://github.com/decargroup/miluv, uwb_ros/msg/RangeStamped.msg (data set MILUV).
@@ -37,7 +37,7 @@ KEYS = {
     "imu": ("angular_velocity", "linear_acceleration"),
     "odometry": ("velocity", "angular_velocity"),
 }
-NO_PATHS = ("unit", "tags")  # keys that hold no field path
+NO_PATHS = ("unit", "tags")  # keys that are not field paths
 REQUIRED = {
     "ranges": ("anchor", "tag", "range"),
     "truth": ("position",),
@@ -57,7 +57,7 @@ _TYPES: dict[str, dict[str, Table]] = {
             "tag_position": "rqst_antenna_offset",
         },
         "uwb_ros/msg/RangeStamped": {"anchor": "to_id", "tag": "from_id", "range": "range"},
-        # Anything that measures a distance; a radio only where there is nothing better.
+        # Any distance sensor; used for a radio only if there is nothing better.
         "sensor_msgs/msg/Range": {
             "anchor": "@topic",
             "tag": "header.frame_id",
@@ -94,9 +94,9 @@ _TYPES: dict[str, dict[str, Table]] = {
         },
     },
 }
-# Types that are taken only where a table names their topic: estimates, trees of frames.
+# Types that are used only if a table names their topic: estimates, frame trees.
 _ONLY_BY_NAME = {"truth": ("nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage")}
-# Where several topics would do: what the documentation of known data sets says.
+# The choice between several topics, from the documentation of known data sets.
 _PREFERRED = {
     "truth": ("/leica/pose/relative", "/*/vrpn_client_node/*/pose"),
     "imu": ("/imu/imu", "/*/mavros/imu/data_raw"),
@@ -109,20 +109,20 @@ _FRAMES = {  # frame names, by the type of the message
 
 
 class Source(NamedTuple):
-    """One kind of measurement: its topics and where in their messages the values stand."""
+    """One kind of measurement: its topics and the field paths of the values."""
 
     topics: tuple[str, ...]
-    table: dict[str, Any]  # what the mapping says, then what is known of the type
-    given: frozenset[str]  # keys that the mapping says
+    table: dict[str, Any]  # from the mapping, then from the known type
+    given: frozenset[str]  # keys given in the mapping
 
 
 def read_mapping(path: str) -> dict[str, Table]:
-    """The tables of a TOML file.
+    """Read the tables of a TOML file.
 
     Raises
     ------
     ValueError
-        If the file cannot be read, or is no TOML.
+        If the file cannot be read, or is not valid TOML.
     """
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
@@ -131,7 +131,7 @@ def read_mapping(path: str) -> dict[str, Table]:
 
 
 def check_mapping(mapping: Mapping[str, Any]) -> None:
-    """Raise where a table or a key has no meaning."""
+    """Raise ValueError if a table or a key is unknown."""
     for kind, table in mapping.items():
         if kind not in KEYS:
             raise ValueError(f"unknown table [{kind}], must be of {[*KEYS]}")
@@ -146,12 +146,12 @@ def check_mapping(mapping: Mapping[str, Any]) -> None:
 def sources(
     topics: Mapping[str, str], mapping: Mapping[str, Table]
 ) -> tuple[dict[str, Source], list[str]]:
-    """What to read of the `topics` (name: type), and notes on what was not chosen.
+    """Return what to read from `topics` (name: type), and notes on what was not chosen.
 
     Raises
     ------
     ValueError
-        If a topic that the mapping names is not there, or a value has no place.
+        If a topic named in the mapping does not exist, or a value has no field path.
     """
     found: dict[str, Source] = {}
     notes: list[str] = []
@@ -178,7 +178,7 @@ def sources(
 
 
 def _candidates(kind: str, topics: Mapping[str, str]) -> tuple[list[str], str]:
-    """The topics of a known type; of the first such type for ranges, else one topic only."""
+    """Return the topics of a known type: for ranges all of the first such type, else one topic."""
     hidden = _ONLY_BY_NAME.get(kind, ())
     known = [name for name in _TYPES[kind] if name not in hidden]
     by_type = {name: [t for t in topics if topics[t] == name] for name in known}
@@ -206,7 +206,7 @@ def _matching(kind: str, pattern: str, topics: Mapping[str, str]) -> list[str]:
 def _filled(
     kind: str, table: dict[str, Any], names: Sequence[str], topics: Mapping[str, str]
 ) -> dict[str, Any]:
-    """The table with what the type of the message says of it."""
+    """Return the table, filled in from the message type."""
     types = {topics[name] for name in names}
     if len(types) > 1:
         raise ValueError(f"[{kind}] topics must be of one type, got {sorted(types)}")

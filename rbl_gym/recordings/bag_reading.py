@@ -1,4 +1,4 @@
-"""Messages of a log, opened by rosbags, and their values by kind."""
+"""Read the messages of a log with rosbags, and collect their values by kind."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ AnyPath = str | os.PathLike[str]
 Paths = AnyPath | Sequence[AnyPath]
 Advance = Callable[[int], Any]
 
-_ODD = 30.0  # units of time differ by more
+_ODD = 30.0  # units of time differ by a larger factor
 _TIME_UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 
 @contextmanager
 def named(where: str) -> Iterator[None]:
-    """Errors of a field or value with the place they come from."""
+    """Add the location to errors of a field or value."""
     try:
         yield
     except (KeyError, ValueError) as error:
@@ -35,7 +35,7 @@ def named(where: str) -> Iterator[None]:
 
 @contextmanager
 def opened(log: Paths, messages: AnyPath | None) -> Iterator[Any]:
-    """rosbags' reader of the log; what it cannot read is a ValueError with the file's name."""
+    """Open the log with rosbags; raise ValueError with the file name if it cannot be read."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -49,7 +49,7 @@ def opened(log: Paths, messages: AnyPath | None) -> Iterator[Any]:
             raise ValueError(f"{path}: no such file or folder")
         if path.is_dir() and not (path / "metadata.yaml").is_file():
             raise ValueError(f"{path}: a folder of ROS 2 holds metadata.yaml, this one does not")
-    # Bags of ROS 2 without definitions are of Humble or older.
+    # ROS 2 bags without definitions come from Humble or older.
     store = get_typestore(Stores.ROS2_HUMBLE)
     if messages is not None:
         given = _definitions(Path(messages))
@@ -58,7 +58,7 @@ def opened(log: Paths, messages: AnyPath | None) -> Iterator[Any]:
         reader = AnyReader(paths, default_typestore=store)
         reader.open()
     try:
-        # A log that carries some definitions is not given the others by itself.
+        # If a log stores some definitions, rosbags does not add the others.
         if any(c.msgtype not in reader.typestore.types for c in reader.connections):
             missing = store.fielddefs.keys() - reader.typestore.fielddefs.keys()
             reader.typestore.register({name: store.fielddefs[name] for name in missing})
@@ -69,7 +69,7 @@ def opened(log: Paths, messages: AnyPath | None) -> Iterator[Any]:
 
 @contextmanager
 def _rosbags(log: Paths) -> Iterator[None]:
-    """Around calls of rosbags: it, sqlite and the decompressors have errors of their own."""
+    """Convert the errors of rosbags, sqlite and the decompressors."""
     try:
         yield
     except Exception as error:
@@ -79,7 +79,7 @@ def _rosbags(log: Paths) -> Iterator[None]:
 
 
 def _definitions(folder: Path) -> dict[str, Any]:
-    """Message types of the .msg files below a folder."""
+    """Return the message types of the .msg files below a folder."""
     from rosbags.typesys import get_types_from_msg
 
     found: dict[str, Any] = {}
@@ -94,22 +94,22 @@ def _definitions(folder: Path) -> dict[str, Any]:
 
 
 def all_paths(log: Paths) -> list[AnyPath]:
-    """The paths of a log of one file or several."""
+    """Return the paths of a log of one file or several."""
     return [log] if isinstance(log, str | os.PathLike) else [*log]
 
 
 def log_name(log: Paths) -> str:
-    """The paths of a log as text."""
+    """Return the paths of a log as text."""
     return ", ".join(os.fspath(path) for path in all_paths(log))
 
 
 def types(reader: Any) -> dict[str, str]:
-    """Topics with their types."""
+    """Return the topics and their types."""
     return {topic: info.msgtype or "several types" for topic, info in sorted(reader.topics.items())}
 
 
 def messages(reader: Any, topics: Sequence[str], advance: Advance) -> Iterator[bag_fields.Received]:
-    """The messages of some topics in the order of recording."""
+    """Yield the messages of some topics in the order of recording."""
     connections = [c for c in reader.connections if c.topic in topics]
     raw_messages: Iterator[Any] = reader.messages(connections) if connections else iter(())
     while True:
@@ -130,21 +130,21 @@ def messages(reader: Any, topics: Sequence[str], advance: Advance) -> Iterator[b
 
 @dataclass
 class Values:
-    """What was read of one kind: rows in the order of recording."""
+    """The values of one kind: rows in the order of recording."""
 
     kind: str
     source: Source
     rows: list[Row] = field(default_factory=list)
-    delays_ns: list[int] = field(default_factory=list)  # of the recording behind the stamp
+    delays_ns: list[int] = field(default_factory=list)  # time of recording minus stamp
     messages: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
-    by_recording: bool = False  # stamps are those of the recording
+    by_recording: bool = False  # stamps are the times of recording
     _getters: list[bag_fields.Getter] = field(default_factory=list)
     _unit: str = "s"
-    _is_number: bool = False  # times are numbers, no stamps
+    _is_number: bool = False  # times are numbers, not stamps
 
     def take(self, received: bag_fields.Received) -> None:
-        """The values of a message."""
+        """Add the values of a message."""
         table = self.source.table
         where = table.get("where", {})
         keys = [key for key in KEYS[self.kind] if table.get(key) and key not in NO_PATHS]
@@ -175,12 +175,12 @@ class Values:
         return self.source.table.get("time") or ("@bag" if stamp is None else "header.stamp")
 
     def finish(self) -> None:
-        """Rows without a stamp: all take the time of the recording, some are dropped.
+        """Handle rows without a stamp: if all lack it, use the time of recording; else drop them.
 
         Raises
         ------
         ValueError
-            If numbers in `time_unit` last far longer or shorter than their recording.
+            If times in `time_unit` span far more or far less than the recording.
         """
         bad = [time <= 0 and not self._is_number for time, _ in self.rows]
         if all(bad) and "time" not in self.source.given:
@@ -210,7 +210,7 @@ class Values:
 def read_values(
     reader: Any, log: Paths, found: Mapping[str, Source], advance: Advance
 ) -> dict[str, Values]:
-    """The values of all kinds, in one pass over the log."""
+    """Read the values of all kinds in one pass over the log."""
     values = {kind: Values(kind, source) for kind, source in found.items()}
     topics = sorted({topic for source in found.values() for topic in source.topics})
     for received in messages(reader, topics, advance):
@@ -225,7 +225,7 @@ def read_values(
 
 
 def _getter(path: Any) -> bag_fields.Getter:
-    """A path, or a list of paths that make a vector."""
+    """Return the getter of a path, or of a list of paths that form a vector."""
     if isinstance(path, str):
         return bag_fields.getter(path)
     if not (isinstance(path, Sequence) and all(isinstance(part, str) for part in path)):
@@ -241,7 +241,7 @@ def _getter(path: Any) -> bag_fields.Getter:
 
 
 def _nanoseconds(stamp: Any, unit: str) -> int:
-    """A stamp of ROS, or a number in the unit."""
+    """Convert a ROS stamp, or a number in `unit`, to nanoseconds."""
     if hasattr(stamp, "nanosec"):
         return stamp.sec * 10**9 + stamp.nanosec
     if isinstance(stamp, int):

@@ -1,4 +1,4 @@
-"""Values of messages as tables: what is no measurement is dropped and counted."""
+"""Convert message values to tables; invalid measurements are dropped and counted."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.recordings.bag_fields import text
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-_UNKNOWN_M = 99999.0  # what drivers write where they do not know a place
-_STANDS_M = 0.01  # an anchor that moves less stands
+_UNKNOWN_M = 99999.0  # what drivers write for an unknown position
+_STANDS_M = 0.01  # an anchor that moves less is fixed
 _VECTORS = {"orientation": "wxyz"}  # all others are x, y, z
 
 Row = tuple[int, dict[str, Any]]  # time in ns, values by key
 
 
 class Sheet(NamedTuple):
-    """A file to be written: its header and rows of text."""
+    """A file to write: its header and rows of text."""
 
     header: tuple[str, ...]
     rows: list[tuple[Any, ...]]
 
 
 class Tables(NamedTuple):
-    """The files that come of one kind of measurement, and what was said of it."""
+    """The files of one kind of measurement, and the notes on it."""
 
     sheets: dict[str, Sheet]  # by the name of the file
-    times_ns: np.ndarray  # (rows,) of the measurements that were kept
+    times_ns: np.ndarray  # (rows,) of the kept measurements
     dropped: Counter[str]
     notes: list[str]
     facts: dict[str, Any]
@@ -39,12 +39,12 @@ class Tables(NamedTuple):
 def make_tables(
     kind: str, rows: Sequence[Row], table: dict[str, Any], given: Container[str] = ()
 ) -> Tables:
-    """The files of one kind, from the values of its messages; `given`: what the user named.
+    """Return the files of one kind from its message values; `given`: keys named by the user.
 
     Raises
     ------
     ValueError
-        If a value is of the wrong form, or a tag stands at several places on the body.
+        If a value has the wrong form, or a tag has several positions on the body.
     """
     notes: list[str] = []
     times = np.array([time for time, _ in rows], dtype=np.int64)
@@ -105,7 +105,7 @@ def _ranges(rows: Sequence[Row], table: dict[str, Any]) -> Tables:
 def _link(
     values: dict[str, Any], body: set[str]
 ) -> tuple[tuple[str, str], dict[str, Any], str | None]:
-    """Anchor and tag, turned round where the body's tag stands at the anchor's end."""
+    """Return anchor and tag, swapped if the tag of the body is given as the anchor."""
     anchor, tag = text(values["anchor"]), text(values["tag"])
     if body:
         if anchor in body and tag in body:
@@ -128,7 +128,7 @@ def _no_range(values: dict[str, Any], distance: float) -> str | None:
         raw = _number("range", values["range"])
         least = _number("least", values.get("least", 0.0))
         most = _number("most", values.get("most", np.inf))
-        # Drivers that do not know their limits leave both at zero.
+        # Drivers without known limits leave both at zero.
         if most > least and not least <= raw <= most:
             return "outside the sensor's limits"
     return None
@@ -148,7 +148,7 @@ def _deviations(
 def _places(
     kept: dict[tuple[int, str, str], dict[str, Any]], key: str, end: int
 ) -> dict[str, list[tuple[int, FloatArray]]]:
-    """Times and places by id, where a place is known."""
+    """Return times and positions by id, for known positions."""
     found: dict[str, list[tuple[int, FloatArray]]] = {}
     for (time, *ends), values in kept.items():
         if values.get(key) is None:
@@ -212,7 +212,7 @@ _MOTION = {
 
 
 def _motion(kind: str, rows: Sequence[Row], table: dict[str, Any], keep_constant: bool) -> Tables:
-    """Truth, inertial readings or odometry: one row a time, all numbers."""
+    """Return truth, inertial readings or odometry: one row per time, all numbers."""
     columns = [(key, names.split()) for key, names in _MOTION[kind] if table.get(key)]
     times = np.array([time for time, _ in rows], dtype=np.int64)
     blocks = {
@@ -253,7 +253,7 @@ def _drop(keep: BoolArray, bad: BoolArray, why: str, dropped: Counter[str]) -> N
 
 
 def vector(key: str, value: Any) -> FloatArray:
-    """The three numbers of a vector, or w, x, y, z of a quaternion."""
+    """Return the three numbers of a vector, or w, x, y, z of a quaternion."""
     names = _VECTORS.get(key, "xyz")
     if all(hasattr(value, name) for name in names):
         numbers = [getattr(value, name) for name in names]
@@ -272,12 +272,12 @@ def _number(key: str, value: Any) -> float:
 
 
 def seconds(time_ns: int) -> str:
-    """A time with all of its digits."""
+    """Return a time with all its digits."""
     return f"{time_ns // 10**9}.{time_ns % 10**9:09d}"
 
 
 def _natural(name: str) -> tuple[int, float, str]:
-    """Ids that are numbers in their order, before the others."""
+    """Sort key: ids that are numbers come first, in numeric order."""
     try:
         return 0, float(name), name
     except ValueError:

@@ -1,7 +1,7 @@
-"""Bags of ROS 1 and ROS 2, and MCAP files, converted to the files of a recording.
+"""Convert bags of ROS 1 and ROS 2, and MCAP files, to the files of a recording.
 
-Reading is the library rosbags' (extra ``bags``). Definitions of messages that the log carries are
-used: bags of ROS 1 and MCAP carry them, bags of sqlite3 since ROS 2 Iron.
+The library rosbags reads the logs (extra ``bags``). Message definitions stored in the log are
+used. Bags of ROS 1 and MCAP store them, and so do sqlite3 bags since ROS 2 Iron.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rbl_gym.recordings.bag_tables import Sheet, Tables, make_tables, seconds
 
 __all__ = ["convert_bag", "list_topics", "show_message"]
 
-_FAR_S = 1.0  # stamps that are further from the time of recording are mentioned
+_FAR_S = 1.0  # stamps further from the time of recording are reported
 
 
 def convert_bag(
@@ -32,37 +32,39 @@ def convert_bag(
     messages: AnyPath | None = None,
     advance: Advance = lambda steps: None,
 ) -> dict[str, Any]:
-    """Write the ranges of a log, and what goes with them, as the files of a recording.
+    """Write the ranges of a log, and the data that belong to them, as the files of a recording.
 
     Parameters
     ----------
     log
-        A bag of ROS 1, or several that follow each other; a folder of ROS 2; a .db3 or .mcap file.
+        A ROS 1 bag, or several consecutive ones; a ROS 2 folder; a .db3 or .mcap file.
     out
-        Folder, made where there is none. Written are ranges.csv; truth.csv, imu.csv and
-        odometry.csv where the log has them; anchors.csv and tags.csv where the messages of the
-        ranges hold their places; convert.json, which is what is returned. Metres, seconds, rad/s.
+        Output folder, created if it does not exist. The files are ranges.csv; truth.csv, imu.csv
+        and odometry.csv if the log has these data; anchors.csv and tags.csv if the range messages
+        hold their positions; and convert.json, which holds the returned dict. Metres, seconds,
+        rad/s.
     mapping
         Tables ``ranges``, ``truth``, ``imu``, ``odometry``: topics and field paths, see
-        docs/bags.md. What is left out is taken from the types of the messages.
+        docs/bags.md. Keys that are left out are taken from the message types.
     messages
-        Folder with ``PACKAGE/msg/NAME.msg``, for logs that do not carry their definitions.
+        Folder with ``PACKAGE/msg/NAME.msg``, for logs without message definitions.
     advance
         Called with the number of messages read since the last call.
 
     Returns
     -------
     dict
-        ``kinds`` (of each kind its topics, type, messages, rows, time span, rate, what was dropped
-        and why), ``topics``, ``files``, ``notes``, and ``replay``, the command that follows.
+        ``kinds`` (for each kind: topics, type, messages, rows, time span, rate, the number of
+        dropped rows and the reasons), ``topics``, ``files``, ``notes``, and ``replay``, the
+        command to run next.
 
     Raises
     ------
     ValueError
-        If the log cannot be read, a topic or field is not there (the message says what is), or no
-        range is left.
+        If the log cannot be read, a topic or field does not exist (the message lists those that
+        do), or no range is left.
     ImportError
-        Without rosbags.
+        If rosbags is not installed.
     """
     out = Path(out)
     with bag_reading.opened(log, messages) as reader:
@@ -110,18 +112,18 @@ def list_topics(
     mapping: Mapping[str, Mapping[str, Any]] | None = None,
     messages: AnyPath | None = None,
 ) -> list[dict[str, Any]]:
-    """The topics of a log: name, type, messages, rate, and what `convert_bag` reads them as.
+    """List the topics of a log: name, type, messages, rate, and their kind for `convert_bag`.
 
-    Arguments and errors as in `convert_bag`.
+    Arguments as in `convert_bag`, with the same errors.
     """
     with bag_reading.opened(log, messages) as reader, bag_reading.named(log_name(log)):
         return _topic_rows(reader, _sources(reader, mapping)[0])
 
 
 def show_message(log: Paths, topic: str, messages: AnyPath | None = None) -> list[tuple[str, str]]:
-    """The field paths of a topic with the values of its first message, as text.
+    """Return the field paths of a topic with the values of its first message, as text.
 
-    Arguments and errors as in `convert_bag`.
+    Arguments as in `convert_bag`, with the same errors.
     """
     with bag_reading.opened(log, messages) as reader:
         if topic not in (topics := bag_reading.types(reader)):
@@ -166,7 +168,7 @@ def _topic_rows(reader: Any, found: Mapping[str, bag_profiles.Source]) -> list[d
 
 
 def _said(values: bag_reading.Values, made: Tables, topics: Mapping[str, str]) -> dict[str, Any]:
-    """What convert.json says of a kind."""
+    """Return the entry of convert.json for one kind."""
     times = made.times_ns
     duration = float(times[-1] - times[0]) * 1e-9 if len(times) else 0.0
     epochs = len(np.unique(times))
@@ -187,7 +189,7 @@ def _said(values: bag_reading.Values, made: Tables, topics: Mapping[str, str]) -
 
 
 def _far_stamps(kinds: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Clocks that differ: stamps of one kind against the time of recording and the others."""
+    """Report kinds whose stamps differ from the time of recording and from the other kinds."""
     delays = {kind: said["delay_s"] for kind, said in kinds.items() if said["delay_s"] is not None}
     if not delays or max(delays.values()) - min(delays.values()) <= _FAR_S:
         return []
@@ -205,7 +207,7 @@ def _to_write(name: str, said: Mapping[str, Any]) -> str:
 
 
 def _write(out: Path, sheets: Mapping[str, Sheet]) -> dict[str, str]:
-    """The files; those of another conversion must not stay beside them."""
+    """Write the files, and remove those of an earlier conversion."""
     made = ("truth.csv", "imu.csv", "odometry.csv")
     if stale := [name for name in made if name not in sheets and (out / name).exists()]:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Biases and slopes of links, taken off the ranges."""
+"""Remove the biases and slopes of links from the ranges."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import MAX_RANGE_M, TOO_LONG, Ids, Table
 
-# Columns that say how well the others are known.
+# Columns with the uncertainty of the other columns.
 _STDS = ("bias_std_m", "slope_std")
 
 
 def calibrated(
     ranges: FloatArray, std: FloatArray | None, table: Table, ids: Ids, said: Said
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Ranges (K, M, N) and their deviations with bias and slope of each link taken off."""
+    """Return ranges (K, M, N) and standard deviations corrected for bias and slope of each link."""
     table.require("anchor", "tag", "bias_m")
     said.read(table, ("anchor", "tag", "bias_m", "slope", "sigma_m", *_STDS))
     link = table.links(ids)

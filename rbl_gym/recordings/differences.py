@@ -1,9 +1,10 @@
-"""Logs of time differences and of pseudo-ranges, as ranges with an unknown offset in common.
+"""Convert time differences and pseudo-ranges to ranges with a common unknown offset.
 
-A difference ``d(anchor_a, tag) - d(anchor_b, tag)`` is that of two arrivals. All differences of a
-tag at one time give back the arrivals but for one unknown length, which they share: pseudo-ranges.
-The noise of a reference anchor, which all differences to it have in common, is that of its own
-pseudo-range then. Their level means nothing; it is set to that of a body at the anchors' centre.
+A difference ``d(anchor_a, tag) - d(anchor_b, tag)`` compares two arrival times. All differences of
+a tag at one time determine the arrival times up to one common unknown length: pseudo-ranges. The
+noise of a reference anchor, which all differences to it share, becomes the noise of its own
+pseudo-range. The common level is arbitrary; it is set to that of a body at the centre of the
+anchors.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from rbl_gym.recordings.points import Points
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import Ids, IntArray, Table
 
-# Pseudo-ranges of a tag may differ by no more than its anchors are apart, and so much (m).
+# Pseudo-ranges of a tag may differ by the distance of its anchors and this margin (m).
 _NOISE_M = 5.0
 _MOST_TOO_LONG = 0.2
 
@@ -26,16 +27,16 @@ _MOST_TOO_LONG = 0.2
 def read_differences(
     table: Table, anchors: Points | None, tags: Points | None, format: Format, said: Said
 ) -> tuple[Measured, IntArray, Ids]:
-    """The differences of a table ``t,anchor_a,anchor_b,tag,difference[,std or var]``.
+    """Read the differences of a table ``t,anchor_a,anchor_b,tag,difference[,std or var]``.
 
     Returns
     -------
-    The differences, as of `anchor_a`; which anchor each is to; ids of anchors and tags.
+    The differences, assigned to `anchor_a`; the second anchor of each; ids of anchors and tags.
 
     Raises
     ------
     ValueError
-        If columns are missing, or the anchors' places are nowhere told.
+        If columns are missing, or the anchor positions are not given.
     """
     table.require("t", "anchor_a", "anchor_b", "difference")
     if anchors is None:
@@ -68,7 +69,7 @@ def read_differences(
 
 
 def mark_double_differences(measured: Measured, other: IntArray, epoch: IntArray) -> None:
-    """Find pairs (R,) of anchors that come twice for a tag at one time, in either order."""
+    """Find pairs (R,) of anchors that occur twice for a tag at one time, in either order."""
     used = np.flatnonzero(measured.cause == 0)
     low, high = np.minimum(measured.anchor, other), np.maximum(measured.anchor, other)
     keys = np.stack([epoch, measured.tag, low, high], axis=1)[used]
@@ -81,10 +82,11 @@ def mark_double_differences(measured: Measured, other: IntArray, epoch: IntArray
 def pseudo_ranges(
     measured: Measured, other: IntArray, epoch: IntArray, shape: tuple[int, int, int]
 ) -> tuple[FloatArray, BoolArray, FloatArray | None, int]:
-    """Pseudo-ranges (K, M, N), which there are, their deviations, and how many had to go.
+    """Return pseudo-ranges (K, M, N), their mask, standard deviations, and how many were dropped.
 
-    Least squares of the differences of a tag at one time. Where some hang together with none of
-    the others, the larger part is taken. A difference has the variance of two arrivals.
+    They are the least-squares solution for the differences of a tag at one time. If the differences
+    form several unconnected groups, the largest is used. A difference has the variance of two
+    arrival times.
     """
     ranges, links = np.zeros(shape), np.zeros(shape, dtype=np.bool_)
     std = None if measured.std is None else np.zeros(shape)
@@ -111,7 +113,7 @@ def pseudo_ranges(
 
 
 def _largest_part(a: IntArray, b: IntArray, anchors: int) -> BoolArray:
-    """Which anchors (M,) the most differences hang together with."""
+    """Return the anchors (M,) of the group connected by the most differences."""
     label = np.arange(anchors)
     while True:
         least = label.copy()
@@ -124,7 +126,7 @@ def _largest_part(a: IntArray, b: IntArray, anchors: int) -> BoolArray:
 
 
 def leveled(ranges: FloatArray, links: BoolArray, anchors: FloatArray, offset: str) -> FloatArray:
-    """Pseudo-ranges (K, M, N) of a body at the anchors' centre, on average; anchors (K, M, 3)."""
+    """Shift pseudo-ranges (K, M, N) to the level of a body at the centre of anchors (K, M, 3)."""
     distance = np.linalg.norm(anchors - anchors.mean(axis=-2, keepdims=True), axis=-1)
     gap = np.where(links, distance[..., None] - ranges, 0.0)
     shift = offsets.common(gap, links.astype(np.float64), offset)
@@ -134,9 +136,9 @@ def leveled(ranges: FloatArray, links: BoolArray, anchors: FloatArray, offset: s
 def check_lengths(
     path: str, ranges: FloatArray, links: BoolArray, points: FloatArray, offset: str
 ) -> None:
-    """A ValueError where ranges with an offset differ by more than their points are apart.
+    """Raise ValueError if ranges with an offset differ by more than the distance of their points.
 
-    `points` (K or 1, M, 3) are the anchors, or for an offset by anchor the tags (1, N, 3).
+    `points` (K or 1, M, 3) are the anchors or, for one offset per anchor, the tags (1, N, 3).
     """
     axis = -1 if offset == "anchor" else -2
     low = np.where(links, ranges, np.inf).min(axis=axis)

@@ -1,4 +1,4 @@
-"""Bias by the direction of the ray, as a file."""
+"""Read the bias by ray direction from a file."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ _MOST = 12
 def read_directions(
     path: AnyPath, ids: Ids, source: Source = AS_NAMED, said: Said | None = None
 ) -> DirectionLaw:
-    """Bias of ranges by the direction of the ray at its ends: a table of harmonics.
+    """Read the range bias by the direction of the ray at its ends: a table of harmonics.
 
     Parameters
     ----------
     path
         ``end,id,harmonic,bias_cos_m,bias_sin_m[,log_std_cos,log_std_sin]``: `end` is ``anchor`` or
-        ``tag``, `id` that of one of them, harmonic 1, 2, ... Bearings count about z from the x
-        axis of the anchors' frame, and of the body. What has no row has no bias.
+        ``tag``, `id` is the id of one of them, harmonic 1, 2, ... Bearings are angles about z from
+        the x axis of the frame of the anchors, or of the body. Points without a row have no bias.
     ids
-        Of the M anchors and of the N tags, in the order of the arrays.
+        Ids of the M anchors and of the N tags, in the order of the arrays.
     source
-        What the columns are called.
+        Names of the columns.
     said
-        Takes up which columns are not read.
+        Object that collects the columns that are not read.
 
     Raises
     ------
     ValueError
-        On another end, an unknown id, a harmonic that is none or comes twice, by line.
+        If an end or id is unknown, or a harmonic is invalid or duplicate. The message names the
+        line.
     """
     table = read_table(path, source)
     table.require(*_COLUMNS[:5])

@@ -1,4 +1,4 @@
-"""How the files of a log are written, where they are not as `read_recording` says."""
+"""Describe the files of a log that differ from the format of `read_recording`."""
 
 from __future__ import annotations
 
@@ -26,39 +26,40 @@ FILES = (
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """How the files of a log are written.
+    """The format of the files of a log.
 
     Parameters
     ----------
     columns
-        What columns are called in the files, by what they hold: ``{"time": "time_s", "anchor":
-        "to_id"}`` of the ranges, ``{"truth.x": "px", "anchors.anchor": "name"}`` of another file.
-        ``{"truth.*": "B_*"}`` stands for all columns that begin so. ``{"range":
+        Names of the columns in the files, by content: ``{"time": "time_s", "anchor": "to_id"}`` for
+        the ranges, ``{"truth.x": "px", "anchors.anchor": "name"}`` for another file.
+        ``{"truth.*": "B_*"}`` stands for all columns with this prefix. ``{"range":
         "r_{anchor}_{tag}", "std": "sd_{anchor}_{tag}"}`` are the columns of a wide table. A unit
-        may stand in brackets: ``"stamp[ms]"``. Columns of a file without a header go by number,
-        from 1: ``{"odometry.t": "2"}``.
+        may follow in brackets: ``"stamp[ms]"``. Columns of a file without a header are named by
+        numbers from 1: ``{"odometry.t": "2"}``.
     where
-        Cells of the rows that are meant, by column, as in `columns`: ``{"anchors.agent": "1"}``.
+        Cells that the rows to use must have, by column, as in `columns`:
+        ``{"anchors.agent": "1"}``.
     time_unit
-        Of the times of the ranges: ``"s"``, ``"ms"``, ``"us"``, ``"ns"`` or ``"iso"``; None: as
-        the header tells, else found from their spacing.
+        Unit of the times of the ranges: ``"s"``, ``"ms"``, ``"us"``, ``"ns"`` or ``"iso"``; None:
+        the unit in the header, or else detected from the spacing.
     unit
-        Of the ranges and their standard deviations: ``"m"``, ``"cm"`` or ``"mm"``; None: as the
-        header tells, else metres.
+        Unit of the ranges and their standard deviations: ``"m"``, ``"cm"`` or ``"mm"``; None: the
+        unit in the header, or else metres.
     offset
-        Whose ranges have an unknown offset in common, and may be zero or negative: ``"tag"``,
-        ``"anchor"`` or ``"epoch"``; None: nobody's. Differences have that of their tag.
+        Ranges of one ``"tag"``, ``"anchor"`` or ``"epoch"`` share an unknown offset, and may be
+        zero or negative; None: there is no offset. Differences always share that of their tag.
     wheelbase_m
-        Of odometry of two wheels: the distance between them.
+        Distance between the two wheels of the odometry, metres.
     turn_unit
-        Of turn rates, of odometry and inertial sensors: ``"rad/s"`` or ``"deg/s"``.
+        Unit of the turn rates of odometry and inertial sensors: ``"rad/s"`` or ``"deg/s"``.
     strict
-        Refuse, by its line, what is dropped, sorted or counted otherwise.
+        Raise ValueError, with the line, for data that would be dropped, sorted or counted.
 
     Raises
     ------
     ValueError
-        On a unit or a file that is not known.
+        If a unit or a file is unknown.
     """
 
     columns: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -85,7 +86,7 @@ class Format:
                     )
 
     def of(self, file: str) -> Source:
-        """Names and rows of one of the files."""
+        """Return the column names and row selection of one of the files."""
         return Source(*(_of(file, names) for names in (self.columns, self.where)))
 
 

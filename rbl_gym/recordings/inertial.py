@@ -1,4 +1,4 @@
-"""The log of an inertial sensor: read, checked for its units, cut at the times of epochs."""
+"""Read logs of inertial sensors, check their units, and split them at the times of epochs."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ __all__ = ["InertialLog", "read_frame", "read_inertial", "samples_between"]
 _COLUMNS = ("t", "wx", "wy", "wz", "ax", "ay", "az")
 TURN_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180}
 FORCE_UNITS = {"m/s^2": 1.0, "g": GRAVITY_M_S2}
-# No sensor on a body turns as fast; a median force outside of these is no force under gravity.
+# Upper limit of turn rates, and limits of the median specific force under gravity.
 _MAX_RATE, _FORCE = 150.0, (0.3, 4.0)
 
 
 class InertialLog(NamedTuple):
-    """Readings of an inertial sensor: times (K,), and (K, 6) in rad/s and m/s^2, as it sits."""
+    """Readings of an inertial sensor: times (K,), and (K, 6) in rad/s and m/s^2, in sensor axes."""
 
     times: FloatArray
     readings: FloatArray
@@ -36,22 +36,22 @@ def read_inertial(
     turn_unit: str = "rad/s",
     force_unit: str = "m/s^2",
 ) -> InertialLog:
-    """The log of an inertial sensor: a table with the columns t, wx, wy, wz, ax, ay, az.
+    """Read the log of an inertial sensor: a table with the columns t, wx, wy, wz, ax, ay, az.
 
     Parameters
     ----------
     path
-        A text file with a header; further columns do not matter.
+        A text file with a header; other columns are ignored.
     columns
-        Name here -> name in the file, where these differ: ``{"wx": "gyro_x"}``.
+        Names used here to names in the file, if they differ: ``{"wx": "gyro_x"}``.
     turn_unit, force_unit
-        ``"rad/s"`` or ``"deg/s"``, ``"m/s^2"`` or ``"g"``: what the file has.
+        Units of the file, ``"rad/s"`` or ``"deg/s"``, and ``"m/s^2"`` or ``"g"``.
 
     Raises
     ------
     ValueError
-        On a cell that is no number, times that do not increase (by file, line and column), a
-        column that is not there, and readings that cannot be in these units.
+        If a cell is not a number or times do not increase (the message names file, line and
+        column), a column does not exist, or the readings cannot be in these units.
     """
     turn = TURN_UNITS[check_one_of("turn_unit", turn_unit, list(TURN_UNITS))]
     force = FORCE_UNITS[check_one_of("force_unit", force_unit, list(FORCE_UNITS))]
@@ -78,7 +78,7 @@ def read_inertial(
 
 
 def read_frame(told: AnyPath) -> FloatArray:
-    """Rotation (3, 3) that turns the axes of a sensor into those of the body.
+    """Return the rotation (3, 3) from the axes of a sensor to those of the body.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def read_frame(told: AnyPath) -> FloatArray:
     Raises
     ------
     ValueError
-        On anything else.
+        If `told` is anything else.
     """
     try:
         vector = [float(part) for part in os.fspath(told).split(",")]
@@ -108,21 +108,21 @@ def read_frame(told: AnyPath) -> FloatArray:
 def samples_between(
     log: InertialLog, start_s: float, end_s: float, max_gap_s: float = 0.1
 ) -> tuple[FloatArray, FloatArray]:
-    """Readings (S, 6) between two times, and the seconds (S,) for which each of them counts.
+    """Return the readings (S, 6) between two times, and the duration (S,) of each in seconds.
 
-    A reading counts from half way to the one before until half way to the next.
+    A reading is valid from half way to the previous one until half way to the next.
 
     Parameters
     ----------
     log, start_s, end_s
         The log, and two times on its clock, the second not before the first.
     max_gap_s
-        Time without a reading that is bridged, or that may lie outside the log.
+        Longest time without a reading that is bridged, also outside the log.
 
     Raises
     ------
     ValueError
-        If the times are not in order, or the log has a longer gap there.
+        If the times are not in order, or the log has a longer gap between them.
     """
     start_s = check_number("start_s", start_s)
     end_s = check_number("end_s", end_s, low=start_s)
@@ -131,7 +131,7 @@ def samples_between(
     middle = 0.5 * (times[1:] + times[:-1])
     first, last = np.searchsorted(middle, [start_s, end_s])
     edges = np.concatenate([[start_s], middle[first:last], [end_s]])
-    # The readings within, and those on both sides.
+    # The readings within the interval, and one on each side.
     near = times[max(np.searchsorted(times, start_s, side="right") - 1, 0) :]
     near = near[: np.searchsorted(near, end_s) + 1]
     gap = max(float(np.diff(near).max(initial=0.0)), times[0] - start_s, end_s - times[-1])

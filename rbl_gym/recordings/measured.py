@@ -1,4 +1,4 @@
-"""Ranges one by one as a file has them, long or wide, and why some are no measurement."""
+"""Read the single ranges of a long or wide table, and find invalid ones with their cause."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from rbl_gym.recordings.points import Points
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import MAX_RANGE_M, METRES, Ids, IntArray, Table, is_first
 
-# A log of which more than this share is no measurement is not what it is taken for.
+# A log with a larger share of invalid ranges is not a log of ranges in this format.
 _MOST_BAD = 0.2
-# No offset is larger (m): a light-second is 3e8.
+# Largest possible offset (m): a light-second is 3e8.
 _FARTHEST_M = 1e9
 _WIDE = "a{anchor}t{tag}"
 
-# Why a range is no link; those of `_FINE` are no fault of the log. What it must be, and where.
+# Causes why a range is not a link; those of `_FINE` are not errors. The requirement, and where.
 _CAUSES = {
     "": ("", ""),
     "empty": ("", "range"),
@@ -40,7 +40,7 @@ _CAUSES = {
     "of an anchor whose place is not known then": ("the anchor's place must be known", "t"),
 }
 _NAMES = [*_CAUSES]
-# What to look at where a cause prevails.
+# Advice if one cause prevails.
 _HINTS = {
     "too long": "ranges in another unit? say it",
     "of an unknown anchor": "add it to the table of anchors",
@@ -53,10 +53,10 @@ _FINE = ("", "empty", "marked as not valid", "repeated")
 
 
 class Measured(NamedTuple):
-    """R ranges as they stand in a table: the row and the column of each, its link, its value.
+    """R ranges of a table: the row and the column of each, its link and its value.
 
-    `cause`: why it is no link, of `_CAUSES`; 0: it is one. Metres; `std` is None where the log
-    has none.
+    `cause`: why it is not a link, an index of `_CAUSES`; 0: it is a link. Metres; `std` is None if
+    the log has none.
     """
 
     row: IntArray
@@ -70,19 +70,19 @@ class Measured(NamedTuple):
     std_columns: list[str]
 
     def drop(self, which: BoolArray, cause: str) -> None:
-        """Give `cause` to these, but for those that have one already."""
+        """Set `cause` for these ranges, except for those that already have one."""
         self.cause[which & (self.cause == 0)] = _NAMES.index(cause)
 
 
 def read_measured(
     table: Table, anchors: Points | None, tags: Points | None, format: Format, said: Said
 ) -> tuple[Measured, Ids]:
-    """The ranges of a table, and the ids of their anchors and tags.
+    """Read the ranges of a table, and the ids of their anchors and tags.
 
     Raises
     ------
     ValueError
-        If columns are missing, or tags or anchors are nowhere told.
+        If columns are missing, or tags or anchors are not given.
     """
     pattern = format.of("ranges").columns.get("range", "")
     if "{" in pattern:
@@ -124,7 +124,7 @@ def read_measured(
 
 
 def ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
-    """Ids of the points of a long table."""
+    """Return the ids of the points of a long table."""
     if points is None:
         if column not in table.columns:
             return ("0",)
@@ -142,7 +142,7 @@ def ids_of(table: Table, column: str, points: Points | None) -> tuple[str, ...]:
 def _read_wide(
     table: Table, anchors: Points | None, tags: Points | None, format: Format, said: Said
 ) -> tuple[Measured, Ids]:
-    """A row an epoch, a column a link."""
+    """Read a table with one row per epoch and one column per link."""
     columns = format.of("ranges").columns
     table.require("t")
     if anchors is None:
@@ -191,7 +191,7 @@ def _read_wide(
 def _links_of(
     table: Table, pattern: str, anchors: tuple[str, ...], tags: tuple[str, ...] | None
 ) -> tuple[dict[str, tuple[int, int]], Ids]:
-    """Anchor and tag of the columns that `pattern` names, and the ids."""
+    """Return anchor and tag of the columns that match `pattern`, and the ids."""
     if "{anchor}" not in pattern or re.sub(r"\{(anchor|tag)\}", "", pattern).count("{"):
         raise ValueError(f"columns of links must be like 'r_{{anchor}}_{{tag}}', got {pattern!r}")
     if tags is None:
@@ -210,7 +210,7 @@ def _links_of(
 
 
 def _tags_named(table: Table, pattern: str, anchors: tuple[str, ...]) -> tuple[str, ...]:
-    """The one tag of a log without a table of tags."""
+    """Return the single tag of a log without a table of tags."""
     if "{tag}" not in pattern:
         return ("0",)
     found: dict[str, None] = {}
@@ -226,7 +226,7 @@ def _tags_named(table: Table, pattern: str, anchors: tuple[str, ...]) -> tuple[s
 
 
 def scale_of(table: Table, column: str, format: Format, said: Said) -> float:
-    """Metres of a unit of the ranges."""
+    """Return the length of a unit of the ranges in metres."""
     told = "" if format.unit else table.unit(column, METRES)
     if told in ("cm", "mm"):
         said.note(table.path, f"ranges are in {told}, as the header tells")
@@ -234,7 +234,7 @@ def scale_of(table: Table, column: str, format: Format, said: Said) -> float:
 
 
 def judge(measured: Measured, table: Table, signed: bool) -> None:
-    """Find the ranges that are no measurement by themselves; `signed`: they may be negative."""
+    """Find the ranges with invalid values; `signed`: they may be negative."""
     range, std = measured.range, measured.std
     if np.isnan(range).any():
         at = np.flatnonzero(np.isnan(range))
@@ -258,12 +258,12 @@ def judge(measured: Measured, table: Table, signed: bool) -> None:
 
 
 def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Said) -> None:
-    """Count what is no link; refuse it where `strict` or where it is more than a fifth.
+    """Count the ranges that are not links; raise if `strict` or if they are more than a fifth.
 
     Raises
     ------
     ValueError
-        With file, line and column of the first that is refused.
+        With file, line and column of the first such range.
     """
     counts = Counter({_NAMES[c]: int(n) for c, n in enumerate(np.bincount(measured.cause)) if n})
     said.ranges += len(measured.cause) - counts["empty"]
@@ -290,7 +290,7 @@ def settle(measured: Measured, table: Table, ids: Ids, format: Format, said: Sai
 
 
 def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str:
-    """Where the first range with one of these causes stands, what it must be, what came."""
+    """Return location, requirement and value of the first range with one of these causes."""
     found = np.isin(measured.cause, [_NAMES.index(cause) for cause in causes])
     at = np.flatnonzero(found)[np.argmin(measured.row[found])]
     cause = _NAMES[measured.cause[at]]
@@ -308,7 +308,7 @@ def _first(measured: Measured, table: Table, ids: Ids, causes: list[str]) -> str
 
 
 def mark_doubles(measured: Measured, epoch: IntArray) -> None:
-    """Find links (R,) that come twice in an epoch, with the same range or with another."""
+    """Find links (R,) that occur twice in an epoch, with the same range or with another."""
     used = np.flatnonzero(measured.cause == 0)
     if not len(used):
         return

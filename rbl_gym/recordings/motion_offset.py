@@ -1,4 +1,4 @@
-"""By how much the clocks of two tracks of one body differ, by how fast it moves and turns."""
+"""Estimate the clock offset of two tracks of one body from its velocities and turn rates."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rbl_gym.recordings.time_offset import TimeOffset, time_offset
 
 __all__ = ["motion_offset"]
 
-# Rates are those of a path smoothed by a Gaussian of so many seconds, or so many median steps.
+# Rates are computed from a path smoothed by a Gaussian of this many seconds, or median steps.
 _SMOOTH_S, _STEPS = 0.25, 1.5
-# Points of the grid in a standard deviation of the smoothing.
+# Grid points per standard deviation of the smoothing.
 _FINE = 4
-# Two estimates further apart than so many standard deviations do not agree.
+# Two estimates that differ by more standard deviations are inconsistent.
 _APART = 4.0
 _MOST_POINTS = 5_000_000
 
@@ -30,35 +30,36 @@ def motion_offset(
     planar: bool = False,
     one_frame: bool = True,
 ) -> TimeOffset:
-    """The offset of two clocks at which a body moves and turns alike in two tracks of it.
+    """Estimate the clock offset at which two tracks of a body have the same motion.
 
-    Velocities and turn rates are compared each for themselves (`time_offset`) and the two offsets
-    averaged by their variances; one of them suffices. A causal filter lags behind the motion, and
-    the lag is part of the offset.
+    Velocities and turn rates are compared separately (`time_offset`). The two offsets are averaged
+    with inverse-variance weights; one of them suffices. A causal filter lags behind the motion, and
+    this lag is part of the offset.
 
     Parameters
     ----------
     a, b
-        Times (K,) in seconds, rotation (K, 3, 3) or None, translation (K, 3), of each track.
+        Times (K,) in seconds, rotation (K, 3, 3) or None, translation (K, 3), for each track.
     search_s
-        As of `time_offset`.
+        As in `time_offset`.
     planar
-        Compare the motion in x and y and the turn about z alone.
+        Compare only the motion in x and y and the rotation about z.
     one_frame
-        Both are given in one world frame, or shifted frames: vectors are compared. Otherwise their
-        lengths, which do not depend on the frame; `planar` frames are turned about z only.
+        Both tracks are in one world frame, or in shifted frames: vectors are compared. Otherwise
+        their lengths are compared, which do not depend on the frame. `planar` frames differ by a
+        rotation about z only.
 
     Returns
     -------
     TimeOffset
-        What has stamp t in `a` has ``t + offset_s`` in `b`. Where velocities and turn rates do not
-        agree within four standard deviations, the standard deviation is at least half of what lies
-        between them.
+        Stamp t in `a` corresponds to ``t + offset_s`` in `b`. If the offsets of velocities and turn
+        rates differ by more than four standard deviations, the standard deviation is at least half
+        of their difference.
 
     Raises
     ------
     ValueError
-        As `time_offset`, if neither velocities nor turn rates give an offset.
+        As in `time_offset`, if neither velocities nor turn rates give an offset.
     """
     steps = [float(np.median(np.diff(poses[0]))) if len(poses[0]) > 1 else 1.0 for poses in (a, b)]
     width = max(_SMOOTH_S, _STEPS * max(steps))
@@ -73,7 +74,7 @@ def motion_offset(
             for times, rotation, translation in (a, b):
                 path = translation if not turning or rotation is None else _turned(rotation)
                 when, rates = _rates(times, path[:, axes], width)
-                # About z, a turn of the frame changes nothing.
+                # A rotation of the frame about z changes nothing.
                 if not one_frame and not (planar and turning):
                     rates = np.linalg.norm(rates, axis=-1)
                 signals += [when, rates]
@@ -88,7 +89,7 @@ def motion_offset(
 
 
 def _together(one: TimeOffset, other: TimeOffset) -> TimeOffset:
-    """The mean of two offsets by their variances."""
+    """Return the mean of two offsets, weighted by their inverse variances."""
     offsets = np.array([one.offset_s, other.offset_s])
     variance = np.maximum(np.square([one.std_s, other.std_s]), 1e-30)
     apart = abs(offsets[0] - offsets[1])
@@ -100,13 +101,13 @@ def _together(one: TimeOffset, other: TimeOffset) -> TimeOffset:
 
 
 def _turned(rotation: FloatArray) -> FloatArray:
-    """The path (K, 3) whose rate is the turn rate, in the world frame."""
+    """Return the path (K, 3) whose rate is the turn rate, in the world frame."""
     step = rotations.error(rotation[1:], rotation[:-1])
     return np.concatenate([np.zeros((1, 3)), np.cumsum(step, axis=0)])
 
 
 def _rates(times: FloatArray, path: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) on a grid and the rates (n, D) of a path (K, D), smoothed; gaps left out."""
+    """Return times (n,) on a grid and the smoothed rates (n, D) of a path (K, D), without gaps."""
     if len(times) < 2 or np.ptp(times) < 4 * width:
         raise ValueError(f"a track must last {4 * width:.3g} s or longer, got {len(times)} poses")
     step = width / _FINE
@@ -116,12 +117,12 @@ def _rates(times: FloatArray, path: FloatArray, width: float) -> tuple[FloatArra
     grid = times[0] + step * np.arange(count)
     after = np.clip(np.searchsorted(times, grid, side="right"), 1, len(times) - 1)
     known = times[after] - times[after - 1] <= 2 * width
-    # Of map coordinates the first is taken off: they have few digits left.
+    # The first position is subtracted, because map coordinates have few digits left.
     columns = [np.interp(grid, times, column - column[0]) for column in path.T]
     rates = [
         scipy.ndimage.gaussian_filter1d(c, _FINE, order=1, mode="nearest") / step for c in columns
     ]
     near = scipy.ndimage.gaussian_filter1d(known.astype(float), _FINE, mode="constant")
-    # A quarter of the weight at most may lie in gaps or beyond an end.
+    # At most a quarter of the weight may lie in gaps or beyond an end.
     used = known & (near > 0.75)
     return grid[used], np.stack(rates, axis=-1)[used]

@@ -1,4 +1,4 @@
-"""The log of odometry: speeds and turn rates in the body's axes, cut at the times of epochs."""
+"""Read odometry logs: velocities and turn rates in body axes, split at the times of epochs."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["OdometryLog", "odometry_between", "read_odometry"]
 
 _COLUMNS = ("wx", "wy", "wz", "vx", "vy", "vz")
 _WHEELS = ("left", "right")
-# No body turns or drives as fast (rad/s, m/s).
+# Upper limits of turn rate and speed (rad/s, m/s).
 _MAX_RATE, _MAX_SPEED = 50.0, 150.0
 
 
 class OdometryLog(NamedTuple):
-    """Readings of odometry: times (K,) in seconds, and (K, 6), rad/s then m/s, of the body's axes.
+    """Odometry readings: times (K,) in seconds, and (K, 6), rad/s then m/s, in body axes.
 
-    What the sensor does not read is NaN.
+    Components that the sensor does not measure are NaN.
     """
 
     times: FloatArray
@@ -37,29 +37,29 @@ def read_odometry(
     wheelbase_m: float | None = None,
     turn_unit: str = "rad/s",
 ) -> OdometryLog:
-    """The log of odometry: a table ``t,vx,vy,vz,wx,wy,wz``, or of two wheels ``t,left,right``.
+    """Read an odometry log: a table ``t,vx,vy,vz,wx,wy,wz``, or of two wheels ``t,left,right``.
 
-    Columns that are not there are not measured (NaN), but for what wheels cannot do: where there
-    is `vx` and neither `vy` nor `vz`, the body moves forwards alone, and where there is `wz` and
-    neither `wx` nor `wy` besides, it stays level. These are zeros then. A row whose time has come
-    before is left out.
+    Missing columns are not measured (NaN), except for motions that wheels cannot make. If there is
+    `vx` but neither `vy` nor `vz`, the body only moves forwards: `vy` and `vz` are zero. If there
+    is also `wz` but neither `wx` nor `wy`, it stays level: `wx` and `wy` are zero. A row with a
+    repeated time is left out.
 
     Parameters
     ----------
     path, source, said
-        The file, how its columns are named, and who takes down what was found. A file without a
-        header has its columns by number, from 1: ``{"t": "2", "left": "3"}``.
+        The file, the names of its columns, and the object that collects notes. The columns of a
+        file without a header are named by numbers from 1: ``{"t": "2", "left": "3"}``.
     wheelbase_m
-        Of `left` and `right`, speeds of wheels or tracks: the distance between them, metres, or
-        the column `width`. The turn rate is ``(right - left) / width``.
+        Distance between the wheels or tracks with the speeds `left` and `right`, metres; or use the
+        column `width`. The turn rate is ``(right - left) / width``.
     turn_unit
-        ``"rad/s"`` or ``"deg/s"``: what the file has.
+        Unit of turn rates in the file, ``"rad/s"`` or ``"deg/s"``.
 
     Raises
     ------
     ValueError
-        On a cell that is no number, times that decrease (by file, line and column), a column that
-        is not there, and readings that cannot be in these units.
+        If a cell is not a number or times decrease (the message names file, line and column), a
+        column does not exist, or the readings cannot be in these units.
     """
     unit = TURN_UNITS[check_one_of("turn_unit", turn_unit, list(TURN_UNITS))]
     said = said or Said()
@@ -132,10 +132,10 @@ def _of_wheels(table: Table, wheelbase_m: float | None) -> tuple[FloatArray, tup
 def odometry_between(
     log: OdometryLog, start_s: float, end_s: float, hold_s: float = 0.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Readings (S, 6) between two times, and the seconds (S,) for which each of them counts.
+    """Return the readings (S, 6) between two times, and the duration (S,) of each in seconds.
 
-    A reading counts from half way to the one before until half way to the next, but no further
-    from its own time than half of `hold_s`; in longer gaps, and outside the log, there are rows of
+    A reading is valid from half way to the previous one until half way to the next, but no further
+    from its own time than half of `hold_s`. Longer gaps, and times outside the log, give rows of
     NaN.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Tables of anchors and tags, and where points that move are at a time."""
+"""Read tables of anchors and tags, and interpolate the positions of moving points."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import MAX_COORDINATE_M, AnyPath, Source, is_first, read_table
 
 MAX_TAG_M = 1e4
-# A point that moves is missed after so many of its usual steps.
+# A gap of more than this number of usual steps of a moving point is reported.
 _GAP = 5.0
 
 
 class Points(NamedTuple):
-    """Ids and places (P, 3) of points; of those that move, times (L,) and places (L, 3) of each."""
+    """Ids and positions (P, 3) of points; times (L,) and positions (L, 3) of each moving point."""
 
     ids: tuple[str, ...]
     places: FloatArray
     tracks: tuple[tuple[FloatArray, FloatArray], ...] | None = None
 
     def at(self, times: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Places (K, P, 3) at times (K,), and where they are known (K, P).
+        """Return positions (K, P, 3) at times (K,), and a mask of known positions (K, P).
 
-        Between its times a point moves straight; before the first and after the last it is known
-        for as long as two of them are apart.
+        Between its times a point moves along a line. Before the first and after the last it is
+        known for the usual interval between two of them.
         """
         shape = len(times), len(self.ids)
         if self.tracks is None:
@@ -42,7 +42,10 @@ class Points(NamedTuple):
 
 
 def read_points(path: AnyPath, kind: str, source: Source, said: Said) -> Points:
-    """The points of a table; `kind` is ``"anchor"`` or ``"tag"``. Anchors may move: column `t`."""
+    """Read the points of a table.
+
+    `kind`: ``"anchor"`` or ``"tag"``. Anchors with column `t` move.
+    """
     table = read_table(path, source)
     column = kind if kind in table.columns or "id" not in table.columns else "id"
     axes = [axis for axis in "xyz" if axis in table.columns]
@@ -78,7 +81,7 @@ def read_points(path: AnyPath, kind: str, source: Source, said: Said) -> Points:
 
 
 def _longest_gap(ids: tuple[str, ...], tracks: list[tuple[FloatArray, FloatArray]]) -> str:
-    """A word on the longest time between two places of a point that moves, where it stands out."""
+    """Return a note on the longest interval between two positions of a moving point, if unusual."""
     gaps = [np.diff(at) if len(at) > 1 else np.zeros(1) for at, _ in tracks]
     worst = max(range(len(ids)), key=lambda p: gaps[p].max())
     gap, usual = gaps[worst].max(), np.median(gaps[worst])
@@ -91,7 +94,7 @@ def _longest_gap(ids: tuple[str, ...], tracks: list[tuple[FloatArray, FloatArray
 
 
 def moving(ids: tuple[str, ...], tracks: tuple[tuple[FloatArray, FloatArray], ...]) -> Points:
-    """Points of these tracks; fixed ones where none of them moves."""
+    """Return the points of these tracks; fixed points if none of them moves."""
     places = np.array([where.mean(axis=0) for _, where in tracks])
     if all(np.ptp(where, axis=0).max() < 1e-9 for _, where in tracks):
         return Points(ids, np.array([where[0] for _, where in tracks]))

@@ -1,4 +1,4 @@
-"""Tables of ranges as arrays over epochs and links."""
+"""Convert tables of ranges to arrays over epochs and links."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from rbl_gym.recordings.points import Points, moving
 from rbl_gym.recordings.report import Said
 from rbl_gym.recordings.tables import IntArray, Table
 
-# Rows that come later than this after a later one are not sorted (s).
+# Rows that are late by more than this are not sorted (s).
 _LATE_S = 1.0
 
 
 class Log(NamedTuple):
-    """Times (K,), ranges (K, M, N), 0 where no link, their deviations, anchors and tags.
+    """Times (K,), ranges (K, M, N), 0 without a link, their standard deviations, anchors and tags.
 
-    `offset`: whose ranges have an unknown one in common.
+    `offset`: which ranges share an unknown offset.
     """
 
     times: FloatArray
@@ -43,15 +43,15 @@ class Log(NamedTuple):
 def read_log(
     table: Table, anchors: Points | None, tags: Points | None, format: Format, said: Said
 ) -> Log:
-    """The ranges of a table, long or wide.
+    """Read the ranges of a table, long or wide.
 
-    Without a table of anchors their places stand beside the ranges; without one of tags there is
-    one tag, at the body's origin.
+    Without a table of anchors, their positions are columns of the table. Without a table of tags,
+    there is one tag, at the origin of the body frame.
 
     Raises
     ------
     ValueError
-        As `rbl_gym.recordings.read_recording`.
+        As in `rbl_gym.recordings.read_recording`.
     """
     table.require("t")
     if format.strict and table.cut:
@@ -108,7 +108,7 @@ def read_log(
 
 
 def _leveled(log: Log, table: Table) -> Log:
-    """Ranges with offsets in common at a level that means nothing, or a ValueError of units."""
+    """Return ranges with common offsets at an arbitrary level; raise if units do not fit."""
     assert log.offset is not None
     points = log.tags.places[None] if log.offset == "anchor" else log.anchor_places
     check_lengths(table.path, log.ranges, log.links, points, log.offset)
@@ -116,7 +116,7 @@ def _leveled(log: Log, table: Table) -> Log:
 
 
 def _sort(measured: Measured, table: Table, times: FloatArray, format: Format, said: Said) -> None:
-    """Count rows that come after a later one; refuse them where `strict`, or by more than 1 s."""
+    """Sort and count late rows; raise if `strict`, or if they are late by more than 1 s."""
     late = np.maximum.accumulate(times) - times
     allowed = 0.0 if format.strict else _LATE_S
     table.check(
@@ -133,7 +133,7 @@ def _sort(measured: Measured, table: Table, times: FloatArray, format: Format, s
 def _anchors_beside(
     table: Table, measured: Measured, ids: tuple[str, ...], times: FloatArray, said: Said
 ) -> tuple[Points, IntArray]:
-    """Anchors whose places stand beside the ranges, and which of them each range is of."""
+    """Return the anchors whose positions are columns of the table, and the anchor of each range."""
     axes = ["ax", "ay", *(["az"] if "az" in table.columns else [])]
     if len(axes) == 2:
         said.note(table.path, "has no heights of the anchors, they are 0")

@@ -1,10 +1,9 @@
-"""Real measurement logs: text files of anchors, tags, ranges, truth and calibration as arrays.
+"""Read measurement logs: text files of anchors, tags, ranges, truth and calibration.
 
-Every file has a header line; columns may come in any order, and those that nobody asks for are
-left alone and named. Between cells stand commas, semicolons, tabs or white space. UTF-8 with or
-without a byte order mark, any line ending; blank lines and lines that start with ``#`` are
-skipped, but for a header. Whatever is wrong in a file is a ValueError that names the file, the
-line, the column and the value that came.
+Every file has a header line; columns may be in any order. Unused columns are ignored and reported.
+Cells are separated by commas, semicolons, tabs or white space. UTF-8 with or without a byte order
+mark, any line ending. Blank lines and lines that start with ``#`` are skipped, except for a header.
+Errors in a file raise a ValueError that names the file, the line, the column and the value.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from rbl_gym.recordings.units import check_units
 __all__ = ["read_recording", "read_runs"]
 
 _AS_DESCRIBED = Format()
-# Longest gap between two poses of a carrier that is bridged (s).
+# Longest gap between two poses of a carrier that is interpolated (s).
 _CARRIER_GAP_S = 1.0
 
 
@@ -71,58 +70,57 @@ def read_recording(
     Parameters
     ----------
     ranges
-        Long, ``t,anchor,tag,range[,std or var][,valid][,run]``: rows of equal `t` make an epoch;
-        where `valid` (0 or 1) is 0, range and std may be any number or empty. Or wide,
-        ``t,a{anchor}t{tag},...``: a row is an epoch. Seconds and metres. A link whose range is
-        empty, or that has no row or column, is missing. Without `anchors`, the place of the
-        anchor stands beside every range: ``ax,ay[,az]``. Or differences of the distances to two
-        anchors, ``t,anchor_a,anchor_b,tag,difference[,std or var]``, that of `anchor_a` less that
-        of `anchor_b`: they become ranges with an unknown offset of the tag.
+        Long, ``t,anchor,tag,range[,std or var][,valid][,run]``: rows with equal `t` form an epoch.
+        If `valid` (0 or 1) is 0, range and std may be any number or empty. Or wide,
+        ``t,a{anchor}t{tag},...``: a row is an epoch. Seconds and metres. A link is missing if its
+        range is empty, or if it has no row or column. Without `anchors`, every row holds the
+        position of the anchor: ``ax,ay[,az]``. Or differences of the distances to two anchors,
+        ``t,anchor_a,anchor_b,tag,difference[,std or var]``, the distance to `anchor_a` minus the
+        distance to `anchor_b`. They become ranges with one unknown offset per tag.
     anchors, tags
         ``anchor,x,y,z`` and ``tag,x,y,z`` (or ``id,x,y,z``), metres; ids are any unique text.
-        Anchors that move have a row for every place and time: ``anchor,t,x,y,z``. Without `tags`
-        there is one tag, at the body's origin.
+        Moving anchors have a row for every position and time: ``anchor,t,x,y,z``. Without `tags`
+        there is one tag, at the origin of the body frame.
     truth
-        As of `rbl_gym.recordings.read_truth`: ``t,x,y,z,qw,qx,qy,qz``, TUM, EuRoC/ASL, a
-        heading or positions alone.
+        File for `rbl_gym.recordings.read_truth`: ``t,x,y,z,qw,qx,qy,qz``, TUM, EuRoC/ASL,
+        positions with a heading, or positions only.
     calibration
         ``anchor,tag,bias_m[,slope][,sigma_m]``: ``(range - bias) / (1 + slope)`` replaces the
         range of that link and ``std / (1 + slope)`` its std. A corrected range that is not
-        positive cannot be a distance and becomes a missing link. Links without a row stay as
-        they are; `sigma_m` is not read.
+        positive becomes a missing link. Links without a row are unchanged; `sigma_m` is not read.
     carrier
-        Poses, as of `truth`, of a body that carries the anchors: `anchors` is in its frame then.
-        May be the file of the ranges.
+        Poses of a body that carries the anchors, in the formats of `truth`. `anchors` is then in
+        the frame of this body. May be the file of the ranges.
     relative
-        Of a `carrier`: the body's pose is wanted in the carrier's frame. The anchors stay where
-        they are on it, and the truth is taken relative to it.
+        Estimate the pose in the frame of the `carrier`. The anchors are fixed in this frame, and
+        the truth is taken relative to it.
     odometry
-        As of `rbl_gym.recordings.read_odometry`: ``t,vx,vy,vz,wx,wy,wz``, or speeds of two wheels.
+        File for `rbl_gym.recordings.read_odometry`: ``t,vx,vy,vz,wx,wy,wz``, or the speeds of two
+        wheels.
     imu, imu_frame
-        As of `rbl_gym.recordings.read_inertial`, ``t,wx,wy,wz,ax,ay,az``, and of `read_frame`: the
-        rotation of its axes into the body's.
+        File for `rbl_gym.recordings.read_inertial`, ``t,wx,wy,wz,ax,ay,az``, and the argument of
+        `read_frame`: the rotation from its axes to those of the body.
     directions
-        As of `rbl_gym.recordings.read_directions`: bias by the direction of the ray at its ends.
-        It is a part of the measurement model, and not taken off the ranges.
+        File for `rbl_gym.recordings.read_directions`: bias by the direction of the ray at its ends.
+        It becomes part of the measurement model; the ranges are not corrected.
     run
-        Of several runs in one file (column `run`) the one to read; see `read_runs`.
+        The run to read, if the file holds several (column `run`); see `read_runs`.
     format
-        How the files are written, where not as above.
+        The format of the files, if it differs from the above.
 
     Returns
     -------
     recording
-        The log. Its `report` says what became of it: ranges that are no measurement (zero,
-        negative, NaN, above 10 km, of unknown anchors or tags) are dropped and counted by cause,
-        rows late by a second at most are sorted, rows that come twice are dropped, units that
-        nobody tells are found.
+        The log. Its `report` lists the changes. Invalid ranges (zero, negative, NaN, above 10 km,
+        unknown anchors or tags) are dropped and counted by cause. Rows late by at most one second
+        are sorted. Duplicate rows are dropped. Units that are not given are detected.
 
     Raises
     ------
     ValueError
-        If a file is not as described, if more than a fifth of the ranges are no measurement, if
-        units do not fit together, or if no epoch has a link; with `format.strict`, at the first
-        range or row that would be dropped or sorted.
+        If a file is not as described, more than a fifth of the ranges are invalid, the units do
+        not fit together, or no epoch has a link. With `format.strict`, also at the first range or
+        row that would be dropped or sorted.
     """
     files = _Files(
         ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame,
@@ -158,11 +156,11 @@ def read_runs(
     directions: AnyPath | None = None,
     format: Format = _AS_DESCRIBED,
 ) -> dict[str, Recording]:
-    """The runs of a log, each a recording, by the names in column `run` and in their order.
+    """Read the runs of a log, each as a recording, keyed by column `run` in the order of the file.
 
-    Arguments as of `read_recording`, and so the errors. A log without that column is one run with
-    the name ``""``. A truth with that column too is each run's own; one without time and with a
-    single pose of a run is of a body that stands.
+    Arguments as in `read_recording`, with the same errors. A log without this column is one run with
+    the name ``""``. If the truth has this column too, each run has its own truth. A truth without
+    time and with a single pose per run belongs to a body at rest.
     """
     files = _Files(
         ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame,
@@ -177,7 +175,7 @@ def read_runs(
 
 
 def _runs_of(table: Table) -> dict[str, np.ndarray]:
-    """Which rows (rows,) each run has."""
+    """Return the rows (rows,) of each run."""
     if "run" not in table.columns:
         return {"": np.ones(len(table.lines), dtype=bool)}
     names = np.array(table.text("run"))
@@ -185,7 +183,7 @@ def _runs_of(table: Table) -> dict[str, np.ndarray]:
 
 
 def _read(files: _Files, table: Table, run: str | None, format: Format, said: Said) -> Recording:
-    """One run."""
+    """Read one run."""
     anchors, tags = (
         None if path is None else read_points(path, kind, format.of(f"{kind}s"), said)
         for kind, path in (("anchor", files.anchors), ("tag", files.tags))
@@ -234,7 +232,7 @@ def _read(files: _Files, table: Table, run: str | None, format: Format, said: Sa
 
 
 def _inertial(files: _Files, format: Format) -> InertialLog | None:
-    """Readings of the inertial sensor in the body's axes."""
+    """Return the readings of the inertial sensor in body axes."""
     if files.imu is None:
         if files.imu_frame is not None:
             raise ValueError("imu_frame means nothing without imu")
@@ -249,7 +247,7 @@ def _inertial(files: _Files, format: Format) -> InertialLog | None:
 def _carried(
     log: Log, arms: FloatArray, carrier: Truth, said: Said, path: str
 ) -> tuple[Log, FloatArray]:
-    """Anchors (K, M, 3) in the world, and the log without epochs whose carrier is nowhere."""
+    """Return anchors (K, M, 3) in the world frame, and the epochs with a known carrier pose."""
     rotation, translation, known = _frame_at(carrier, log.times, path)
     places = np.swapaxes(rotation @ np.swapaxes(arms, -1, -2), -1, -2) + translation[:, None]
     if not known.all():
@@ -263,7 +261,7 @@ def _carried(
 
 
 def _seen_from(carrier: Truth, truth: Truth, path: str) -> Truth:
-    """Poses in the carrier's frame, where its own are known."""
+    """Return poses in the frame of the carrier, at times when its own pose is known."""
     rotation, translation, known = _frame_at(carrier, truth.times, path)
     back = np.swapaxes(rotation, -1, -2)
     shift = (back @ (truth.translation - translation)[..., None])[..., 0]
@@ -275,7 +273,7 @@ def _seen_from(carrier: Truth, truth: Truth, path: str) -> Truth:
 def _frame_at(
     carrier: Truth, times: FloatArray, path: str
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Rotation and translation of the carrier (K, ...), and where they are known."""
+    """Return rotation and translation of the carrier (K, ...), and a mask of known poses."""
     rotation, translation, known = truth_at(carrier, times, _CARRIER_GAP_S)
     if rotation is None:
         raise ValueError(f"{path}: a carrier needs rotations, got positions alone")

@@ -1,4 +1,4 @@
-"""A log of ranges as arrays."""
+"""Store a log of ranges as arrays."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ __all__ = ["Recording"]
 
 
 class Recording(NamedTuple):
-    """Ranges between M anchors and N tags over K epochs, and what is known beside them."""
+    """Ranges between M anchors and N tags over K epochs, and the data that belong to them."""
 
-    times: FloatArray  # (K,) seconds, strictly increasing, at any spacing
-    ranges: FloatArray  # (K, M, N) metres, 0 where there is no link
+    times: FloatArray  # (K,) seconds, strictly increasing, any spacing
+    ranges: FloatArray  # (K, M, N) metres, 0 without a link
     links: BoolArray  # (K, M, N) True where a range was measured
-    range_std: FloatArray | None  # (K, M, N) metres, 0 where no link; None: not in the log
-    anchors: FloatArray  # (M, 3) metres, world frame; (K, M, 3) where they move
+    range_std: FloatArray | None  # (K, M, N) metres, 0 without a link; None: not in the log
+    anchors: FloatArray  # (M, 3) metres, world frame; (K, M, 3) if they move
     tags: FloatArray  # (N, 3) metres, body frame
     anchor_ids: tuple[str, ...]  # in the order of `anchors`
     tag_ids: tuple[str, ...]  # in the order of `tags`
-    truth: Truth | None  # at times of its own, see `truth_at`
+    truth: Truth | None  # with its own times, see `truth_at`
     report: Report = Report()  # what was dropped, sorted and found while it was read
-    offset: str | None = None  # whose ranges have an unknown offset in common, and any sign
+    offset: str | None = None  # which ranges share an unknown offset; they may be negative
     odometry: OdometryLog | None = None  # on the clock of `times`
     inertial: InertialLog | None = None  # in the body frame, on the clock of `times`
-    directions: DirectionLaw | None = None  # what ranges have too much by the ray's direction
+    directions: DirectionLaw | None = None  # range bias by ray direction
 
     @property
     def anchors_by_epoch(self) -> FloatArray:
-        """Anchors (K, M, 3) at every epoch, also of those that stand; a view, not to be written."""
+        """Return the anchors (K, M, 3) at every epoch, also if they are fixed; a read-only view."""
         shape = (len(self.times), *self.anchors.shape[-2:])
         return np.broadcast_to(self.anchors, shape)
 
     @property
     def last_anchors(self) -> FloatArray:
-        """Anchors (M, 3) where they stand, or stood at last."""
+        """Return the anchors (M, 3) at fixed positions, or at their last positions."""
         return self.anchors_by_epoch[-1]

@@ -1,4 +1,4 @@
-"""What was dropped, sorted, converted and found while a log was read."""
+"""Report what was dropped, sorted, converted and found while a log was read."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["Report"]
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What became of the ranges of a log while it was read.
+    """Counts and notes on the ranges of a log, collected while it was read.
 
     Attributes
     ----------
     ranges
-        How many the log holds, empty cells not counted.
+        Number of ranges in the log, without empty cells.
     dropped
-        How many became no link, by cause.
+        Number of ranges that did not become a link, by cause.
     sorted_rows
-        Rows that came after a later one, by a second at most.
+        Number of rows that were out of order, by one second at most.
     notes
-        What a reader is to know of it, a sentence each.
+        Notes for the user, one sentence each.
     """
 
     ranges: int = 0
@@ -35,7 +35,7 @@ class Report:
 
 
 class Said:
-    """Collects a `Report` while files are read."""
+    """Collect a `Report` while files are read."""
 
     def __init__(self) -> None:
         self.ranges = 0
@@ -45,17 +45,17 @@ class Said:
         self._unread: dict[str, tuple[str, set[str]]] = {}
 
     def note(self, path: str, text: str) -> None:
-        """Take down a sentence on a file; an empty one is none."""
+        """Add a note on a file; an empty sentence is ignored."""
         if text:
             self.notes.append(f"{path}: {text}.")
 
     def drop(self, cause: str, count: int) -> None:
-        """Count ranges that become no link."""
+        """Count ranges that do not become a link."""
         if count:
             self.dropped[cause] += count
 
     def read(self, table: Table, columns: Iterable[str]) -> None:
-        """Take down which columns of a table are read, and what was wrong with its end."""
+        """Note which columns of a table are read, and whether its last row was cut off."""
         shown = {table.name(column) for column in columns} | {*table.chosen_by}
         hidden = {*table.names.values()} - shown
         path, before = self._unread.get(os.path.realpath(table.path), (table.path, hidden))
@@ -64,7 +64,7 @@ class Said:
             self.note(table.path, f"the last line, {table.cut}, is cut off and is left out")
 
     def report(self) -> Report:
-        """The report so far."""
+        """Return the report so far."""
         notes = [*dict.fromkeys(self.notes)]
         for path, names in self._unread.values():
             named = [name for name in names if not name.startswith("(column")]

@@ -1,4 +1,4 @@
-"""Time stamps: their units, found where nobody says them."""
+"""Convert time stamps, and detect their unit if it is not given."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from rbl_gym.checks import FloatArray
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WORDS = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
-# Epochs of a log in this unit are seldom further apart (s), no log starts later (s).
+# Largest usual spacing of epochs (s), and latest start of a log (s), in this unit.
 _LONGEST_STEP_S = {"s": 10.0, "ms": 1.0, "us": 1.0}
 _LATEST_S = 1e11
-# Seconds since 1970 of the years 2001 to 2065: stamps that say their unit by their size.
+# Seconds since 1970 of the years 2001 to 2065: the size of such stamps determines their unit.
 _DATES_S = (1e9, 3e9)
 _LONGEST_DATED_STEP_S = 60.0
-# Fewer different times say nothing by their spacing.
+# With fewer distinct times, the spacing gives no information.
 _FEWEST = 4
-# Whole numbers further apart are taken for milliseconds where there are many.
+# Integers with a larger spacing are taken as milliseconds if there are many.
 _WHOLE_STEP_S, _MANY = 2.0, 20
 _ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
 
 
 def seconds_per(unit: str) -> float:
-    """What one `unit` of time is in seconds.
+    """Return the length of one `unit` of time in seconds.
 
     Raises
     ------
     ValueError
-        If `unit` is none of s, ms, us, ns.
+        If `unit` is not one of s, ms, us, ns.
     """
     if unit not in TIME_UNITS:
         raise ValueError(f"time unit must be one of {[*TIME_UNITS, 'iso']}, got {unit!r}")
@@ -39,7 +39,7 @@ def seconds_per(unit: str) -> float:
 
 
 def dated_unit(stamps: FloatArray) -> str | None:
-    """The unit of stamps (K,) that are times since 1970, of the years 2001 to 2065; None: none."""
+    """Return the unit of stamps (K,) since 1970 in the years 2001 to 2065; None: no such stamps."""
     distinct = np.unique(stamps)
     if len(distinct) < 2:
         return None
@@ -51,7 +51,7 @@ def dated_unit(stamps: FloatArray) -> str | None:
 
 
 def found_unit(stamps: FloatArray) -> tuple[str, str]:
-    """The unit that stamps (K,) are likely in, and a sentence on it where it is not seconds."""
+    """Return the probable unit of stamps (K,), and a note on it if it is not seconds."""
     distinct = np.unique(stamps)
     if len(distinct) < 2:
         return "s", ""
@@ -67,7 +67,7 @@ def found_unit(stamps: FloatArray) -> tuple[str, str]:
             unit = name
             break
     if unit == "s" and step >= _WHOLE_STEP_S:
-        # A log of many whole numbers is one of ticks.
+        # A log of many integers has ticks of a clock.
         if len(distinct) >= _MANY and (distinct == np.round(distinct)).all():
             return "ms", _words("ms", step)
         return "s", (
@@ -87,9 +87,9 @@ def _words(unit: str, step: float) -> str:
 
 
 def iso_seconds(cells: list[str]) -> FloatArray | None:
-    """Seconds since 1970 of times of ISO 8601, NaN for those that are none; None: not one is.
+    """Convert ISO 8601 times to seconds since 1970, NaN for other cells; None: no cell is a time.
 
-    A time without a zone is taken for UTC. Digits beyond the microsecond are dropped.
+    A time without a zone is taken as UTC. Digits beyond the microsecond are dropped.
     """
     stamps = np.full(len(cells), np.nan)
     for i, cell in enumerate(cells):

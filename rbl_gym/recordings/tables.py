@@ -1,4 +1,4 @@
-"""Cells of a text file by column, checked: what is wrong is named with file, line and column."""
+"""Read the cells of a text file by column; errors name file, line and column."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rbl_gym.recordings.text import is_number, read_cells
 
 AnyPath = str | os.PathLike[str]
 IntArray = NDArray[np.intp]
-Ids = tuple[tuple[str, ...], tuple[str, ...]]  # of the anchors, of the tags
+Ids = tuple[tuple[str, ...], tuple[str, ...]]  # anchors, tags
 
 MAX_RANGE_M = 10e3
 MAX_COORDINATE_M = 1e8  # geocentric and map coordinates are in the world frame
@@ -24,9 +24,9 @@ MAX_TIME_S = 1e11  # the year 5138
 TOO_LONG = f"must be at most {MAX_RANGE_M:.0f} m (looks like millimetres?)"
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
-# What loggers write where there is no number.
+# What loggers write for a missing number.
 _MISSING = frozenset(("", "nan", "na", "n/a", "none", "null", "-", "inf", "-inf", "+inf"))
-# Other names that a column often has; a unit may stand behind them: time_ms, range_mm.
+# Other common names of a column. A unit may follow: time_ms, range_mm.
 _OTHER_NAMES = {
     "t": ("t", "time", "timestamp", "stamp"),
     "range": ("range", "distance", "dist"),
@@ -41,11 +41,11 @@ _UNIT = re.compile(
 
 
 class Source(NamedTuple):
-    """How the columns of a file are named, and which of its rows are meant.
+    """Column names of a file, and the rows to use.
 
-    `columns`: what a column is called in the file, by what it holds; ``{"*": "B_*"}`` names all
-    that begin so; a unit may stand in brackets behind a name, ``"stamp[ms]"``. `where`: cells that
-    the rows meant have, by column.
+    `columns` maps the content of a column to its name in the file. ``{"*": "B_*"}`` names all
+    columns with this prefix. A unit may follow a name in brackets, ``"stamp[ms]"``. `where` gives,
+    by column, the cell that the rows to use must have.
     """
 
     columns: Mapping[str, str] = {}
@@ -56,20 +56,20 @@ AS_NAMED = Source()
 
 
 class Table(NamedTuple):
-    """Cells of a text file by column, the line of the header and the lines of the rows."""
+    """Cells of a text file by column, with the line of the header and the lines of the rows."""
 
     path: str
     header_line: int
     lines: NDArray[np.int64]
-    columns: dict[str, NDArray[np.object_]]  # by what they hold, or else by their name in the file
+    columns: dict[str, NDArray[np.object_]]  # by content, or else by name in the file
     names: dict[str, str]  # in the file
-    units: dict[str, str]  # that the header tells
+    units: dict[str, str]  # given in the header
     decimal: str  # "." or ","
-    cut: int | None  # line of a last row that was cut off and is not here
-    chosen_by: tuple[str, ...]  # names in the file of columns that chose the rows
+    cut: int | None  # line of a last row that was cut off and left out
+    chosen_by: tuple[str, ...]  # names in the file of the columns that selected the rows
 
     def require(self, *columns: str) -> None:
-        """Raise unless all `columns` are there."""
+        """Raise ValueError unless all `columns` exist."""
         for column in columns:
             if column not in self.columns:
                 raise ValueError(
@@ -78,15 +78,15 @@ class Table(NamedTuple):
                 )
 
     def name(self, column: str) -> str:
-        """What `column` is called in the file."""
+        """Return the name of `column` in the file."""
         return self.names.get(column, column)
 
     def place(self, row: int, column: str) -> str:
-        """File, line and column in words."""
+        """Return file, line and column as text."""
         return f"{self.path}, line {self.lines[row]}, column {self.name(column)!r}"
 
     def unit(self, column: str, known: Iterable[str]) -> str:
-        """The unit of a column that the header tells, one of `known`; "" where it tells none."""
+        """Return the unit of a column given in the header, one of `known`; "" if it gives none."""
         unit = self.units.get(column, "")
         if unit and unit not in known:
             raise ValueError(
@@ -103,16 +103,16 @@ class Table(NamedTuple):
             raise ValueError(f"{self.place(row, column)}: {must}, got {value:.80}")
 
     def select(self, rows: BoolArray) -> Table:
-        """The table of some of the rows."""
+        """Return the table with some of the rows."""
         columns = {name: cells[rows] for name, cells in self.columns.items()}
         return self._replace(lines=self.lines[rows], columns=columns)
 
     def text(self, column: str) -> list[str]:
-        """(rows,) cells without space around them."""
+        """Return (rows,) cells without surrounding space."""
         return [cell.strip() for cell in self.columns[column]]
 
     def numbers(self, column: str, *, may_be_missing: bool = False) -> FloatArray:
-        """(rows,) finite numbers, NaN for cells without a number where these are allowed."""
+        """Return (rows,) finite numbers; NaN for empty cells if these are allowed."""
         cells = self.columns[column].tolist()
         if self.decimal == ",":
             cells = [cell.replace(",", ".") for cell in cells]
@@ -130,9 +130,9 @@ class Table(NamedTuple):
         return values
 
     def seconds(self, unit: str | None = None) -> tuple[FloatArray, str]:
-        """(rows,) column `t` in seconds, and what is to be said of its unit ("": nothing).
+        """Return (rows,) column `t` in seconds, and a note on its unit ("": none).
 
-        `unit`: s, ms, us, ns or iso; None: as the header tells, else found from the cells.
+        `unit`: s, ms, us, ns or iso; None: the unit in the header, or else detected from the cells.
         """
         self.require("t")
         said = unit or self.unit("t", TIME_UNITS) or None
@@ -150,14 +150,14 @@ class Table(NamedTuple):
         return times, note
 
     def times(self) -> FloatArray:
-        """(rows,) column `t` in seconds, increasing."""
+        """Return (rows,) column `t` in seconds, increasing."""
         times, _ = self.seconds()
         step = np.diff(times, prepend=-np.inf)
         self.check(step > 0, "t", "time must increase from row to row")
         return times
 
     def points(self, columns: Iterable[str], most: float = MAX_COORDINATE_M) -> FloatArray:
-        """(rows, len(columns)) coordinates in metres, of magnitude `most` at most."""
+        """Return (rows, len(columns)) coordinates in metres, of magnitude `most` at most."""
         points = {column: self.numbers(column) for column in columns}
         too_far = f"must be at most {most:.0f} m (looks like millimetres?)"
         for column, values in points.items():
@@ -166,10 +166,10 @@ class Table(NamedTuple):
         return np.stack([*points.values()], axis=-1)
 
     def positions(self, column: str, ids: tuple[str, ...]) -> IntArray:
-        """(rows,) where in `ids` the cells of `column` stand, -1 for those that are none.
+        """Return (rows,) indices in `ids` of the cells of `column`, -1 for unknown ids.
 
-        Ids are text. Where one is not there as it is, capital letters and a ``.0`` that a
-        spreadsheet has put behind a number do not count.
+        Ids are text. If there is no exact match, case and a ``.0`` that a spreadsheet has added to
+        a number are ignored.
         """
         index = {name: i for i, name in enumerate(ids)}
         plain: dict[str, int] = {}
@@ -183,7 +183,7 @@ class Table(NamedTuple):
         return np.array([found[cell] for cell in cells], dtype=np.intp)
 
     def links(self, ids: Ids) -> tuple[IntArray, IntArray]:
-        """Anchor and tag indices (rows,) of known ids, every link at most once."""
+        """Return the anchor and tag indices (rows,) of known ids, every link at most once."""
         found = []
         for column, known in zip(("anchor", "tag"), ids, strict=True):
             found.append(self.positions(column, known))
@@ -195,14 +195,15 @@ class Table(NamedTuple):
 
 
 def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str] = ()) -> Table:
-    """The cells of a file with a header; `headless` names the columns of a table without one.
-    Columns that `source` names by numbers are those of a table without a header, from 1.
+    """Read the cells of a file with a header; `headless` names the columns of a table without one.
+
+    If `source` names columns by numbers, from 1, the table has no header.
 
     Raises
     ------
     ValueError
-        If it cannot be read, a row does not fit the header, a column that `source` names is not
-        there, or no row is left.
+        If the file cannot be read, a row does not fit the header, a column named by `source`
+        does not exist, or no row is left.
     """
     asked = {_name_and_unit(name)[0] for name in source.columns.values()}
     numbered = bool(asked) and all(name.isdigit() for name in asked)
@@ -243,7 +244,7 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
 
 
 def _name_and_unit(cell: str) -> tuple[str, str]:
-    """``time [ms]`` is ``time`` in ms, ``time_ms`` keeps its name."""
+    """Split a name and its unit: ``time [ms]`` is ``time`` in ms; ``time_ms`` keeps its name."""
     cell = cell.strip()
     unit = _UNIT.search(cell)
     if unit is None:
@@ -260,7 +261,7 @@ def _column(cells: tuple[str, ...]) -> NDArray[np.object_]:
 
 
 def _roles(where: str, header: list[str], columns: dict[str, str]) -> dict[str, str]:
-    """Names in the file by what the columns hold."""
+    """Return the names in the file by the content of the columns."""
     if "time" in columns:
         columns["t"] = columns.pop("time")
     names: dict[str, str] = {}
@@ -290,13 +291,13 @@ def _roles(where: str, header: list[str], columns: dict[str, str]) -> dict[str, 
         if len(like) == 1:
             names[role] = like[0]
             taken.add(like[0])
-    # A column whose name another one has taken over stands in brackets.
+    # A column whose name is used for another one is kept in brackets.
     left = [name for name in header if name not in taken]
     return names | {f"({name})" if name in names else name: name for name in left}
 
 
 def is_first(values: ArrayLike) -> BoolArray:
-    """(rows,) False where a value has come before."""
+    """Return (rows,) booleans, False if the value occurred in an earlier row."""
     values, first = np.asarray(values), np.unique(values, return_index=True)[1]
     return np.isin(np.arange(len(values)), first)
 

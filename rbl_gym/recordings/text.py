@@ -1,4 +1,4 @@
-"""Text files as cells: encoding, comments, the header, what stands between cells."""
+"""Read text files as cells: encoding, comments, header and delimiter."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-# What may stand between cells; white space only where the header has none of the others.
+# Possible delimiters; white space only if the header has none of the others.
 _DELIMITERS = ("\t", ";", ",")
-# A first line by which spreadsheets say what does.
+# A first line by which spreadsheets declare the delimiter.
 _SEPARATOR = re.compile(r"sep=.\r?$", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"\d,\d")
 _DECIMAL_POINT = re.compile(r"\d\.\d")
 
 
 class Cells(NamedTuple):
-    """A header and the cells below it by column, and the lines where they stand."""
+    """A header and the cells below it by column, with their line numbers."""
 
     path: str
     header_line: int
@@ -26,11 +26,11 @@ class Cells(NamedTuple):
     lines: list[int]
     columns: list[tuple[str, ...]]
     decimal: str  # "." or ","
-    cut: int | None  # line of a last row that was cut off and is not here
+    cut: int | None  # line of a last row that was cut off and left out
 
 
 def is_number(cell: str) -> bool:
-    """Whether `cell` reads as a number; NaN and infinities do."""
+    """Return whether `cell` is a number, including NaN and infinities."""
     try:
         return bool(cell) and "_" not in cell and isinstance(float(cell), float)
     except ValueError:
@@ -40,12 +40,12 @@ def is_number(cell: str) -> bool:
 def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) -> Cells:
     """Read a text file: UTF-8 with or without a byte order mark, any line ending.
 
-    Cells are separated by commas, semicolons, tabs or, where the header has none of these, by
-    white space; with semicolons and tabs, a comma may be the decimal point. Blank lines and lines
-    that begin with ``#`` are skipped, unless the first row below holds numbers only a comment can
-    name: then the last comment above it whose cells fit the row is the header. A file of numbers
-    between white space with neither has the names `headless`, if there are as many. With `numbered`
-    the columns of any table without a header are 1, 2 and so on.
+    Cells are separated by commas, semicolons or tabs, or by white space if the header has none of
+    these. With semicolons and tabs, a comma may be the decimal point. Blank lines and lines that
+    begin with ``#`` are skipped. There is one exception: if the first row holds numbers, the header
+    is the last comment above it whose cells fit the row. If there is no such comment either,
+    columns separated by white space get the names `headless`, if their number fits. With
+    `numbered`, the columns of any table without a header are 1, 2 and so on.
 
     Raises
     ------
@@ -97,8 +97,8 @@ def read_cells(path: str, headless: Sequence[str] = (), numbered: bool = False) 
 def _rows(
     path: str, lines: list[str], start: int, header: list[str], comma: str | None
 ) -> tuple[list[list[str]], list[int], int | None]:
-    """The rows below the header, their lines, and the line of a last row that was cut off."""
-    # A comment is turned into a blank line, an empty row: line numbers stay those of the file.
+    """Return the rows below the header, their lines, and the line of a row that was cut off."""
+    # A comment becomes an empty row, so that line numbers remain those of the file.
     text = ("" if line.lstrip()[:1] in ("", "#") else line for line in lines[start + 1 :])
     rows: list[list[str]] = []
     numbers: list[int] = []
@@ -114,9 +114,9 @@ def _rows(
             if not row:
                 continue
             if len(row) > width and not any(row[width:]):
-                row = row[:width]  # a delimiter at the end of the line
+                row = row[:width]  # trailing delimiter
             if len(row) < width and line == len(lines) and rows:
-                return rows, numbers, line  # no line feed behind it
+                return rows, numbers, line  # no line feed at the end
             if len(row) != width:
                 raise csv.Error(f"must have {width} cells like the header, got {len(row)}")
             rows.append(row)
@@ -128,7 +128,7 @@ def _rows(
 
 
 def _check_decimals(path: str, rows: list[list[str]], numbers: list[int]) -> None:
-    """Raise where commas and points are both decimal points of a table."""
+    """Raise ValueError if a table uses both commas and points as decimal points."""
     pointed = {i for row in rows for i, c in enumerate(row) if is_number(c) and "." in c}
     for row, line in zip(rows, numbers, strict=True):
         for i in pointed:
@@ -149,7 +149,7 @@ def _read_lines(path: str) -> list[str]:
 
 
 def _delimiter(header: str, row: str) -> str | None:
-    """What stands between the cells of two lines; None: white space."""
+    """Return the delimiter of the cells of two lines; None: white space."""
     counts = {d: (len(_split(header, d)), len(_split(row, d))) for d in _DELIMITERS}
     for d, (one, other) in counts.items():
         if one == other > 1:
@@ -170,6 +170,6 @@ def _split(line: str, delimiter: str | None) -> list[str]:
 
 
 def _is_numeric(cell: str) -> bool:
-    """Whether a cell looks like a number, with a point or a comma, or like a time stamp."""
+    """Return whether a cell looks like a number, with a point or a comma, or like a time stamp."""
     cell = cell.strip().replace(",", ".")
     return is_number(cell) or bool(re.match(r"\d{4}-\d\d-\d\d[T ]", cell))

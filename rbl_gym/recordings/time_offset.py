@@ -1,7 +1,7 @@
-"""By how much two clocks differ that saw the same motion: the shift at which signals agree.
+"""Estimate the offset of two clocks: the shift at which signals of the same motion agree.
 
-The signals may be anything that both clocks saw: speeds, turn rates, positions. Their sampling may
-differ and be irregular.
+The signals may be any quantity measured with both clocks: speeds, turn rates, positions. Their
+sampling may differ and be irregular.
 """
 
 from __future__ import annotations
@@ -16,32 +16,32 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array, check_number
 
 __all__ = ["TimeOffset", "time_offset"]
 
-# Points of the grid in a standard deviation of the smoothing.
+# Grid points per standard deviation of the smoothing.
 _FINE = 2
-# Gaps of more than so many median steps are not bridged.
+# Gaps of more than this number of median steps are not bridged.
 _GAP = 5.0
-# Least share of the shorter signal that both must have in common, and least points of it.
+# Minimum overlap, as a share of the shorter signal, and in points.
 _OVERLAP, _FEWEST = 0.5, 20
-# Correlations below this are chance; an offset whose lack of correlation is below so many times
-# that of the best, and so much, explains the signals as well.
+# Correlations below the first number are chance. Another offset explains the signals equally well
+# if its lack of correlation is below this multiple of that of the best, and below this value.
 _LEAST, _RIVAL, _AS_GOOD = 0.3, 1.2, 5e-3
-# Smoothing is doubled, up to so many widths, until the correlation is above the second number or
-# grows by less than the third.
+# Smoothing is doubled, up to this number of widths, until the correlation is above the second
+# number or grows by less than the third.
 _DOUBLINGS, _SMOOTH, _GAIN = 5, 0.9, 0.01
-# Parts whose scores give the standard deviation.
+# Number of parts of the record whose scores give the standard deviation.
 _PARTS = 24
 _MOST_POINTS = 5_000_000
 
 
 class TimeOffset(NamedTuple):
-    """A difference of two clocks: what has stamp t by the first has ``t + offset_s`` by the second.
+    """The offset of two clocks: stamp t of the first is ``t + offset_s`` on the second.
 
     Attributes
     ----------
     offset_s, std_s
-        The difference and its standard deviation, seconds.
+        The offset and its standard deviation, seconds.
     correlation
-        Of the two signals, smoothed, at this offset.
+        Correlation of the two smoothed signals at this offset.
     """
 
     offset_s: float
@@ -50,7 +50,7 @@ class TimeOffset(NamedTuple):
 
 
 class _Signal(NamedTuple):
-    """A signal on a regular grid: start (s), values (n, D) of mean 0, where it is known (n,)."""
+    """A signal on a regular grid: start (s), values (n, D) of mean 0, mask of known values (n,)."""
 
     start: float
     values: FloatArray
@@ -65,36 +65,36 @@ def time_offset(
     search_s: float | None = None,
     smooth_s: float | None = None,
 ) -> TimeOffset:
-    """The offset at which two signals agree best: ``values_a(t)`` is ``values_b(t + offset)``.
+    """Estimate the offset at which two signals agree best: ``values_a(t) = values_b(t + offset)``.
 
-    Both are smoothed and interpolated onto a grid. The offset of the highest correlation is refined
-    by Gauss-Newton steps on the squared difference of the signals. Gains and constant offsets of
-    the values do not matter.
+    Both are smoothed and interpolated onto a grid. The offset with the highest correlation is
+    refined by Gauss-Newton steps on the squared difference of the signals. Gains and constant
+    offsets of the values have no effect.
 
     Parameters
     ----------
     times_a, times_b
-        (K,) and (L,), seconds, increasing, at any spacing.
+        (K,) and (L,), seconds, increasing, any spacing.
     values_a, values_b
-        (K,) and (L,), or (K, D) and (L, D): D signals of one unit, which count together.
+        (K,) and (L,), or (K, D) and (L, D): D signals in one unit, used together.
     search_s
-        Offsets up to this magnitude are tried; None: all that leave half of the shorter signal in
-        common.
+        Offsets up to this magnitude are tried; None: all with an overlap of at least half of the
+        shorter signal.
     smooth_s
-        Standard deviation of the smoothing by a Gaussian, the same for both; None: the larger of
-        the two median steps, doubled while the signals correlate poorly and better for it.
+        Standard deviation of the Gaussian smoothing, the same for both; None: the larger of the two
+        median steps, doubled while the correlation is poor and improves.
 
     Returns
     -------
     TimeOffset
-        The standard deviation is that of the scores of parts of the record, and so holds for
-        errors of either signal that are correlated in time over less than a part (a 24th).
+        The standard deviation is computed from the scores of parts of the record. It is valid for
+        errors that are correlated in time over less than one part (a 24th of the record).
 
     Raises
     ------
     ValueError
-        If the signals do not overlap, do not correlate, or agree as well at another offset (motion
-        that repeats itself).
+        If the signals do not overlap, do not correlate, or agree equally well at another offset
+        (periodic motion).
     """
     a, b = _checked("a", times_a, values_a), _checked("b", times_b, values_b)
     if a[1].shape[1] != b[1].shape[1]:
@@ -117,7 +117,7 @@ def time_offset(
             start, correlation = _coarse(one, other, step, search)
             found = TimeOffset(*_refined(one, other, step, start), correlation)
         except ValueError as error:
-            # Noise may go with more smoothing: the first word on it is the plainest.
+            # More smoothing may remove noise. The first error message is the clearest.
             failed = failed or error
             continue
         if best is not None and correlation < best.correlation + _GAIN:
@@ -172,10 +172,10 @@ def _on_grid(times: FloatArray, values: FloatArray, step: float, width: float) -
 
 
 def _coarse(a: _Signal, b: _Signal, step: float, search: float) -> tuple[float, float]:
-    """The offset of the grid with the highest correlation, and that correlation."""
+    """Return the offset on the grid with the highest correlation, and that correlation."""
 
     def lagged(x: FloatArray, y: FloatArray) -> FloatArray:
-        """``sum_k x[k] y[k + lag]`` for lags from -(len(x) - 1) on."""
+        """Return ``sum_k x[k] y[k + lag]`` for lags from -(len(x) - 1)."""
         count = len(x) + len(y) - 1
         size = 1 << (count - 1).bit_length()
         spectrum = np.fft.rfft(y, size) * np.fft.rfft(x[::-1], size)
@@ -199,7 +199,7 @@ def _coarse(a: _Signal, b: _Signal, step: float, search: float) -> tuple[float, 
         power_a += lagged(x**2, n) - sum_a**2 / most
         power_b += lagged(m, y**2) - sum_b**2 / most
     power = np.sqrt(np.maximum(power_a, 0) * np.maximum(power_b, 0))
-    # Where one of the signals does not change in what they have in common, nothing is known.
+    # If one of the signals is constant over the overlap, the correlation is unknown.
     flat = power <= 1e-6 * np.sqrt((a.values**2).sum() * (b.values**2).sum())
     correlation = np.where(tried & ~flat, cross / np.where(flat, 1.0, power), -1.0)
     best = int(correlation.argmax())
@@ -219,10 +219,10 @@ def _coarse(a: _Signal, b: _Signal, step: float, search: float) -> tuple[float, 
 
 
 def _check_rivals(offsets: FloatArray, correlation: FloatArray, best: int) -> None:
-    """Raise where another peak is as high."""
+    """Raise ValueError if another peak is as high."""
     inner = correlation[1:-1]
     peaks = 1 + np.flatnonzero((inner >= correlation[:-2]) & (inner > correlation[2:]))
-    # A peak that no valley parts from the best is the best.
+    # A peak that no valley separates from the best one belongs to it.
     low = 0.5 * (correlation[best] + min(_LEAST, correlation[best]))
     below = np.flatnonzero(correlation < max(low, 1 - 4 * (1 - correlation[best])))
     left = below[below < best].max(initial=-1)
@@ -240,13 +240,13 @@ def _check_rivals(offsets: FloatArray, correlation: FloatArray, best: int) -> No
 
 
 def _refined(a: _Signal, b: _Signal, step: float, offset: float) -> tuple[float, float]:
-    """The offset of least squares near `offset`, and its standard deviation."""
+    """Return the least-squares offset near `offset`, and its standard deviation."""
     grid_a = step * np.arange(len(a.values))
     grid_b = step * np.arange(len(b.values))
     spline = scipy.interpolate.CubicSpline
     spline_a, spline_b = spline(grid_a, a.values), spline(grid_b, b.values)
     rate_a = spline_a(grid_a, 1)
-    # Stamps since 1970 have few digits left: the shift is taken between the two starts.
+    # Stamps since 1970 have few digits left, so the shift is taken between the two starts.
     apart = b.start - a.start
     first = shift = offset - apart
     for _ in range(20):
@@ -259,7 +259,7 @@ def _refined(a: _Signal, b: _Signal, step: float, offset: float) -> tuple[float,
         x, y = x - x.mean(axis=0), y - y.mean(axis=0)
         gain = (x * y).sum() / max((y * y).sum(), 1e-300)
         score = ((x - gain * y) * rate).sum(axis=-1)
-        # Noise of a signal is in its own rate alone: the product of both rates has none of it.
+        # The noise of a signal is only in its own rate, so the product of both rates is unbiased.
         slope = float((rate_a[used] * rate).sum())
         if not slope > 0:
             raise ValueError(f"signals do not change enough to tell an offset near {offset:.4g} s")

@@ -1,4 +1,4 @@
-"""Reference poses: read from a file, and between their times."""
+"""Read reference poses from a file, and interpolate them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_YAW_DEG = 1e6
 _TUM = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _ANGLES = ("roll", "pitch", "yaw")
-# Words in the names of columns that are no pose.
+# Words in column names that do not belong to a pose.
 _NO_POSE = {"covariance", "cov", "std", "twist", "velocity", "vel", "linear", "angular", "acc",
             "acceleration", "gyro", "bias"}  # fmt: skip
 
@@ -33,31 +33,31 @@ class Truth(NamedTuple):
     """Reference poses of the body, ``p_world = rotation @ p_body + translation``."""
 
     times: FloatArray  # (L,) seconds, strictly increasing
-    rotation: FloatArray | None  # (L, 3, 3); None: positions alone
+    rotation: FloatArray | None  # (L, 3, 3); None: only positions
     translation: FloatArray  # (L, 3) metres
-    planar: bool = False  # height, roll and pitch are not known: 0 where they stand
-    form: str = "poses"  # how the file had it, in words
+    planar: bool = False  # height, roll and pitch are unknown and set to 0
+    form: str = "poses"  # format of the file, in words
 
 
 def truth_at(
     truth: Truth, times: ArrayLike, max_gap_s: float = 0.5
 ) -> tuple[FloatArray | None, FloatArray, BoolArray]:
-    """Truth at other times: linear in position, along the geodesic in rotation.
+    """Interpolate the truth: linearly in position, along the geodesic in rotation.
 
     Parameters
     ----------
     truth, times
-        Reference poses; the times they are wanted at, (..., K) seconds.
+        Reference poses; the requested times, (..., K) seconds.
     max_gap_s
-        Longest gap between two reference poses that is bridged, seconds.
+        Longest gap between two reference poses that is interpolated, seconds.
 
     Returns
     -------
     rotation, translation
-        (..., K, 3, 3) and (..., K, 3) metres; finite but meaningless where not `valid`. The
-        rotation is None where the truth has none.
+        (..., K, 3, 3) and (..., K, 3) metres; finite but meaningless if not `valid`. The
+        rotation is None if the truth has none.
     valid
-        (..., K) False outside the truth's time span and inside a gap longer than `max_gap_s`.
+        (..., K) False outside the time span of the truth and in gaps longer than `max_gap_s`.
 
     Raises
     ------
@@ -87,32 +87,33 @@ def read_truth(
     run: str | None = None,
     times: FloatArray | None = None,
 ) -> Truth:
-    """The reference poses of a file.
+    """Read the reference poses of a file.
 
-    Known are TUM (``t x y z qx qy qz qw`` between blanks, no header), EuRoC/ASL (a header that
-    begins with ``#``, nanoseconds, qw first), and tables with a header: ``t,x,y,z,qw,qx,qy,qz``;
-    ``t,x,y,z,roll_deg,pitch_deg,yaw_deg``, turned about z, y and x in this order; ``t,x,y[,z]``
-    with ``yaw_deg`` or without. Angles may be ``_rad``. Columns of messages go by their last word,
-    as in ``pose.position.x``. Quaternions may be off unit norm by 0.01 and are normalised.
+    The known formats are TUM (``t x y z qx qy qz qw`` separated by blanks, no header), EuRoC/ASL (a
+    header that begins with ``#``, nanoseconds, qw first), and tables with a header:
+    ``t,x,y,z,qw,qx,qy,qz``; ``t,x,y,z,roll_deg,pitch_deg,yaw_deg``, rotated about z, y and x in
+    this order; ``t,x,y[,z]`` with or without ``yaw_deg``. Angles may be ``_rad``. Columns of
+    messages are identified by their last word, as in ``pose.position.x``. The norm of quaternions
+    may differ from 1 by 0.01; they are normalised.
 
     Parameters
     ----------
     path, source, said
-        The file, how its columns are named, and who takes down what was found.
+        The file, the names of its columns, and the object that collects notes.
     run
-        Where the file has a column `run`, the one that is meant.
+        The run to read, if the file has a column `run`.
     times
-        Of a file without times that has one pose: those at which the body stands there.
+        Times (K,) for a file with one pose and no times: the body is at rest in this pose.
 
     Returns
     -------
     Truth
-        Without rotation where the file has positions alone; `planar` where it has no heights.
+        Without rotation if the file has only positions; `planar` if it has no heights.
 
     Raises
     ------
     ValueError
-        If the file is not as above: it names file, line and column.
+        If the file has another format. The message names file, line and column.
     """
     said = said or Said()
     table = _known_names(read_table(path, source, _TUM))
@@ -135,7 +136,7 @@ def read_truth(
     table.require("t")
     unit = table.units.get("t")
     if unit is None and is_number(table.columns["t"][0]):
-        # Poses may be rare: their spacing does not tell seconds from milliseconds.
+        # Poses may be rare, so their spacing does not distinguish seconds from milliseconds.
         unit = dated_unit(table.numbers("t")) or "s"
     stamps, _ = table.seconds(unit)
     table.check(np.diff(stamps, prepend=-np.inf) > 0, "t", "time must increase from row to row")
@@ -143,7 +144,7 @@ def read_truth(
 
 
 def _rotations(table: Table) -> tuple[FloatArray | None, tuple[str, ...]]:
-    """Rotations (L, 3, 3), and the columns that they are of; None: positions alone."""
+    """Return rotations (L, 3, 3) and their columns; None: only positions."""
     found = [name for name in _QUATERNION if name in table.columns]
     if found:
         table.require(*_QUATERNION)
@@ -181,7 +182,7 @@ def _rotations(table: Table) -> tuple[FloatArray | None, tuple[str, ...]]:
 
 
 def _form(table: Table, angles: int, planar: bool) -> str:
-    """What the file is, in words."""
+    """Return the format of the file, in words."""
     names = [*table.names.values()]
     known = "TUM" if [*table.columns] == [*_TUM] else "table"
     if any(name.lower().startswith(("p_rs", "q_rs")) for name in names):
@@ -191,7 +192,7 @@ def _form(table: Table, angles: int, planar: bool) -> str:
 
 
 def _known_names(table: Table) -> Table:
-    """The table with columns of other names under those that are read, where one alone fits."""
+    """Return the table with column names replaced by the known ones, if the match is unique."""
     like: dict[str, list[str]] = {}
     for name in table.columns:
         role = _role(name, table.units.get(name, ""))
@@ -206,7 +207,7 @@ def _known_names(table: Table) -> Table:
 
 
 def _role(name: str, unit: str) -> str | None:
-    """What a column of this name holds, if it is read: ``q_RS_w []`` is qw."""
+    """Return the content of a column of this name, if it is known: ``q_RS_w []`` is qw."""
     words = re.findall(r"[a-z0-9]+", re.sub(r"[\[(].*?[\])]", "", name.lower()))
     if words[-1:] in (["m"], ["deg"], ["rad"]):
         unit = words.pop()

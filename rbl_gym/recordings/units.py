@@ -1,4 +1,4 @@
-"""Do the units of a recording fit together? Triangle inequalities between ranges and tables."""
+"""Check that the units of a recording fit together, by triangle inequalities."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
 
-# Ranges of one link this old still say where the body is, to a part of its distance to an anchor.
+# Oldest range of a link (s) that is still used. The body moves little in this time compared with
+# its distance to an anchor.
 _STALE_S = 0.5
-# Epochs and pairs of points that are looked at.
+# Largest number of epochs and of pairs of points that are checked.
 _EPOCHS, _PAIRS = 500, 200
-# Fewer pairs of ranges may all be wrong by chance.
+# With fewer pairs of ranges, all may be wrong by chance.
 _FEWEST = 12
-# Points are too far apart where the sum of two ranges is below this share of their distance,
-# too near to each other where ranges differ by more than so many of their distances.
+# Points are too far apart if the sum of two ranges is below this share of their distance. They
+# are too close if ranges differ by more than this multiple of their distance.
 _SUM, _TOO_NEAR = 0.9, 20.0
 # Differences of ranges below this share of a range may be noise.
 _NOISE = 0.03
-# Tags are too far apart where nine in ten differences of ranges are below this share of their
-# distance: all anchors would stand broadside to all pairs of tags, within three degrees.
+# Tags are too far apart if nine in ten differences of ranges are below this share of their
+# distance. All anchors would then lie broadside to all pairs of tags, within three degrees.
 _BROADSIDE = 0.05
-# Below this the unit is more likely a thousandth than a hundredth.
+# Below this ratio the unit is more likely a thousandth than a hundredth.
 _MILLI = 3e-3
-# Spread of points, relative to their size or to the range, below which they are flat.
+# Points with a spread below this share of their size, or of the range, count as flat.
 _FLAT = 0.1
 # The median range over the mean distance of the anchors from their centre, or its inverse.
 _MAX_SCALE_RATIO = 50.0
@@ -37,12 +38,13 @@ def check_units(
     tags: FloatArray,
     anchors_are: str = "stand",
 ) -> None:
-    """Raise where ranges (K, M, N), anchors (M, 3) and tags (N, 3) cannot be in one unit.
+    """Raise ValueError if ranges (K, M, N), anchors (M, 3) and tags (N, 3) cannot be in one unit.
 
     A range r of a point p obeys ``|r - r'| <= |p - p'| <= r + r'`` for two anchors of one tag and
     for two tags of one anchor; noise adds to the left side. `paths` are the files of the ranges,
-    the anchors and the tags, for the message. `anchors_are`: they ``"stand"`` around the body, or
-    are ``"carried"`` by another one, which may be far away, or ``"move"`` about these places.
+    the anchors and the tags, for the message. `anchors_are`: ``"stand"`` if they are fixed around
+    the body, ``"carried"`` if they are on another body, which may be far away, ``"move"`` if they
+    move around these positions.
 
     Raises
     ------
@@ -51,7 +53,7 @@ def check_units(
     """
     typical = float(np.median(ranges[links]))
     layout = np.linalg.norm(anchors - anchors.mean(axis=0), axis=-1).mean()
-    # A single anchor, or anchors all at one place, say nothing about the scale.
+    # A single anchor, or anchors at one position, contain no information on the scale.
     scale = typical / layout if layout > 1e-6 and anchors_are == "stand" else 1.0
     if not 1 / _MAX_SCALE_RATIO <= scale <= _MAX_SCALE_RATIO:
         hint = " (ranges in cm or mm? say their unit)" if scale > 1 else ""
@@ -68,9 +70,9 @@ def check_units(
 
 
 def _held(times: FloatArray, ranges: FloatArray, links: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """The last range of every link at some epochs, and where it is not too old.
+    """Return the last range of every link at some epochs, and whether it is recent enough.
 
-    Radios that measure one link at a time never have two in one epoch.
+    Radios that measure one link at a time never have two ranges in one epoch.
     """
     count = len(times)
     last = np.where(links, np.arange(count)[:, None, None], -1)
@@ -81,7 +83,7 @@ def _held(times: FloatArray, ranges: FloatArray, links: BoolArray) -> tuple[Floa
 
 
 def _pairs(points: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
-    """Indices of pairs of distinct points, and their distances."""
+    """Return indices of pairs of distinct points, and their distances."""
     one, other = np.triu_indices(len(points), 1)
     distance = np.linalg.norm(points[one] - points[other], axis=-1)
     far = np.flatnonzero(distance > 1e-9)[:: 1 + len(one) // _PAIRS]
@@ -98,7 +100,7 @@ def _check_pairs(
     fresh: BoolArray,
     typical: float,
 ) -> None:
-    """Raise where points (P, 3), the last axis of the ranges, break a triangle inequality."""
+    """Raise ValueError if points (P, 3), last axis of the ranges, break a triangle inequality."""
     one, other, distance = _pairs(points)
     both = fresh[..., one] & fresh[..., other]
     if both.sum() >= _FEWEST:
@@ -131,13 +133,13 @@ def _check_spread(
     fresh: BoolArray,
     typical: float,
 ) -> None:
-    """Raise where tags are so far apart that no anchor would stand but broadside to them."""
+    """Raise ValueError if tags are so far apart that all anchors would lie broadside to them."""
     one, other, distance = _pairs(tags)
     both = fresh[..., one] & fresh[..., other]
     if both.sum() < _FEWEST:
         return
-    # Pairs of a line have all directions broadside to them in one plane, those of a flat body
-    # in one line, those of a solid nowhere.
+    # For points on a line, the directions broadside to all pairs fill a plane. For a flat body
+    # they form a line. For a solid there are none.
     size = _extents(tags)
     solid = int((size > _FLAT * size[0]).sum())
     reach = np.append(_extents(anchors), np.inf)[[2, 1, 3][solid - 1]]
@@ -154,7 +156,7 @@ def _check_spread(
 
 
 def _extents(points: FloatArray) -> FloatArray:
-    """Root mean squares (3,) of points (P, 3) along their principal axes, the largest first."""
+    """Return the root mean squares (3,) of points (P, 3) along their principal axes, descending."""
     spread = (points - points.mean(axis=0)) / np.sqrt(len(points))
     values = np.linalg.svd(spread, compute_uv=False)
     return np.pad(values, (0, 3 - len(values)))

@@ -1,4 +1,4 @@
-"""Tracks as files: TUM, which other tools read, or CSV with covariance, and reading them back."""
+"""Write and read track files: TUM, which other tools read, or CSV with covariance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _COVARIANCE = tuple(f"cov_{_ERROR[i]}_{_ERROR[j]}" for i, j in zip(*_UPPER, stri
 
 
 class TrackFile(NamedTuple):
-    """A track of K epochs, as a file holds it.
+    """A track of K epochs, as stored in a file.
 
     Attributes
     ----------
@@ -35,13 +35,13 @@ class TrackFile(NamedTuple):
         (K, 3, 3), and (K, 3) in metres.
     covariance
         (K, 6, 6) of the pose error (w, v), ``Q_hat = exp(w) Q``, ``t_hat = t + v``, radians and
-        metres; None where the file has none, as TUM.
+        metres; None if the file has none, as in TUM.
     nis, dof
-        Normalised innovation squared (K,) of each epoch's ranges, and of how many it is (K,);
-        None where the file has none.
+        (K,) normalised innovation squared of the ranges of each epoch, and (K,) its degrees of
+        freedom; None if the file has none.
     rank
-        How many of the six directions of the pose the ranges of each epoch determine (K,); None
-        where the file has none.
+        (K,) how many of the six directions of the pose the ranges of each epoch determine; None if
+        the file has none.
     """
 
     times: FloatArray
@@ -54,7 +54,7 @@ class TrackFile(NamedTuple):
 
 
 def check_track_path(path: AnyPath) -> None:
-    """Raise ValueError unless the ending says a format: ``.tum`` or ``.txt``, or ``.csv``."""
+    """Raise ValueError unless the file suffix is ``.tum``, ``.txt`` or ``.csv``."""
     if Path(path).suffix.lower() not in _TUM + _CSV:
         raise ValueError(
             f"{os.fspath(path)}: a track must end in .tum or .txt (TUM) or in .csv, with covariance"
@@ -62,23 +62,24 @@ def check_track_path(path: AnyPath) -> None:
 
 
 def write_track(path: AnyPath, track: TrackFile) -> None:
-    """Write a track; the ending of the file says how.
+    """Write a track in the format given by the file suffix.
 
-    ``.tum`` and ``.txt``: ``t x y z qx qy qz qw`` without a header. ``.csv``: a header;
-    ``t,x,y,z,qw,qx,qy,qz``, then, where the track has them, the upper triangle of the covariance by
-    rows, ``cov_rx_rx,cov_rx_ry,...,cov_z_z``, and ``nis,dof,rank``. Numbers have all their digits.
+    ``.tum`` and ``.txt``: ``t x y z qx qy qz qw`` without a header. ``.csv``: a header, and
+    ``t,x,y,z,qw,qx,qy,qz``. If the track has them, the upper triangle of the covariance follows by
+    rows, ``cov_rx_rx,cov_rx_ry,...,cov_z_z``, and ``nis,dof,rank``. Numbers are written with full
+    precision.
 
     Parameters
     ----------
     path
-        Of the file.
+        Path of the file.
     track
-        What is written. An infinite NIS is an empty cell.
+        The track to write. An infinite NIS becomes an empty cell.
 
     Raises
     ------
     ValueError
-        On another ending, or arrays that are not as `TrackFile` says.
+        If the suffix is another one, or the shape of an array is not the one in `TrackFile`.
     OSError
         If the file cannot be written.
     """
@@ -116,12 +117,12 @@ def _column(name: str, value: ArrayLike, count: int) -> list[float]:
 
 
 def read_track(path: AnyPath) -> TrackFile:
-    """A track as `write_track` writes it, or any poses that `read_truth` takes.
+    """Read a track written by `write_track`, or any poses that `read_truth` accepts.
 
     Raises
     ------
     ValueError
-        If the file is none: it names file, line and column.
+        If the file is not a track. The message names file, line and column.
     """
     truth = read_truth(path)
     if truth.rotation is None:
