@@ -187,8 +187,9 @@ def tracked(
         judged = pose_errors(step.belief, truth.rotation, truth.translation, tags)
         turn, move = judged.pose[:3], judged.pose[3:]
         errors = [np.linalg.norm(move), np.rad2deg(np.linalg.norm(turn)), judged.nees]
-    figures = map(float, (*errors, found.nis))
-    return Tracked(label, step.belief, refused, *figures, int(found.dof))
+    position, turned, nees = map(float, errors)
+    nis, dof = float(found.nis), int(found.dof)
+    return Tracked(label, step.belief, refused, position, turned, nees, nis, dof)
 
 
 def is_robust(filter: Any) -> bool:

@@ -125,13 +125,12 @@ def stage_of_problem(problem: Problem, anchors: FloatArray, steps: int | None = 
         initial_rotation_rad=min(problem.prior.rotation_rad, 0.2),
         initial_translation_m=min(problem.prior.position_m, 0.5),
     )
-    share = None
-    if problem.obstacles or problem.gain:
 
-        def share(anchors: FloatArray, place: FloatArray) -> FloatArray:
-            return problem.share(anchors, place[None])[0]
+    def share(anchors: FloatArray, place: FloatArray) -> FloatArray:
+        return problem.share(anchors, place[None])[0]
 
-    return Stage(stage_of_scene(scene, steps).scene, share)
+    obstructed = bool(problem.obstacles or problem.gain)
+    return Stage(stage_of_scene(scene, steps).scene, share if obstructed else None)
 
 
 class Moment(NamedTuple):

@@ -64,7 +64,7 @@ def link_lines(
         The body (N, 3), and by how much it is drawn larger.
     """
     kinds = link_kinds(frame.links, frame.tracks[which].refused if frame.tracks else None)
-    pose = frame.truth
+    pose: Any = frame.truth
     if pose is None or pose.rotation is None:
         pose = frame.tracks[0].belief if frame.tracks else None
     if pose is None or not kinds.size:
@@ -183,9 +183,8 @@ class WatchView:
                 point_size=0.12 * self.radius, point_shape="circle", precision="float32",
             )  # fmt: skip
         handle = self._handles[name]
-        seen = pose is not None and bool(np.isfinite(pose.translation).all())
-        handle.visible = seen
-        if seen:
+        handle.visible = pose is not None and bool(np.isfinite(pose.translation).all())
+        if pose is not None and handle.visible:
             handle.position = tuple(pose.translation)
             if pose.rotation is not None and np.isfinite(pose.rotation).all():
                 handle.wxyz = tuple(rotations.quaternion(pose.rotation))
