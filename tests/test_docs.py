@@ -16,6 +16,8 @@ from rbl_gym.estimators import filter as belief
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import design
 from rbl_gym.studies.learning import policies
+from rbl_gym.studies.learning.deep_sets import DeepSets
+from rbl_gym.studies.learning.set_policies import SET_KINDS, SetPolicy
 from tests.helpers import ROOT, needs
 
 # Its blocks are files of a package: tests/test_your_estimator.py.
@@ -49,6 +51,10 @@ def write_files_that_pages_read(folder: Path) -> None:
     layer = np.zeros((3, 22)), np.zeros(3)
     policy = policies.Policy((layer[0],), (layer[1],), "box", {"task": "auv_buoys"})
     policies.save(policy, folder / "out" / "auv_buoys-0.npz")
+    own, pair, out = SET_KINDS["sight"][1]
+    layers = ((np.zeros((2, own + pair)), np.zeros(2)),), ((np.zeros((out, own + 4)), np.zeros(1)),)
+    chooser = SetPolicy(DeepSets(*layers), "sight", {"task": "halls"})
+    policies.save(chooser, folder / "out" / "halls-0.npz")
 
 
 @needs("cmaes")
