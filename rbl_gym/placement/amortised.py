@@ -1,7 +1,7 @@
-"""Layouts from a network that has seen many problems: one pass, no search.
+"""Layouts from a network trained on many problems: one pass, no search.
 
-Tokens of the problem and one token for each anchor attend to each other. In boxes, shells and rooms
-each anchor's token gives a place, from which the region makes a legal one; on other mounts it
+Tokens of the problem and one token per anchor attend to each other. In boxes, shells and rooms each
+anchor's token gives a position, which the region projects to a legal one. On other mounts it
 chooses among candidates. `rbl_gym.studies.learning.amortised` trains the network.
 """
 
@@ -35,16 +35,16 @@ from rbl_gym.placement.tokens import (
 
 __all__ = ["Network", "load", "of_problem", "of_task", "read"]
 
-# Anchors that are placed at most, and heads of the attention.
+# Largest number of anchors, and number of attention heads.
 MOST, HEADS = 16, 4
 _FILE = "amortised.npz"
-# Places over which a building's score and gradient are taken, and legal places looked at where
-# one turned out to lie inside an obstacle.
+# Numbers of positions for the score and gradient of a building, and of legal positions tried
+# instead of one inside an obstacle.
 _STEP_PLACES, _SPOTS = 256, 512
 
 
 class Network(NamedTuple):
-    """Weights by their names, and how they were made."""
+    """Weights by name, and how they were trained."""
 
     weights: dict[str, FloatArray]
     meta: dict[str, Any]
@@ -52,12 +52,12 @@ class Network(NamedTuple):
 
 @functools.cache
 def load() -> Network:
-    """The network of the package."""
+    """Load the network of the package."""
     return read(resources.files("rbl_gym.placement").joinpath(_FILE))
 
 
 def read(path: Any) -> Network:
-    """A network of a file that the training wrote; a path, or what has its `open`."""
+    """Read a network from a file written by the training: a path, or an object with `open`."""
     with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         meta = json.loads(str(arrays["meta"]))
         weights = {name: arrays[name].astype(float) for name in arrays.files if name != "meta"}
@@ -65,7 +65,7 @@ def read(path: Any) -> Network:
 
 
 def shapes(sizes: dict[str, int], width: int, layers: int) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the weights; `sizes` are the lengths of the tokens' rows."""
+    """Return names and shapes of the weights; `sizes` are the lengths of the token rows."""
     found: dict[str, tuple[int, ...]] = {
         f"{kind}.weight": (sizes[kind], width) for kind in Tokens._fields
     }
@@ -84,7 +84,7 @@ def shapes(sizes: dict[str, int], width: int, layers: int) -> dict[str, tuple[in
 
 
 def pattern(count: int) -> FloatArray:
-    """A ring (M, 3), alternately low and high, to which the network's steps are added."""
+    """Return a ring (M, 3), alternately low and high, to which the network's steps are added."""
     angle = 2 * np.pi * (np.arange(count) + 0.5) / count
     height = np.where(np.arange(count) % 2, 0.5, -0.5)
     return np.stack([np.cos(angle), np.sin(angle), height], axis=-1)
@@ -93,16 +93,16 @@ def pattern(count: int) -> FloatArray:
 def forward(
     weights: dict[str, FloatArray], tokens: Tokens, count: int, total: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Steps (..., M, 3) of the anchors, and scores (..., M, C) of the candidates.
+    """Return steps (..., M, 3) of the anchors, and scores (..., M, C) of the candidates.
 
     Parameters
     ----------
     weights
-        Of a `Network`.
+        Weights of a `Network`.
     tokens
-        Of the problem.
+        Tokens of the problem.
     count, total
-        How many anchors are placed, and how many there are with the fixed ones.
+        Number of placed anchors, and of all anchors with the fixed ones.
     """
     w = weights
     width = w["ordinal"].shape[1]
@@ -160,10 +160,10 @@ def _silu(x: FloatArray) -> FloatArray:
 
 
 def places(network: Network, seen: Scenery, count: int, image: int = 0) -> FloatArray:
-    """Places (..., M, 3) for `count` anchors; on boxes, shells and walls not yet made legal.
+    """Return positions (..., M, 3) of `count` anchors, not yet legal on boxes, shells and walls.
 
-    On walls a place stands for the ray from the middle of the room, see `Walls.place`. The network
-    looks at one of the eight mirror images of the problem.
+    On walls a position stands for the ray from the centre of the room, see `Walls.place`. The
+    network is applied to one of the eight mirror images of the problem.
     """
     if image:
         seen = turned(seen, image)
@@ -176,7 +176,7 @@ def places(network: Network, seen: Scenery, count: int, image: int = 0) -> Float
 
 
 def _chosen(scores: FloatArray, candidates: FloatArray) -> FloatArray:
-    """The candidates (..., M, 3) of the largest scores (..., M, C), each at most once."""
+    """Return the candidates (..., M, 3) with the largest scores (..., M, C), each at most once."""
     scores = scores.copy()
     found = []
     for m in range(scores.shape[-2]):
@@ -194,23 +194,23 @@ def of_task(
     evaluations: int = 0,
     network: Network | None = None,
 ) -> FloatArray:
-    """Layouts (..., M, 3) of a task in contexts (...).
+    """Return layouts (..., M, 3) of a task in contexts (...).
 
     Parameters
     ----------
     task, context
         The problems; 1 to 16 anchors.
     evaluations
-        Of the score, at most, after the network. Where something is in the way, up to 8 compare
-        what the network says of the problem's mirror images; the others, with the gradient, are for
-        steps along it. 0: none.
+        Largest number of score evaluations after the network. If there are obstacles, up to 8 of
+        them compare the network's layouts for mirror images of the problem. The others, with the
+        gradient, are for gradient steps. 0: none.
     network
-        None: that of the package.
+        None selects the network of the package.
 
     Raises
     ------
     ValueError
-        On more anchors than the network places.
+        If there are more anchors than the network can place.
     """
     check_count("n_anchors", task.n_anchors, least=1, most=MOST)
     evaluations = check_count("evaluations", evaluations, least=0)
@@ -238,19 +238,19 @@ def of_task(
 def of_problem(
     problem: Problem, evaluations: int = 0, network: Network | None = None
 ) -> FloatArray:
-    """The layout (M, 3) of a building, fixed anchors first.
+    """Return the layout (M, 3) of a building, fixed anchors first.
 
     Parameters
     ----------
     problem
-        What is placed; 1 to 16 anchors besides the fixed ones.
+        The problem; 1 to 16 anchors besides the fixed ones.
     evaluations, network
         As `of_task`.
 
     Raises
     ------
     ValueError
-        On more anchors than the network places, and where there are fewer legal places.
+        If there are more anchors than the network can place, or than legal positions.
     """
     count = problem.n_anchors - len(problem.fixed)
     if not count:
@@ -277,12 +277,12 @@ def of_problem(
 
 
 def _images(evaluations: int, in_the_way: bool) -> int:
-    """How many mirror images are looked at."""
+    """Return the number of mirror images to compare."""
     return min(max(evaluations, 1), IMAGES) if in_the_way else 1
 
 
 def _legal(region: Region, obstacles: Obstacles, seen: Scenery, points: FloatArray) -> FloatArray:
-    """The legal places (..., M, 3) that points stand for, outside of what stands there."""
+    """Return legal positions (..., M, 3) for points, outside of obstacles."""
     if KINDS[seen.kind] == "mounts":
         return points
     if isinstance(region, Walls):

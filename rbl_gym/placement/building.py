@@ -1,6 +1,6 @@
-"""A placement problem as it is: the building, where anchors may stand, where the body works.
+"""A placement problem of a building: obstacles, mounts, and zones in which the body works.
 
-`scene_files` reads one from a file or makes it of a named scene.
+`scene_files` reads one from a file or makes one from a named scene.
 """
 
 from __future__ import annotations
@@ -24,39 +24,38 @@ from rbl_gym.worlds.scene import Scene
 
 __all__ = ["ATTITUDES", "Plan", "Prior", "Problem", "Zone", "free_places"]
 
-# What the body's attitude can be in a zone.
+# Possible attitudes of the body in a zone.
 ATTITUDES = ("free", "level", "heading")
-# Points on the edge of a zone count to it, metres.
+# Points this close to the edge of a zone are in it, metres.
 _EDGE_M = 1e-6
 # Irrational steps that fill the cube evenly (Roberts's sequence in three dimensions).
 _STEPS = 1.22074408460575947536 ** -np.arange(1.0, 4.0)
-# So many times the points asked for are looked at, at most, for those that are free.
+# At most this many times the requested number of points is tried to find free ones.
 _MOST_TRIES = 1024
 
 
 @dataclass(frozen=True, eq=False)
 class Zone:
-    """Where the body works, and what is asked of its pose there.
+    """A zone in which the body works, and the requirements on its pose there.
 
     Parameters
     ----------
     name
-        Of the zone.
+        Name of the zone.
     polygon
-        (V, 2), counter-clockwise, metres. That of a box may have no area.
+        Corners (V, 2), counter-clockwise, metres. A box may have zero area.
     low_m, high_m
-        Heights between which the body's origin moves; they may be the same.
+        Lowest and highest height of the body's origin; they may be equal.
     weight
-        How much the zone counts in the score, whatever its size.
+        Weight of the zone in the score, independent of its size.
     attitude
-        ``"free"``: the body turns anyhow. ``"level"``: it stands upright at any heading, and all
-        six numbers of its pose are estimated. ``"heading"``: its tilt is known, and its heading
-        is estimated.
+        ``"free"``: any rotation. ``"level"``: the body is upright at any heading, and all six pose
+        parameters are estimated. ``"heading"``: its tilt is known, and its heading is estimated.
     position_m, height_m, heading_deg
-        Requirements, each None where there is none: one sigma of the horizontal position, of the
+        Requirements, None for no requirement: standard deviation of the horizontal position, of the
         height, and of the heading, from one epoch of ranges.
     share
-        In so much of the zone all of them must hold.
+        Fraction of the zone in which all requirements must hold.
     """
 
     name: str
@@ -71,47 +70,47 @@ class Zone:
     share: float = 0.95
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner (3,) of the smallest box around it."""
+        """Return lower and upper corner (3,) of the bounding box."""
         low, high = self.polygon.min(axis=0), self.polygon.max(axis=0)
         return np.array([*low, self.low_m]), np.array([*high, self.high_m])
 
     @functools.cached_property
     def is_box(self) -> bool:
-        """Whether it fills its `bounds`."""
+        """Whether the zone fills its `bounds`."""
         low, high = self.polygon.min(axis=0), self.polygon.max(axis=0)
         at_corner = (self.polygon == low) | (self.polygon == high)
         return len(self.polygon) == 4 and bool(at_corner.all())
 
     def contains(self, points: FloatArray) -> BoolArray:
-        """Which points (..., 3) lie in the zone or on its edge."""
+        """Return which points (..., 3) lie in the zone or on its edge."""
         z = points[..., 2]
         level = (z >= self.low_m - _EDGE_M) & (z <= self.high_m + _EDGE_M)
         return level & contains(self.polygon, points[..., :2], -_EDGE_M)
 
     @property
     def has_requirement(self) -> bool:
-        """Whether anything is asked of the pose."""
+        """Whether the zone has any requirement on the pose."""
         return not self.position_m is self.height_m is self.heading_deg is None
 
 
 class Prior(NamedTuple):
-    """Standard deviations of what is known of the pose before the first range."""
+    """Standard deviations of the pose known before the first range."""
 
     rotation_rad: float
     position_m: float
 
 
 class Plan(NamedTuple):
-    """The drawing behind a problem.
+    """The drawing of a problem.
 
     Attributes
     ----------
     image, drawing
-        Paths of a picture and of the drawing it was imported from, or None.
+        Paths of a picture and of the imported drawing, or None.
     metres_per_pixel, origin
-        Scale of the picture, and the place (x, y) of its lower left corner, metres.
+        Scale of the picture, and the position (x, y) of its lower left corner, metres.
     units, zero
-        Units of the drawing, and its point (x, y) in these that is the origin here.
+        Units of the drawing, and the point (x, y) in these units that is the origin here.
     """
 
     image: str | None = None
@@ -124,32 +123,32 @@ class Plan(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is placed, where it may stand, and what for.
+    """A placement problem: number of anchors, mounts, obstacles and zones.
 
     Parameters
     ----------
     name
-        Of the problem.
+        Name of the problem.
     tags
-        (N, 3) in the body frame, metres.
+        Tags (N, 3) in the body frame, metres.
     noise
-        Law of the ranges.
+        Noise law of the ranges.
     obstacles
-        What takes information from links.
+        Obstacles, which reduce the information of links.
     mounts
-        Where anchors may stand.
+        Region of legal anchor positions.
     zones
-        Where the body works; at least one.
+        Zones in which the body works; at least one.
     n_anchors
-        How many anchors there are in all.
+        Total number of anchors.
     fixed
-        (F, 3): anchors that stay where they are, metres; they count in `n_anchors`.
+        Fixed anchors (F, 3), metres; they count in `n_anchors`.
     gain
-        How far and how wide an anchor reaches.
+        Reach and field of view of an anchor.
     prior
-        What is known of the pose before the first range.
+        Knowledge of the pose before the first range.
     plan
-        The drawing behind it, if there is one.
+        The drawing of the building, or None.
     """
 
     name: str
@@ -165,17 +164,17 @@ class Problem:
     plan: Plan | None = None
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner (3,) of the smallest box around all zones."""
+        """Return lower and upper corner (3,) of the bounding box of all zones."""
         low, high = zip(*(zone.bounds() for zone in self.zones), strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
 
     def free(self, points: FloatArray) -> BoolArray:
-        """Which points (..., 3) lie in a zone and outside of the obstacles."""
+        """Return which points (..., 3) lie in a zone and outside of the obstacles."""
         within = np.any([zone.contains(points) for zone in self.zones], axis=0)
         return within & ~self.obstacles.contain(points)
 
     def free_places(self, count: int) -> FloatArray:
-        """Up to `count` points (n, 3) spread evenly over the zones, to each by its weight."""
+        """Return up to `count` points (n, 3) spread evenly over the zones, shared by weight."""
         share = np.cumsum([0.0, *(zone.weight for zone in self.zones)])
         counts = np.diff(np.round(count * share / share[-1]).astype(int)).tolist()
         found = [
@@ -186,10 +185,10 @@ class Problem:
         return np.concatenate(found)
 
     def share(self, anchors: FloatArray, points: FloatArray) -> FloatArray:
-        """Share (..., P, M) of its information that a link from each anchor to each point has.
+        """Return the information fraction (..., P, M) of links from each anchor to each point.
 
-        By what stands between them, and by the anchors' range and field of view. Anchors
-        (..., M, 3) and points (..., P, 3), metres.
+        It depends on the obstacles between them, and on the anchors' reach and field of view.
+        Anchors (..., M, 3) and points (..., P, 3), metres.
         """
         share = self.obstacles.share(anchors, points)
         if not self.gain:
@@ -200,9 +199,9 @@ class Problem:
 
     @functools.cached_property
     def scene(self) -> Scene:
-        """The problem as a world: its volume is the box around all zones.
+        """Return the problem as a scene: its volume is the box around all zones.
 
-        Prisms, range and field of view are not in it.
+        Prisms, reach and field of view are not included.
         """
         boxes = self.obstacles.boxes
         return Scene(
@@ -222,19 +221,19 @@ class Problem:
 
     @functools.cached_property
     def context(self) -> Context:
-        """Box around all zones and boxes in the way, as `layouts` and `criteria` take them."""
+        """Return the box around all zones, and the boxes, for `layouts` and `criteria`."""
         low, high = self.corners()
         return Context(0.5 * (low + high), 0.5 * (high - low), self.obstacles.boxes)
 
     def with_anchors(self, n_anchors: int) -> Problem:
-        """The same problem with another number of anchors."""
+        """Return the same problem with another number of anchors."""
         return dataclasses.replace(self, n_anchors=n_anchors)
 
 
 def free_places(zone: Zone, obstacles: Obstacles, count: int) -> FloatArray:
-    """Up to `count` points (n, 3) spread evenly over a zone, those inside obstacles left out.
+    """Return up to `count` points (n, 3) spread evenly over a zone, without those in obstacles.
 
-    The first of them are those of a smaller count.
+    The first ones are those of a smaller count.
     """
     low, high = zone.bounds()
     tries = 4 * count if obstacles or not zone.is_box else count
@@ -248,5 +247,5 @@ def free_places(zone: Zone, obstacles: Obstacles, count: int) -> FloatArray:
 
 
 def cube(count: int) -> FloatArray:
-    """Points (count, 3) that fill the unit cube evenly."""
+    """Return points (count, 3) that fill the unit cube evenly."""
     return (0.5 + np.arange(1, count + 1)[:, None] * _STEPS) % 1.0

@@ -1,4 +1,4 @@
-"""What a layout of anchors is worth by other measures than the score of `placement`."""
+"""Other measures of a layout than the score of `placement`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Criteria", "criteria"]
 
 
 class Criteria(NamedTuple):
-    """What a layout is worth by other measures, each (...); all small is good.
+    """Measures of a layout, each (...); small is good for all of them.
 
     Attributes
     ----------
@@ -26,12 +26,12 @@ class Criteria(NamedTuple):
     d_optimal_m
         Geometric mean of the six standard deviations, the rotation in metres at the tags.
     e_optimal_m
-        Root mean square over the poses of the largest of the six.
+        Root mean square over the poses of the largest of the six standard deviations.
     worst_m
         b of the worst pose.
     conditioning
-        Geometric mean over the poses of the condition number of Abar, the weighted anchors less
-        their mean (static paper, Remark 1): large where the linear estimators lose a direction.
+        Geometric mean over the poses of the condition number of Abar, the weighted anchors minus
+        their mean (static paper, Remark 1). It is large if the linear estimators lose a direction.
     """
 
     score_m: FloatArray
@@ -44,7 +44,7 @@ class Criteria(NamedTuple):
 
 
 def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Criteria:
-    """All criteria of layouts (..., M, 3)."""
+    """Return all criteria of layouts (..., M, 3)."""
     anchors = check_array("anchors", anchors, ("M", 3))
     context = placement.checked_context(context)
     covariance = np.linalg.inv(
@@ -73,18 +73,18 @@ def criteria(task: PlacementTask, context: Context, anchors: FloatArray) -> Crit
 
 
 def _conditioning(spread: FloatArray) -> FloatArray:
-    """Geometric mean (...) of the condition numbers of Abar (..., P, M, 3); fewer than 4: inf."""
+    """Return mean condition numbers (...) of Abar (..., P, M, 3); inf for fewer than 4 anchors."""
     if spread.shape[-2] < 4:
         return np.full(spread.shape[:-3], np.inf)
     singular = np.linalg.svd(spread, compute_uv=False)
     least = np.maximum(singular[..., 2], 1e-12 * singular[..., 0])
-    # Anchors that all coincide leave nothing at all.
+    # Coincident anchors leave only zeros.
     ratio = np.divide(singular[..., 0], least, out=np.full(least.shape, 1e12), where=least > 0)
     return np.exp(np.log(ratio).mean(axis=-1))
 
 
 def _weighted_anchors(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """Abar (..., P, M, 3): anchors less their weighted mean, by the root of the weights."""
+    """Return Abar (..., P, M, 3): anchors minus weighted mean, times the root of the weights."""
     places = placement.positions(task, context)
     distance = ranging.distances(anchors[..., None, :, :], places[..., None, :])
     weight = 1 / task.scene.noise.squared_range_variance(np.maximum(distance, 1e-6))

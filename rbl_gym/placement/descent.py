@@ -1,4 +1,4 @@
-"""Layouts moved along the gradient of their score, each anchor within its face."""
+"""Gradient descent of the score of layouts, each anchor within its face."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from rbl_gym.placement.setting import Setting
 
 __all__ = ["descend"]
 
-# Unit of length of the search: a share of the region's largest extent.
+# Unit of length of the search: a fraction of the region's largest extent.
 _UNIT = 0.1
 
 
 def descend(
     setting: Setting, anchors: FloatArray, evaluations: int = 30
 ) -> tuple[FloatArray, float]:
-    """L-BFGS-B on the log of the score over all anchors (M, 3), each within its face.
+    """Minimize the log of the score of all anchors (M, 3) by L-BFGS-B, each within its face.
 
     Returns
     -------
-    The best legal layout that was evaluated, the start among them, and its score.
+    The best evaluated legal layout, including the start, and its score.
     """
-    from scipy import optimize  # takes long to import
+    from scipy import optimize  # slow to import
 
     region = setting.region
     unit = _UNIT * float(np.ptp(region.bounds(), axis=0).max())
@@ -64,14 +64,14 @@ def descend(
     legal = setting.legal(found)
     if legal.all():
         return found, score
-    # Those that ended behind an obstacle's face, or where it is forbidden, stay where they were.
+    # Anchors that ended in an obstacle or where mounting is forbidden keep their position.
     found = np.where(legal[:, None], found, anchors)
     before, score = setting.score(anchors), setting.score(found)
     return (found, score) if score < before else (anchors, before)
 
 
 def _pulled_back(gradient: FloatArray, free: FloatArray, points: FloatArray) -> FloatArray:
-    """The derivative by free points, of that by the points of a shell that are nearest to them."""
+    """Return the derivative with respect to free points, from that at the nearest shell points."""
     length = np.linalg.norm(free, axis=-1, keepdims=True)
     ratio = np.linalg.norm(points, axis=-1, keepdims=True) / length
     outward = free / length

@@ -1,9 +1,9 @@
-"""The search for the layout of a problem whose score is least.
+"""Search for the layout of a problem with the smallest score.
 
-Greedy with swaps over candidates gives starts. Each is then improved in turns by fresh candidates,
-near and far, which find their way past walls, and by the gradient, which moves all anchors at
-once; first over few places, at the end over as many as it takes for the layout to be as good on
-places that the search has not seen.
+Greedy search with swaps over candidates gives starts. Fresh candidates and the gradient then
+improve each of them in turn. Fresh candidates, near and far, find ways past walls. The gradient
+moves all anchors at once. Early stages use few positions. The last one uses enough positions for
+the layout to be as good at positions that the search has not used.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from rbl_gym.placement.setting import Setting, of_problem
 
 __all__ = ["STAGES", "find_layout", "free_candidates"]
 
-# Places of each stage, and how many of the layouts go on to the next.
+# Numbers of positions in each stage, and of layouts that go on to the next.
 STAGES, _KEPT = (256, 1024, 2048), (2, 1, 1)
-# Rounds of fresh candidates of each stage, and then steps along the gradient.
+# Rounds of fresh candidates in each stage, and gradient steps after them.
 _FRESH, _STEPS = 3, 12
-# Steps where nothing is in the way: there the gradient alone finds the layout.
+# Gradient steps without obstacles: the gradient alone then finds the layout.
 _STEPS_FREE = 40
-# Candidates of greedy, and greedy starts: as many as make so many anchors in all, at most so many.
+# Numbers of greedy candidates, and of greedy starts: limited by the total number of anchors.
 _CANDIDATES, _ANCHORS, _STARTS = 400, 32, 4
 
 
@@ -37,24 +37,24 @@ def find_layout(
     starts: Mapping[str, FloatArray] | None = None,
     advance: Callable[[], object] = lambda: None,
 ) -> tuple[FloatArray, str]:
-    """The best layout (M, 3) that the search finds, fixed anchors first, and from which start.
+    """Return the best layout (M, 3) found, fixed anchors first, and the name of its start.
 
     Parameters
     ----------
     problem
-        What is placed.
+        The problem.
     rng
-        Of all randomness.
+        Source of all random numbers.
     starts
-        Further starts by their names: legal places (K, 3) of the anchors that are not fixed. Where
-        K is less than how many are placed, the others are added where they help most.
+        Further starts by name: legal positions (K, 3) of the anchors that are not fixed. If K is
+        too small, the missing anchors are added greedily.
     advance
         Called after each of the stages.
 
     Raises
     ------
     ValueError
-        If there are fewer legal places than anchors.
+        If there are fewer legal positions than anchors.
     """
     count = problem.n_anchors - len(problem.fixed)
     if not count:
@@ -79,7 +79,7 @@ def _starts(
     count: int,
     given: Mapping[str, FloatArray],
 ) -> dict[str, FloatArray]:
-    """Layouts (`count`, 3): those given, and greedy with swaps among some draws of candidates."""
+    """Return layouts (`count`, 3): given ones, and greedy with swaps for draws of candidates."""
     most = 1 if problem.mounts.listed() is not None else max(1, min(_STARTS, _ANCHORS // count))
     found: dict[str, FloatArray] = {}
     for number in range(most):
@@ -101,7 +101,7 @@ def _starts(
 def _improved(
     setting: Setting, layout: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, float]:
-    """A layout after fresh candidates and steps along the gradient, and its score."""
+    """Return a layout after fresh candidates and gradient steps, and its score."""
     if setting.is_smooth:
         return descend(setting, layout, _STEPS_FREE)
     for _ in range(_FRESH):
@@ -110,12 +110,12 @@ def _improved(
 
 
 def free_candidates(problem: Problem, rng: np.random.Generator, count: int) -> FloatArray:
-    """Legal places (count, 3) outside of the obstacles, uniform; or all of a list of mounts.
+    """Return legal positions (count, 3) outside of the obstacles, uniform; or all listed mounts.
 
     Raises
     ------
     ValueError
-        If there are fewer legal places than anchors.
+        If there are fewer legal positions than anchors.
     """
     drawn = problem.mounts.listed()
     if drawn is None:

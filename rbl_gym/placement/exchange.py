@@ -1,4 +1,4 @@
-"""Anchors chosen among candidates: one after the other, one for another, and by fresh ones.
+"""Choose anchors among candidates: greedily, by swaps, and by fresh candidates.
 
 Information is a sum over the anchors, so that of each candidate is computed once.
 """
@@ -15,33 +15,33 @@ __all__ = ["choose", "refresh", "swap"]
 
 # Candidates that are evaluated at a time, and for a swap.
 _AT_ONCE, _FOR_SWAP = 8, 24
-# So many anchors help each other: before, a candidate may be worth more than it was.
+# Below this number anchors support each other: the benefit of a candidate may increase.
 _TOGETHER = 6
-# Poses over which fresh candidates are compared first, and how many are then compared over all.
+# Number of poses for a first comparison of fresh candidates, and of those compared over all.
 _SCREEN, _SCREENED = 512, 6
-# Standard deviations of fresh candidates about an anchor: shares of the region's largest extent.
+# Standard deviations of fresh candidates around an anchor: fractions of the largest extent.
 _SPREADS = np.array([0.005, 0.02, 0.05, 0.15])
-# Anchors nearer to each other than this stand at one place, metres.
+# Anchors closer to each other than this coincide, metres.
 _APART_M = 1e-3
-# Upper half of a 6 x 6 matrix, and how often an entry of it counts in a product.
+# Upper half of a 6 x 6 matrix, and the multiplicity of its entries in a product.
 _ROWS, _COLUMNS = np.triu_indices(6)
 _TIMES = np.where(_ROWS == _COLUMNS, 1.0, 2.0)
 
 
 def choose(setting: Setting, parts: FloatArray, count: int) -> list[int]:
-    """Indices of `count` candidates, each the one that helps most beside those before it.
+    """Return indices of `count` candidates, chosen greedily.
 
-    What a candidate is worth falls as anchors are added, nearly always: only those that were
-    worth more than the best so far are evaluated again (lazy greedy).
+    The benefit of a candidate nearly always decreases as anchors are added. Therefore only
+    candidates whose last benefit was above the present best are evaluated again (lazy greedy).
 
     Parameters
     ----------
     setting
-        What a layout is judged by.
+        The setting of the score.
     parts
         Information (C, P, 6, 6) of the candidates, C at least `count`.
     count
-        How many are chosen.
+        How many to choose.
     """
     found: list[int] = []
     base = setting.sample.prior
@@ -65,10 +65,10 @@ def choose(setting: Setting, parts: FloatArray, count: int) -> list[int]:
 
 
 def swap(setting: Setting, parts: FloatArray, indices: list[int], rounds: int = 3) -> list[int]:
-    """The chosen candidates after swaps of one for another, as long as they help.
+    """Return the chosen candidates after swaps of one for another, as long as they help.
 
-    Only the candidates that the derivative of the mean square promises most of are evaluated.
-    Arguments as `choose`.
+    Only the candidates with the best derivative of the mean square are evaluated. Arguments as in
+    `choose`.
     """
     found = list(indices)
     packed = np.ascontiguousarray(parts[..., _ROWS, _COLUMNS], dtype=np.float32)
@@ -94,7 +94,7 @@ def swap(setting: Setting, parts: FloatArray, indices: list[int], rounds: int = 
 
 
 def _promise(setting: Setting, information: FloatArray) -> FloatArray:
-    """Minus the derivative of the mean square by the upper halves of the information (P x 21)."""
+    """Return minus the derivative of the mean square by the information's upper halves (P x 21)."""
     sample = setting.sample
     P = np.linalg.inv(information)
     J = bounds.tag_jacobian(sample.rotation, setting.tags)
@@ -109,19 +109,19 @@ def refresh(
     rng: np.random.Generator,
     each: int = 8,
 ) -> tuple[FloatArray, float]:
-    """One round of fresh candidates for every anchor: it moves to the best of them if that helps.
+    """Do one round of fresh candidates: each anchor moves to its best one if that helps.
 
     Parameters
     ----------
     setting
-        What a layout is judged by.
+        The setting of the score.
     anchors
         (M, 3), metres.
     rng
         Draws the candidates.
     each
-        Candidates at each of some distances about the anchor, and as many from anywhere. They are
-        projected on the region, so that those near an edge stand on its other side too.
+        Number of candidates at each of some distances around the anchor, and of candidates from
+        anywhere. They are projected onto the region, so that they also pass its edges.
 
     Returns
     -------

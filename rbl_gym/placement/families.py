@@ -1,4 +1,4 @@
-"""Families of placement tasks: scenes, numbers of anchors and racks that are drawn anew."""
+"""Families of placement tasks: drawn scenes, numbers of anchors and racks."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ from rbl_gym.worlds.families import members_of, padded
 
 __all__ = ["TaskFamily", "described"]
 
-# Where boxes stand that a problem does not have: without a size, they block nothing.
+# Missing boxes are here: they have no size and block nothing.
 _NOWHERE = np.array([1e12, 1e12, 1e12, 0.0, 0.0, 0.0])
 _KINDS = (Box, Walls, Shell)
 
 
 @dataclass(frozen=True, eq=False)
 class TaskFamily:
-    """Placement tasks of which one is drawn for every episode.
+    """A family of placement tasks; every episode draws one of them.
 
     Parameters
     ----------
     members
         As `rbl_gym.worlds.families.SceneFamily`. A dict may have `racks` besides the fields of a
-        scene, a number or a law. `n_anchors` of a dict is the number of anchors that are placed.
+        scene, a number or a law. `n_anchors` of a dict is the number of placed anchors.
     n_anchors, racks
-        What stands where a member says nothing, see `rbl_gym.placement.task`.
+        Defaults for members that do not set them, see `rbl_gym.placement.task`.
 
     Raises
     ------
     ValueError
-        On an empty list, a law that is none, or a task that cannot be made.
+        If the list is empty, a law is invalid, or a task is invalid.
     """
 
     members: tuple[Any, ...]
@@ -57,7 +57,7 @@ class TaskFamily:
 
     @functools.cached_property
     def corners(self) -> tuple[PlacementTask, ...]:
-        """A task of every choice and of both ends of all integers; other numbers in the middle."""
+        """Tasks with all choices and both ends of all integers; other numbers are midpoints."""
         found: list[PlacementTask] = []
         for index, member in enumerate(self.members):
             found += [self._made(index, one) for one in laws.corners(member, f"scenes[{index}]")]
@@ -65,7 +65,7 @@ class TaskFamily:
 
     @property
     def smallest(self) -> tuple[PlacementTask, ...]:
-        """Of each member a task with the fewest anchors."""
+        """For each member a task with the fewest anchors."""
         found = []
         for index, member in enumerate(self.members):
             made = [self._made(index, one) for one in laws.corners(member, f"scenes[{index}]")]
@@ -74,21 +74,21 @@ class TaskFamily:
 
     @functools.cached_property
     def most_anchors(self) -> int:
-        """The most anchors of a task."""
+        """Largest number of anchors of a task."""
         return max(one.n_anchors for one in self.corners)
 
     @functools.cached_property
     def most_boxes(self) -> int:
-        """The most boxes that stand in the way in a problem."""
+        """Largest number of boxes in a problem."""
         return max(len(one.scene.obstacles) + one.racks for one in self.corners)
 
     @functools.cached_property
     def most_tags(self) -> int:
-        """The most tags of a body."""
+        """Largest number of tags of a body."""
         return max(len(one.scene.tags) for one in self.corners)
 
     def draw(self, rng: np.random.Generator) -> tuple[PlacementTask, dict[str, Any]]:
-        """A task, and the overrides that make it."""
+        """Draw a task; return it with its overrides."""
         index = int(rng.integers(len(self.members))) if len(self.members) > 1 else 0
         member = laws.draw(self.members[index], rng)
         made = self._made(index, member)
@@ -107,7 +107,7 @@ class TaskFamily:
 
 
 def task_family(value: Any, n_anchors: int | None = None, racks: int = 0) -> TaskFamily:
-    """The family of a list of scenes, of one scene with laws, or of one scene alone."""
+    """Return the family of a list of scenes, of one scene with laws, or of one scene."""
     if isinstance(value, TaskFamily):
         return value
     found = TaskFamily(members_of(value), n_anchors, racks)
@@ -120,7 +120,7 @@ def task_family(value: Any, n_anchors: int | None = None, racks: int = 0) -> Tas
     return found
 
 
-# --- tasks side by side -----------------------------------------------------------------------
+# --- stacked tasks ----------------------------------------------------------------------------
 
 
 class _Arrays(NamedTuple):
@@ -139,14 +139,14 @@ class _Arrays(NamedTuple):
 
 
 class StackedTasks:
-    """Tasks of B worlds side by side, and their problems.
+    """The stacked tasks of B worlds, and their problems.
 
     Parameters
     ----------
     family
-        That they are drawn from.
+        The family from which the tasks are drawn.
     num_envs
-        B. All have the first task of the family until `begin`.
+        Number of worlds B. All have the first task of the family until `begin`.
     """
 
     def __init__(self, family: TaskFamily, num_envs: int) -> None:
@@ -163,7 +163,7 @@ class StackedTasks:
         )
 
     def begin(self, world: int, rng: np.random.Generator) -> dict[str, Any]:
-        """Draw a task and a problem of it; the overrides of the task."""
+        """Draw a task and a problem of it; return the overrides of the task."""
         one, overrides = self.family.draw(rng)
         self.tasks[world] = one
         for held, field in zip(self.arrays, _numbers(self.family, one), strict=True):
@@ -175,22 +175,22 @@ class StackedTasks:
         return overrides
 
     def problem(self, world: int) -> Context:
-        """The problem of a world, without what is padded."""
+        """Return the problem of a world, without padding."""
         centre, half, racks = (field[world].copy() for field in self.contexts)
         return Context(centre, half, racks[: self.arrays.n_boxes[world]])
 
     @property
     def anchor_mask(self) -> np.ndarray:
-        """(B, M), 1 for the anchors that are placed in a world."""
+        """(B, M), 1 for the anchors of a world."""
         return _mask(self.arrays.n_anchors, self.family.most_anchors)
 
     @property
     def box_mask(self) -> np.ndarray:
-        """(B, K), 1 for the boxes that stand in a world."""
+        """(B, K), 1 for the boxes of a world."""
         return _mask(self.arrays.n_boxes, self.family.most_boxes)
 
     def place(self, rows: np.ndarray, actions: FloatArray) -> FloatArray:
-        """Legal places (R, K, 3) of actions (R, K, 3) of the worlds of some rows."""
+        """Return legal positions (R, K, 3) of actions (R, K, 3) of the worlds of some rows."""
         kinds = self.arrays.kind[rows]
         low, high = self.arrays.low[rows, None], self.arrays.high[rows, None]
         actions = np.clip(actions, -1.0, 1.0, dtype=np.float64)
@@ -203,7 +203,7 @@ class StackedTasks:
         return placed
 
     def score(self, rows: np.ndarray, anchors: FloatArray, counted: np.ndarray) -> FloatArray:
-        """`placement.score` (R,) of layouts (R, M, 3) in which some anchors (R, M) count."""
+        """Return `placement.score` (R,) of layouts (R, M, 3), of the anchors in a mask (R, M)."""
         square = np.empty(len(rows))
         for count in np.unique(self.arrays.n_tags[rows]).tolist():
             alike = self.arrays.n_tags[rows] == count
@@ -228,7 +228,7 @@ def _mask(counts: np.ndarray, most: int) -> np.ndarray:
 
 
 def _numbers(family: TaskFamily, one: PlacementTask) -> tuple[Any, ...]:
-    """The numbers of a task in the order of `_Arrays`."""
+    """Return the numbers of a task in the order of `_Arrays`."""
     scene = one.scene
     low, high = scene.anchor_region.bounds()
     kinds = (index for index, kind in enumerate(_KINDS) if isinstance(scene.anchor_region, kind))
@@ -246,19 +246,19 @@ def _numbers(family: TaskFamily, one: PlacementTask) -> tuple[Any, ...]:
     )
 
 
-# --- what a policy is told of a task ----------------------------------------------------------
+# --- description of a task for a policy -------------------------------------------------------
 
 DESCRIBED = 18
 
 
 def described(one: PlacementTask) -> FloatArray:
-    """What kind of world a task is, (18,), of [-1, 1].
+    """Return a description (18,) of a task's world, in [-1, 1].
 
-    The legal space is a box, walls, a shell or another (4); half sizes of the volume and of the
-    legal space, and the way from the middle of the one to that of the other, over the scene's
-    extent (9); decimal logarithms over 4 of that extent in metres, of the noise of a range of its
-    length over the body's radius, and of that radius over the extent (3); tags over 16; the share
-    that a blocked link keeps.
+    In this order: one-hot kind of the legal space: box, walls, shell or other (4); half sizes of
+    the volume and of the legal space, and the offset from the volume's centre to that of the legal
+    space, divided by the scene's extent (9); decimal logarithms divided by 4 of the extent in
+    metres, of the noise of a range of this length divided by the body's radius, and of this radius
+    divided by the extent (3); number of tags divided by 16; information fraction of a blocked link.
     """
     scene, extent = one.scene, float(one.scene.scales.extent)
     kinds = [isinstance(scene.anchor_region, kind) for kind in _KINDS]

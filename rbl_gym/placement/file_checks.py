@@ -1,4 +1,4 @@
-"""Whether a placement problem can be solved at all; errors name the table of its file."""
+"""Checks whether a placement problem is solvable; errors name the table of the file."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from rbl_gym.geometry.regions import Walls
 from rbl_gym.placement.building import Problem, Zone, cube, free_places
 from rbl_gym.placement.file_walls import show
 
-# Places of a zone that are looked at for free ones, and for the way to the nearest mount.
+# Number of positions of a zone checked for free ones and for the distance to a mount.
 _PLACES = 1000
-# Points on a line differ by less than this share of their extent.
+# Points on a line deviate by less than this fraction of their extent.
 _FLAT = 1e-9
 
 
 def check_problem(problem: Problem) -> Problem:
-    """The problem, or a ValueError."""
+    """Return the problem; raises ValueError if it is not solvable."""
     for zone in problem.zones:
         _check_room(problem, zone)
     _check_tags(problem)
@@ -31,7 +31,7 @@ def check_problem(problem: Problem) -> Problem:
 
 
 def _check_room(problem: Problem, zone: Zone) -> None:
-    """In a room the body works inside of it; below its lowest mounts is well."""
+    """Check that in a room the body works inside; below the lowest mounts is allowed."""
     if not isinstance(problem.mounts, Walls):
         return
     low, high = zone.bounds()
@@ -44,7 +44,7 @@ def _check_room(problem: Problem, zone: Zone) -> None:
 
 
 def _check_tags(problem: Problem) -> None:
-    """No zone asks for what the tags cannot tell."""
+    """Check that the tags can determine what each zone requires."""
     tags = problem.tags
     spread = np.linalg.svd(tags - tags.mean(axis=0), compute_uv=False)
     if len(tags) > 2 and spread[1] > _FLAT * max(spread[0], 1e-300):
@@ -78,7 +78,7 @@ def _check_fixed(problem: Problem) -> None:
 
 
 def _check_zone(problem: Problem, zone: Zone, name: str) -> None:
-    """A zone has free places, and mounts within reach."""
+    """Check that a zone has free positions, and mounts within reach."""
     low, high = zone.bounds()
     for index, (centre, half) in enumerate(problem.obstacles.boxes.reshape(-1, 2, 3)):
         if (centre - half <= low).all() and (centre + half >= high).all():
@@ -104,7 +104,7 @@ def _check_zone(problem: Problem, zone: Zone, name: str) -> None:
 
 
 def _extent(problem: Problem) -> float:
-    """Diagonal of the box around mounts, obstacles and fixed anchors."""
+    """Return the diagonal of the box around mounts, obstacles and fixed anchors."""
     prisms = problem.obstacles.prisms
     points: list[FloatArray] = [np.array(problem.mounts.bounds()), problem.fixed]
     points += [
@@ -116,7 +116,7 @@ def _extent(problem: Problem) -> float:
 
 
 def check_numbers(problem: Problem) -> None:
-    """There are as many anchors as stay where they are, and places for the others."""
+    """Check that the fixed anchors fit in the number of anchors, and the others on the mounts."""
     n_fixed = len(problem.fixed)
     if problem.n_anchors < n_fixed:
         raise ValueError(

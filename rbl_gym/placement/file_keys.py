@@ -1,6 +1,6 @@
-"""The format of a placement file: every table, its keys, and what they may hold.
+"""The format of a placement file: every table, its keys, and their values.
 
-One table of keys serves the reader, its messages, and the JSON schema for editors
+One table of keys serves the reader, its error messages, and the JSON schema for editors
 (`file_schema`).
 """
 
@@ -14,7 +14,7 @@ from rbl_gym.geometry import bodies
 from rbl_gym.measurements.ranging import NOISE_LAWS
 from rbl_gym.placement.building import ATTITUDES
 
-# Fewer anchors never tell a pose; three leave its mirror image in their plane.
+# Fewer anchors never determine a pose. Three leave its mirror image in their plane.
 MIN_ANCHORS, MAX_ANCHORS = 3, 256
 BODIES = {
     "octahedron": bodies.octahedron,
@@ -22,28 +22,28 @@ BODIES = {
     "cube": bodies.cube,
     "plate": lambda size_m: bodies.plate(size_m, size_m),
 }
-# No building is larger or smaller than this, metres.
+# Limits of the size of a building, metres.
 MOST_M, _LEAST_M = 1e6, 1e-3
 
 
 class Key(NamedTuple):
-    """What one key holds.
+    """The values of one key.
 
     Attributes
     ----------
     kind
-        ``"number"``, ``"count"``, ``"text"``, ``"flag"``, ``"choice"``; ``"spot"`` and
-        ``"place"``: two and three numbers; ``"spots"`` and ``"places"``: lists of them;
-        ``"line"`` and ``"polygon"``: checked lists of spots; ``"shares"``: numbers by name;
-        ``"any"``: looked at elsewhere.
+        ``"number"``, ``"count"``, ``"text"``, ``"flag"``, ``"choice"``; ``"spot"`` and ``"place"``:
+        two and three numbers; ``"spots"`` and ``"places"``: lists of them; ``"line"`` and
+        ``"polygon"``: checked lists of spots; ``"shares"``: numbers by name; ``"any"``: checked
+        elsewhere.
     doc
         One line for the schema and the reference.
     needed, default
-        Whether it must be there, and what stands for it where it is not.
+        Whether the key is required, and its default otherwise.
     low, high
         Limits of a number.
     choices
-        Of a choice.
+        Allowed values of a choice.
     """
 
     kind: str
@@ -56,7 +56,7 @@ class Key(NamedTuple):
 
 
 class Form(NamedTuple):
-    """One form of a table, meant where that has the key `mark`, with `value` if given."""
+    """One form of a table, used if the table has the key `mark`, with `value` if given."""
 
     keys: dict[str, Key]
     mark: str = ""
@@ -64,7 +64,7 @@ class Form(NamedTuple):
 
 
 class Table(NamedTuple):
-    """A table of the file: its forms, whether there may be several, what it is for."""
+    """A table of the file: its forms, whether there may be several, its description."""
 
     doc: str
     forms: tuple[Form, ...]

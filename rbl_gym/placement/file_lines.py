@@ -1,19 +1,19 @@
-"""Where in a TOML file an error is: the line of a table's key."""
+"""Find the line of a table's key in a TOML file, for errors."""
 
 from __future__ import annotations
 
 import re
 
-# What an error begins with: a table, maybe one of many, maybe a key of it.
+# Start of an error message: a table, perhaps with an index, perhaps with a key.
 _SUBJECT = re.compile(r"^([A-Za-z_]\w*)(?:\[(\d+)\])?(?:(?:\.|: )([A-Za-z_]\w*))?")
 
 _UNKNOWN = re.compile(r"unknown key '(\w+)'")
 
 
 def line_of(text: str, message: str) -> int | None:
-    """The line, from 1, of what an error about the tables of a TOML file is about.
+    """Return the line, from 1, of an error message about the tables of a TOML file.
 
-    None where the file does not have it, or has it in another way than as tables with keys.
+    None if the file does not have the key, or not as tables with keys.
     """
     subject = _SUBJECT.match(message)
     if subject is None:

@@ -1,4 +1,4 @@
-"""Worlds of building files: the scene that a file of `rbl-gym place` describes."""
+"""Scenes from building files of `rbl-gym place`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rbl_gym.worlds.scene import Scene
 
 __all__ = ["scene_of_file"]
 
-# How a body moves that a file says nothing of: as in `uwb_room`.
+# Motion of the body, which a file does not describe: as in `uwb_room`.
 _DT = 0.1
 _MOTION = {
     "dt": _DT,
@@ -25,16 +25,16 @@ _MOTION = {
 
 
 def scene_of_file(path: str) -> Scene:
-    """The world of a building file (docs/building_files.md).
+    """Return the scene of a building file (docs/building_files.md).
 
-    The body moves in the box around the file's zones. The fixed anchors of the file stay; the
-    others, up to its number, are drawn anew at every reset, where they may stand. What the file
-    says nothing of (speeds, process noise, time) is that of the scene ``"uwb_room"``.
+    The body moves in the box around the file's zones. The fixed anchors of the file stay. Every
+    reset draws the others, up to the file's number, on legal positions. Values that the file does
+    not have (speeds, process noise, time) are those of the scene ``"uwb_room"``.
 
     Raises
     ------
     ValueError
-        On a file that is none; the message names the file and, where it can be told, the line.
+        If the file is invalid; the message has the file and, if known, the line.
     """
     file = Path(path)
     if not file.is_file():
@@ -44,7 +44,7 @@ def scene_of_file(path: str) -> Scene:
 
 @functools.lru_cache(maxsize=64)
 def _read(path: str, changed_ns: int) -> Scene:
-    """The scene of a file as it was at that time: equal files give one and the same."""
+    """Read the scene of a file as of a time: an unchanged file gives the same object."""
     found = problem(path)
     fixed = as_tuples(found.fixed) if len(found.fixed) else ()
     every = len(fixed) == found.n_anchors

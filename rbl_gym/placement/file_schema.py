@@ -27,7 +27,7 @@ _TYPES: dict[str, dict[str, Any]] = {
 
 
 def schema() -> dict[str, Any]:
-    """The JSON schema (draft 2020-12) of a file."""
+    """Return the JSON schema (draft 2020-12) of a file."""
     tables: dict[str, Any] = {
         "name": {"description": "of the problem", **_TYPES["text"]},
         "$schema": {"description": "where this schema is, for editors", **_TYPES["text"]},

@@ -1,4 +1,4 @@
-"""Values of the tables of a placement file, checked by `file_keys.FORMAT`."""
+"""Values of the tables of a placement file, checked with `file_keys.FORMAT`."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from rbl_gym.checks import FloatArray, check_array, check_number
 from rbl_gym.geometry.polygons import check_line, check_polygon
 from rbl_gym.placement.file_keys import FORMAT, MOST_M, Form, Key
 
-# Boxes may be of the size of orbits; polygons may not.
+# Boxes may be as large as orbits; polygons may not.
 _FARTHEST_M = 1e9
-# More points than this in a list are refused.
+# Limit of the number of points in a list.
 _MOST_POINTS = 10_000
 
 
 def read_table(name: str, table: Any, kind: str | None = None) -> dict[str, Any]:
-    """The values of one table, checked, with defaults; a ValueError names what is wrong.
+    """Return the checked values of one table, with defaults; a ValueError names what is wrong.
 
     Parameters
     ----------
     name
-        Under which errors speak of it, such as ``"walls[3]"``.
+        Name in errors, such as ``"walls[3]"``.
     table
-        What the file has there.
+        The value in the file.
     kind
-        Which of `FORMAT` it is; None: as it is named.
+        Its name in `FORMAT`; None: the same as `name`.
     """
     table = as_table(table, name)
     keys = _form(name, table, FORMAT[kind or name].forms).keys
@@ -42,7 +42,7 @@ def read_table(name: str, table: Any, kind: str | None = None) -> dict[str, Any]
 
 
 def _form(name: str, table: Mapping[str, Any], forms: tuple[Form, ...]) -> Form:
-    """The form that a table has."""
+    """Return the form of a table."""
     marked = [form for form in forms if form.value and form.mark in form.keys]
     if marked and marked[0].mark in table:
         mark, given = marked[0].mark, table[marked[0].mark]
@@ -61,14 +61,14 @@ def _form(name: str, table: Mapping[str, Any], forms: tuple[Form, ...]) -> Form:
 
 
 def as_table(value: Any, name: str) -> dict[str, Any]:
-    """A table of keys, or a ValueError."""
+    """Return a table of keys; raises ValueError for anything else."""
     if not isinstance(value, Mapping):
         raise ValueError(f"{name} must be a table of keys, got {value!r:.80}")
     return dict(value)
 
 
 def check_keys(table: Mapping[str, Any], name: str, keys: Mapping[str, Key]) -> None:
-    """No key but these, and all that are needed."""
+    """Check that there are only these keys, and all required ones."""
     for key in table:
         if key not in keys:
             raise ValueError(
@@ -80,7 +80,7 @@ def check_keys(table: Mapping[str, Any], name: str, keys: Mapping[str, Key]) -> 
 
 
 def _checked(name: str, value: Any, key: Key) -> Any:
-    """The value as it is used."""
+    """Return the checked value."""
     if key.kind == "number":
         return check_number(name, value, low=key.low, high=key.high)
     if key.kind == "flag":
@@ -105,7 +105,7 @@ def _checked(name: str, value: Any, key: Key) -> Any:
 
 
 def check_text(name: str, value: Any) -> str:
-    """A text that can be printed, or a ValueError."""
+    """Return a text if it is printable; raises ValueError otherwise."""
     if not isinstance(value, str) or not value or not value.isprintable():
         raise ValueError(f"{name} must be a printable text, got {value!r:.80}")
     return value

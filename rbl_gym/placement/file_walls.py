@@ -1,4 +1,4 @@
-"""What stands in a building, from the tables of a file: walls, obstacles, slabs, mounts."""
+"""Obstacles and mounts of a building from the tables of a file: walls, obstacles, slabs."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.geometry.polygons import TOUCH_M, check_polygon
 from rbl_gym.placement.mounting import Mount
 
-# A mitre that is longer than so many half thicknesses is cut off.
+# Mitres longer than this many half thicknesses are cut off.
 _LONGEST_MITRE = 4.0
-# A mount runs along a wall where their directions differ by less than this, radians.
+# A mount is parallel to a wall if their directions differ by less than this, radians.
 _PARALLEL = 1e-3
 
 
 class WallPieces(NamedTuple):
-    """Straight pieces of walls: ends (W, 2) in the plan, half thickness and heights (W,)."""
+    """Straight wall pieces: ends (W, 2) in plan, half thickness and heights (W,)."""
 
     start: FloatArray
     end: FloatArray
@@ -30,7 +30,7 @@ class WallPieces(NamedTuple):
 
 
 class Solids(NamedTuple):
-    """Polygons with heights and shares, as they are gathered from the tables."""
+    """Polygons with heights and information fractions, collected from the tables."""
 
     rings: list[FloatArray]
     low: list[float]
@@ -38,7 +38,7 @@ class Solids(NamedTuple):
     share: list[float]
 
     def add(self, ring: FloatArray, low: float, high: float, share: float) -> None:
-        """One more."""
+        """Add a polygon."""
         self.rings.append(ring)
         self.low.append(low)
         self.high.append(high)
@@ -48,16 +48,16 @@ class Solids(NamedTuple):
 def read_obstacles(
     tables: Mapping[str, list[dict[str, Any]]], materials: Mapping[str, float], blocked: float
 ) -> tuple[Obstacles, WallPieces]:
-    """All that takes information from links, and the walls piece by piece.
+    """Return all obstacles, and the walls piece by piece.
 
     Parameters
     ----------
     tables
-        The read tables: ``obstacles``, ``walls``, ``slabs``, and whether there are ``mounts``.
+        The tables ``obstacles``, ``walls``, ``slabs``, and whether there are ``mounts``.
     materials
-        Shares by name.
+        Information fractions by name.
     blocked
-        What those without a share leave.
+        Information fraction of obstacles without their own.
     """
     boxes, solids, walls = [], Solids([], [], [], []), []
     for name, table in _each(tables, "obstacles"):
@@ -69,7 +69,7 @@ def read_obstacles(
         low, high = np.array(table["low"]), np.array(table["high"])
         if not (high > low).all():
             raise ValueError(f"{name}: low must lie below high, got {show(low)}, {show(high)}")
-        # A box holds its own faces too, and then nothing may hang on them.
+        # A box includes its own faces, so that no anchor can be on them.
         is_box = math.isnan(share) and not tables.get("mounts")
         if not is_box and (high - low).min() < 1e-3:
             raise ValueError(f"{name} must be at least a millimetre wide, got {show(high - low)}")
@@ -101,7 +101,7 @@ def _each(tables: Mapping[str, Any], kind: str) -> list[tuple[str, dict[str, Any
 
 
 def _share(name: str, table: Mapping[str, Any], materials: Mapping[str, float]) -> float:
-    """What is left behind it; NaN: what obstacles have in common."""
+    """Return the information fraction behind an obstacle; NaN: the common default."""
     material, share = table["material"], table["information"]
     if material is not None and share is not None:
         raise ValueError(f"{name} must have either material or information, got both")
@@ -123,18 +123,18 @@ def _check_rises(name: str, table: Mapping[str, Any]) -> None:
 
 
 def rectangle(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Corners (4, 2) of a box in the plan, counter-clockwise."""
+    """Return corners (4, 2) of a box in plan, counter-clockwise."""
     return np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
 
 
 def segments(line: FloatArray, closed: bool) -> list[tuple[FloatArray, FloatArray]]:
-    """The straight pieces of a line (V, 2)."""
+    """Return the straight pieces of a line (V, 2)."""
     ends = np.roll(line, -1, axis=0)
     return list(zip(line, ends, strict=True))[: None if closed else -1]
 
 
 def wall_pieces(line: FloatArray, half: float, closed: bool) -> list[FloatArray]:
-    """Quadrilaterals (4, 2) about the pieces of a line, mitred where two of them meet."""
+    """Return quadrilaterals (4, 2) around the pieces of a line, mitred at their joints."""
     found = []
     parts = segments(line, closed)
     along = np.array([(end - start) / np.hypot(*(end - start)) for start, end in parts])
@@ -146,7 +146,7 @@ def wall_pieces(line: FloatArray, half: float, closed: bool) -> list[FloatArray]
             for k, join in zip((i - 1, i + 1), joined, strict=True)
         )
         ring = np.array([start - before, end - after, end + after, start + before])
-        # Where a piece is shorter than the mitres at its ends they would cross.
+        # Mitres of a piece that is shorter than them would cross.
         if min((ring[1] - ring[0]) @ along[i], (ring[2] - ring[3]) @ along[i]) < TOUCH_M:
             ring = np.array([start - left, end - left, end + left, start + left])
         found.append(ring)
@@ -154,7 +154,7 @@ def wall_pieces(line: FloatArray, half: float, closed: bool) -> list[FloatArray]
 
 
 def _mitre(one: FloatArray, other: FloatArray, half: float) -> FloatArray:
-    """From a corner of two directions to where their left sides meet."""
+    """Return the vector from a corner of two directions to the intersection of their left sides."""
     middle = _turned(one) + _turned(other)
     square = middle @ middle
     # cos^2 of half the turn is square / 4.
@@ -164,12 +164,12 @@ def _mitre(one: FloatArray, other: FloatArray, half: float) -> FloatArray:
 
 
 def _turned(direction: FloatArray) -> FloatArray:
-    """A quarter turn to the left."""
+    """Return vectors rotated by 90 degrees to the left."""
     return np.array([-direction[1], direction[0]])
 
 
 def read_mounts(tables: list[dict[str, Any]], walls: WallPieces) -> list[Mount]:
-    """The faces of all mounts; those along a wall are moved to its face."""
+    """Return the faces of all mounts; those along a wall are moved to its face."""
     found: list[Mount] = []
     for index, table in enumerate(tables):
         kind = table["kind"]
@@ -200,7 +200,7 @@ def _wall(name: str, table: Mapping[str, Any], walls: WallPieces) -> list[Mount]
 def _in_wall(
     ends: FloatArray, normal: FloatArray, table: Mapping[str, Any], walls: WallPieces
 ) -> float:
-    """How far a face inside a wall, or on its other side, lies behind the wall's face."""
+    """Return how far a face inside a wall, or on its other side, lies behind the wall's face."""
     direction = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
     along = walls.end - walls.start
     turn = np.abs(along @ normal) / np.hypot(*along.T)
@@ -252,7 +252,7 @@ def _upright(ends: FloatArray, normal: FloatArray, table: Mapping[str, Any]) -> 
 
 
 def _axis(name: str, table: Mapping[str, Any]) -> FloatArray:
-    """The direction in which anchors look, of unit length; zero: everywhere."""
+    """Return the unit vector of the anchors' view; zero for all directions."""
     if table["axis"] is None:
         return np.zeros(3)
     axis = np.array(table["axis"])
@@ -263,5 +263,5 @@ def _axis(name: str, table: Mapping[str, Any]) -> FloatArray:
 
 
 def show(corner: FloatArray) -> str:
-    """A point as a text."""
+    """Return a point as text."""
     return "(" + ", ".join(f"{value:g}" for value in corner) + ")"

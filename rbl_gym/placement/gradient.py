@@ -1,4 +1,4 @@
-"""The score of a layout with its derivative by the places of the anchors."""
+"""The score of a layout and its derivative with respect to the anchor positions."""
 
 from __future__ import annotations
 
@@ -24,36 +24,35 @@ def score_and_gradient(
     gain: Gain = EVERYWHERE,
     normals: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Score (...) of layouts and its derivative (..., M, 3) by the places of the anchors.
+    """Return score (...) of layouts and its derivative (..., M, 3) by the anchor positions.
 
     The score is the root of the weighted mean over the poses of b^2, ``b^2 = mean_n tr(J_n P
-    J_n^T)`` with ``P = (F + prior)^-1``. `share` and `normals` count as constant: what blocks
-    sight is taken as it is, and an anchor that is about to lose sight of a pose is not warned.
+    J_n^T)`` with ``P = (F + prior)^-1``. `share` and `normals` are constants of the derivative: it
+    does not see that an anchor is about to lose sight of a pose.
 
     Parameters
     ----------
     anchors
         (..., M, 3), metres.
     sample
-        The poses, their weights and what is known at them before the first range.
+        The poses, their weights and the prior information.
     tags
         (N, 3) in the body frame, metres.
     noise
         The law of the ranges: one of `ranging.NOISE_LAWS`.
     share
-        Of its information that each link has: (..., P, M), or (..., P, M, N) where it is known
-        for each tag. None: all.
+        Information fraction of each link, (..., P, M), or (..., P, M, N) per tag. None: 1.
     gain
-        Limit of the range, and field of view.
+        Reach and field of view of the anchors.
     normals
-        (..., M, 3) of the mounts, of unit length, for the field of view; None or zero: anchors
-        see everywhere.
+        (..., M, 3) of the mounts, of unit length, for the field of view; None or zero: all
+        directions.
 
     Raises
     ------
     ValueError
-        On arrays of other shapes or that are not finite, on a law that is not of `NOISE_LAWS`,
-        and where the information is singular.
+        If arrays have wrong shapes or are not finite, the law is not one of `NOISE_LAWS`, or the
+        information is singular.
     """
     anchors, tags = check_array("anchors", anchors, ("M", 3)), check_array("tags", tags, ("N", 3))
     law = ranging.numbers_of(noise, len(tags))
@@ -67,14 +66,14 @@ def score_and_gradient(
 
 
 def of_arrays(*arrays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """`score_and_gradient`, of the arguments of `square_and_gradient`."""
+    """Return `score_and_gradient` for the arguments of `square_and_gradient`."""
     square, gradient = square_and_gradient(*arrays)
     root = root_of(square)
     return root, gradient / (2 * root[..., None, None])
 
 
 def _shares(share: FloatArray | None, p: int, m: int, n: int) -> FloatArray:
-    """Shares (..., P, M, N) of the links."""
+    """Return the information fractions (..., P, M, N) of the links."""
     if share is None:
         return np.ones((p, m, n))
     share = check_finite("share", as_float("share", share))
@@ -100,11 +99,11 @@ def square_and_gradient(
     gain: FloatArray,
     share: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Weighted sum (...) of b^2 over poses, and its derivative (..., M, 3) by the anchors.
+    """Return the weighted sum (...) of b^2 over poses, and its derivative (..., M, 3) by anchors.
 
-    With ``K = P S P``, S the mean of ``J_n^T J_n``, b^2 falls by ``tr(K dF)``. A link tells
-    ``F = w q q^T`` with ``q = J_n^T d`` and ``w = g / (var r^2)``, of the offset ``d = s_n - a_m``
-    and of its gain g.
+    With ``K = P S P`` and S the mean of ``J_n^T J_n``, the derivative of b^2 is ``-tr(K dF)``. A
+    link has the information ``F = w q q^T`` with ``q = J_n^T d`` and ``w = g / (var r^2)``, where
+    ``d = s_n - a_m`` is its offset and g its gain.
     """
     noise = ranging.law_of(law)
     J = bounds.tag_jacobian(rotation, tags[..., None, :, :])
@@ -120,7 +119,7 @@ def square_and_gradient(
     Kq = q @ (P @ S @ P)[..., None, :, :]
     told = (q * Kq).sum(axis=-1)
     by_link, by_reference, reference = _weight_slopes(noise, distance)
-    # The derivatives by the offset, of w without its gain, then of the gain.
+    # Derivatives by the offset, of w without its gain, then of the gain.
     slope = np.einsum("...mn,...nia,...mna->...mi", w, J, Kq)
     slope -= ((w * told * by_link)[..., None] * d).sum(axis=-2)
     slope -= (w * told * by_reference).sum(axis=-1, keepdims=True) * d[..., reference, :]
@@ -132,9 +131,10 @@ def square_and_gradient(
 def _weight_slopes(
     noise: ranging.NoiseLaw, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Minus the derivatives of ``log w`` by the squares of two distances (..., M, N).
+    """Return minus the derivatives of ``log w`` by two squared distances (..., M, N).
 
-    Those of the link, and of the reference tag to the same anchor, whose index is the third.
+    These are the distance of the link, and that of the reference tag to the same anchor. The third
+    output is the index of the reference tag.
     """
     if isinstance(noise, ranging.SquaredRangeNoise):
         return np.zeros_like(distance), 1 / distance[..., :1] ** 2 + 0 * distance, 0

@@ -1,4 +1,4 @@
-"""Layouts of anchors from CSV files: one anchor a line, columns by their names."""
+"""Read layouts of anchors from CSV files: one anchor per line, columns by name."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ _AXES = ("x_m", "y_m", "z_m")
 
 
 class Layout(NamedTuple):
-    """Anchors of a file: names (M), places (M, 3) in metres."""
+    """Anchors of a file: names (M), positions (M, 3) in metres."""
 
     names: tuple[str, ...]
     positions: FloatArray
 
 
 def read_layout(path: str) -> Layout:
-    """The anchors of a CSV file with the columns x_m, y_m, z_m and, if it has one, name.
+    """Read anchors from a CSV file with the columns x_m, y_m, z_m and optionally name.
 
-    Columns in any order, others are left alone; separated by commas or semicolons. Without names
-    the anchors are called 1, 2, ...
+    Columns may be in any order, and other columns are ignored. Separators are commas or semicolons.
+    Without names the anchors are called 1, 2, ...
 
     Parameters
     ----------
     path
-        Of the file.
+        Path of the file.
 
     Raises
     ------
     ValueError
-        On a file that is none, names the file, the line and the column.
+        If the file is invalid; the message has the file, the line and the column.
     """
     return parse_layout(path, Path(path).read_bytes())
 
 
 def parse_layout(path: str, content: bytes) -> Layout:
-    """`read_layout` of a file's bytes; `path` is what errors call it."""
+    """Return `read_layout` of a file's bytes; `path` is its name in errors."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

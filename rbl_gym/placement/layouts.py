@@ -1,7 +1,7 @@
-"""The usual layouts of anchors: what people do without asking the bound.
+"""Usual layouts of anchors, chosen without the bound.
 
 A layout is a function ``(task, context, rng) -> anchors (..., M, 3)`` of a placement problem with
-any leading axes; `search` holds those that look at the score.
+any leading axes. `search` has those that use the score.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ __all__ = ["LAYOUTS", "amortised", "corners", "grid", "layout", "perimeter", "ra
 
 Layout = Callable[[PlacementTask, Context, np.random.Generator], FloatArray]
 
-# Radius of the ring about the work region: shares of the region's half width and of the height
-# between the region's middle and the anchors. Tuned on auv_buoys and drone_yard.
+# Radius of the ring around the work region: fractions of the region's half width and of the height
+# between the region's centre and the anchors. Tuned on auv_buoys and drone_yard.
 RING_WIDTH, RING_HEIGHT = 0.7, 0.65
 
 
 def random(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
-    """Uniform over the legal places."""
+    """Draw uniform legal positions."""
     batch = context.centre.shape[:-1]
     return task.scene.anchor_region.draw(rng.random((*batch, task.n_anchors, 3)))
 
 
 def corners(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
-    """The corners of the legal space, alternately high and low, then the middles between them."""
+    """Use the corners of the legal space, alternately high and low, then the midpoints of edges."""
     if isinstance(task.scene.anchor_region, Shell):
         return _everywhere(task, context, _sphere(task.n_anchors))
     around = [(-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0)]
@@ -46,7 +46,7 @@ def corners(task: PlacementTask, context: Context, rng: np.random.Generator) -> 
 
 
 def grid(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
-    """A regular grid on the ceiling, or on the top of the legal space."""
+    """Use a regular grid on the ceiling, or on the top of the legal space."""
     if isinstance(task.scene.anchor_region, Shell):
         return _everywhere(task, context, _sphere(task.n_anchors))
     n_rows = max(1, round(task.n_anchors**0.5))
@@ -61,7 +61,7 @@ def grid(task: PlacementTask, context: Context, rng: np.random.Generator) -> Flo
 
 
 def perimeter(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
-    """At equal distances along the edge of the legal space, alternately low and high."""
+    """Place anchors at equal distances along the legal space's edge, alternately low and high."""
     if isinstance(task.scene.anchor_region, Shell):
         return _everywhere(task, context, _sphere(task.n_anchors))
     low, high = task.scene.anchor_region.bounds()
@@ -82,12 +82,12 @@ def ring(
     width: float = RING_WIDTH,
     height: float = RING_HEIGHT,
 ) -> FloatArray:
-    """A circle about the work region, alternately low and high where the legal space has a height.
+    """Place anchors on a circle around the work region, alternately low and high if possible.
 
-    Its radius is `width` times the region's mean half width plus `height` times how far the
-    region's middle lies above or below the anchors.
+    Its radius is `width` times the region's mean half width plus `height` times the vertical
+    distance between the region's centre and the anchors.
 
-    Arguments as `layout`.
+    Arguments as in `layout`.
     """
     if isinstance(task.scene.anchor_region, Shell):
         return _everywhere(task, context, _sphere(task.n_anchors))
@@ -106,14 +106,15 @@ def ring(
 def amortised(
     task: PlacementTask, context: Context, rng: np.random.Generator, evaluations: int = 0
 ) -> FloatArray:
-    """What a network that has seen many random problems proposes, see `placement.amortised`.
+    """Return the layout of a network trained on many random problems, see `placement.amortised`.
 
     Parameters
     ----------
     task, context, rng
-        As `layout`; 1 to 16 anchors. Nothing is drawn.
+        As in `layout`; 1 to 16 anchors. Nothing is random.
     evaluations
-        Of score and gradient, at most, in steps along the gradient after it; 0: none.
+        Largest number of evaluations of score and gradient, in gradient steps after the network; 0:
+        none.
     """
     return network.of_task(task, context, evaluations)
 
@@ -130,25 +131,25 @@ LAYOUTS: dict[str, Layout] = {
 def layout(
     name: str, task: PlacementTask, context: Context, rng: np.random.Generator
 ) -> FloatArray:
-    """The named layout (..., M, 3) of a problem.
+    """Return the named layout (..., M, 3) of a problem.
 
     Parameters
     ----------
     name
-        Of `LAYOUTS`.
+        Name in `LAYOUTS`.
     task, context, rng
-        The problem, contexts (...), and the source of what is drawn.
+        The problem, contexts (...), and the source of random numbers.
 
     Raises
     ------
     ValueError
-        On an unknown name.
+        If the name is unknown.
     """
     return LAYOUTS[check_one_of("layout", name, list(LAYOUTS))](task, context, rng)
 
 
 def _sphere(n: int) -> FloatArray:
-    """Directions (n, 3) spread evenly over the sphere (Fibonacci's spiral), for shells."""
+    """Return directions (n, 3) spread evenly over the sphere (Fibonacci spiral), for shells."""
     z = 1 - (2 * np.arange(n) + 1) / n
     turn = np.pi * (3 - 5**0.5) * np.arange(n)
     flat = np.sqrt(1 - z**2)
@@ -156,7 +157,7 @@ def _sphere(n: int) -> FloatArray:
 
 
 def _everywhere(task: PlacementTask, context: Context, actions: FloatArray) -> FloatArray:
-    """The same places for all contexts, by actions (M, 3)."""
+    """Return the same positions for all contexts, from actions (M, 3)."""
     region: Any = task.scene.anchor_region
     return _broadcast(task, context, region.place(actions))
 

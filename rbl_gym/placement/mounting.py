@@ -1,4 +1,4 @@
-"""Mounts of a building: faces cut into pieces, without what is forbidden or covered.
+"""Mounts of a building: faces cut into pieces, without forbidden or covered parts.
 
 Needs shapely (extra ``placement``).
 """
@@ -15,29 +15,29 @@ from rbl_gym.geometry.mounts import Mounts
 from rbl_gym.geometry.obstacles import Obstacles, Prisms
 from rbl_gym.geometry.regions import Faces
 
-# What stands so close in front of a face covers it, metres.
+# An obstacle this close in front of a face covers it, metres.
 _BEFORE_M = 1e-3
-# Forbidden prisms hold their own faces, metres.
+# Forbidden prisms include their own faces, with this tolerance, metres.
 _GROWN_M = 1e-6
-# Smaller pieces than this are left out, metres and square metres.
+# Smaller pieces are left out, metres and square metres.
 _LEAST_M, _LEAST_M2 = 1e-3, 1e-4
 
 
 class Mount(NamedTuple):
-    """A face as a file says it: a segment (2, 2), a polygon (V, 2) or a point (1, 2) in the plan.
+    """A face as given in a file: a segment (2, 2), a polygon (V, 2) or a point (1, 2) in plan.
 
     Attributes
     ----------
     shape
-        Corners in the plan, metres.
+        Corners in plan, metres.
     low_m, high_m
         Heights.
     normal
-        Where anchors on it look, of unit length; zero: everywhere.
+        Unit vector of the view of its anchors; zero for all directions.
     cost, name
-        Of an anchor on it.
+        Cost and name of an anchor on it.
     on_surface
-        Whether it is a surface with a front, not a space.
+        Whether it is a surface with a front side, not a volume.
     """
 
     shape: FloatArray
@@ -50,10 +50,10 @@ class Mount(NamedTuple):
 
 
 def cut_mounts(mounts: list[Mount], obstacles: Obstacles, forbidden: Prisms) -> Mounts | None:
-    """The region of all mounts, without what is forbidden or covered; None: nothing is left.
+    """Return the region of all mounts without forbidden or covered parts; None if it is empty.
 
-    A place on a surface is covered where the point a millimetre in front of it lies inside of an
-    obstacle, other places where they do.
+    A position on a surface is covered if the point a millimetre in front of it lies in an obstacle.
+    Other positions are covered if they lie in an obstacle themselves.
     """
     shapely = _shapely()
     covers = _solids(shapely, _prisms_of(obstacles), 0.0)
@@ -69,7 +69,7 @@ def cut_mounts(mounts: list[Mount], obstacles: Obstacles, forbidden: Prisms) -> 
 
 
 def faces_of(mounts: list[Mount]) -> Faces:
-    """The mounts as boxes of one, two or three sides."""
+    """Return the mounts as boxes with one, two or three sides."""
     rows = []
     for mount in mounts:
         axes, extents = np.zeros((3, 3)), np.zeros(3)
@@ -89,21 +89,21 @@ def faces_of(mounts: list[Mount]) -> Faces:
 
 
 class _Solids(NamedTuple):
-    """Prisms as shapely's polygons, and their heights (K,)."""
+    """Prisms as polygons of shapely, and their heights (K,)."""
 
     shapes: Any
     low: FloatArray
     high: FloatArray
 
     def at(self, shapely: Any, shape: Any, low: float, high: float) -> _Solids:
-        """Those that meet a shape in the plan between two heights."""
+        """Return those that meet a shape in plan between two heights."""
         near = (self.low < high) & (self.high > low)
         near[near] = shapely.intersects(self.shapes[near], shape)
         return _Solids(self.shapes[near], self.low[near], self.high[near])
 
 
 def _prisms_of(obstacles: Obstacles) -> Prisms:
-    """All obstacles as prisms."""
+    """Return all obstacles as prisms."""
     centre, half = obstacles.boxes[:, :3], obstacles.boxes[:, 3:]
     turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     rings = [*(centre[:, None, :2] + turns * half[:, None, :2]), *obstacles.prisms.corners]
@@ -119,11 +119,11 @@ def _solids(shapely: Any, prisms: Prisms, grown: float) -> _Solids:
 
 
 def _pieces(shapely: Any, mount: Mount, covers: _Solids, bans: _Solids) -> list[list[float]]:
-    """What is left of a mount, rows as `Mounts` takes them."""
+    """Return the remaining pieces of a mount, rows as for `Mounts`."""
     make = {1: shapely.Point, 2: shapely.LineString}.get(len(mount.shape), shapely.Polygon)
     shape = make(mount.shape)
     ahead = _BEFORE_M * mount.normal * mount.on_surface
-    # Moved by so much, what covers the place in front of the face covers the face.
+    # Moved by this vector, an obstacle in front of the face covers the face.
     low, high = mount.low_m + ahead[2], mount.high_m + ahead[2]
     near = covers.at(shapely, make(mount.shape + ahead[:2]), low, high)
     bans = bans.at(shapely, shape, mount.low_m, mount.high_m)
@@ -143,11 +143,11 @@ def _pieces(shapely: Any, mount: Mount, covers: _Solids, bans: _Solids) -> list[
 def _layers(
     shapely: Any, shape: Any, mount: Mount, solids: _Solids
 ) -> list[tuple[float, float, Any]]:
-    """Heights, and what of the shape is left between them."""
+    """Yield heights, and the remaining shape between them."""
     stops = np.unique([mount.low_m, mount.high_m, *solids.low, *solids.high])
     stops = stops[(stops >= mount.low_m) & (stops <= mount.high_m)]
     layers: list[tuple[float, float, Any]] = []
-    # A level face is one layer without a height.
+    # A horizontal face is one layer without height.
     stops = np.resize(stops, 2) if len(stops) == 1 else stops
     for bottom, top in itertools.pairwise(stops):
         middle = 0.5 * (bottom + top)
@@ -161,7 +161,7 @@ def _layers(
 
 
 def _simplices(shapely: Any, shape: Any) -> list[FloatArray]:
-    """A shape as triangles, segments and points, each (3, 2), the last corner repeated."""
+    """Return a shape as triangles, segments and points, each (3, 2), repeating the last corner."""
     found = []
     for part in () if shape.is_empty else shapely.get_parts(shape):
         if part.geom_type == "Point":

@@ -1,12 +1,12 @@
-"""Where do the anchors go so that the pose is good? The problem: contexts, legal places, scores.
+"""The problem of anchor placement: contexts, legal positions, scores.
 
-A task is a scene, a number of anchors and how many racks may stand in the way. A context is what
-changes from one problem to the next: the work region, a box inside the body's volume, and the
-racks. A layout is an array (..., M, 3) of anchors, and its score on a context is the root mean
-square tag error in metres that the Cramer-Rao bound promises over fixed poses in the work
-region. Everything broadcasts: layouts and contexts of one call may carry any leading axes.
+A task is a scene, a number of anchors and a number of racks. A context is what varies between
+problems: the work region, a box inside the body's volume, and the racks. A layout is an array (...,
+M, 3) of anchors. Its score on a context is the root mean square tag error in metres that the
+Cramer-Rao bound gives over fixed poses in the work region. Everything broadcasts: layouts and
+contexts of one call may have any leading axes.
 
-Solutions stand in `layouts` and `search`.
+`layouts` and `search` have solutions.
 """
 
 from __future__ import annotations
@@ -42,20 +42,20 @@ __all__ = [
     "task", "whole_volume",
 ]  # fmt: skip
 
-# Anchors of a task where nothing else is said: the scenes' own, and one fewer beside racks.
+# Default numbers of anchors: the scene's own, and one fewer with racks.
 MAX_RACKS = 2
-# More anchors or poses than any machine scores.
+# Limit of the numbers of anchors and poses.
 _MOST_PLACES = 10**6
-# Rotation of the prior that regularises the bound.
+# Rotation of the prior that regularizes the bound.
 _PRIOR_ROTATION_RAD = math.radians(60)
-# The poses of a task are the same for ever, so that scores can be compared.
+# The poses of a task are always the same, so that scores can be compared.
 _POSE_SEED = 20130821
-# Range of the work region's half size as a share of the volume's, (x, y, z).
+# Range of the work region's half size as a fraction of the volume's, (x, y, z).
 _LEAST, _MOST = np.array([0.15, 0.15, 0.3]), np.array([0.6, 0.6, 1.0])
 _SPAN = _MOST - _LEAST
-# Uniforms that a context takes: region 6, each rack 6.
+# Numbers of uniforms of a context: 6 for the region, 6 for each rack.
 _REGION_UNIFORMS, _RACK_UNIFORMS = 6, 6
-# Which of `PlacementTask.rack_limits` are a rack's centre and half sizes.
+# Indices of a rack's centre and half sizes in `PlacementTask.rack_limits`.
 _LONG_X, _LONG_Y = np.array([0, 1, 5, 3, 2, 5]), np.array([0, 1, 5, 2, 3, 5])
 
 
@@ -67,7 +67,7 @@ class Context(NamedTuple):
     centre, half
         Work region (..., 3), metres.
     racks
-        (..., K, 6): centre and half size of all boxes that block sight: the scene's own, then
+        Centre and half size (..., K, 6) of all boxes that block sight: first the scene's own, then
         those of the problem.
     """
 
@@ -83,16 +83,16 @@ class PlacementTask:
     Parameters
     ----------
     scene
-        Gives the body, its volume, the noise, where anchors may stand, its own obstacles and
-        what a blocked link keeps of its information (sight is judged from the anchor to the
+        Scene with the body, its volume, the noise, the legal anchor positions, obstacles and the
+        information fraction of a blocked link (the line of sight is that from the anchor to the
         body's centre).
     n_anchors
-        How many are placed, besides those that the scene has `fixed`.
+        Number of placed anchors, in addition to the scene's `fixed` ones.
     racks
-        Boxes on the floor that every problem draws besides, 0 to 2; only in rooms (scenes with
+        Number of boxes on the floor that every problem draws, 0 to 2; only in rooms (scenes with
         walls).
     n_poses
-        Poses in the work region over which a layout is scored.
+        Number of poses in the work region for the score.
     """
 
     scene: Scene
@@ -126,18 +126,18 @@ class PlacementTask:
 
     @property
     def blocked_information(self) -> float:
-        """Share of its information that a link without line of sight keeps: the scene's."""
+        """Information fraction of a link without line of sight, from the scene."""
         return self.scene.blocked_information
 
     def obstacles(self, context: Context) -> Obstacles:
-        """What stands in the way in a context."""
+        """Return the obstacles of a context."""
         return Obstacles(context.racks, self.scene.blocked_information, self.scene.prisms)
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size.
+        """Return rotations (P, 3, 3) and offsets (P, 3) in units of the work region's half size.
 
-        Read-only, as all that a task keeps.
+        The arrays are read-only, as are all arrays of a task.
         """
         rng = np.random.default_rng(_POSE_SEED)
         offsets = rng.uniform(-1, 1, (self.n_poses, 3))
@@ -145,7 +145,7 @@ class PlacementTask:
 
     @functools.cached_property
     def rack_limits(self) -> tuple[FloatArray, FloatArray]:
-        """Least (6,) and span of a rack's x, y, shorter and longer half size, none, half height."""
+        """Minimum (6,) and span of a rack's x, y, shorter and longer half size, 0, half height."""
         low, high = self.scene.anchor_region.bounds()
         x, y, _ = high - low
         least = np.array([low[0] + 0.15 * x, low[1] + 0.15 * y, 0.2, 1.0, 0.0, 0.6])
@@ -153,7 +153,7 @@ class PlacementTask:
 
     @functools.cached_property
     def prior_information(self) -> FloatArray:
-        """(6, 6): 60 degrees, and half of the volume's largest extent."""
+        """Prior information (6, 6): 60 degrees, and half of the volume's largest extent."""
         extent = float(np.ptp(self.scene.volume.bounds(), axis=0).max())
         diagonal = [_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3
         return _read_only(np.diag(diagonal))
@@ -165,14 +165,14 @@ def _read_only(array: FloatArray) -> FloatArray:
 
 
 def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0) -> PlacementTask:
-    """The task of a scene (a name or overrides, see `scenes.get`).
+    """Return the task of a scene (a name or overrides, see `scenes.get`).
 
-    `n_anchors` None: as many as the scene has, and one fewer where racks stand in the room.
+    `n_anchors` None: as many as in the scene, and one fewer if racks are drawn.
 
     Raises
     ------
     ValueError
-        On an unknown scene, racks outside a room, a number that is none.
+        If the scene is unknown, there are racks outside a room, or a number is invalid.
     """
     scene = scenes.get(scene)
     racks = check_count("racks", racks, least=0, most=MAX_RACKS)
@@ -184,20 +184,19 @@ def task(scene: Any = "auv_buoys", n_anchors: int | None = None, racks: int = 0)
 
 
 def context_uniforms(task: PlacementTask) -> int:
-    """How many uniforms a context takes."""
+    """Return the number of uniforms of a context."""
     return _REGION_UNIFORMS + _RACK_UNIFORMS * task.racks
 
 
 def draw_contexts(
     task: PlacementTask, rng: np.random.Generator, batch: tuple[int, ...] = ()
 ) -> Context:
-    """Random contexts: work regions that fit in the volume, racks on the floor besides the scene's
-    own obstacles."""
+    """Draw contexts: work regions in the volume, and racks besides the scene's obstacles."""
     return build_contexts(task, rng.random((*batch, context_uniforms(task))))
 
 
 def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
-    """Contexts of uniforms (..., `context_uniforms`)."""
+    """Return the contexts of uniforms (..., `context_uniforms`)."""
     low, high = task.scene.volume.bounds()
     half = (_LEAST + _SPAN * uniforms[..., :3]) * (0.5 * (high - low))
     least = low + half
@@ -213,7 +212,7 @@ def build_contexts(task: PlacementTask, uniforms: FloatArray) -> Context:
 
 
 def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
-    """Racks (..., K, 6) on the floor, in the middle 70 % of the room, long in x or in y."""
+    """Return racks (..., K, 6) on the floor, in the central 70 % of the room, long in x or in y."""
     least, span = task.rack_limits
     drawn = least + span * uniforms
     along_x = uniforms[..., 4:5] < 0.5
@@ -221,13 +220,13 @@ def _racks(task: PlacementTask, uniforms: FloatArray) -> FloatArray:
 
 
 def whole_volume(task: PlacementTask) -> Context:
-    """The context whose work region is the body's volume, among the scene's own obstacles."""
+    """Return the context whose work region is the whole volume, with the scene's obstacles."""
     low, high = task.scene.volume.bounds()
     return Context(0.5 * (low + high), 0.5 * (high - low), task.scene.obstruction.boxes.copy())
 
 
 def positions(task: PlacementTask, context: Context) -> FloatArray:
-    """Places (..., P, 3) of the body's centre at the task's poses."""
+    """Return positions (..., P, 3) of the body's centre at the task's poses."""
     return context.centre[..., None, :] + task.poses[1] * context.half[..., None, :]
 
 
@@ -235,10 +234,10 @@ def positions(task: PlacementTask, context: Context) -> FloatArray:
 
 
 def information(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """Fisher information (..., P, 6, 6) at the task's poses, without the prior.
+    """Return Fisher information (..., P, 6, 6) at the task's poses, without the prior.
 
-    It is a sum over the anchors: the information of a layout is that of its parts together. That of
-    the scene's fixed anchors is not in it.
+    It is a sum over the anchors: the information of a layout is the sum of that of its parts. It
+    does not include the scene's fixed anchors.
     """
     places = positions(task, context)
     share = _share(task, context, anchors, places)[..., None]
@@ -248,7 +247,7 @@ def information(task: PlacementTask, context: Context, anchors: FloatArray) -> F
 
 
 def information_of_fixed(task: PlacementTask, context: Context) -> FloatArray:
-    """`information` (..., P, 6, 6) of the scene's fixed anchors."""
+    """Return `information` (..., P, 6, 6) of the scene's fixed anchors."""
     batch = context.centre.shape[:-1]
     if not task.scene.fixed:
         return np.zeros((*batch, task.n_poses, 6, 6))
@@ -259,7 +258,7 @@ def information_of_fixed(task: PlacementTask, context: Context) -> FloatArray:
 def _share(
     task: PlacementTask, context: Context, anchors: FloatArray, places: FloatArray
 ) -> FloatArray:
-    """Share (..., P, M) of its information that each anchor's sight of each place leaves."""
+    """Return the information fraction (..., P, M) for each anchor's sight of each position."""
     in_the_way, gain = task.obstacles(context), task.scene.gain
     if not in_the_way and not gain:
         return np.ones((task.n_poses, anchors.shape[-2]))
@@ -271,23 +270,23 @@ def _share(
 
 
 def score(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """Score (...) of layouts (..., M, 3) in metres: small is good.
+    """Return the score (...) of layouts (..., M, 3) in metres: small is good.
 
-    The root mean square over the poses of b, ``b^2 = mean_n tr(J_n P J_n^T)`` with ``P = (F +
-    prior)^-1``. The prior keeps layouts that see nothing comparable, and a proper inverse keeps
-    coincident anchors from winning.
+    The score is the root mean square over the poses of b, ``b^2 = mean_n tr(J_n P J_n^T)`` with ``P
+    = (F + prior)^-1``. The prior keeps the scores of layouts without sight comparable. A proper
+    inverse keeps coincident anchors from winning.
     """
     anchors, context = check_array("anchors", anchors, ("M", 3)), checked_context(context)
     return score_of_checked(task, context, anchors)
 
 
 def score_of_checked(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """`score`, of arrays that the caller has checked."""
+    """Return `score` of arrays that the caller has checked."""
     return root_of(mean_square(*arguments(task, context, anchors)))
 
 
 def arguments(task: PlacementTask, context: Context, anchors: FloatArray) -> tuple[FloatArray, ...]:
-    """What the score is computed from: arguments of `mean_square`."""
+    """Return the arguments of `mean_square` for the score."""
     if task.scene.fixed:
         fixed = np.broadcast_to(task.scene.fixed, (*anchors.shape[:-2], len(task.scene.fixed), 3))
         anchors = np.concatenate([fixed, anchors], axis=-2)
@@ -308,7 +307,7 @@ def mean_square(
     law: FloatArray,
     share: FloatArray,
 ) -> FloatArray:
-    """Mean (...) of b^2 over poses (..., P, 3, 3), (..., P, 3) with a share (..., P, M)."""
+    """Return the mean (...) of b^2 over poses (..., P, 3, 3), (..., P, 3), shares (..., P, M)."""
     told = bounds.information_at(
         anchors[..., None, :, :],
         tags[..., None, :, :],
@@ -325,14 +324,14 @@ def mean_square(
 def weighted_square(
     information: FloatArray, rotation: FloatArray, tags: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Sum (...) of b^2 by weights (..., P) over poses of information (..., P, 6, 6)."""
+    """Return the sum (...) of b^2, weighted by (..., P), for information (..., P, 6, 6)."""
     J = bounds.tag_jacobian(rotation, tags[..., None, :, :])
     S = np.einsum("...nia,...nib->...ab", J, J) / tags.shape[-2]
     return (weight * np.einsum("...ab,...ba->...", S, np.linalg.inv(information))).sum(axis=-1)
 
 
 def checked_context(context: Context) -> Context:
-    """The context with finite arrays of the right shapes, or a ValueError."""
+    """Return the context with finite arrays of correct shapes; may raise ValueError."""
     centre, half = (check_array(name, getattr(context, name), (3,)) for name in ("centre", "half"))
     racks = check_finite("racks", as_float("racks", context.racks))
     if racks.ndim < 2 or racks.shape[-1] != 6:
@@ -341,15 +340,15 @@ def checked_context(context: Context) -> Context:
 
 
 def score_of(task: PlacementTask, information: FloatArray) -> FloatArray:
-    """Score (...) of an information (..., P, 6, 6) at the task's poses."""
+    """Return the score (...) of an information (..., P, 6, 6) at the task's poses."""
     told = information + task.prior_information
     weight = np.full(task.n_poses, 1 / task.n_poses)
     return root_of(weighted_square(told, task.poses[0], task.scene.body, weight))
 
 
 def root_of(square: FloatArray) -> FloatArray:
-    """Scores (...) of their squares, or a ValueError where those are not finite."""
-    # False of NaN too.
+    """Return scores (...) from their squares; raises ValueError if they are not finite."""
+    # Also false for NaN.
     if np.count_nonzero(square > 0) < square.size or not all_finite(square):
         raise ValueError(f"information must be positive and finite, got b^2 = {square.max()}")
     return np.sqrt(square)
@@ -359,19 +358,19 @@ def root_of(square: FloatArray) -> FloatArray:
 
 
 def mounts(task: PlacementTask) -> FloatArray:
-    """Mount points (57, 3) of a room: three heights on the walls, nine on the ceiling.
+    """Return mount points (57, 3) of a room: three heights on the walls, nine on the ceiling.
 
     Raises
     ------
     ValueError
-        If the scene is no room.
+        If the scene is not a room.
     """
     region = task.scene.anchor_region
     if not isinstance(region, Walls):
         raise ValueError(f"scene must have walls for mount points, got {task.scene.name!r}")
     low, high = region.bounds()
     x, y, _ = (np.linspace(low, high, 5)).T
-    # Half way up, to the decimetre.
+    # Half of the height, rounded to a decimetre.
     heights = (low[2], np.round(0.5 * (low[2] + high[2]) - 1e-9, 1), high[2])
     points = [(a, b, z) for z in heights for b in (low[1], high[1]) for a in x]
     points += [(a, b, z) for z in heights for a in (low[0], high[0]) for b in y[1:-1]]
@@ -380,7 +379,7 @@ def mounts(task: PlacementTask) -> FloatArray:
 
 
 def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """Share (..., M) of the task's poses that each anchor sees."""
+    """Return the fraction (..., M) of the task's poses that each anchor sees."""
     in_the_way = task.obstacles(context)
     if not in_the_way:
         return np.ones(np.broadcast_shapes(anchors.shape[:-1], (*context.centre.shape[:-1], 1)))
@@ -388,6 +387,6 @@ def sight_fractions(task: PlacementTask, context: Context, anchors: FloatArray) 
 
 
 def is_legal(task: PlacementTask, anchors: FloatArray, tolerance_m: float = 1e-6) -> BoolArray:
-    """Whether each anchor (..., M) stands where the scene allows it."""
+    """Return whether each anchor (..., M) is at a legal position of the scene."""
     off = np.abs(task.scene.anchor_region.project(anchors) - anchors).max(axis=-1)
     return np.asarray(off <= tolerance_m)

@@ -1,4 +1,4 @@
-"""Poses over which a layout is judged."""
+"""Poses for the score of a layout."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from rbl_gym.placement.problem import Context, PlacementTask, positions
 
 __all__ = ["Sample", "of_context", "sample"]
 
-# Places of a zone, at least.
+# Smallest number of positions in a zone.
 _LEAST_PLACES = 64
-# Rotation of the prior that regularises the bound, and information where the tilt is known.
+# Rotation of the prior that regularizes the bound, and information of a known tilt.
 _PRIOR_ROTATION_RAD, _KNOWN = math.radians(60), 1e12
 
 
 class Sample(NamedTuple):
-    """Poses, with what each counts and what is known there before the first range.
+    """Poses with their weights and prior information.
 
     Attributes
     ----------
     rotation, places
-        (P, 3, 3) and (P, 3), metres. The turns of the body at one place follow each other.
+        Rotations (P, 3, 3) and positions (P, 3), metres. Rotations at one position are consecutive.
     weight
-        (P,), sums to 1.
+        Weights (P,) with sum 1.
     prior
         Information (P, 6, 6) of the pose error.
     zone
-        (P,) index of the zone in which the place lies.
+        Index (P,) of the zone of the position.
     turns
-        How many poses stand at each place.
+        Number of rotations at each position.
     """
 
     rotation: FloatArray
@@ -45,7 +45,7 @@ class Sample(NamedTuple):
     turns: int = 1
 
     def every(self, step: int, first: int) -> np.ndarray:
-        """Indices of the poses at every so many places of each zone, from the first on."""
+        """Return indices of the poses at every k-th position of each zone, from the first on."""
         zone = self.zone[:: self.turns]
         rank = np.empty(len(zone), dtype=np.int64)
         for index in np.unique(zone):
@@ -53,7 +53,7 @@ class Sample(NamedTuple):
         return np.flatnonzero(np.repeat(rank % step == first, self.turns))
 
     def part(self, index: np.ndarray) -> Sample:
-        """The poses of indices, with weights that leave each zone what it counts."""
+        """Return the poses of indices; the total weight of each zone does not change."""
         rotation, places, weight, prior, zone = (field[index] for field in self[:5])
         arrays = Sample(rotation, places, weight, prior, zone, self.turns)
         whole = np.bincount(self.zone, self.weight)
@@ -63,25 +63,25 @@ class Sample(NamedTuple):
 
 
 def sample(problem: Problem, n_places: int = 1024, turns: int = 1, seed: int = 0) -> Sample:
-    """Poses that fill the zones of a problem evenly, those inside obstacles left out.
+    """Return poses that fill the zones of a problem evenly, without those inside obstacles.
 
     Parameters
     ----------
     problem
-        Gives zones, obstacles and what is known before the first range.
+        Problem with zones, obstacles and the prior.
     n_places
-        How many places, shared among the zones by their weights; each zone has at least 64. Those
-        of a smaller number are among those of a larger one.
+        Number of positions, shared among the zones by weight; each zone has at least 64. A larger
+        number includes the positions of a smaller one.
     turns
-        Poses at each place: any turn, or about the vertical where the attitude of the zone is
-        level or the heading alone is estimated.
+        Number of rotations at each position: any rotations, or rotations about the vertical if the
+        attitude of the zone is level or only the heading is estimated.
     seed
-        Of the turns.
+        Seed of the rotations.
 
     Raises
     ------
     ValueError
-        Where a zone has no free place, and on numbers below 1.
+        If a zone has no free position, or a number is below 1.
     """
     n_places = check_count("n_places", n_places, least=1)
     turns = check_count("turns", turns, least=1)
@@ -100,7 +100,8 @@ def sample(problem: Problem, n_places: int = 1024, turns: int = 1, seed: int = 0
                 places,
                 np.full(n, zone.weight / (total * n * turns)),
                 np.full(n, index),
-                # Where the place stands in its zone: any part of the sample has places of all.
+                # Order of the position in its zone: any part of the sample has positions of all
+                # zones.
                 (np.arange(n) + 0.5) / n,
             )
         )
@@ -128,7 +129,7 @@ def _turns(rng: np.random.Generator, zone: Zone, batch: tuple[int, ...]) -> Floa
 
 
 def _prior(problem: Problem, zone: Zone) -> FloatArray:
-    """(6, 6): 60 degrees, half of the extent of all zones; the tilt where it is known."""
+    """Return prior information (6, 6): 60 degrees, half of the extent of all zones; known tilt."""
     extent = float(np.ptp(problem.corners(), axis=0).max())
     diagonal = np.array([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
     if zone.attitude == "heading":
@@ -137,7 +138,7 @@ def _prior(problem: Problem, zone: Zone) -> FloatArray:
 
 
 def of_context(task: PlacementTask, context: Context) -> Sample:
-    """The poses over which the environments score a layout in a context without batch axes."""
+    """Return the poses of the environments' score for a context without batch axes."""
     n = task.n_poses
     prior = np.broadcast_to(task.prior_information, (n, 6, 6))
     return Sample(

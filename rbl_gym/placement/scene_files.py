@@ -1,7 +1,7 @@
-"""Placement problems from files: a building, where anchors may stand, where the body works.
+"""Placement problems from files: a building, its mounts, and zones in which the body works.
 
-A TOML or JSON file, or a named scene with a work region, becomes a `Problem`. The format is that
-of `file_keys.FORMAT`; docs/building_files.md is its reference.
+A TOML or JSON file, or a named scene with a work region, becomes a `Problem`. The format is defined
+by `file_keys.FORMAT`; docs/building_files.md is its reference.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ def problem(
     racks: int = 0,
     seed: int = 0,
 ) -> Problem:
-    """The problem of a named scene, or of a file (.toml, .json).
+    """Return the problem of a named scene, or of a file (.toml, .json).
 
     Parameters
     ----------
     scene
         Name or path.
     n_anchors
-        How many are placed; None: what the scene or file says.
+        Number of anchors; None: that of the scene or file.
     region
-        Corners of the work region in place of the scene's volume or the file's zones.
+        Corners of the work region, instead of the scene's volume or the file's zones.
     racks, seed
-        In a named room: boxes on the floor that block sight, drawn by the seed, besides those
-        that the scene has.
+        In a named room: number of boxes on the floor that block sight, in addition to those of the
+        scene, and the seed with which they are drawn.
 
     Raises
     ------
     ValueError
-        On anything that cannot be placed; the message names the table of the file.
+        If the problem is invalid; the message names the table of the file.
     ModuleNotFoundError
         If the file has ``[[mounts]]`` and shapely is not installed.
     """
@@ -99,12 +99,12 @@ def problem(
 
 
 def load(path: str) -> dict[str, Any]:
-    """The tables of a TOML or JSON file; a ValueError names the file and what is wrong in it."""
+    """Return the tables of a TOML or JSON file; a ValueError names the file and the error."""
     data = Path(path).read_bytes()
     try:
         text = data.decode("utf-8")
         found = tomllib.loads(text) if path.lower().endswith(".toml") else json.loads(text)
-    # Both parsers recurse into what is nested.
+    # Both parsers recurse into nested values.
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from error
     return as_table(found, path)
@@ -117,16 +117,16 @@ def of_mapping(
     name: str = "file",
     folder: str | Path = ".",
 ) -> Problem:
-    """The problem that the tables of a file describe.
+    """Return the problem described by the tables of a file.
 
     Parameters
     ----------
     tables, n_anchors, region
-        As `problem`.
+        As in `problem`.
     name
-        Where the file gives none.
+        Name if the file has none.
     folder
-        Paths in the file start there.
+        Folder of relative paths in the file.
     """
     _check_tables(tables)
     lists = {key: _rows(tables, key) for key, table in FORMAT.items() if table.many}
@@ -166,14 +166,14 @@ def of_mapping(
 
 
 def with_anchors(problem: Problem, n_anchors: int) -> Problem:
-    """The same problem with another number of anchors, the fixed ones included."""
+    """Return the same problem with another total number of anchors, including fixed ones."""
     problem = problem.with_anchors(check_n_anchors(n_anchors))
     check_numbers(problem)
     return problem
 
 
 def check_n_anchors(number: Any) -> int:
-    """A number of anchors that can tell a pose, or a ValueError."""
+    """Return a number of anchors that can determine a pose; raises ValueError otherwise."""
     if isinstance(number, bool) or not isinstance(number, int):
         raise ValueError(f"the number of anchors must be a whole number, got {number!r:.80}")
     if not MIN_ANCHORS <= number <= MAX_ANCHORS:
@@ -188,7 +188,7 @@ def check_n_anchors(number: Any) -> int:
 
 
 def _check_tables(tables: Mapping[str, Any]) -> None:
-    """No table but those of the format, and those that every problem needs."""
+    """Check that there are only tables of the format, and all required ones."""
     allowed = ("name", *FORMAT, "materials", "$schema")
     for key in tables:
         if key not in allowed:
@@ -211,7 +211,7 @@ _INSTEAD = {"anchors": " or [[mounts]]", "region": " or [[zones]]"}
 
 
 def _rows(tables: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    """The values of all tables of a list."""
+    """Return the values of all tables of a list."""
     rows = tables.get(name, [])
     if not isinstance(rows, list):
         raise ValueError(f"{name} must be a list of tables, got {rows!r:.80}")
@@ -228,7 +228,7 @@ def _materials(table: Any) -> dict[str, float]:
 def _mounts(
     anchors: dict[str, Any], lists: dict[str, Any], obstacles: Obstacles, walls: WallPieces
 ) -> Region:
-    """Where anchors may stand."""
+    """Return the legal anchor positions."""
     rows, forbidden = lists["mounts"], lists["forbidden"]
     kind: Any = anchors.get("kind")
     if not rows:
@@ -274,7 +274,7 @@ def _zones(rows: list[dict[str, Any]]) -> tuple[Zone, ...]:
 
 
 def _box_zone(name: str, low: Any, high: Any) -> Zone:
-    """A box as a zone of that name; it may be flat, not empty."""
+    """Return a box as a zone with this name; it may be flat, not empty."""
     box = _named(name, Box, low=tuple(low), high=tuple(high))
     low, high = box.bounds()
     if not (high > low).any():
@@ -283,7 +283,7 @@ def _box_zone(name: str, low: Any, high: Any) -> Zone:
 
 
 def _noise(table: Any) -> tuple[NoiseLaw, float]:
-    """The law of the ranges, and what is left of a link's information without sight."""
+    """Return the noise law of the ranges, and the information fraction without line of sight."""
     values = read_table("noise", table)
     given = {key: table[key] for key in values if key in table}
     law = NOISE_LAWS[given.pop("kind", values["kind"])]
@@ -336,7 +336,7 @@ def _plan(tables: Mapping[str, Any], folder: Path) -> Plan | None:
 
 
 def _named(name: str, make: Any, *rows: Any, **arguments: Any) -> Any:
-    """What `make` makes of the arguments; its errors begin with the table's name."""
+    """Return the result of `make`; its errors begin with the table's name."""
     try:
         return make(*(rows[0] if rows else ()), **arguments)
     except ValueError as error:
@@ -344,7 +344,7 @@ def _named(name: str, make: Any, *rows: Any, **arguments: Any) -> Any:
 
 
 def _corners(name: str, region: tuple[ArrayLike, ArrayLike]) -> tuple[Any, Any]:
-    """Two corners that came as arguments."""
+    """Return two corners given as arguments."""
     found = []
     for which, corner in zip(("low", "high"), region, strict=True):
         array = check_array(f"{name} {which}", corner, (3,))

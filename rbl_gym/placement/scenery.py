@@ -1,4 +1,4 @@
-"""What the network of `amortised` sees of a placement task or of a building."""
+"""Input of the network of `amortised` from a placement task or a building."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from rbl_gym.placement.tokens import KINDS, Scenery
 
 __all__ = ["of_problem", "of_task"]
 
-# Candidates in a room with something in the way, and on mounts; places that judge the latter.
+# Numbers of candidates in a room with obstacles, and on mounts; positions to judge the latter.
 ROOM_CANDIDATES, _CANDIDATES, _PLACES = 48, 160, 64
 _KINDS = {Box: "box", Shell: "shell", Walls: "walls"}
 
 
 def of_task(task: PlacementTask, context: Context) -> Scenery:
-    """A task in contexts (...)."""
+    """Return the scenery of a task in contexts (...)."""
     scene = task.scene
     batch = context.centre.shape[:-1]
     zone = np.concatenate([context.centre, context.half, np.zeros((*batch, 4))], axis=-1)
@@ -49,7 +49,7 @@ def of_task(task: PlacementTask, context: Context) -> Scenery:
 
 
 def of_problem(problem: Problem) -> Scenery:
-    """A building."""
+    """Return the scenery of a building."""
     rows = []
     for zone in problem.zones:
         low, high = zone.bounds()
@@ -72,7 +72,7 @@ def of_problem(problem: Problem) -> Scenery:
 
 
 def _noise(noise: ranging.NoiseLaw, n_tags: int) -> FloatArray:
-    """Standard deviation at the anchor and its growth (2,): of squared ranges, that of a range."""
+    """Return standard deviation at the anchor and growth (2,); squared ranges as ranges."""
     numbers = ranging.numbers_of(noise, n_tags)
     assert numbers is not None  # the laws of scenes have numbers
     squared, first, second, _ = numbers.tolist()
@@ -80,7 +80,7 @@ def _noise(noise: ranging.NoiseLaw, n_tags: int) -> FloatArray:
 
 
 def _rows_of(obstacles: Obstacles) -> FloatArray:
-    """Boxes around obstacles, and what they leave of a link: (K, 7)."""
+    """Return boxes around obstacles, and their information fractions: (K, 7)."""
     prisms = obstacles.prisms
     boxes = np.concatenate(
         [obstacles.boxes, np.full((len(obstacles.boxes), 1), obstacles.blocked_information)], axis=1
@@ -94,7 +94,7 @@ def _rows_of(obstacles: Obstacles) -> FloatArray:
 def _scenery(
     region: Region, obstacles: Obstacles, rows: FloatArray, gain: Gain, **known: Any
 ) -> Scenery:
-    """The rest of the fields, from the region, what is in the way, and the gain."""
+    """Return the remaining fields from the region, the obstacles, and the gain."""
     zones, places = known["zones"], known["places"]
     batch = zones.shape[:-2]
     kind = _KINDS.get(type(region), "mounts")
@@ -132,7 +132,7 @@ def _scenery(
 
 
 def _spots(region: Region, obstacles: Obstacles) -> FloatArray:
-    """Legal places (C, 3) on mounts: all of a list, else some that are spread evenly."""
+    """Return legal positions (C, 3) on mounts: all of a list, else some spread evenly."""
     spots = region.listed()
     if spots is None:
         spots = _scaled_draw(region, cube(2 * _CANDIDATES))
@@ -141,7 +141,7 @@ def _spots(region: Region, obstacles: Obstacles) -> FloatArray:
 
 
 def _scaled_draw(region: Region, uniforms: FloatArray) -> FloatArray:
-    """Points of the region as if it were of unit size: what is small there is so in any unit."""
+    """Draw points of the region scaled to unit size, so that tolerances fit any unit."""
     if not isinstance(region, Mounts):
         return region.draw(uniforms)
     unit = 0.1 * float(np.ptp(region.bounds(), axis=0).max())

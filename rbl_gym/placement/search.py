@@ -1,7 +1,7 @@
-"""Layouts that look at the score: the best of many, greedy, along the gradient, hybrid, CMA-ES.
+"""Searches that use the score: best of many, greedy, along the gradient, hybrid, CMA-ES.
 
-As in `layouts` a search is a function ``(task, context, rng) -> anchors (..., M, 3)``; options
-come as keywords. CMA-ES is the `cmaes` package's (extra ``placement``).
+As in `layouts`, a search is a function ``(task, context, rng) -> anchors (..., M, 3)``. Options are
+keywords. CMA-ES is that of the package `cmaes` (extra ``placement``).
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ __all__ = [
     "greedy_swaps", "hybrid", "shared_layout",
 ]  # fmt: skip
 
-# Candidates of a greedy start, rounds of fresh ones after them, and then steps along the gradient.
+# Candidates of a greedy start, rounds of fresh ones after them, and then gradient steps.
 _CANDIDATES, _ROUNDS, _STEPS = 100, 3, 12
-# Of the hybrid search: greedy starts, turns of fresh candidates and gradient, steps of each turn.
+# Hybrid search: greedy starts, turns of fresh candidates and gradient, steps of each turn.
 _STARTS, _TURNS, _STEPS_OF_TURN = 2, 2, 20
 
 
 def best_of_random(
     task: PlacementTask, context: Context, rng: np.random.Generator, tries: int = 100
 ) -> FloatArray:
-    """The best of `tries` random layouts.
+    """Return the best of `tries` random layouts.
 
-    Arguments as `cma_es`.
+    Arguments as in `cma_es`.
     """
     check_number("tries", tries, low=1)
     batch = context.centre.shape[:-1]
@@ -51,7 +51,7 @@ def greedy(
     n_candidates: int = 150,
     swaps: bool = False,
 ) -> FloatArray:
-    """One anchor after the other where it helps most, among candidates.
+    """Add one anchor after the other, each the best among candidates.
 
     Parameters
     ----------
@@ -60,9 +60,9 @@ def greedy(
     rng
         Draws the candidates.
     candidates
-        (K, 3); None: `n_candidates` uniform over the legal places, for each context its own.
+        Candidates (K, 3); None: `n_candidates` uniform legal positions, separate for each context.
     swaps
-        Afterwards, as long as it helps, replace one anchor by one candidate.
+        Whether to replace single anchors by candidates afterwards, as long as this helps.
     """
     batch = context.centre.shape[:-1]
     if candidates is None:
@@ -83,14 +83,14 @@ def greedy(
 
 
 def greedy_swaps(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
-    """`greedy` with swaps."""
+    """Return `greedy` with swaps."""
     return greedy(task, context, rng, swaps=True)
 
 
 def _greedy(
     task: PlacementTask, context: Context, candidates: FloatArray, swaps: bool
 ) -> list[int]:
-    """Indices of the chosen candidates (K, 3) of one problem; none is chosen twice."""
+    """Return indices of the chosen candidates (K, 3) of one problem, without repetition."""
     # Information is a sum over the anchors, so each candidate's is computed once.
     parts = information(task, context, candidates[:, None])
     chosen: list[int] = []
@@ -122,17 +122,16 @@ def along_gradient(
     evaluations: int = 30,
     start: FloatArray | None = None,
 ) -> FloatArray:
-    """L-BFGS-B along the gradient of the score, from the ring; greedy and fresh candidates first
-    where something is in the way.
+    """Minimize by L-BFGS-B from the ring; with obstacles, from greedy and fresh candidates.
 
     Parameters
     ----------
     task, context, rng
-        As `cma_es`.
+        As in `cma_es`.
     evaluations
-        Of score and gradient, at most, for each context; behind greedy there are fewer.
+        Largest number of evaluations of score and gradient per context; fewer after greedy.
     start
-        Legal anchors (..., M, 3) to start from in place of those, for instance a policy's.
+        Legal anchors (..., M, 3) to start from instead, for example those of a policy.
     """
     if start is None:
         result = ring(task, context, rng)
@@ -149,10 +148,10 @@ def along_gradient(
 
 
 def hybrid(task: PlacementTask, context: Context, rng: np.random.Generator) -> FloatArray:
-    """Fresh candidates and the gradient in turns, from the ring and from greedy with swaps.
+    """Alternate fresh candidates and the gradient, from the ring and from greedy with swaps.
 
-    The search of `placement.design` over the poses of an environment's problem. It is several
-    times as long as `along_gradient`. Arguments as `cma_es`.
+    This is the search of `placement.design` over the poses of an environment's problem. It takes
+    several times as long as `along_gradient`. Arguments as in `cma_es`.
     """
     result = ring(task, context, rng)
     for where, seen in _settings(task, context):
@@ -165,7 +164,7 @@ def hybrid(task: PlacementTask, context: Context, rng: np.random.Generator) -> F
 def _settings(
     task: PlacementTask, context: Context
 ) -> Iterator[tuple[tuple[int, ...], setting.Setting]]:
-    """Each problem of a batch with its index."""
+    """Yield each problem of a batch with its index."""
     for where in np.ndindex(context.centre.shape[:-1]):
         yield where, setting.of_task(task, Context(*(field[where] for field in context)))
 
@@ -173,7 +172,7 @@ def _settings(
 def _greedy_start(
     task: PlacementTask, seen: setting.Setting, rng: np.random.Generator
 ) -> FloatArray:
-    """A layout (M, 3) by greedy with swaps, outside of obstacles."""
+    """Return a layout (M, 3) by greedy with swaps, outside of obstacles."""
     region = task.scene.anchor_region
     candidates = region.draw(rng.random((max(_CANDIDATES, 4 * task.n_anchors), 3)))
     free = candidates[~seen.obstacles.contain(candidates)]
@@ -185,7 +184,7 @@ def _greedy_start(
 def _in_turns(
     seen: setting.Setting, anchors: FloatArray, rng: np.random.Generator, turns: int, steps: int
 ) -> tuple[FloatArray, float]:
-    """A layout after `turns` of fresh candidates and of steps along the gradient; its score."""
+    """Return a layout after `turns` of fresh candidates and gradient steps, and its score."""
     score = math.inf
     for _ in range(turns):
         for _ in range(_ROUNDS):
@@ -203,22 +202,22 @@ def cma_es(
     sigma: float = 0.6,
     start: FloatArray | None = None,
 ) -> FloatArray:
-    """CMA-ES on the actions of all anchors, each context on its own.
+    """Run CMA-ES on the actions of all anchors, separately for each context.
 
     Parameters
     ----------
     task, context, rng
-        The problem, contexts (...), and the source of all randomness.
+        The problem, contexts (...), and the source of all random numbers.
     generations, population
         Their product is the number of layouts scored for each context.
     sigma
-        First standard deviation, of the action box [-1, 1].
+        Initial standard deviation, in the action box [-1, 1].
     start
-        Anchors (..., M, 3) to start from, for instance a policy's; None: near the middle.
+        Anchors (..., M, 3) to start from, for example those of a policy; None: near the centre.
 
     Returns
     -------
-    The best layout that was scored, the start among them.
+    The best layout evaluated, including the start.
 
     Raises
     ------
@@ -259,9 +258,9 @@ def shared_layout(
     population: int = 16,
     sigma: float = 0.6,
 ) -> FloatArray:
-    """One layout (M, 3) for all contexts (C,): CMA-ES on the mean log score.
+    """Return one layout (M, 3) for all contexts (C,): CMA-ES on the mean log score.
 
-    Arguments as `cma_es`.
+    Arguments as in `cma_es`.
     """
     if contexts.centre.ndim != 2:
         raise ValueError(f"contexts must have one batch axis, got {contexts.centre.shape[:-1]}")
@@ -289,7 +288,7 @@ def _strategy(mean: FloatArray, sigma: float, population: int, rng: np.random.Ge
 
 
 def _placed(task: PlacementTask, actions: FloatArray) -> FloatArray:
-    """Anchors (..., M, 3) of flat actions (..., 3 M)."""
+    """Return anchors (..., M, 3) of flat actions (..., 3 M)."""
     return task.scene.anchor_region.place(actions.reshape((*actions.shape[:-1], -1, 3)))
 
 
@@ -298,7 +297,7 @@ def _scores(task: PlacementTask, context: Context, actions: FloatArray) -> Float
 
 
 def expand(context: Context) -> Context:
-    """The contexts with one more batch axis, for several layouts of each."""
+    """Return the contexts with one more batch axis, for several layouts of each."""
     return Context(
         context.centre[..., None, :], context.half[..., None, :], context.racks[..., None, :, :]
     )
@@ -313,5 +312,5 @@ SEARCHES: dict[str, Layout] = {
     "amortised": amortised,
     "cma-es": cma_es,
 }
-# Those whose best layout counts as the best known.
+# Layouts whose best one counts as the best known.
 STRONGEST = ("gradient", "hybrid", "cma-es")

@@ -1,4 +1,4 @@
-"""What a layout is judged by: the body, the law, the poses, what is in the way, on plain arrays."""
+"""What the score of a layout depends on, on plain arrays: body, noise, poses, obstacles."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ __all__ = ["Setting", "of_problem", "of_task"]
 
 
 class Setting(NamedTuple):
-    """A placement problem as the search sees it.
+    """A placement problem in the form of the search.
 
     Attributes
     ----------
     tags
-        (N, 3) in the body frame, metres.
+        Tags (N, 3) in the body frame, metres.
     noise
-        The law of the ranges.
+        The noise law of the ranges.
     sample
-        The poses over which a layout is judged. Its prior has what anchors tell that stay.
+        The poses for the score. Their prior includes the information of fixed anchors.
     region
-        Where anchors may stand.
+        Legal anchor positions.
     obstacles
-        What stands in the way. Sight is judged from the anchor to the body's origin.
+        Obstacles. The line of sight is that from the anchor to the body's origin.
     gain
-        Limit of the range, and field of view.
+        Reach and field of view of the anchors.
     """
 
     tags: FloatArray
@@ -47,7 +47,7 @@ class Setting(NamedTuple):
     gain: Gain = EVERYWHERE
 
     def sight(self, anchors: FloatArray) -> FloatArray:
-        """Share (P, M, N) of its information that what stands in the way leaves each link."""
+        """Return the information fraction (P, M, N) of each link behind the obstacles."""
         sample, links = self.sample, (len(anchors), len(self.tags))
         if not self.obstacles:
             return np.broadcast_to(1.0, (len(sample.places), *links))
@@ -56,7 +56,7 @@ class Setting(NamedTuple):
         return np.broadcast_to(share, (*share.shape[:-2], *links))
 
     def parts(self, anchors: FloatArray) -> FloatArray:
-        """Information (M, P, 6, 6) of each anchor alone at each pose."""
+        """Return the information (M, P, 6, 6) of each anchor alone at each pose."""
         sample = self.sample
         share = np.moveaxis(self.sight(anchors), 1, 0)[..., None, :]
         if self.gain:
@@ -67,20 +67,20 @@ class Setting(NamedTuple):
         return bounds.information_at(anchors[:, None, None], self.tags, *places, self.noise, share)
 
     def told(self, anchors: FloatArray) -> FloatArray:
-        """Information (P, 6, 6) of a layout and of the prior."""
+        """Return the information (P, 6, 6) of a layout and of the prior."""
         return self.parts(anchors).sum(axis=0) + self.sample.prior
 
     def squares(self, information: FloatArray) -> FloatArray:
-        """Weighted mean square (...) of b, of information (..., P, 6, 6) with the prior."""
+        """Return the weighted mean (...) of b^2, for information (..., P, 6, 6) with the prior."""
         sample = self.sample
         return weighted_square(information, sample.rotation, self.tags, sample.weight)
 
     def score(self, anchors: FloatArray) -> float:
-        """The score of a layout (M, 3), metres."""
+        """Return the score of a layout (M, 3), metres."""
         return float(np.sqrt(self.squares(self.told(anchors))))
 
     def score_and_gradient(self, anchors: FloatArray) -> tuple[float, FloatArray]:
-        """Score of a layout, and its derivative (M, 3) by the anchors."""
+        """Return the score of a layout, and its derivative (M, 3) by the anchors."""
         normals = self.region.normal(anchors) if self.gain else np.zeros(anchors.shape)
         law = ranging.numbers_of(self.noise, len(self.tags))
         assert law is not None  # the laws of scenes have numbers
@@ -96,26 +96,26 @@ class Setting(NamedTuple):
         return float(score), gradient
 
     def legal(self, points: FloatArray) -> BoolArray:
-        """Which points (..., 3) lie in the region and outside of what stands in the way."""
+        """Return which points (..., 3) lie in the region and outside of obstacles."""
         off = np.abs(self.region.project(points) - points).max(axis=-1)
         return (off <= 1e-6) & ~self.obstacles.contain(points)
 
     @property
     def is_smooth(self) -> bool:
-        """Whether the score has a gradient everywhere and anchors can go everywhere along it.
+        """Whether the score is differentiable and anchors can follow its gradient everywhere.
 
-        Nothing is in the way, nothing is out of reach, and the faces meet.
+        This holds without obstacles and limits of reach, if the faces are connected.
         """
         plain = isinstance(self.region, Box | Shell | Walls)
         return plain and not self.obstacles and not self.gain
 
     def part(self, index: np.ndarray) -> Setting:
-        """The setting over the poses of indices."""
+        """Return the setting for the poses of indices."""
         return self._replace(sample=self.sample.part(index))
 
 
 def of_task(task: PlacementTask, context: Context) -> Setting:
-    """The setting of an environment's problem, a context without batch axes."""
+    """Return the setting of an environment's problem, a context without batch axes."""
     scene, poses = task.scene, of_context(task, context)
     setting = Setting(
         scene.body, scene.noise, poses, scene.anchor_region, task.obstacles(context), scene.gain
@@ -124,7 +124,7 @@ def of_task(task: PlacementTask, context: Context) -> Setting:
 
 
 def of_problem(problem: Problem, sample: Sample) -> Setting:
-    """The setting of a problem over poses of it, its fixed anchors in the prior."""
+    """Return the setting of a problem for its poses, with its fixed anchors in the prior."""
     setting = Setting(
         problem.tags, problem.noise, sample, problem.mounts, problem.obstacles, problem.gain
     )
@@ -132,7 +132,7 @@ def of_problem(problem: Problem, sample: Sample) -> Setting:
 
 
 def _with_fixed(setting: Setting, fixed: FloatArray) -> Setting:
-    """The setting with what anchors (F, 3) tell that stay in the prior."""
+    """Return the setting with the information of fixed anchors (F, 3) in the prior."""
     if not len(fixed):
         return setting
     return setting._replace(sample=setting.sample._replace(prior=setting.told(fixed)))

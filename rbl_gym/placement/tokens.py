@@ -1,7 +1,7 @@
-"""A placement problem as tokens: rows of numbers without units, for the network of `amortised`.
+"""A placement problem as tokens: rows of dimensionless numbers, for the network of `amortised`.
 
-Lengths are divided by a length of the problem itself, `Scenery.unit`, and counted from the middle
-of where the body works. The first number of a row is 1; rows of zeros are padding.
+Lengths are divided by a length of the problem, `Scenery.unit`, and relative to the centre of the
+zones. The first number of a row is 1; rows of zeros are padding.
 """
 
 from __future__ import annotations
@@ -14,52 +14,52 @@ from rbl_gym.checks import FloatArray
 
 __all__ = ["KINDS", "Scenery", "Tokens", "tokens_of"]
 
-# Kinds of regions. "mounts" is any other: there an anchor stands at one of the candidates.
+# Kinds of regions. "mounts" is any other, with candidates for the anchors.
 KINDS = ("box", "shell", "walls", "mounts")
-# Mirror images of a problem, itself the first.
+# Mirror images of a problem, itself first.
 IMAGES = 8
-# Where a candidate sees the body: cells of the plan of where that works, in x and in y.
+# Cells of the plan of the zones, in x and in y, for the views of candidates.
 _CELLS = 3
-# Lengths that are zero, and noise that does not grow, count as so much of the unit.
+# Lengths of zero, and noise that does not grow, are replaced by this fraction of the unit.
 _LEAST = 1e-6
 
 
 class Scenery(NamedTuple):
-    """What a layout is judged by, as arrays with leading axes; lengths in any unit.
+    """What the score of a layout depends on, as arrays with leading axes; lengths in any unit.
 
     Attributes
     ----------
     kind
-        Of the region: an index of `KINDS`.
+        Kind of the region: an index of `KINDS`.
     low, high
         Corners (..., 3) of the box around the region.
     inner
-        (...): inner radius of a shell about the origin; else 0.
+        Inner radius (...) of a shell around the origin; otherwise 0.
     zones
-        (..., Z, 10): where the body works. Centre and half size, weight, and 1 for the attitude
-        of `building.ATTITUDES`. Rows of zeros are padding.
+        Zones (..., Z, 10): centre and half size, weight, and one-hot attitude of
+        `building.ATTITUDES`. Rows of zeros are padding.
     obstacles
-        (..., K, 7): centre and half size of boxes, and what they leave of a link. Rows of zeros are
-        padding.
+        Obstacles (..., K, 7): centre and half size of boxes, and their information fraction. Rows
+        of zeros are padding.
     fixed
-        (..., F, 3): anchors that stay.
+        Fixed anchors (..., F, 3).
     tags
-        (..., N, 3) in the body frame.
+        Tags (..., N, 3) in the body frame.
     noise
-        (..., 2): standard deviation of a range at the anchor, and its growth with the range.
+        Standard deviation of a range at the anchor, and its growth with the range (..., 2).
     gain
-        (..., 4): of `Gain.numbers`.
+        `Gain.numbers` (..., 4).
     extent
-        (...): largest extent of where the body may be, of which the prior's position is half.
+        Largest extent (...) of the zones; the prior's position standard deviation is half of it.
     nearest
-        (...): from the middle of where the body works to the nearest place of the region.
+        Distance (...) from the centre of the zones to the nearest position of the region.
     even
-        Whether the poses fill the zones evenly; else they are those of a placement task.
+        Whether the poses fill the zones evenly; otherwise they are those of a placement task.
     places
-        (..., P, 3): of the body, over which candidates are judged.
+        Positions (..., P, 3) of the body for judging candidates.
     candidates, normals, seen
-        Legal places (..., C, 3), their normals, and the share (..., P, C) of a link's information
-        at each. C may be 0.
+        Legal positions (..., C, 3), their normals, and the information fractions (..., P, C) of
+        their links. C may be 0.
     """
 
     kind: int
@@ -81,16 +81,16 @@ class Scenery(NamedTuple):
     seen: FloatArray
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
-        """Corners (..., 3) of the box around all zones."""
+        """Return corners (..., 3) of the box around all zones."""
         centre, half, real = self.zones[..., :3], self.zones[..., 3:6], self.zones[..., 6:7] > 0
         low = np.where(real, centre - half, np.inf).min(axis=-2)
         return low, np.where(real, centre + half, -np.inf).max(axis=-2)
 
     def frame(self) -> tuple[FloatArray, FloatArray]:
-        """Origin (..., 3) and unit (...): the middle of where the body works, and a length.
+        """Return origin (..., 3) and unit (...): the centre of the zones, and a length.
 
-        The length is how far anchors stand from there: the root of the squares of the half
-        width and of the way to the nearest legal place.
+        The length is a typical anchor distance: the root of the sum of squares of the half width
+        and of the distance to the nearest legal position.
         """
         low, high = self.corners()
         origin, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -100,9 +100,9 @@ class Scenery(NamedTuple):
 
 
 def turned(seen: Scenery, image: int) -> Scenery:
-    """One of the eight mirror images of a problem: of x, of y, and of the two for each other.
+    """Return one of the eight mirror images of a problem: x, y mirrored, and both exchanged.
 
-    The body, whose attitude may be any, stays as it is.
+    The body does not change, because its attitude may be any.
     """
 
     def points(x: FloatArray) -> FloatArray:
@@ -126,7 +126,7 @@ def turned(seen: Scenery, image: int) -> Scenery:
 
 
 def turned_points(points: FloatArray, image: int, back: bool = False) -> FloatArray:
-    """Points (..., 3) in a mirror image of `turned`, or back from it."""
+    """Return points (..., 3) in a mirror image of `turned`, or back from it."""
     signs = np.array([1.0 - 2 * (image & 1), 1.0 - (image & 2), 1.0])
     axes = [1, 0, 2] if image & 4 else [0, 1, 2]
     return points[..., axes] * signs if not back else (points * signs)[..., axes]
@@ -138,9 +138,9 @@ class Tokens(NamedTuple):
     Attributes
     ----------
     world
-        (..., 1, G): region, body, noise.
+        Region, body and noise (..., 1, G).
     zones, obstacles, fixed, candidates
-        (..., Z, .), (..., K, .), (..., F, .), (..., C, .).
+        Rows (..., Z, .), (..., K, .), (..., F, .), (..., C, .).
     """
 
     world: FloatArray
@@ -151,7 +151,7 @@ class Tokens(NamedTuple):
 
 
 def tokens_of(seen: Scenery, count: int) -> Tokens:
-    """The tokens of a problem in which `count` anchors are placed."""
+    """Return the tokens of a problem in which `count` anchors are placed."""
     origin, unit = seen.frame()
     at, by = origin[..., None, :], unit[..., None, None]
     real = (seen.zones[..., 6:7] > 0).astype(float)
@@ -178,7 +178,7 @@ def tokens_of(seen: Scenery, count: int) -> Tokens:
 
 
 def _world(seen: Scenery, count: int, origin: FloatArray, unit: FloatArray) -> FloatArray:
-    """Numbers (..., G) of the region, the body and the noise."""
+    """Return numbers (..., G) of the region, the body and the noise."""
     batch = origin.shape[:-1]
     by = unit[..., None]
     kind = np.broadcast_to(np.eye(len(KINDS))[seen.kind], (*batch, len(KINDS)))
@@ -220,7 +220,7 @@ def _world(seen: Scenery, count: int, origin: FloatArray, unit: FloatArray) -> F
 
 
 def _views(seen: Scenery) -> FloatArray:
-    """What share of its information a candidate has (..., C, 10): in each cell, and over all."""
+    """Return information fractions (..., C, 10) of candidates: in each cell, and over all."""
     low, high = seen.corners()
     size = np.maximum(high - low, 1e-12 * np.abs(high - low).max(axis=-1, keepdims=True))
     share = ((seen.places - low[..., None, :]) / size[..., None, :])[..., :2]
@@ -234,12 +234,12 @@ def _views(seen: Scenery) -> FloatArray:
 
 
 def _place(x: FloatArray) -> FloatArray:
-    """Coordinates (..., 3) near and far as (..., 6)."""
+    """Return coordinates (..., 3) on a near and a far scale as (..., 6)."""
     return _joined(np.minimum(np.maximum(x, -3.0), 3.0), 0.5 * np.arcsinh(x))
 
 
 def _size(x: FloatArray) -> FloatArray:
-    """Half sizes (..., 3), small and large, as (..., 6)."""
+    """Return half sizes (..., 3) on a small and a large scale as (..., 6)."""
     return _joined(0.5 * np.arcsinh(x), 0.2 * np.log10(x + 1e-3))
 
 
