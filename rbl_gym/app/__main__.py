@@ -1,4 +1,4 @@
-"""``python -m rbl_gym.app`` is ``rbl-gym``."""
+"""``python -m rbl_gym.app`` runs ``rbl-gym``."""
 
 import sys
 

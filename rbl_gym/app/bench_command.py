@@ -1,4 +1,4 @@
-"""The commands bench and rerun."""
+"""The commands rbl-gym bench and rerun."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rbl_gym.studies import backends
 
 
 def add_bench(commands: Any) -> None:
-    """The parser of ``rbl-gym bench``."""
+    """Add the parser of ``rbl-gym bench``."""
     bench = commands.add_parser(
         "bench",
         help="the leaderboard: every filter on every scene",
@@ -58,7 +58,7 @@ def add_bench(commands: Any) -> None:
 
 
 def add_rerun(commands: Any) -> None:
-    """The parser of ``rbl-gym rerun``."""
+    """Add the parser of ``rbl-gym rerun``."""
     rerun = commands.add_parser(
         "rerun",
         help="the records of a bench once more, and what differs",

@@ -1,4 +1,4 @@
-"""The page of `rbl-gym bench`: what stress does to every filter, and all rows to sort."""
+"""The HTML page of `rbl-gym bench`: the effect of stress on every filter, and all rows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rbl_gym.app import bench_report, page
 from rbl_gym.studies.bench.leaderboard import is_recording
 
 _COLUMNS = 4
-# Ratios to the bound beyond this are one colour: the filter is lost.
+# Ratios to the bound above this have one colour: the filter is lost.
 _LOST_RATIO = 30.0
 _HEADINGS = (
     "scene",
@@ -35,7 +35,7 @@ _HEADINGS = (
 
 
 def bench(result: dict[str, Any]) -> str:
-    """The page of a result of `leaderboard.summary`."""
+    """Return the page of a result of `leaderboard.summary`."""
     rows = [
         row | {"microseconds_per_step": microseconds}
         for row, microseconds in zip(result["rows"], result["microseconds_per_step"], strict=True)
@@ -66,12 +66,12 @@ def bench(result: dict[str, Any]) -> str:
 
 
 def _trials(rows: list[dict[str, Any]]) -> str:
-    """What stands behind the rows: trials of scenes, recordings, or both."""
+    """Describe the data of the rows: trials of scenes, recordings, or both."""
     return " or ".join(dict.fromkeys(bench_report.trials(row) for row in rows))
 
 
 def _maps(rows: list[dict[str, Any]]) -> go.Figure:
-    """A map for each scene: filters by conditions, coloured by the ratio to the bound."""
+    """Return a map per scene: filters by conditions, coloured by the ratio to the bound."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     filters = list(dict.fromkeys(row["filter"] for row in rows))[::-1]
     conditions = list(dict.fromkeys(row["condition"] for row in rows))
@@ -128,7 +128,7 @@ def _maps(rows: list[dict[str, Any]]) -> go.Figure:
 
 
 def _cells(row: dict[str, Any]) -> list[Any]:
-    """A row of the table; what a filter could not do is "-", with its remark."""
+    """Return a row of the table; "-" with a remark if a filter could not run."""
     head = [row["scene"], row["condition"], row["filter"]]
     remark = row["message"] or (
         f"rank {row['rank']} of {row['states']}" if row["rank"] != row["states"] else None

@@ -23,13 +23,13 @@ _HEADINGS = (
     "worse than best, 95 %",
     "us / step",
 )
-# From here on a column would show nothing but digits.
+# Beyond this number a column would contain only digits.
 _HUGE = 1e4
 _STRESS = ("nlos", "lost-links", "noise-x2", "anchor-off", "tag-off")
 
 
 def print_bench(result: dict[str, Any]) -> None:
-    """One table for each scene: the nominal condition in full, then the stress columns."""
+    """Print a table per scene: the nominal condition in full, then the stress columns."""
     console = new_console(170)
     rows: dict[str, dict[str, dict[str, Any]]] = {}
     for row, microseconds in zip(result["rows"], result["microseconds_per_step"], strict=True):
@@ -92,7 +92,7 @@ def _nominal(scene: str, first: dict[str, Any], by_filter: dict[str, dict[str, A
 
 
 def _worse(ran: dict[str, dict[str, Any]]) -> list[str]:
-    """Intervals of what each filter's tag error is above the best one's."""
+    """Return intervals of each filter's excess tag error over the best filter."""
     parts = {name: row["difference"].get("tags_m") for name, row in ran.items()}
     shown = {name: part for name, part in parts.items() if part and part["best"] != name}
     decimals = decimals_of([part["high"] for part in shown.values()], 2)
@@ -118,7 +118,7 @@ def _stressed(scene: str, by_filter: dict[str, dict[str, Any]], stress: list[str
 
 
 def _stress(rows: list[dict[str, Any]]) -> list[str]:
-    """A column: tag error, ANEES, trials lost; or why there are none."""
+    """Return a column: tag error, ANEES, lost trials; or why there are none."""
     ran = [row for row in rows if "tags_m" in row]
     pairs = zip(fixed([row["tags_m"]["rmse"] for row in ran]), _anees(ran), strict=True)
     texts = iter([f"{error}  {honesty}" for error, honesty in pairs])
@@ -131,7 +131,7 @@ def _stress(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
-    """What a row of figures cannot say."""
+    """Return remarks that explain a row."""
     first = next(iter(conditions.values()))
     lines = []
     if first["status"] == "unobservable":
@@ -149,7 +149,7 @@ def _remarks(name: str, conditions: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def _tags(conditions: dict[str, Any], condition: str) -> float:
-    """Order of a filter: its tag RMSE, infinite where it has none."""
+    """Return the sort key of a filter: its tag RMSE, infinite without one."""
     value = conditions.get(condition, {}).get("tags_m", {}).get("rmse")
     return float("inf") if value is None else value
 
@@ -159,7 +159,7 @@ def _rank(row: dict[str, Any]) -> str:
 
 
 def _anees(rows: list[dict[str, Any]]) -> list[str]:
-    """A column with its verdicts as marks, or a space where there is none."""
+    """Return an ANEES column with verdict marks, or a space without a verdict."""
     marks = {"optimistic": "+", "pessimistic": "-", "consistent": " "}
     texts = fixed([row["anees"] for row in rows])
     return [text + marks[row["verdict"]] for text, row in zip(texts, rows, strict=True)]
@@ -174,7 +174,7 @@ def _number(value: float | None, form: str) -> str:
 
 
 def fixed(column: Sequence[float | None]) -> list[str]:
-    """Numbers with as many decimals as three digits of the smallest take; None is "-"."""
+    """Format numbers with the decimals of three digits of the smallest one; None is "-"."""
     decimals = decimals_of(column, 3)
     return [
         "-" if value is None else f"{value:.2e}" if abs(value) >= _HUGE else f"{value:.{decimals}f}"
@@ -183,18 +183,18 @@ def fixed(column: Sequence[float | None]) -> list[str]:
 
 
 def decimals_of(column: Sequence[float | None], digits: int) -> int:
-    """Decimals that show so many digits of the smallest number, zeros apart."""
+    """Return the decimals that show this many digits of the smallest nonzero number."""
     sizes = [abs(value) for value in column if value]
     return max(0, digits - 1 - math.floor(math.log10(min(sizes)))) if sizes else 0
 
 
 def trials(row: Mapping[str, Any]) -> str:
-    """How many trials stand behind a row: of a recording there is one."""
+    """Return the number of trials of a row; a recording counts as one."""
     return "a recording" if is_recording(row["spec"]) else f"{row['trials']} trials"
 
 
 def print_rerun(result: dict[str, Any]) -> None:
-    """How many records came out the same, and what differs."""
+    """Print how many records were reproduced, and which ones differ."""
     console = new_console()
     console.print(f"{result['identical']} of {result['records']} records are identical")
     for name, (before, after) in (*result["versions"].items(), *result["sources"].items()):

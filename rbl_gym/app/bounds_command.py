@@ -1,4 +1,4 @@
-"""The command bounds."""
+"""The command rbl-gym bounds."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rbl_gym.app.terminal import add_json, add_trials, progress, write_json
 
 
 def add_bounds(commands: Any) -> None:
-    """The parser of ``rbl-gym bounds``."""
+    """Add the parser of ``rbl-gym bounds``."""
     bounds = commands.add_parser(
         "bounds",
         help="what an inertial sensor, a better survey, calibrated links would buy",
@@ -46,7 +46,7 @@ def _bounds(options: argparse.Namespace) -> int:
 
 
 def _print(result: dict[str, Any]) -> None:
-    """One table for position, one for rotation: what is not known by what tells the motion."""
+    """Print a table for position and one for rotation: unknowns by motion sensor."""
     console = new_console()
     rows = {(row["motion"], row["unknown"]): row for row in result["rows"]}
     motions = list(dict.fromkeys(motion for motion, _ in rows))

@@ -11,7 +11,7 @@ from rbl_gym.app.terminal import add_json, offset, print_files, progress, window
 
 
 def add_calibrate(commands: Any) -> None:
-    """The parser of ``rbl-gym calibrate``."""
+    """Add the parser of ``rbl-gym calibrate``."""
     calibrate = commands.add_parser(
         "calibrate",
         help="biases, lever arms, clock and noise by truth; without truth the anchors' places",
@@ -194,7 +194,7 @@ def _links(options: argparse.Namespace, given: dict[str, Any]) -> Any:
 
 
 def _inertial(options: argparse.Namespace, figures: dict[str, Any]) -> dict[str, str]:
-    """Axes and clock of the inertial sensor, put into the figures; the file that was written."""
+    """Add axes and clock of the inertial sensor to the figures; return the written file."""
     from rbl_gym.studies import calibrate
 
     longest = max(read_runs(options).values(), key=lambda run: len(run.times))

@@ -16,12 +16,12 @@ _MOST_POINTS = 20_000
 
 @styled
 def figure_of(found: CalibratedLinks | SurveyedAnchors) -> Figure:
-    """The picture of either kind of calibration."""
+    """Return the picture of either kind of calibration."""
     return _links_figure(found) if isinstance(found, CalibratedLinks) else _anchors_figure(found)
 
 
 def _anchors_figure(found: SurveyedAnchors) -> Figure:
-    """Anchors with their ellipses, magnified, and the body's path; residuals by anchor."""
+    """Draw anchors with enlarged ellipses, and the body's path; residuals by anchor."""
     figure = new_figure(12, 5.6)
     left, right = figure.subplots(1, 2, width_ratios=[1.2, 1])
     state, cov = found.survey.state, found.survey.covariance
@@ -53,7 +53,7 @@ def _anchors_figure(found: SurveyedAnchors) -> Figure:
 
 
 def _links_figure(found: CalibratedLinks) -> Figure:
-    """Biases of the links, residuals over distance, their histogram; tags in the body frame."""
+    """Draw link biases, residuals over distance, their histogram, and tags in the body frame."""
     ends = []
     if found.directions is not None:
         law = found.directions.law
@@ -114,7 +114,7 @@ def _histogram(axes: Any, found: CalibratedLinks) -> None:
 
 
 def _directions(axes: Any, found: CalibratedLinks, end: str) -> None:
-    """Bias over the bearing of the ray at one end, a line a node."""
+    """Draw the bias over the bearing of the ray at one end, a line per node."""
     assert found.directions is not None
     law = found.directions.law
     field = law.anchors if end == "anchor" else law.tags

@@ -9,7 +9,7 @@ from rbl_gym.app.tables import new_console, new_table
 
 
 def print_calibrated(figures: dict[str, Any]) -> None:
-    """Links, or anchors, and what is not determined."""
+    """Print links or anchors, and undetermined quantities."""
     (_print_links if "links" in figures else _print_anchors)(figures)
 
 
@@ -35,7 +35,7 @@ def _print_anchors(figures: dict[str, Any]) -> None:
 
 
 def _print_links(figures: dict[str, Any]) -> None:
-    """Links, tags, clock, and what is not determined."""
+    """Print links, tags, clock, and undetermined quantities."""
     console = new_console()
     title = f"{figures['ranges']} ranges, biases by {figures['biases']}"
     table = new_table(title)
@@ -77,7 +77,7 @@ def _print_links(figures: dict[str, Any]) -> None:
 
 
 def _sentences(figures: dict[str, Any]) -> list[str]:
-    """What stands beside the tables."""
+    """Return the sentences that accompany the tables."""
     said = []
     if clock := figures["time_offset"]:
         said.append(

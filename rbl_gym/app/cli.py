@@ -1,4 +1,4 @@
-"""The command line: its parser, made of one module for each command, and its exit status."""
+"""The command line: a parser with one module per command, and the exit status."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from rbl_gym.studies.extras import MissingExtraError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit status (2: what came in is wrong, with a message)."""
+    """Run the command line; return the exit status (2: invalid input, with a message)."""
     options = _parser().parse_args(arguments)
-    # MODULE:FACTORY may be a file of the working folder, which only `python -m` would search.
+    # MODULE:FACTORY may be in a file of the working folder, which only `python -m` would search.
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:

@@ -1,4 +1,4 @@
-"""What a log says of itself: NIS and residuals, on the terminal, in pictures and in pages."""
+"""Consistency of a log, NIS and residuals: on the terminal, in pictures and in pages."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from rbl_gym.studies.replay import Replayed, nis_curve
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Rows of a table on the terminal: of more anchors or tags those with the largest residuals.
+# Largest number of rows of a terminal table: those with the largest residuals.
 _ROWS = 12
 _HONEST, _BAND = "#1c7ed6", "#868e96"
 _HEADINGS = ("ranges", "mean (m)", "spread (m)", "refused (%)")
 
 
 def print_consistency(console: Any, result: dict[str, Any]) -> None:
-    """NIS and a table of the residuals of anchors and tags; nothing where they were not made."""
+    """Print NIS and a table of the residuals of anchors and tags, if they were computed."""
     if "tuned" in result:
         console.print(tuned_text(result["tuned"]))
     found = result.get("consistency")
@@ -43,7 +43,7 @@ def print_consistency(console: Any, result: dict[str, Any]) -> None:
 
 
 def tuned_text(found: dict[str, Any]) -> str:
-    """What was tuned, as options that can be repeated."""
+    """Return the tuned values as command line options."""
     return (
         f"tuned on {found['epochs']} epochs of the first {found['seconds']:.1f} s: "
         f"{found['options']} (log-likelihood per range {found['log_likelihood']:.3f}, with the "
@@ -66,7 +66,7 @@ def _cells(row: dict[str, Any]) -> list[str]:
 
 
 def draw_nis(axes: Axes, replayed: Replayed) -> None:
-    """NIS per degree of freedom over time, with the band of an honest filter."""
+    """Draw NIS per degree of freedom over time, with the band of a consistent filter."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     found = replayed.track.innovations
@@ -88,7 +88,7 @@ def draw_nis(axes: Axes, replayed: Replayed) -> None:
 
 
 def consistency_parts(replayed: Replayed) -> list[str]:
-    """The section of a page: NIS over time, heat maps of the links, tables; none without them."""
+    """Return page parts: NIS over time, heat maps of the links, tables; empty without data."""
     from rbl_gym.app import page
 
     found = replayed.figures.get("consistency")
@@ -132,7 +132,7 @@ def consistency_parts(replayed: Replayed) -> list[str]:
 
 
 def _charts(replayed: Replayed) -> Any:
-    """NIS over time; mean residual and share refused of every link."""
+    """Return charts of NIS over time, mean residual and rejected fraction of every link."""
     from plotly import graph_objects as go
     from plotly.subplots import make_subplots
 

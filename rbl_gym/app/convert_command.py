@@ -18,7 +18,7 @@ _KINDS = {
 
 
 def add_convert(commands: Any) -> None:
-    """The parser of ``rbl-gym convert``."""
+    """Add the parser of ``rbl-gym convert``."""
     convert = commands.add_parser(
         "convert",
         help="a bag of ROS 1 or ROS 2, or an MCAP file, as files for replay",
@@ -77,7 +77,7 @@ def _convert(options: argparse.Namespace) -> int:
 
 
 def _table(text: str) -> dict[str, Any]:
-    """``KEY=VALUE,...``; a part without ``=`` is one more value, the first one a topic."""
+    """Parse ``KEY=VALUE,...``; a part without ``=`` is another value, or first a topic."""
     table: dict[str, Any] = {}
     key = "topic"
     for part in text.split(","):

@@ -1,4 +1,4 @@
-"""What a conversion found, on the terminal."""
+"""Results of a conversion on the terminal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rbl_gym.app.tables import new_console, new_table
 
 
 def print_topics(topics: Sequence[dict[str, Any]]) -> None:
-    """The topics of a log."""
+    """Print the topics of a log."""
     table = new_table()
     for heading in ("topic", "type"):
         table.add_column(heading)
@@ -23,7 +23,7 @@ def print_topics(topics: Sequence[dict[str, Any]]) -> None:
 
 
 def print_fields(fields: Sequence[tuple[str, str]]) -> None:
-    """Field paths of a message and their first values."""
+    """Print field paths of a message and their first values."""
     table = new_table()
     for heading in ("field", "in the first message"):
         table.add_column(heading)
@@ -33,7 +33,7 @@ def print_fields(fields: Sequence[tuple[str, str]]) -> None:
 
 
 def print_convert(result: dict[str, Any]) -> None:
-    """What was read, written and dropped, and the command that follows."""
+    """Print what was read, written and dropped, and the next command."""
     console = new_console()
     table = new_table()
     for heading in ("", "topic", "type"):

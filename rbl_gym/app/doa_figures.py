@@ -1,4 +1,4 @@
-"""Picture and tables of the DOA paper's experiment."""
+"""Picture and tables of the experiment of the DOA paper."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PAPERS = "R = I"  # the setting of Fig. 2 and Table 1
 
 @styled
 def doa2019_figure(result: dict[str, Any]) -> Figure:
-    """RMSE of R and t over the noise with the bound (Fig. 2), and successes; a row a setting."""
+    """Draw RMSE of R and t over the noise with the bound (Fig. 2), and successes, per setting."""
     settings = result["settings"]
     figure = new_figure(12, 3.3 * len(settings) + 0.6)
     axes = figure.subplots(len(settings), 3, squeeze=False)
@@ -62,7 +62,7 @@ def _successes(ax: Any, label: str, data: dict[str, Any], table_1: dict[str, Any
 
 
 def print_doa2019(result: dict[str, Any]) -> None:
-    """Table 1 beside ours, then accuracy, success and time of every method and setting."""
+    """Print Table 1 with ours, then accuracy, success and time of every method and setting."""
     out = new_console()
     _print_table_1(out, result)
     for label, data in result["settings"].items():

@@ -1,4 +1,4 @@
-"""Pictures, by matplotlib without a display."""
+"""Pictures, drawn by matplotlib without a display."""
 
 from __future__ import annotations
 
@@ -34,31 +34,31 @@ STATIC_COLOURS = {
     "ML": "#1b7f5c",
     "ML, marginalised": "#7fb800",
 }
-# A belief is centimetres wide on a track of tens of metres.
+# Beliefs are centimetres wide on a track of tens of metres.
 _MAGNIFY = 20
 
 
-# A decorator for what draws: matplotlib's settings outside of it stay the user's.
+# Decorator of drawing functions: the user's matplotlib settings do not change outside.
 styled = matplotlib.rc_context(
     {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
 )
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure."""
+    """Return an empty figure."""
     return Figure(figsize=(width, height), layout="constrained")
 
 
 @styled
 def save_figure(figure: Figure, path: str) -> None:
-    """Write a figure, making its folder."""
+    """Write a figure; create its folder."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
 
 
 @styled
 def camsap2013_figure(result: dict[str, Any], example: Example) -> Figure:
-    """Figs 2 and 3 of the tracking paper, NEES, and one trial or ET-KF's trade beside them."""
+    """Draw Figs 2 and 3 of the tracking paper, NEES, and one trial or the trade-off of ET-KF."""
     figure = new_figure(14, 7.2)
     axes = figure.subplots(2, 3, width_ratios=[1.05, 1, 1])
     _trajectory(axes[0, 0], example)
@@ -71,7 +71,7 @@ def camsap2013_figure(result: dict[str, Any], example: Example) -> Figure:
 
 
 def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bool = True) -> None:
-    """RMSE of rotation and translation (Fig. 2), MAE (Fig. 3), mean NEES; each over the steps."""
+    """Draw RMSE of rotation and translation (Fig. 2), MAE (Fig. 3), mean NEES over the steps."""
     panels = (
         ("rotation_rmse", "rotation RMSE (Frobenius)", "Fig. 2, rotation: "),
         ("translation_rmse_m", "translation RMSE [m]", "Fig. 2, translation: "),
@@ -121,7 +121,7 @@ def tracking_curves(axes: Sequence[Any], result: dict[str, Any], *, of_paper: bo
 
 
 def _trajectory(axes: Any, example: Example) -> None:
-    """The track seen from above, the beliefs of a magnified error around it."""
+    """Draw the track in plan, with enlarged beliefs around it."""
     episode = example.trials.episode
     truth = episode.translation[0]
     axes.plot(*truth[:, :2].T, color="0.6", lw=1, zorder=1)
@@ -150,7 +150,7 @@ def _trajectory(axes: Any, example: Example) -> None:
 
 
 def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
-    """ET-KF's error against how often it projects, a point for every threshold."""
+    """Draw ET-KF's error against how often it projects, a point for every threshold."""
     rates = [100 * row["trigger_rate"] for row in trade]
     errors = [row["rotation_rmse"] for row in trade]
     axes.plot(rates, errors, "o-", ms=4, lw=1.2, color=COLOURS["ET-KF"])
@@ -170,7 +170,7 @@ def _trade(axes: Any, trade: list[dict[str, float]]) -> None:
 
 
 def _errors(axes: Any, example: Example) -> None:
-    """The same trial's rotation error about one axis inside its 3-sigma band."""
+    """Draw the same trial's rotation error about one axis within its 3-sigma band."""
     steps = np.arange(1, len(example.trials.measurements) + 1)
     for name, belief in example.beliefs.items():
         errors = np.rad2deg(example.errors[name][:, 2])
@@ -187,7 +187,7 @@ def _errors(axes: Any, example: Example) -> None:
 
 @styled
 def static_figure(result: dict[str, Any]) -> Figure:
-    """Figs 2 and 3 of the static paper over the reference range, a column for every setting."""
+    """Draw Figs 2 and 3 of the static paper over the reference range, a column per setting."""
     settings = result["settings"]
     figure = new_figure(3.4 * len(settings) + 1.2, 6.6)
     axes = figure.subplots(2, len(settings), squeeze=False, sharex=True)
@@ -198,7 +198,7 @@ def static_figure(result: dict[str, Any]) -> Figure:
 
 @styled
 def slides2013_figure(result: dict[str, Any]) -> Figure:
-    """The static part in the first columns, the dynamic part in the last two."""
+    """Draw the static part in the first columns, the dynamic part in the last two."""
     settings = result["settings"]
     count = len(settings)
     figure = new_figure(3.8 * (count + 2), 7.2)
@@ -259,7 +259,7 @@ def _common_legend(figure: Figure, axes: Any) -> None:
 
 
 def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
-    """Outline (points, 2) of the 95 % region of a zero-mean Gaussian in the plane."""
+    """Return the outline (points, 2) of the 95 % region of a planar zero-mean Gaussian."""
     angle = np.linspace(0, 2 * np.pi, points)
     values, vectors = np.linalg.eigh(covariance)
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -268,7 +268,7 @@ def ellipse(covariance: FloatArray, points: int = 60) -> FloatArray:
 
 @styled
 def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
-    """The track from above with the anchors; over time the errors, where truth exists, and NIS."""
+    """Draw the track in plan with anchors, and over time errors (with truth) and NIS."""
     track, found = replayed.track, replayed.errors
     labels = []
     if found is not None:
@@ -291,7 +291,7 @@ def replay_figure(recording: Recording, replayed: Replayed) -> Figure:
     if replayed.smoothed is not None:
         smoothed = replayed.smoothed.track.translation
         axes.plot(*smoothed[:, :2].T, color=COLOURS["KF"], lw=0.8, label="smoothed")
-    axes.set_aspect("equal", adjustable="box")  # datalim cuts off the label
+    axes.set_aspect("equal", adjustable="box")  # datalim would cut off the label
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(frameon=False, fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))

@@ -21,7 +21,7 @@ _COLOURS = {
 
 @styled
 def hard_figure(result: dict[str, Any]) -> Figure:
-    """Translation errors over the bound, and who is back after wrong starts."""
+    """Draw translation errors relative to the bound, and recovery after wrong starts."""
     figure = new_figure(12, 8)
     upper, lower = figure.subfigures(2, 1, squeeze=False)[:, 0]
     axes = upper.subplots(1, len(result["links"]), squeeze=False)[0]
@@ -63,7 +63,7 @@ def hard_figure(result: dict[str, Any]) -> Figure:
 
 
 def print_hard(result: dict[str, Any]) -> None:
-    """One table of links for each scene, one of starts."""
+    """Print one table of links for each scene, and one of starts."""
     console = new_console()
     for name, conditions in result["links"].items():
         table = new_table(f"{name}, {result['trials']} trials")

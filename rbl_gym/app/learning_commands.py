@@ -19,12 +19,12 @@ from rbl_gym.studies.learning.rl_tasks import TASKS, RlTask, rl_task
 from rbl_gym.studies.learning.training import ALGORITHMS
 from rbl_gym.worlds.scene_source import read_scene, read_scenes
 
-# Held-out worlds in which a trained policy is scored, those of ``evaluate``.
+# Number of held-out worlds for the score of a trained policy, as in ``evaluate``.
 _WORLDS = 256
 
 
 def add_train(commands: Any) -> None:
-    """The parser of ``rbl-gym train``."""
+    """Add the parser of ``rbl-gym train``."""
     train = commands.add_parser(
         "train",
         help="learn a policy (extra rl)",
@@ -41,7 +41,7 @@ def add_train(commands: Any) -> None:
 
 
 def add_evaluate(commands: Any) -> None:
-    """The parser of ``rbl-gym evaluate``."""
+    """Add the parser of ``rbl-gym evaluate``."""
     evaluate = commands.add_parser(
         "evaluate",
         help="policies and references on held-out worlds",
@@ -54,7 +54,7 @@ def add_evaluate(commands: Any) -> None:
 
 
 def add_transfer(commands: Any) -> None:
-    """The parser of ``rbl-gym transfer``."""
+    """Add the parser of ``rbl-gym transfer``."""
     transfer = commands.add_parser(
         "transfer",
         help="layouts rolled through real filters",
@@ -71,7 +71,7 @@ def add_transfer(commands: Any) -> None:
 
 
 def _add_worlds(parser: argparse.ArgumentParser) -> None:
-    """In which worlds the task is played."""
+    """Add options for the worlds of the task."""
     worlds = parser.add_mutually_exclusive_group()
     worlds.add_argument(
         "--scene", metavar="NAME|F", help="another scene: its name, or a JSON or TOML file"
@@ -82,7 +82,7 @@ def _add_worlds(parser: argparse.ArgumentParser) -> None:
 
 
 def _task(options: argparse.Namespace) -> RlTask:
-    """The task in the worlds that are asked for."""
+    """Return the task in the requested worlds."""
     task = rl_task(options.task)
     if options.scenes:
         return task.in_worlds(scenes=read_scenes(options.scenes))
@@ -90,7 +90,7 @@ def _task(options: argparse.Namespace) -> RlTask:
 
 
 def _title(options: argparse.Namespace) -> str:
-    """The task and its worlds, in a word."""
+    """Return a title for the task and its worlds."""
     worlds = options.scene or options.scenes
     return f"{options.task} in {worlds}" if worlds else options.task
 
@@ -98,7 +98,7 @@ def _title(options: argparse.Namespace) -> str:
 def _add_players(
     parser: argparse.ArgumentParser, tasks: list[str], worlds: int, references: str
 ) -> None:
-    """The task, the policies and references that play it, and the worlds they play it in."""
+    """Add options for the task, the policies and references, and the worlds."""
     parser.add_argument("task", choices=sorted(tasks))
     _add_worlds(parser)
     parser.add_argument(
@@ -132,7 +132,7 @@ def _train(options: argparse.Namespace) -> int:
     policy.meta["command"] = _command(options, steps, algorithm)
     policies.save(policy, path)
     result["policy"] = str(path)
-    # Of the file, not of what PPO remembers: that is what others will play.
+    # Of the file, not of the PPO object: others will load the file.
     result["held_out"] = evaluation.held_out_returns(task, policies.load(path), _WORLDS, seed=0)
     if write_json(result, options.json):
         from rbl_gym.app import reports
@@ -142,7 +142,7 @@ def _train(options: argparse.Namespace) -> int:
 
 
 def _command(options: argparse.Namespace, steps: int, algorithm: str) -> str:
-    """What makes a policy again."""
+    """Return the command that trains the policy again."""
     worlds = {"--scene": options.scene, "--scenes": options.scenes}
     told = [f"{flag} {value}" for flag, value in worlds.items() if value]
     if algorithm != rl_task(options.task).algorithm:
@@ -193,7 +193,7 @@ def _transfer(options: argparse.Namespace) -> int:
 
 
 def _references(options: argparse.Namespace, task: RlTask, default: list[str]) -> list[str]:
-    """Names of references of the task, each once; without the option, the default ones."""
+    """Return unique names of references of the task; without the option, the defaults."""
     from rbl_gym.studies.learning import evaluation
 
     known = evaluation.references(task)
@@ -202,7 +202,7 @@ def _references(options: argparse.Namespace, task: RlTask, default: list[str]) -
 
 
 def _policies(paths: list[str]) -> dict[str, Any]:
-    """Policies by the names of their files, or a ValueError where two share one."""
+    """Return policies by file name; raises ValueError if two have the same name."""
     from rbl_gym.studies.learning import policies
 
     loaded: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Picture and tables of the network paper's experiment."""
+"""Picture and tables of the experiment of the network paper."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FRAMES = (
 
 @styled
 def network2009_figure(result: dict[str, Any]) -> Figure:
-    """Figs 3 to 6 of the paper, then kappa against n, the speed of (14), three nodes in space."""
+    """Draw Figs 3 to 6 of the paper, kappa against n, the speed of (14), three nodes in 3-D."""
     figure = new_figure(17, 11)
     axes = figure.subplots(3, 4)
     _networks(axes[0, :3], result)
@@ -41,7 +41,7 @@ def network2009_figure(result: dict[str, Any]) -> Figure:
 
 
 def _networks(axes: Any, result: dict[str, Any]) -> None:
-    """Fig. 3: the points, the largest footprint, the one of ten loops or the smallest."""
+    """Draw Fig. 3: points, the largest footprint, and that of ten loops or the smallest."""
     data = result["networks"]
     places = np.array(data["positions"])
     loops = [row["loops"] for row in result["accuracy"]]
@@ -64,7 +64,7 @@ def _networks(axes: Any, result: dict[str, Any]) -> None:
 
 
 def _frames(ax: Axes, result: dict[str, Any]) -> None:
-    """Fig. 6: both axes of every frame at its true place."""
+    """Draw Fig. 6: both axes of every frame at its true position."""
     places, run = np.array(result["networks"]["positions"]), result["run"]
     length = 0.14 * np.ptp(places, axis=0).max()
     for key, style, colour, label in _FRAMES:
@@ -85,7 +85,7 @@ def _frames(ax: Axes, result: dict[str, Any]) -> None:
 
 
 def _accuracy(ax: Axes, result: dict[str, Any]) -> None:
-    """Fig. 4."""
+    """Draw Fig. 4."""
     rows = result["accuracy"]
     edges = [row["edges"] for row in rows]
     ax.plot(edges, [row["mse"]["measured"] for row in rows], "k--x", ms=4, label="y")
@@ -105,7 +105,7 @@ def _accuracy(ax: Axes, result: dict[str, Any]) -> None:
 
 
 def _over_steps(axes: Any, result: dict[str, Any]) -> None:
-    """Fig. 5."""
+    """Draw Fig. 5."""
     run = result["run"]
     axes[0].plot(run["edge_angles"], lw=0.7)
     axes[0].set(xlabel="iteration", ylabel="angle estimate of every edge [rad]")
@@ -121,7 +121,7 @@ def _over_steps(axes: Any, result: dict[str, Any]) -> None:
 def _growth(ax: Axes, name: str, data: dict[str, Any]) -> None:
     nodes = [row["nodes"] for row in data["rows"]]
     for rule, slope in data["slope"].items():
-        # "best" lies on "theorem" where lambda_min is 1.
+        # "best" coincides with "theorem" if lambda_min is 1.
         ax.loglog(
             nodes,
             [row["kappa"][rule] for row in data["rows"]],
@@ -179,7 +179,7 @@ def _space(ax: Axes, rows: list[dict[str, Any]]) -> None:
 
 
 def print_network2009(result: dict[str, Any]) -> None:
-    """Accuracy against the bound, growth, convergence, three nodes in space."""
+    """Print accuracy against the bound, growth, convergence, three nodes in 3-D."""
     out = new_console()
     _print_accuracy(out, result)
     for name, data in result["growth"].items():

@@ -9,7 +9,7 @@ from rbl_gym.app.terminal import add_json, print_files, write_json
 
 
 def add_network(commands: Any) -> None:
-    """The parser of ``rbl-gym network``."""
+    """Add the parser of ``rbl-gym network``."""
     network = commands.add_parser(
         "network",
         help="orientations of a planar network or pose graph",

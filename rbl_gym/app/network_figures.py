@@ -15,7 +15,7 @@ from rbl_gym.studies.network import Solved
 
 @styled
 def network_figure(solved: Solved) -> Figure:
-    """The graph where it has places, and the residuals of its edges."""
+    """Draw the graph if it has positions, and the residuals of its edges."""
     figure = new_figure(10, 4.6)
     left, right = figure.subplots(1, 2)
     if solved.positions is not None:
@@ -38,7 +38,7 @@ def network_figure(solved: Solved) -> Figure:
 
 
 def print_network(result: dict[str, Any]) -> None:
-    """The figures of a network, one a line."""
+    """Print the figures of a network, one per line."""
     out = new_console()
     proof = (
         "certified: no other orientations cost less"
@@ -62,7 +62,7 @@ def print_network(result: dict[str, Any]) -> None:
         f"{result['residual_max_deg']:.2f} deg at most; largest:"
     )
     for edge in result["worst_edges"]:
-        degrees = round(edge["residual_deg"], 3) + 0.0  # no "-0.000"
+        degrees = round(edge["residual_deg"], 3) + 0.0  # avoids "-0.000"
         out.print(f"  edge {edge['i']} {edge['j']}: {degrees:.3f} deg, weight {edge['weight']:g}")
     out.print(f"chordal cost {result['chordal_cost']:.10g}, {proof}")
     out.print(

@@ -1,4 +1,4 @@
-"""Self-contained HTML pages: plots of plotly, tables that sort by a click, no network needed."""
+"""Self-contained HTML pages: plots by plotly, sortable tables, no network needed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ input.filter { font: inherit; font-size: .9em; padding: .2em .6em; margin: 0 0 .
                border: 1px solid #bbb; border-radius: 4px; width: 18em; }
 p.note { color: #555; font-size: .9em; margin: .4em 0; }
 """
-# Cells sort as numbers where all of a column are numbers, what is missing comes last.
+# Cells sort as numbers if all of a column are numbers; missing ones come last.
 _SCRIPT = """
 document.querySelectorAll("table.sortable").forEach(table => {
   const body = table.tBodies[0], heads = [...table.tHead.rows[0].cells];
@@ -61,12 +61,12 @@ document.querySelectorAll("table.sortable").forEach(table => {
   });
 });
 """
-# Tables of more rows than this get a field that filters them.
+# Tables with more rows than this get a filter field.
 _MANY = 12
 
 
 def document(title: str, parts: Iterable[str]) -> str:
-    """A whole page of parts that are HTML already."""
+    """Return a whole page of HTML parts."""
     name = html.escape(title)
     return "\n".join(
         [
@@ -83,12 +83,12 @@ def document(title: str, parts: Iterable[str]) -> str:
 
 
 def note(text: str) -> str:
-    """A remark, small."""
+    """Return a small remark."""
     return f'<p class="note">{html.escape(text)}</p>'
 
 
 def plot(figure: Any, name: str, first: bool = True) -> str:
-    """A figure of plotly; the first of a page brings plotly's script."""
+    """Return a plotly figure; the first one of a page includes plotly's script."""
     return figure.to_html(
         full_html=False,
         include_plotlyjs=first,
@@ -99,10 +99,10 @@ def plot(figure: Any, name: str, first: bool = True) -> str:
 
 
 def table(title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table that sorts by a click on a heading.
+    """Return a table that sorts when a heading is clicked.
 
-    Cells are numbers (shown to four digits), texts, booleans or None; a text that begins with a
-    number ("x1.20", "0.3 m") sorts by it. Long tables get a field that filters their rows.
+    Cells are numbers (shown with four digits), texts, booleans or None. A text that begins with a
+    number ("x1.20", "0.3 m") sorts by this number. Long tables get a field to filter their rows.
     """
     columns = [[row[k] for row in rows] for k in range(len(headings))]
     is_text = [
@@ -125,7 +125,7 @@ def table(title: str, headings: Sequence[str], rows: Sequence[Sequence[Any]]) ->
 
 
 def digits(value: float, count: int) -> str:
-    """So many significant digits, zeros at the end too."""
+    """Format with this many significant digits, with trailing zeros."""
     return f"{value:#.{count}g}".rstrip(".")
 
 
@@ -144,7 +144,7 @@ def _text(value: Any) -> str:
 
 
 def _number(value: Any) -> float | None:
-    """What a cell sorts by: its number, or that at the beginning of its text; None for neither."""
+    """Return the sort key of a cell: its number, or that at the start of its text, or None."""
     if isinstance(value, bool) or value is None:
         return None
     if isinstance(value, str):
@@ -157,6 +157,6 @@ def _number(value: Any) -> float | None:
 
 
 def write(text: str, path: str) -> None:
-    """Write a page, making its folder."""
+    """Write a page; create its folder."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The commands rbl-gym demo and rbl-gym reproduce: the experiments of the papers."""
+"""The commands rbl-gym demo and rbl-gym reproduce: experiments of the papers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rbl_gym.app.terminal import (
 
 
 def add_demo(commands: Any) -> None:
-    """The parser of ``rbl-gym demo``."""
+    """Add the parser of ``rbl-gym demo``."""
     demo = commands.add_parser(
         "demo",
         help="the tracking paper's experiment: five filters against the bound",
@@ -51,7 +51,7 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def add_reproduce(commands: Any) -> None:
-    """The parser of ``rbl-gym reproduce``."""
+    """Add the parser of ``rbl-gym reproduce``."""
     from rbl_gym.app.papers import experiments
 
     reproduce = commands.add_parser(

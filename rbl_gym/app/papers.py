@@ -1,4 +1,4 @@
-"""What `rbl-gym reproduce` can make: the papers' experiments, and our own, by their names."""
+"""Experiments of `rbl-gym reproduce`: those of the papers, and our own, by name."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 
 
 class Experiment(NamedTuple):
-    """What an experiment shows, its function, and how its result is drawn and printed."""
+    """Title of an experiment, its function, and how its result is drawn and printed."""
 
     summary: str
-    run: Callable[..., dict[str, Any]]  # of trials, seed, advance; `options` by keyword
+    run: Callable[..., dict[str, Any]]  # of trials, seed, advance; `options` are keywords
     figure: Callable[[dict[str, Any], int], Any]  # of the result and the seed
     show: Callable[[dict[str, Any]], None]
-    options: tuple[str, ...] = ()  # of the command line, beside trials and seed
+    options: tuple[str, ...] = ()  # of the command line, besides trials and seed
 
 
 def _late(module: str, name: str) -> Callable[..., Any]:
-    """A function of a module that is imported when it is called: what it needs takes its time."""
+    """Return a function whose module is imported when it is called, as imports are slow."""
 
     def call(*arguments: Any, **options: Any) -> Any:
         return getattr(importlib.import_module(f"rbl_gym.{module}"), name)(*arguments, **options)
@@ -29,7 +29,7 @@ def _late(module: str, name: str) -> Callable[..., Any]:
 
 
 def _drawn(module: str, name: str) -> Callable[[dict[str, Any], int], Any]:
-    """A figure that needs the result alone."""
+    """Return a figure function that needs only the result."""
     return lambda result, _: _shown(module, name)(result)
 
 
@@ -54,7 +54,7 @@ def _static(*arguments: Any) -> dict[str, Any]:
 
 
 def experiments() -> dict[str, Experiment]:
-    """All experiments by name."""
+    """Return all experiments by name."""
     return {
         "camsap2013": Experiment(
             "tracking: KF, UC-KF, ET-KF, KF-ortho, iterated EKF (Figs 2 and 3), ET-KF's trade",
@@ -97,7 +97,7 @@ def experiments() -> dict[str, Experiment]:
 
 
 def write_csv(result: dict[str, Any], path: str) -> None:
-    """Every figure of a result as a row: its place in the result, then the value."""
+    """Write every figure of a result as a row: its path in the result, then the value."""
     rows = list(_leaves(result, ()))
     width = max(len(place) for place, _ in rows)
     Path(path).parent.mkdir(parents=True, exist_ok=True)

@@ -1,10 +1,10 @@
-"""The question and the answer of a placement in words, for titles, the first page, the page."""
+"""Question and answer of a placement in words, for titles, the first page and the page."""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-# Said by a sign and a word too: colours alone do not reach everyone.
+# Verdicts also have a sign and a word, because not everyone can distinguish colours.
 SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? UNDECIDED", "no requirement": "-"}
 _NAMES = {
     "position_m": ("horizontal position", "m"),
@@ -14,7 +14,7 @@ _NAMES = {
 
 
 class ZoneAnswer(NamedTuple):
-    """What a zone asks for and what it gets, in words."""
+    """Requirement and result of a zone in words."""
 
     name: str
     verdict: str
@@ -24,7 +24,7 @@ class ZoneAnswer(NamedTuple):
 
 
 def verdict(result: dict[str, Any]) -> str:
-    """Of all zones: ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``."""
+    """Return the verdict: ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``."""
     found = [zone["verdict"] for zone in result["zones"]]
     for one in ("fail", "undecided", "pass"):
         if one in found:
@@ -33,7 +33,7 @@ def verdict(result: dict[str, Any]) -> str:
 
 
 def headline(result: dict[str, Any]) -> str:
-    """One line: how many anchors, and whether they do."""
+    """Return one line: the number of anchors, and whether they suffice."""
     count = f"{result['n_anchors']} anchors"
     zones = result["zones"]
     asked = [zone for zone in zones if zone["verdict"] != "no requirement"]
@@ -55,7 +55,7 @@ def headline(result: dict[str, Any]) -> str:
 
 
 def typical(zones: list[dict[str, Any]]) -> str:
-    """Typical errors of the zones, the least and the largest median."""
+    """Return typical errors of the zones: the smallest and the largest median."""
     parts = []
     for key in ("position_m", "heading_deg"):
         name, unit = _NAMES[key]
@@ -68,7 +68,7 @@ def typical(zones: list[dict[str, Any]]) -> str:
 
 
 def question(result: dict[str, Any]) -> list[str]:
-    """What was asked, a line each."""
+    """Return the question, one line per part."""
     count = result["n_anchors"]
     lines = [f"Where do {count} anchors go in {result['scene']!r}, and what do they promise?"]
     for zone in zone_answers(result):
@@ -78,7 +78,7 @@ def question(result: dict[str, Any]) -> list[str]:
 
 
 def zone_answers(result: dict[str, Any]) -> list[ZoneAnswer]:
-    """Every zone in words."""
+    """Return every zone in words."""
     found = []
     for zone in result["zones"]:
         asks = reached = ""
@@ -104,7 +104,7 @@ def zone_answers(result: dict[str, Any]) -> list[ZoneAnswer]:
 
 
 def percent(share: float) -> str:
-    """A share, 100 % only where it is all."""
+    """Format a fraction; 100 % only if it is exact."""
     text = f"{100 * share:.1f}"
     if text == "100.0" and share < 1:
         text = "99.9"
@@ -112,5 +112,5 @@ def percent(share: float) -> str:
 
 
 def digits(value: float) -> str:
-    """Three digits, without exponents where people read."""
+    """Format three digits, without exponents in the usual range."""
     return f"{value:.3g}" if value < 1000 else f"{value:.0f}"

@@ -1,4 +1,4 @@
-"""Style and script of a placement's page: `place_svg` writes what they work on."""
+"""Style and script of the page of a placement, for the output of `place_svg`."""
 
 STYLE = """
 .plan { margin: 1em 0; } .plan .stage { position: relative; width: 100%; touch-action: pan-y; }

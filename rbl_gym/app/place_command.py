@@ -27,7 +27,7 @@ from rbl_gym.app.terminal import (
 
 
 def add_place(commands: Any) -> None:
-    """The parser of ``rbl-gym place``."""
+    """Add the parser of ``rbl-gym place``."""
     place = commands.add_parser(
         "place",
         help="where anchors go, and how good the pose will be",
@@ -150,7 +150,7 @@ def _place(options: argparse.Namespace) -> int:
 
 
 class _Schema(argparse.Action):
-    """Prints the JSON schema of a building file, for editors, and ends the program."""
+    """Print the JSON schema of a building file, for editors, and exit."""
 
     def __call__(self, parser: Any, *_: Any) -> None:
         from rbl_gym.placement.file_schema import schema
@@ -160,7 +160,7 @@ class _Schema(argparse.Action):
 
 
 def _layout(options: argparse.Namespace) -> Any:
-    """The anchors of --layout, or None; options that need it, or exclude it, are looked at."""
+    """Return the anchors of --layout, or None; check options that need or exclude it."""
     if options.layout is None:
         for name in ("optimise", "keep"):
             if getattr(options, name):
@@ -178,7 +178,7 @@ def _layout(options: argparse.Namespace) -> Any:
 
 
 def _kept(names: str | None, layout: Any) -> tuple[int, ...]:
-    """Indices of the anchors of a layout that stay."""
+    """Return indices of the anchors of a layout that stay."""
     if names is None:
         return ()
     if names.strip() == "all":
@@ -195,7 +195,7 @@ def _kept(names: str | None, layout: Any) -> tuple[int, ...]:
 
 
 def _numbers(text: str) -> range:
-    """N or A..B as a range."""
+    """Parse N or A..B as a range."""
     first, dots, last = text.partition("..")
     numbers = range(positive(first), positive(last if dots else first) + 1)
     if not numbers:
@@ -204,7 +204,7 @@ def _numbers(text: str) -> range:
 
 
 def _region(text: str) -> tuple[list[float], list[float]]:
-    """Six numbers as two corners."""
+    """Parse six numbers as two corners."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:

@@ -1,4 +1,4 @@
-"""A building from above by matplotlib: walls, zones, mounts, anchors, maps of accuracy."""
+"""Plan of a building by matplotlib: walls, zones, mounts, anchors, accuracy maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WHITE = {"boxstyle": "round,pad=0.18", "fc": "white", "ec": "0.75", "lw": 0.5, 
 def draw_building(
     axes: Any, problem: Problem, anchors: FloatArray, mounts: bool = True, names: bool = True
 ) -> None:
-    """Backdrop, obstacles, zones, and where anchors may stand; axes in metres."""
+    """Draw backdrop, obstacles, zones, and mounts; axes in metres."""
     edges = shapes.limits(problem, anchors)
     axes.set_xlim(*edges[:, 0])
     axes.set_ylim(*edges[:, 1])
@@ -89,7 +89,7 @@ def _draw_backdrop(axes: Any, problem: Problem) -> None:
 def draw_anchors(
     axes: Any, problem: Problem, anchors: FloatArray, names: list[str], heights: bool = False
 ) -> list[Any]:
-    """Markers of the anchors; returns texts that `settle_labels` puts beside them."""
+    """Draw markers of the anchors; return labels for `settle_labels`."""
     edges = shapes.limits(problem, anchors)
     low, high = problem.corners()
     texts = []
@@ -118,10 +118,10 @@ def draw_anchors(
 
 
 def settle_labels(figure: Any, groups: list[tuple[Any, list[Any]]]) -> None:
-    """Put the texts of each axes beside their markers, none on another; after all is laid out."""
+    """Move the labels of each axes next to their markers without overlaps, after layout."""
     renderer = FigureCanvasAgg(figure).get_renderer()
     figure.draw_without_rendering()
-    # From here on the layout stays.
+    # The layout is fixed from here on.
     figure.set_layout_engine("none")
     unit = figure.dpi / 72
     for axes, texts in groups:
@@ -155,7 +155,7 @@ def settle_labels(figure: Any, groups: list[tuple[Any, list[Any]]]) -> None:
 
 
 def draw_map(axes: Any, shown: list[shapes.Layer], quantity: shapes.Quantity) -> None:
-    """Accuracy over the zones with its colour bar; hatched where a zone's limit is exceeded."""
+    """Draw accuracy over the zones with a colour bar; hatched where a limit is exceeded."""
     limits = [getattr(layer.zone, str(quantity.limit), None) for layer in shown]
     given = [limit for limit in limits if limit is not None]
     low, high = shapes.colour_range(shown, max(given, default=None))
@@ -190,7 +190,7 @@ def draw_map(axes: Any, shown: list[shapes.Layer], quantity: shapes.Quantity) ->
 
 
 def draw_verdict(axes: Any, shown: list[shapes.Layer]) -> None:
-    """Where the zones' requirements are met, and where not: colours and hatches."""
+    """Draw where the zones' requirements are met and where not: colours and hatches."""
     for layer in shown:
         colour = shapes.WITHIN if layer.free.any() else shapes.NOTHING
         axes.add_patch(Polygon(layer.zone.polygon, fc=colour, ec="none", zorder=1))
@@ -199,7 +199,7 @@ def draw_verdict(axes: Any, shown: list[shapes.Layer]) -> None:
 
 
 def verdict_handles(shown: list[shapes.Layer]) -> list[Patch]:
-    """The legend of `draw_verdict`."""
+    """Return the legend of `draw_verdict`."""
     handles = [
         Patch(fc=shapes.WITHIN, ec="0.4", label="within the requirement"),
         Patch(fc=shapes.BEYOND, ec="white", hatch="////", label="not within"),
@@ -217,7 +217,7 @@ def _clip(axes: Any, artist: Any, layer: shapes.Layer) -> None:
 
 
 def _hatch(axes: Any, layer: shapes.Layer, limit: float, colour: str = "none") -> bool:
-    """Hatch what is beyond a limit; returns whether anything is."""
+    """Hatch what exceeds a limit; return whether anything does."""
     values = np.pad(layer.values, 1, mode="edge")
     if values.max() <= limit or min(layer.values.shape) < 2:
         return False

@@ -1,4 +1,4 @@
-"""The picture of a placement: maps of accuracy over the plan, the answer, the usual layouts."""
+"""The picture of a placement: accuracy maps in plan, the answer, the usual layouts."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ styled = matplotlib.rc_context({"font.size": 9, "axes.titlesize": 10, "axes.labe
 
 @styled
 def place_figure(placed: Placed) -> Figure:
-    """One sheet: where requirements are met, maps of what is asked, zones in words, a chart."""
+    """Draw one sheet: verdicts, maps of the required quantities, zones in words, a chart."""
     problem, anchors, result = placed.problem, placed.design.anchors, placed.result
     maps = shapes.maps_of(problem, anchors)
     panels = map_panels(problem)
     tall = map_height(problem, anchors)
     heights = [tall] * ((len(panels) + 1) // 2)
-    # A chart of its own row is lower than a map.
+    # A chart in its own row is lower than a map.
     if len(panels) % 2 == 0:
         heights.append(_CHART)
     size = (14, sum(heights) + 0.75 * len(heights) + 0.6)
@@ -53,7 +53,7 @@ def place_figure(placed: Placed) -> Figure:
 
 @styled
 def building_figure(problem: Problem) -> Figure:
-    """The building alone, with a grid of metres: to see whether it was read as it is."""
+    """Draw the building alone with a metre grid, to check how it was read."""
     nothing = np.empty((0, 3))
     figure = Figure(figsize=(11, 0.9 * map_height(problem, nothing, 9.0) + 1.2))
     figure.set_layout_engine("constrained")
@@ -73,7 +73,7 @@ def building_figure(problem: Problem) -> Figure:
 
 
 def map_panels(problem: Problem) -> list[shapes.Quantity]:
-    """What is shown: the requirement where there is one, and each quantity."""
+    """Return the shown maps: the requirement if there is one, and each quantity."""
     first = [REQUIREMENT] if shapes.has_requirement(problem) else []
     return first + shapes.quantities(problem)
 
@@ -82,7 +82,7 @@ REQUIREMENT = shapes.Quantity("relative", "requirement", "", None)
 
 
 def map_height(problem: Problem, anchors: FloatArray, wide: float = _WIDE) -> float:
-    """Height of a map so wide, inches."""
+    """Return the height of a map of this width, inches."""
     width, height = np.ptp(shapes.limits(problem, anchors), axis=0)
     return float(np.clip(wide * height / width, 2.8, _TALL))
 
@@ -90,7 +90,7 @@ def map_height(problem: Problem, anchors: FloatArray, wide: float = _WIDE) -> fl
 def map_panel(
     axes: Any, placed: Placed, maps: list[Map], quantity: shapes.Quantity, heights: bool
 ) -> list[Any]:
-    """One map with its title; returns the texts of the anchors."""
+    """Draw one map with its title; return the labels of the anchors."""
     problem, anchors = placed.problem, placed.design.anchors
     shown = shapes.layers(problem, maps, quantity.field)
     if quantity.field == "relative":
@@ -121,12 +121,12 @@ def map_panel(
 
 
 def anchor_names(placed: Placed) -> list[str]:
-    """What the anchors are called."""
+    """Return the names of the anchors."""
     return [str(row["name"]) for row in placed.result["anchors"]]
 
 
 def legend_text(problem: Problem) -> str:
-    """What the signs of a plan are."""
+    """Return the legend of a plan."""
     parts = ["triangles: anchors, by number"]
     if len(problem.fixed):
         parts.append("squares: anchors that stay")
@@ -137,7 +137,7 @@ def legend_text(problem: Problem) -> str:
 
 
 def draw_chart(axes: Any, result: dict[str, Any]) -> None:
-    """Accuracy against the number of anchors, or the usual layouts."""
+    """Draw accuracy against the number of anchors, or the usual layouts."""
     if "against_number" in result:
         _draw_numbers(axes, result["against_number"])
     elif place_answer.verdict(result) == "no requirement":
@@ -147,12 +147,12 @@ def draw_chart(axes: Any, result: dict[str, Any]) -> None:
 
 
 def _draw_scores(axes: Any, rows: dict[str, dict[str, Any]]) -> None:
-    """b of every layout, the best on top."""
+    """Draw b of every layout, the best on top."""
     names = list(rows)[::-1]
     values = [rows[name]["score_m"] for name in names]
     texts = [f"{rows[name]['score_m']:.3g} m  (x {rows[name]['ratio']:.2f})" for name in names]
     own = _own(rows)
-    # A layout that is bad must not hide how the good ones differ.
+    # A bad layout must not hide differences of the good ones.
     edge = min(1.12 * max(values), 4.0 * rows[own]["score_m"])
     _draw_bars(axes, names, values, texts, own, edge)
     axes.set_xlabel("b, root mean square error of the tags over all zones [m]")
@@ -160,9 +160,9 @@ def _draw_scores(axes: Any, rows: dict[str, dict[str, Any]]) -> None:
 
 
 def _draw_margins(axes: Any, result: dict[str, Any]) -> None:
-    """How far every layout is from the requirements, the best on top."""
+    """Draw the margin of every layout to the requirements, the best on top."""
     rows = result["layouts"]
-    # The design was judged at more places than the others.
+    # The design was evaluated at more positions than the others.
     own = _own(rows)
     zones = {name: row["zones"] for name, row in rows.items()} | {own: result["zones"]}
     margins = {
@@ -181,7 +181,7 @@ def _draw_margins(axes: Any, result: dict[str, Any]) -> None:
 
 
 def _own(rows: dict[str, dict[str, Any]]) -> str:
-    """The layout that all else is about."""
+    """Return the layout of the report."""
     return "designed" if "designed" in rows else "given"
 
 
@@ -211,7 +211,7 @@ def _draw_bars(
 
 
 def _draw_numbers(axes: Any, rows: list[dict[str, float]]) -> None:
-    """Accuracy against the number of anchors."""
+    """Draw accuracy against the number of anchors."""
     numbers = [int(row["n_anchors"]) for row in rows]
     other = axes.twinx()
     for ax, key, unit, colour in (

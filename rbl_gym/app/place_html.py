@@ -1,6 +1,6 @@
-"""A placement as one HTML file: the answer, the plan with its maps, the tables, the scene in 3-D.
+"""A placement as one HTML file: answer, plan with maps, tables, 3-D scene.
 
-The file carries plotly's script (extra ``viz``) and needs no network.
+The file includes plotly's script (extra ``viz``) and needs no network.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rbl_gym.studies.placing.answer import Placed
 
 
 def write_place(placed: Placed, path: str) -> None:
-    """Write the page, making its folder."""
+    """Write the page; create its folder."""
     result = placed.result
     headings, *rows = mounting_rows(placed)
     parts = [
@@ -41,7 +41,7 @@ def write_place(placed: Placed, path: str) -> None:
 
 
 def place_scene(placed: Placed) -> go.Figure:
-    """Anchors, obstacles, zones, and a map over the middle of each zone."""
+    """Return anchors, obstacles, zones, and a map at mid-height of each zone, in 3-D."""
     problem, anchors = placed.problem, placed.design.anchors
     shown = go.Figure()
     quantity = shapes.quantities(problem)[0]

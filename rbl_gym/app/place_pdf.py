@@ -1,4 +1,4 @@
-"""The report of a placement as PDF: question and answer, plan, maps, mounting list, tables."""
+"""The PDF report of a placement: question and answer, plan, maps, mounting list, tables."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rbl_gym.app.place_report import notes, tables
 from rbl_gym.studies.placing.answer import Placed
 from rbl_gym.studies.placing.layout_export import mounting_list
 
-# A4 on its side, inches; text between these edges, as shares of the page.
+# A4 landscape, inches; text margins, as fractions of the page.
 _PAGE = (11.69, 8.27)
 _LEFT, _RIGHT, _TOP, _BOTTOM = 0.06, 0.94, 0.9, 0.08
 _ROW = 0.027
@@ -30,7 +30,7 @@ _COLOURS = {
 
 
 def write_pdf(placed: Placed, path: str) -> None:
-    """Write the report, making its folder. The same result gives the same bytes."""
+    """Write the report; create its folder. The same result gives the same bytes."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     name = placed.result["scene"]
     about = {"Title": f"Anchors for {name}", "Creator": "rbl-gym", "CreationDate": None}
@@ -49,7 +49,7 @@ def write_pdf(placed: Placed, path: str) -> None:
 
 
 def report_pages(placed: Placed) -> Iterator[Figure]:
-    """The pages as figures."""
+    """Return the pages as figures."""
     problem, anchors, result = placed.problem, placed.design.anchors, placed.result
     yield _title_page(result)
     yield _plan_page(placed)
@@ -65,7 +65,7 @@ def report_pages(placed: Placed) -> Iterator[Figure]:
 
 
 def mounting_rows(placed: Placed) -> list[list[str]]:
-    """The mounting list as texts, headings first."""
+    """Return the mounting list as texts, headings first."""
     headings = ["anchor", "x [m]", "y [m]", "z [m]", "above floor [m]", "mount", "faces"]
     found = mounting_list(placed.problem, placed.design.anchors, place_figures.anchor_names(placed))
     with_corners = any(row["corners"] for row in found)
@@ -133,7 +133,7 @@ def _title_page(result: dict[str, Any]) -> Figure:
 
 
 def _badge(page: Figure, x: float, y: float, verdict: str) -> None:
-    """A verdict as colour, sign and word."""
+    """Draw a verdict with colour, sign and word."""
     if verdict == "no requirement":
         return
     fail = verdict == "fail"
@@ -183,7 +183,7 @@ Table = tuple[str, list[str], list[list[str]]]
 
 
 def _table_pages(title: str, found: list[Table]) -> Iterator[Figure]:
-    """Tables one below the other, continued on the next page."""
+    """Return tables one below the other, continued on the next page."""
     page, y = _page(title), _TOP - 0.02
     for name, headings, rows in found:
         widths, size = _widths(headings, rows)
@@ -202,7 +202,7 @@ def _table_pages(title: str, found: list[Table]) -> Iterator[Figure]:
 
 
 def _widths(headings: list[str], rows: list[list[str]]) -> tuple[list[float], float]:
-    """Widths of columns as shares of the page, and the size of the letters that fits them."""
+    """Return column widths as fractions of the page, and a font size that fits them."""
     letters = [
         max(1.18 * len(head), *map(len, cells)) + 2.4
         for head, *cells in zip(_broken(headings), *rows, strict=True)
@@ -212,7 +212,7 @@ def _widths(headings: list[str], rows: list[list[str]]) -> tuple[list[float], fl
 
 
 def _broken(headings: list[str]) -> list[str]:
-    """The longest line of each heading."""
+    """Return the longest line of each heading."""
     return [max(_lines(heading), key=len) for heading in headings]
 
 
@@ -229,7 +229,7 @@ def _draw_table(
     widths: list[float],
     size: float,
 ) -> float:
-    """Draw a table below `y`; returns where it ends."""
+    """Draw a table below `y`; return its lower end."""
     if name:
         page.text(_LEFT, y - 0.012, name, fontsize=10.5, fontweight="bold", va="center")
         y -= 1.3 * _ROW

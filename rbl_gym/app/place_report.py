@@ -1,4 +1,4 @@
-"""Tables of a placement on the terminal, and the same as HTML's."""
+"""Tables of a placement, on the terminal and in HTML."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from rbl_gym.app.page import digits
 from rbl_gym.app.place_survey import survey_table
 from rbl_gym.app.tables import new_console, new_table
 
-# A share of lost bodies above this is said in words.
+# Fractions of lost bodies above this are mentioned.
 _MANY_LOST = 0.01
 
 
 class Rows(NamedTuple):
-    """A table as texts; the first column is text, the others are figures."""
+    """A table of texts; the first column is text, the others are figures."""
 
     title: str
     headings: list[str]
@@ -23,7 +23,7 @@ class Rows(NamedTuple):
 
 
 def tables(result: dict[str, Any]) -> Iterator[Rows]:
-    """All tables of a result, in the order in which they answer: first what was asked."""
+    """Return all tables of a result, starting with the requirements."""
     yield _zones(result)
     if "fewest" in result:
         yield from _fewest(result["fewest"])
@@ -45,7 +45,7 @@ def tables(result: dict[str, Any]) -> Iterator[Rows]:
 
 
 def verdict(result: dict[str, Any]) -> str:
-    """The answer in one sentence."""
+    """Return the answer in one sentence."""
     survives = ", with any one anchor missing" if result["survive"] else ""
     count = f"{result['n_anchors']} anchors{survives}"
     if result["verdict"] == "no requirement":
@@ -67,7 +67,7 @@ def verdict(result: dict[str, Any]) -> str:
 
 
 def notes(result: dict[str, Any]) -> list[str]:
-    """What the tables mean, and what to be warned of; one sentence or two each."""
+    """Return notes on the tables and warnings, one or two sentences each."""
     criteria, check = result["criteria"], result["check"]
     conditioning = criteria["conditioning"]
     found = [
@@ -109,7 +109,7 @@ def notes(result: dict[str, Any]) -> list[str]:
 
 
 def print_place(result: dict[str, Any]) -> None:
-    """The answer, every table, and the notes."""
+    """Print the answer, every table, and the notes."""
     console = new_console()
     console.print(verdict(result))
     for rows in tables(result):
@@ -160,7 +160,7 @@ def _percent(share: float) -> str:
 
 
 def _share(row: dict[str, Any]) -> list[str]:
-    """Share within, its interval, what is required, margin; dashes without a requirement."""
+    """Return fraction within limits, interval, requirement, margin; dashes without requirement."""
     if "share" not in row:
         return ["-"] * 4
     interval = f"{100 * row['share_low']:.1f} to {100 * row['share_high']:.1f} %"
@@ -168,7 +168,7 @@ def _share(row: dict[str, Any]) -> list[str]:
 
 
 def required(asked: dict[str, Any]) -> str:
-    """A requirement in words: ``0.1 m, 5 deg in 95 %``."""
+    """Return a requirement in words: ``0.1 m, 5 deg in 95 %``."""
     parts = []
     if asked["position_m"] is not None:
         parts.append(f"{asked['position_m']:g} m")
@@ -180,7 +180,7 @@ def required(asked: dict[str, Any]) -> str:
 
 
 def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
-    """What would have to give with one anchor less."""
+    """Return which requirements would fail with one anchor less."""
     less = fewest["one_less"]
     if less is None:
         return
@@ -214,7 +214,7 @@ def _anchors(result: dict[str, Any]) -> Rows:
 
 
 def _without(result: dict[str, Any]) -> Rows:
-    """What each anchor is for: what is left without it."""
+    """Return the effect of each anchor: the result without it."""
     asking = [row["name"] for row in result["zones"] if "share" in row]
     rows = []
     for anchor in result["anchors"]:
@@ -235,7 +235,7 @@ def _without(result: dict[str, Any]) -> Rows:
 
 
 def _next(result: dict[str, Any]) -> Rows:
-    """Where one more anchor would help most."""
+    """Return where one more anchor would help most."""
     more = result["next_anchor"]
     rows = []
     for now, row in zip(more["zones_now"], more["zones"], strict=True):
@@ -258,7 +258,7 @@ def _next(result: dict[str, Any]) -> Rows:
 
 
 def _mounts(result: dict[str, Any]) -> Rows:
-    """How many anchors hang where, and what they cost."""
+    """Return the number of anchors on each mount, and their cost."""
     kinds: dict[tuple[str, float], int] = {}
     for anchor in result["anchors"]:
         key = anchor["mount"], anchor["cost"]
@@ -357,7 +357,7 @@ def _check_zones(check: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _check_within(check: dict[str, Any]) -> Rows:
-    """Bodies within the limits of their zone, by each filter."""
+    """Return bodies within the limits of their zone, by each filter."""
     rows = [
         [
             name,

@@ -1,4 +1,4 @@
-"""What pictures and pages of a placement draw: outlines, maps without holes, places of labels."""
+"""Shapes of pictures and pages of a placement: outlines, filled maps, label positions."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from rbl_gym.placement.scene_files import Problem
 from rbl_gym.studies.placing.accuracy import Map, accuracy_map
 from rbl_gym.studies.placing.judging import limits_of
 
-# Okabe and Ito's blue and vermilion: told apart by everyone, and in grey.
+# Blue and vermilion of Okabe and Ito, distinguishable by everyone, and in grey.
 WITHIN, BEYOND, NOTHING = "#56b4e9", "#d55e00", "#c9ced2"
-# Anchors further out than so many half sizes of the zones leave their maps too small to read.
+# If anchors are more than this many half sizes of the zones away, maps would be too small.
 _FAR = 4.0
-# A map that hardly varies must not look as if it did: its colours span at least this ratio.
+# The colours of a map span at least this ratio, so that small variations look small.
 _LEAST_CONTRAST = 1.15
-# A hole of a zone is joined to its outline by a slit so narrow, metres.
+# A hole of a zone is joined to its outline by a slit of this width, metres.
 _SLIT_M = 0.003
 
 
 class Quantity(NamedTuple):
-    """What a map shows: a field of `Map`, its name and unit, the key of its requirement."""
+    """A mapped quantity: a field of `Map`, its name and unit, the key of its requirement."""
 
     field: str
     name: str
@@ -48,7 +48,7 @@ _PLAIN = (
 
 
 def quantities(problem: Problem) -> list[Quantity]:
-    """What is worth a map: what the zones ask for, else position and orientation in space."""
+    """Return the quantities to map: the required ones, otherwise position and orientation."""
     asked = {q.field for q in _ASKED for z in problem.zones if getattr(z, str(q.limit)) is not None}
     if not asked and all(zone.attitude == "free" for zone in problem.zones):
         return list(_PLAIN)
@@ -57,12 +57,12 @@ def quantities(problem: Problem) -> list[Quantity]:
 
 
 def has_requirement(problem: Problem) -> bool:
-    """Whether any zone asks for anything."""
+    """Return whether any zone has a requirement."""
     return any(limits_of(zone).any() for zone in problem.zones)
 
 
 class Solid(NamedTuple):
-    """An obstacle from above: corners (V, 2), heights, share of information that it leaves."""
+    """An obstacle in plan: corners (V, 2), heights, information fraction behind it."""
 
     corners: FloatArray
     low_m: float
@@ -71,7 +71,7 @@ class Solid(NamedTuple):
 
 
 def solids(problem: Problem) -> list[Solid]:
-    """All obstacles, the lowest first."""
+    """Return all obstacles, the lowest first."""
     obstacles = problem.obstacles
     turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     common = obstacles.blocked_information
@@ -88,12 +88,12 @@ def solids(problem: Problem) -> list[Solid]:
 
 
 def grey(share: float) -> str:
-    """Darker, the less a solid leaves."""
+    """Return a grey level, darker for smaller information fractions."""
     return f"{0.32 + 0.36 * min(max(share, 0.0), 1.0):.2f}"
 
 
 def mount_shapes(problem: Problem) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Lines (2, 2) and areas (V, 2) from above on which anchors may stand; points are lines."""
+    """Return mounts in plan as lines (2, 2) and areas (V, 2); points are lines."""
     if isinstance(problem.mounts, Shell):
         return [], []
     if isinstance(problem.mounts, Mounts):
@@ -106,14 +106,14 @@ def mount_shapes(problem: Problem) -> tuple[list[FloatArray], list[FloatArray]]:
 
 
 def sides_of(polygon: FloatArray) -> list[FloatArray]:
-    """Sides (2, 2) of a zone, without the slits that join its holes to its outline."""
+    """Return sides (2, 2) of a zone, without the slits that join its holes to its outline."""
     sides = np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1)
     apart = np.abs(sides[:, None] - sides[None, :, ::-1]).max(axis=(-1, -2))
     return list(sides[~(apart < _SLIT_M).any(axis=1)])
 
 
 def inner_point(polygon: FloatArray, blocked: list[Solid], anchors: FloatArray) -> FloatArray:
-    """A place for a zone's name: inside, wide, off obstacles and anchors, near the middle."""
+    """Return a label position inside a zone: wide, off obstacles and anchors, near the centre."""
     low, high = polygon.min(axis=0), polygon.max(axis=0)
     middle = 0.5 * (low + high)
     if not (high > low).all():
@@ -129,7 +129,7 @@ def inner_point(polygon: FloatArray, blocked: list[Solid], anchors: FloatArray) 
     for ring in near:
         clear[contains(ring, inside)] = 0.0
     away = np.linalg.norm((inside - middle) / (high - low), axis=-1)
-    # Labels are wider than high: anchors beside a name are nearer than those above it.
+    # Labels are wider than high: anchors beside a name are closer than those above it.
     for anchor in anchors[:, :2]:
         off = (inside - anchor) * (0.5, 1.0)
         clear = np.minimum(clear, np.linalg.norm(off, axis=-1))
@@ -137,7 +137,7 @@ def inner_point(polygon: FloatArray, blocked: list[Solid], anchors: FloatArray) 
 
 
 def _distance(points: FloatArray, ring: FloatArray) -> FloatArray:
-    """From points (P, 2) to the edge of a ring."""
+    """Return the distance from points (P, 2) to the edge of a ring."""
     away = np.roll(ring, -1, axis=0) - ring
     off = points[:, None] - ring
     share = (off * away).sum(-1) / np.maximum((away**2).sum(-1), 1e-12)
@@ -145,14 +145,14 @@ def _distance(points: FloatArray, ring: FloatArray) -> FloatArray:
 
 
 def is_far(problem: Problem, anchors: FloatArray) -> bool:
-    """Whether the anchors are so far out that only the zones can be shown."""
+    """Return whether the anchors are so far away that only the zones can be shown."""
     low, high = problem.corners()
     reach = np.abs(anchors - 0.5 * (low + high))[:, :2].max(initial=0.0)
     return bool(reach > _FAR * 0.5 * (high - low)[:2].max())
 
 
 def limits(problem: Problem, anchors: FloatArray, margin: float = 0.03) -> FloatArray:
-    """Lower and upper corner (2, 2) of what is shown from above."""
+    """Return lower and upper corner (2, 2) of the plan."""
     points = [corner[:2] for corner in problem.corners()]
     far = is_far(problem, anchors)
     if not far:
@@ -167,12 +167,12 @@ def limits(problem: Problem, anchors: FloatArray, margin: float = 0.03) -> Float
 
 
 def is_kept(problem: Problem, anchor: FloatArray) -> bool:
-    """Whether an anchor (3,) is one of those that stay."""
+    """Return whether an anchor (3,) is one of those that stay."""
     return bool((np.abs(problem.fixed - anchor).max(axis=-1, initial=0.0) < 1e-6).any())
 
 
 def shown_place(place: FloatArray, edges: FloatArray) -> tuple[FloatArray, bool]:
-    """Where an anchor (2,) is drawn: itself, or on the way to it at the edge of what is shown."""
+    """Return where to draw an anchor (2,): its position, or the edge of the plan towards it."""
     if (place >= edges[0]).all() and (place <= edges[1]).all():
         return place, False
     centre = edges.mean(axis=0)
@@ -185,7 +185,7 @@ def shown_place(place: FloatArray, edges: FloatArray) -> tuple[FloatArray, bool]
 
 
 class Layer(NamedTuple):
-    """A zone's map without holes: edges of its columns and rows (2,), values (rows, columns)."""
+    """A filled map of a zone: edges of its columns and rows (2,), values (rows, columns)."""
 
     zone: Any
     left: float
@@ -197,12 +197,12 @@ class Layer(NamedTuple):
 
 
 def maps_of(problem: Problem, anchors: FloatArray, share: float = 0.5) -> list[Map]:
-    """The map of each zone, at this share of its height."""
+    """Return the map of each zone at this fraction of its height."""
     return [accuracy_map(problem, anchors, share=share, zone=zone) for zone in problem.zones]
 
 
 def layers(problem: Problem, maps: list[Map], field: str) -> list[Layer]:
-    """What is drawn of the maps, of one field or of ``"relative"``: the largest error to limit."""
+    """Return the layers of one field, or of ``"relative"``: the largest error-to-limit ratio."""
     return [
         layer_of(zone, one, values_of(zone, one, field))
         for zone, one in zip(problem.zones, maps, strict=True)
@@ -210,7 +210,7 @@ def layers(problem: Problem, maps: list[Map], field: str) -> list[Layer]:
 
 
 def values_of(zone: Any, one: Map, field: str) -> FloatArray:
-    """Values (rows, columns) of a map; NaN off the zone, in an obstacle, and without limits."""
+    """Return values (rows, columns) of a map; NaN off the zone, in obstacles, without limits."""
     if field != "relative":
         return getattr(one, field)
     ratios = [
@@ -222,7 +222,7 @@ def values_of(zone: Any, one: Map, field: str) -> FloatArray:
 
 
 def layer_of(zone: Any, one: Map, values: FloatArray) -> Layer:
-    """A map whose holes are filled from their nearest neighbours: what is there is drawn on top."""
+    """Return a map with holes filled from nearest neighbours; obstacles are drawn on top."""
     free = np.isfinite(values)
     if free.any() and not free.all():
         nearest: Any = ndimage.distance_transform_edt(
@@ -239,13 +239,13 @@ def _edges(centres: FloatArray) -> tuple[float, float]:
 
 
 def colour_range(shown: list[Layer], limit: float | None) -> tuple[float, float]:
-    """Least and largest value of the colours, over all zones; a limit that is near lies within."""
+    """Return the colour range of all zones; it includes a limit that is close to it."""
     values = np.concatenate([layer.values[layer.free] for layer in shown])
     values = values[np.isfinite(values)]
     if not len(values):
         return 0.0, 1.0
     low, high = float(values.min()), float(np.quantile(values, 0.99))
-    # A limit that is near is shown; one that is far would make the map one colour.
+    # Include a close limit; a far one would make the map one colour.
     if limit is not None and limit < 1.5 * high:
         low, high = min(low, limit), max(high, 1.1 * limit)
     return low, max(high, _LEAST_CONTRAST * low, low + 1e-12)
@@ -261,18 +261,18 @@ def spread_labels(
     marker: float,
     taken: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> FloatArray:
-    """Centres (K, 2) of labels beside points (K, 2) such that none lies on another.
+    """Return centres (K, 2) of labels next to points (K, 2), without overlaps.
 
     Parameters
     ----------
     points, sizes
-        Places of the markers, widths and heights of the labels (K, 2); pixels.
+        Positions of the markers, widths and heights of the labels (K, 2); pixels.
     edges
-        Lower and upper corner (2, 2) of what is shown.
+        Lower and upper corner (2, 2) of the view.
     marker
         Half size of a marker.
     taken
-        Centres and half sizes (2,) of what stands there already.
+        Centres and half sizes (2,) of existing objects.
     """
     placed: list[FloatArray] = []
     angles = np.deg2rad([25, 155, -25, -155, 90, -90, 0, 180, 60, 120, -60, -120])

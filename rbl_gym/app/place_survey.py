@@ -1,4 +1,4 @@
-"""The table of a placement that says what a better survey, or calibrated links, would buy."""
+"""Table of the benefit of a better survey, or of calibrated links, for a placement."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from rbl_gym.app.page import digits
 
 
 def survey_table(result: dict[str, Any]) -> tuple[str, list[str], list[list[str]]]:
-    """Title, headings and rows."""
+    """Return title, headings and rows."""
     rows, asking = [], list(result["survey"][0]["within"])
     for row in result["survey"]:
         figures = (("position_m", 4), ("rotation_deg", 3), ("score_m", 4))

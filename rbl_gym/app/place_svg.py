@@ -1,4 +1,4 @@
-"""The plan of a placement for a page: SVG with maps, labels of fixed size, a readout by a touch."""
+"""The plan of a placement as SVG: maps, labels of fixed size, readout on touch."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.studies.placing.accuracy import Map
 from rbl_gym.studies.placing.answer import Placed
 
-# Width of the SVG's own units; zoom of hatched pictures.
+# Width of the SVG in its own units; zoom of hatched pictures.
 _WIDTH, _ZOOM = 1000.0, 6
-# Heights at which maps are shown: shares of a zone's height, by name.
+# Heights of maps as fractions of a zone's height, by name.
 _LEVELS = (("bottom", 0.0), ("middle", 0.5), ("top", 1.0))
-# With more zones than this only the middle is shown.
+# With more zones than this only the middle height is shown.
 _FEW = 6
 
 
 def answer_part(result: dict[str, Any]) -> str:
-    """The verdicts in words, with signs."""
+    """Return the verdicts in words, with signs."""
     rows = []
     for zone in place_answer.zone_answers(result):
         badge = ""
@@ -45,7 +45,7 @@ def answer_part(result: dict[str, Any]) -> str:
 
 
 def plan_part(placed: Placed) -> str:
-    """The plan with its controls, as HTML."""
+    """Return the plan with its controls, as HTML."""
     problem, anchors = placed.problem, placed.design.anchors
     edges = shapes.limits(problem, anchors)
     scale = _WIDTH / float(np.ptp(edges[:, 0]))
@@ -91,28 +91,28 @@ def plan_part(placed: Placed) -> str:
 
 
 class _Drawing:
-    """Metres to the units of an SVG."""
+    """Converts metres to the units of an SVG."""
 
     def __init__(self, edges: FloatArray, scale: float) -> None:
         self.edges, self.scale = edges, scale
 
     def points(self, points: FloatArray) -> list[str]:
-        """Coordinates as texts."""
+        """Return coordinates as texts."""
         x = (points[:, 0] - self.edges[0, 0]) * self.scale
         y = (self.edges[1, 1] - points[:, 1]) * self.scale
         return [f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True)]
 
     def polygon(self, points: FloatArray, style: str = "") -> str:
-        """A polygon."""
+        """Return a polygon."""
         return f'<polygon points="{" ".join(self.points(points))}" {style}/>'
 
     def lines(self, lines: list[FloatArray], style: str) -> str:
-        """Lines (n, 2) as one path."""
+        """Return lines (n, 2) as one path."""
         path = "".join(f"M{' L'.join(self.points(line))}" for line in lines)
         return f'<path d="{path}" fill="none" vector-effect="non-scaling-stroke" {style}/>'
 
     def image(self, data: str, box: tuple[float, float, float, float], style: str = "") -> str:
-        """A picture in a box: left, right, bottom, top."""
+        """Return a picture in a box: left, right, bottom, top."""
         left, right, bottom, top = box
         x, y = self.points(np.array([[left, top]]))[0].split(",")
         width, height = (right - left) * self.scale, (top - bottom) * self.scale
@@ -138,7 +138,7 @@ def _backdrop(draw: _Drawing, problem: Any) -> str:
 
 
 def _building(draw: _Drawing, placed: Placed) -> str:
-    """Obstacles, mounts, zones and markers."""
+    """Return obstacles, mounts, zones and markers."""
     problem, anchors = placed.problem, placed.design.anchors
     parts = []
     for solid in shapes.solids(problem):
@@ -155,7 +155,7 @@ def _building(draw: _Drawing, placed: Placed) -> str:
 
 
 def _labels(placed: Placed, edges: FloatArray) -> str:
-    """Names of zones and markers of anchors, elements of fixed size over the SVG."""
+    """Return names of zones and markers of anchors, elements of fixed size over the SVG."""
     problem, anchors = placed.problem, placed.design.anchors
     parts, solids = [], shapes.solids(problem)
     for name, anchor, row in zip(
@@ -187,7 +187,7 @@ def _labels(placed: Placed, edges: FloatArray) -> str:
 
 
 def _share(place: FloatArray, edges: FloatArray) -> tuple[float, float]:
-    """A place as shares of the width from the left, and of the height from the top."""
+    """Return a position as fractions of the width from the left and of the height from the top."""
     x, y = (place - edges[0]) / np.ptp(edges, axis=0)
     return float(x), 1 - float(y)
 
@@ -217,7 +217,7 @@ def _images(
     quantity: shapes.Quantity,
     span: tuple[float, float],
 ) -> str:
-    """The map of each zone, clipped to it; hatched beyond its limit."""
+    """Return the map of each zone, clipped to it; hatched beyond its limit."""
     parts = []
     for k, layer in enumerate(shapes.layers(problem, maps, quantity.field)):
         box = (layer.left, layer.right, layer.bottom, layer.top)
@@ -238,7 +238,7 @@ def _images(
 
 
 def _verdict_image(layer: shapes.Layer) -> Any:
-    """Two colours, and stripes on the second."""
+    """Return an image in two colours, with stripes on the second."""
     if not layer.free.any():
         return _picture(np.full((1, 1, 3), _rgb(shapes.NOTHING), np.uint8))
     beyond = _zoomed(layer.values) > 1
@@ -248,7 +248,7 @@ def _verdict_image(layer: shapes.Layer) -> Any:
 
 
 def _zoomed(values: FloatArray) -> FloatArray:
-    """Between the centres by straight lines."""
+    """Interpolate linearly between the centres."""
     shape = tuple(_ZOOM * n for n in values.shape)
     places = [(np.arange(n) + 0.5) / _ZOOM - 0.5 for n in shape]
     return ndimage.map_coordinates(
@@ -266,7 +266,7 @@ def _rgb(colour: str) -> np.ndarray:
 
 
 def _picture(pixels: np.ndarray) -> Any:
-    """An image, its rows from the bottom."""
+    """Return an image, its rows from the bottom."""
     from PIL import Image
 
     image = Image.fromarray(np.ascontiguousarray(pixels[::-1]))
@@ -282,7 +282,7 @@ def _uri(image: Any) -> str:
 def _scale(
     problem: Any, quantity: shapes.Quantity, span: tuple[float, float], maps: list[list[Map]]
 ) -> str:
-    """The legend of a map."""
+    """Return the legend of a map."""
     if quantity.field == "relative":
         keys = [
             f'<span class="key" style="background:{shapes.WITHIN}"></span>within the requirement',
@@ -316,7 +316,7 @@ def _data(
     edges: FloatArray,
     middle: int,
 ) -> str:
-    """What the readout needs, as JSON."""
+    """Return the data of the readout, as JSON."""
     problem = placed.problem
     names = {q.field: f"{q.name} # {q.unit}" for q in panels}
     names["relative"] = "# of what is asked for"

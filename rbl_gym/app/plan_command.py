@@ -11,7 +11,7 @@ from rbl_gym.app.terminal import add_json, positive, print_files, write_json
 
 
 def add_plan(commands: Any) -> None:
-    """The parser of ``rbl-gym plan``."""
+    """Add the parser of ``rbl-gym plan``."""
     plan = commands.add_parser(
         "plan",
         help="a floor plan (DXF, GeoJSON, PNG) as a building file for place",

@@ -1,4 +1,4 @@
-"""Options about floor plans: how they are read, of `plan` and `place`; what is written of them."""
+"""Options of `plan` and `place` about floor plans: reading them, and the report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _HELP = {
 
 
 def add_plan_options(parser: argparse.ArgumentParser) -> None:
-    """What is said about a drawing or a picture."""
+    """Add the options about a drawing or a picture."""
     plan = parser.add_argument_group(
         "floor plan",
         "A drawing (.dxf, .geojson) or a picture (.png, .jpg). Each layer of a drawing is said to "
@@ -62,7 +62,7 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
 
 
 class Plan(NamedTuple):
-    """A plan as it was read: tables of a building file, layers and what they were taken for."""
+    """A plan that was read: tables of a building file, layers and their meanings."""
 
     tables: dict[str, Any]
     said: list[str]
@@ -71,7 +71,7 @@ class Plan(NamedTuple):
 
 
 def is_plan(path: str) -> bool:
-    """Whether a file is a drawing or a picture, and no building file."""
+    """Return whether a file is a drawing or a picture, not a building file."""
     suffix = Path(path).suffix.lower()
     if suffix != ".json":
         return suffix in (".dxf", ".dwg", ".geojson", *_PICTURES)
@@ -80,7 +80,7 @@ def is_plan(path: str) -> bool:
 
 
 def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = None) -> Plan:
-    """The plan that a file and the options describe; a ValueError says what is wrong."""
+    """Return the plan of a file and the options; a ValueError says what is wrong."""
     from rbl_gym.placement.plans import drawing, layers, pictures, uses
 
     told = [uses.parse_use(kind, text) for kind in uses.KINDS for text in getattr(options, kind)]
@@ -101,7 +101,7 @@ def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = No
 
 
 def read_problem(options: argparse.Namespace, n_anchors: int | None) -> Any:
-    """The `Problem` of --scene: a named scene, a building file, or a plan with its layers."""
+    """Return the `Problem` of --scene: a named scene, a building file, or a plan with layers."""
     from rbl_gym.placement import building, scene_files
     from rbl_gym.placement.plans import toml_text
 
@@ -128,7 +128,7 @@ def read_problem(options: argparse.Namespace, n_anchors: int | None) -> Any:
 
 
 def add_report_options(parser: argparse.ArgumentParser) -> None:
-    """The options --report and --export."""
+    """Add the options --report and --export."""
     parser.add_argument(
         "--report",
         metavar="F",
@@ -145,7 +145,7 @@ def add_report_options(parser: argparse.ArgumentParser) -> None:
 
 
 def check_report_options(options: argparse.Namespace) -> None:
-    """A ValueError before the work where a file cannot be written in its format."""
+    """Raise ValueError before the work if a file cannot be written in its format."""
     from rbl_gym.studies.placing.layout_export import SUFFIXES
 
     for path in options.export:
@@ -158,7 +158,7 @@ def check_report_options(options: argparse.Namespace) -> None:
 
 
 def write_report(placed: Any, options: argparse.Namespace) -> None:
-    """Write what --report and --export ask for."""
+    """Write the files of --report and --export."""
     if options.report:
         from rbl_gym.app import place_pdf
 
@@ -172,14 +172,14 @@ def write_report(placed: Any, options: argparse.Namespace) -> None:
 
 
 def picture(options: argparse.Namespace) -> dict[str, Any]:
-    """The table [plan] of the option --picture."""
+    """Return the table [plan] of the option --picture."""
     from rbl_gym.placement.plans import pictures
 
     return pictures.backdrop(options.picture, scale(options.picture, options), options.origin)
 
 
 def scale(path: str, options: argparse.Namespace) -> float:
-    """Metres per pixel, or a ValueError."""
+    """Return metres per pixel; raises ValueError if invalid."""
     from rbl_gym.placement.plans import pictures
 
     if (options.metres_per_pixel is None) == (options.width is None):

@@ -1,4 +1,4 @@
-"""What a floor plan held, on the terminal; the building file that is written of it."""
+"""Contents of a floor plan on the terminal, and the building file made from it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rbl_gym.placement.plans.toml_text import to_toml
 
 
 def layer_rows(plan: Plan) -> list[dict[str, Any]]:
-    """Each layer: what it was taken for, and how many entities of each kind it has."""
+    """Return each layer: its meaning, and its number of entities of each kind."""
     rows, drawing = [], plan.drawing
     if drawing is None:
         return rows
@@ -31,7 +31,7 @@ def layer_rows(plan: Plan) -> list[dict[str, Any]]:
 
 
 def print_plan(layers: list[dict[str, Any]], said: list[str]) -> None:
-    """The layers, those that nothing maps too, and what there is to know."""
+    """Print the layers, including unmapped ones, and remarks."""
     console = new_console()
     if layers:
         table = new_table("layers of the drawing")
@@ -59,7 +59,7 @@ def _counts(counts: dict[str, int]) -> str:
 
 
 def write_building(tables: dict[str, Any], source: str, said: list[str], path: str) -> None:
-    """Write a building file, making its folder; files of [plan] are named from there."""
+    """Write a building file; create its folder; paths in [plan] are relative to it."""
     folder = Path(path).parent
     folder.mkdir(parents=True, exist_ok=True)
     plan = {

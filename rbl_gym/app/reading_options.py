@@ -1,4 +1,4 @@
-"""The files of a recording, and how they are written, on the command line."""
+"""Command line options for the files of a recording and their format."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _FILES = (
 
 
 def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ()) -> None:
-    """The options that `read_runs` reads.
+    """Add the options that `read_runs` reads.
 
-    `left_out`: names of files whose options the command has itself. Then no file is required.
+    `left_out`: names of files for which the command has its own options. Then no file is required.
     """
     files = parser.add_argument_group("files")
     for name, text in (
@@ -103,7 +103,7 @@ def add_reading(parser: argparse.ArgumentParser, left_out: Collection[str] = ())
 
 
 def read_runs(options: argparse.Namespace) -> dict[str, Recording]:
-    """The recordings that the options tell, by the names of their runs."""
+    """Return the recordings given by the options, by name of run."""
     from rbl_gym import recordings
 
     paths = {name: getattr(options, name) for name in _FILES}
@@ -127,7 +127,7 @@ def read_runs(options: argparse.Namespace) -> dict[str, Recording]:
 
 
 def _pairs(text: str) -> dict[str, str]:
-    """``a=b,c=d`` as a dictionary."""
+    """Parse ``a=b,c=d`` into a dictionary."""
     pairs = {}
     for part in text.split(","):
         name, equal, value = part.partition("=")

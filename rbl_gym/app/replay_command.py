@@ -24,15 +24,15 @@ from rbl_gym.app.terminal import (
     write_json,
 )
 
-# Law of the biases of radios that nobody calibrated: constant ones, learned.
+# Law of the biases of uncalibrated radios: constant, learned.
 _RAW = {"bias_std_m": 0.05, "bias_time_s": None, "bias_common_m": 0.1}
 
 
 def add_replay(commands: Any) -> None:
-    """The parser of ``rbl-gym replay``.
+    """Add the parser of ``rbl-gym replay``.
 
-    An argument of a field of `rbl_gym.studies.replay.Settings` has its name and no default: what
-    is not given is left to the settings.
+    An argument for a field of `rbl_gym.studies.replay.Settings` has its name and no default.
+    Arguments that are not given keep the values of the settings.
     """
     replay = commands.add_parser(
         "replay",
@@ -220,7 +220,7 @@ def _replay(options: argparse.Namespace) -> int:
         recordings.check_track_path(options.track)
     settings = _settings(options)
     runs = read_runs(options)
-    # What is wrong is said before the work begins.
+    # Report errors before the work begins.
     for recording in runs.values() if len(runs) == 1 else ():
         replay.check_replay(recording, settings)
     settings, clocks = found_clocks(options, runs, settings)
@@ -255,7 +255,7 @@ def _replay(options: argparse.Namespace) -> int:
 
 
 def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
-    """What the longest run tells of the settings, where that is asked for."""
+    """Return the settings tuned on the longest run, if requested."""
     if not options.tune and options.tune_s is None:
         return None
     from rbl_gym.studies import replay
@@ -264,8 +264,8 @@ def _tuned(options: argparse.Namespace, runs: Any, settings: Any) -> Any:
     length = {} if options.tune_s is None else {"seconds": options.tune_s}
     filters: tuple[str, ...] = ()
     if not options.filter and not options.odometry and settings.filter in ("iekf", "iekf-log"):
-        # Where no filter is named the likelihood chooses one too. What a calibration leaves is
-        # small and moves with the pose: the law of iekf-bias.
+        # Without a named filter the likelihood also chooses one. Errors left by a calibration are
+        # small and move with the pose: the law of iekf-bias.
         filters = ("iekf-bias",) if options.calibration else ("iekf-log", "iekf", "iekf-bias")
     with progress("tune", replay.TUNING_ROUNDS * max(len(filters), 1)) as advance:
         return replay.tune(longest, settings, filters=filters, advance=advance, **length)
@@ -293,7 +293,7 @@ def _replay_runs(
 
 
 def _settings(options: argparse.Namespace) -> Any:
-    """`rbl_gym.studies.replay.Settings` of what was given."""
+    """Return the `rbl_gym.studies.replay.Settings` of the arguments."""
     from rbl_gym.studies import replay
 
     given = {
@@ -320,7 +320,7 @@ def _settings(options: argparse.Namespace) -> Any:
 
 
 def _filter_for(given: Mapping[str, Any], biases: Mapping[str, Any]) -> str:
-    """The filter that takes what was told; told nothing, the one that needs nothing."""
+    """Return a filter for the given inputs; without inputs, one that needs none."""
     if biases:
         return "iekf-bias"
     return "iekf" if "walk_m" in given or "walk_deg" in given else "iekf-log"
@@ -344,7 +344,7 @@ def _start(text: str) -> tuple[float, ...]:
 
 
 def _volume(text: str) -> tuple[float | None, ...]:
-    """Six numbers with commas, some of which may be empty."""
+    """Parse six numbers separated by commas, some of which may be empty."""
     try:
         limits = [float(part) if part.strip() else None for part in text.split(",")]
     except ValueError:

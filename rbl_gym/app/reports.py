@@ -19,7 +19,7 @@ CAMSAP_COLUMNS = (
 )
 
 
-# What stands beside ours where a source has no table and no claim in words.
+# Our column alone, if a source has neither a table nor a claim in words.
 _NO_NUMBERS = {
     "icassp2013": "The paper prints no numbers. Its Figs 2 and 3 are angle and translation over\n"
     "the reference range, settings with 1 mm their parts (b). CLS and CTLS have one solution "
@@ -29,7 +29,7 @@ _NO_NUMBERS = {
 
 
 def print_camsap2013(result: dict[str, Any]) -> None:
-    """The filters in a table, and the claims of the paper and ours with their figures."""
+    """Print the filters in a table, and the claims of the paper with our figures."""
     console = new_console()
     table = new_table(f"{result['experiment']}, {result['trials']} trials")
     table.add_column("filter")
@@ -63,7 +63,7 @@ def print_camsap2013(result: dict[str, Any]) -> None:
 
 
 def print_static(result: dict[str, Any]) -> None:
-    """Mean ratios to the bound over the reference ranges, one table for each setting."""
+    """Print mean ratios to the bound over the reference ranges, one table per setting."""
     console = new_console()
     for label, data in result["settings"].items():
         low, high = data["reference_range_db"][0], data["reference_range_db"][-1]
@@ -86,7 +86,7 @@ def print_static(result: dict[str, Any]) -> None:
 
 
 def print_slides2013(result: dict[str, Any]) -> None:
-    """The static part, then the dynamic one."""
+    """Print the static part, then the dynamic one."""
     print_static(result)
     print_camsap2013(result["dynamic"])
 
@@ -95,7 +95,7 @@ _SHOWN = {"centre": "tags' centre", "axis": "tags' line"}
 
 
 def print_replay(result: dict[str, Any]) -> None:
-    """The figures of a recording, one a line."""
+    """Print the figures of a recording, one per line."""
     console = new_console()
     speed = ""
     if "microseconds_per_epoch" in result:
@@ -148,7 +148,7 @@ def _print_errors(console: Any, title: str, result: dict[str, Any], axes: str) -
 
 
 def print_runs(result: dict[str, Any]) -> None:
-    """The figures of several runs, a row each, and of all together."""
+    """Print the figures of several runs, a row each, and of all together."""
     console = new_console()
     every = {**result["runs"], "together": result["together"]}
     columns = [
@@ -178,7 +178,7 @@ def print_runs(result: dict[str, Any]) -> None:
 
 
 def compared(result: dict[str, Any]) -> list[str]:
-    """How the track of a recording was brought together with its truth, in lines."""
+    """Return how the track of a recording was aligned with its truth, in lines."""
     parts = [
         f"{result['epochs_with_truth']} of {result['epochs']} epochs have truth "
         f"({result['truth_format']})"
@@ -221,7 +221,7 @@ def _print_notes(console: Any, result: dict[str, Any]) -> None:
 
 
 def print_training(result: dict[str, Any]) -> None:
-    """The learning curve in a few points, where the time went, and how good the policy is."""
+    """Print the learning curve at a few points, the computing times, and the policy's score."""
     console = new_console()
     curve = result["curve"]
     explores = result["env_share"] is not None
@@ -248,7 +248,7 @@ def print_training(result: dict[str, Any]) -> None:
 
 
 def print_evaluation(result: dict[str, Any]) -> None:
-    """Policies and references, the best first."""
+    """Print policies and references, the best first."""
     console = new_console()
     table = new_table(f"{result['task']}, {result['worlds']} held-out worlds")
     table.add_column("policy")
@@ -270,7 +270,7 @@ def print_evaluation(result: dict[str, Any]) -> None:
 
 
 def print_transfer(result: dict[str, Any]) -> None:
-    """One table for each filter: score and real error, and how they go together."""
+    """Print a table per filter: score and actual error, and their correlation."""
     console = new_console()
     for name, rows in result["filters"].items():
         table = new_table(

@@ -1,4 +1,4 @@
-"""Sensors on the body and their clocks, on the command line of ``rbl-gym replay``."""
+"""Options of ``rbl-gym replay`` for sensors on the body and their clocks."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from rbl_gym.recordings import Recording
     from rbl_gym.studies.replay import Settings
 
-# Settings that are the offsets of clocks.
+# Settings that are clock offsets.
 _CLOCKS = {"truth": "time_offset", "odometry": "odometry_offset_s", "imu": "imu_offset_s"}
 
 
 def add_odometry(group: Any) -> None:
-    """Options of `rbl_gym.studies.replay.Odometry`."""
+    """Add the options of `rbl_gym.studies.replay.Odometry`."""
     for name, text in (
         ("odometry-m", "by how much its way is off after 1 s, default 0.05"),
         ("slip-m", "the same sideways and vertically, default 0.03"),
@@ -35,7 +35,7 @@ def add_odometry(group: Any) -> None:
 
 
 def add_inertial(group: Any) -> None:
-    """Options of `rbl_gym.studies.replay.Inertial`."""
+    """Add the options of `rbl_gym.studies.replay.Inertial`."""
     for name, text in (
         ("gyro-noise", "density of its white noise, rad/s/sqrt(Hz), default 0.003"),
         ("accel-noise", "the same of the accelerometer, m/s^2/sqrt(Hz), default 0.05"),
@@ -49,7 +49,7 @@ def add_inertial(group: Any) -> None:
 
 
 def add_clocks(group: Any) -> None:
-    """The option ``--time-offset``."""
+    """Add the option ``--time-offset``."""
     group.add_argument(
         "--time-offset",
         type=_clock,
@@ -64,12 +64,12 @@ def add_clocks(group: Any) -> None:
 
 
 def told_clocks(options: argparse.Namespace) -> dict[str, Any]:
-    """Settings of the clocks that are told; that of the truth may be ``"auto"``.
+    """Return settings of the given clocks; that of the truth may be ``"auto"``.
 
     Raises
     ------
     ValueError
-        On the clock of a sensor that there is not.
+        If there is no sensor for a clock.
     """
     told = dict(options.time_offsets or ())
     for what in told:
@@ -83,7 +83,7 @@ def told_clocks(options: argparse.Namespace) -> dict[str, Any]:
 def found_clocks(
     options: argparse.Namespace, runs: Mapping[str, Recording], settings: Settings
 ) -> tuple[Settings, dict[str, Any]]:
-    """The settings with the clocks of sensors that are to be found, and figures of these."""
+    """Return the settings with estimated sensor clocks, and figures of these."""
     from rbl_gym.studies import replay
 
     figures: dict[str, Any] = {}

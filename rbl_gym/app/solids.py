@@ -12,36 +12,36 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.polygons import ears
 from rbl_gym.rendering.drawing import RADIUS_95, gapped
 
-# Latitudes and longitudes of an ellipsoid's net.
+# Latitudes and longitudes of an ellipsoid's mesh.
 _LATITUDES, _LONGITUDES = 9, 16
 
 
 def numbers(values: FloatArray, digits: int = 5) -> Any:
-    """Nested lists to a few digits, None where there is no number: pages stay small."""
+    """Return nested lists rounded to a few digits, None for missing numbers: pages stay small."""
     if values.ndim > 1:
         return [numbers(row, digits) for row in values]
     return [float(f"{x:.{digits}g}") if np.isfinite(x) else None for x in values]
 
 
 def xyz(points: FloatArray) -> dict[str, list[float | None]]:
-    """Points (K, 3) as plotly's coordinates; NaN is a gap."""
+    """Return points (K, 3) as plotly's coordinates; NaN is a gap."""
     return dict(zip("xyz", numbers(points.T), strict=True))
 
 
 def lines(segments: FloatArray, **style: Any) -> go.Scatter3d:
-    """Segments (S, 2, 3) as one line."""
+    """Return segments (S, 2, 3) as one line."""
     return go.Scatter3d(**xyz(gapped(segments)), mode="lines", hoverinfo="skip", **style)
 
 
 def prism_edges(corners: FloatArray, low: float, high: float) -> FloatArray:
-    """The edges (3 V, 2, 3) of a prism over corners (V, 2)."""
+    """Return the edges (3 V, 2, 3) of a prism over corners (V, 2)."""
     bottom, top = (np.insert(corners, 2, z, axis=1) for z in (low, high))
     rings = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in (bottom, top)]
     return np.concatenate([*rings, np.stack([bottom, top], axis=1)])
 
 
 def prisms(found: Sequence[tuple[FloatArray, float, float]], **style: Any) -> go.Mesh3d:
-    """Prisms, each of corners (V, 2) and two heights, as one mesh with faces."""
+    """Return prisms, each with corners (V, 2) and two heights, as one mesh with faces."""
     points, triangles, count = [], [], 0
     for corners, low, high in found:
         size = len(corners)
@@ -73,7 +73,7 @@ def prisms(found: Sequence[tuple[FloatArray, float, float]], **style: Any) -> go
 
 
 def ellipsoid(centre: FloatArray, covariance: FloatArray) -> dict[str, list[float | None]]:
-    """Coordinates of the 95 % region of a Gaussian, on the net of `net`."""
+    """Return coordinates of the 95 % region of a Gaussian, on the mesh of `net`."""
     values, vectors = np.linalg.eigh(covariance)
     height = np.linspace(-np.pi / 2, np.pi / 2, _LATITUDES)[:, None]
     around = np.linspace(0, 2 * np.pi, _LONGITUDES, endpoint=False)
@@ -88,7 +88,7 @@ def ellipsoid(centre: FloatArray, covariance: FloatArray) -> dict[str, list[floa
 
 
 def net() -> dict[str, list[int]]:
-    """Triangles of an ellipsoid's net."""
+    """Return the triangles of an ellipsoid's mesh."""
     rows = np.arange(_LATITUDES - 1)[:, None] * _LONGITUDES
     along = np.arange(_LONGITUDES)
     next_ = (along + 1) % _LONGITUDES

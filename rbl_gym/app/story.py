@@ -1,4 +1,4 @@
-"""A track as its page tells it: what was believed, what is true, how large errors are drawn."""
+"""Data of the page of a track: beliefs, truth, and the enlargement of errors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rbl_gym.studies.epochs import AxisErrors, axis_errors, nees_interval
 
 
 class Beliefs(NamedTuple):
-    """Of K epochs: rotation (K, 3, 3), translation (K, 3), covariance (K, 6, 6); and a colour."""
+    """Beliefs of K epochs: rotation (K, 3, 3), translation (K, 3), covariance (K, 6, 6); colour."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -30,16 +30,16 @@ class Story(NamedTuple):
     times
         (K,), seconds.
     anchors, names
-        (M, 3) and what they are called.
+        Anchors (M, 3) and their names.
     tags
-        (N, 3) in the body frame.
+        Tags (N, 3) in the body frame.
     truth
-        Rotation (K, 3, 3), or None for positions alone, and translation (K, 3), and where they are
-        known (K,); None: nowhere.
+        Rotation (K, 3, 3), or None for positions only, translation (K, 3), and whether they are
+        known (K,). None: no truth.
     beliefs
-        By the filters' names.
+        Beliefs by filter name.
     axes
-        ``"xyz"``, or ``"xy"``: only yaw and the position in the plane are judged.
+        ``"xyz"``, or ``"xy"``: only yaw and the horizontal position are evaluated.
     """
 
     times: FloatArray
@@ -52,20 +52,20 @@ class Story(NamedTuple):
 
 
 def freedom_of(story: Story) -> int:
-    """How many components of the pose are judged."""
+    """Return the number of evaluated pose components."""
     places, turns = len(story.axes), 1 if story.axes == "xy" else 3
     return places if story.truth is not None and story.truth[0] is None else places + turns
 
 
 def errors_of(story: Story, belief: Beliefs) -> AxisErrors:
-    """Errors of a track, with the standard deviations that it claims."""
+    """Return errors of a track, with the standard deviations of its beliefs."""
     assert story.truth is not None
     found = PoseBelief(belief.rotation, belief.translation, belief.covariance, belief.rotation)
     return axis_errors(found, *story.truth, planar=story.axes == "xy")
 
 
 def chart_limits(story: Story) -> list[tuple[float, float]]:
-    """Limits of the three charts; what the first epochs do from far off is cut."""
+    """Return limits of the three charts; large errors of the first epochs are cut."""
     found = [errors_of(story, belief) for belief in story.beliefs.values()]
     limits = []
     pairs = (
@@ -83,7 +83,7 @@ def chart_limits(story: Story) -> list[tuple[float, float]]:
 
 
 def enlargement(story: Story) -> float:
-    """By how much errors are enlarged close up, so that a usual ellipsoid is of the body's size."""
+    """Return the enlargement of errors that makes typical ellipsoids as large as the body."""
     size = float(np.linalg.norm(story.tags, axis=-1).max())
     widest = [np.sqrt(np.linalg.eigvalsh(belief.covariance[:, 3:, 3:])[:, -1])
               for belief in story.beliefs.values()]  # fmt: skip

@@ -12,7 +12,7 @@ from rbl_gym.studies.extras import require
 
 
 def add_studio(commands: Any) -> None:
-    """The parser of ``rbl-gym studio``."""
+    """Add the parser of ``rbl-gym studio``."""
     studio = commands.add_parser(
         "studio",
         help="take anchors by the hand, watch filters at work: a page in the browser",
@@ -113,14 +113,14 @@ def _check_scene(options: argparse.Namespace) -> None:
 
 
 def _layout(options: argparse.Namespace) -> Any:
-    """Anchors (M, 3) of --layout; None: there is none."""
+    """Return anchors (M, 3) of --layout, or None."""
     from rbl_gym.placement.layout_files import read_layout
 
     return read_layout(options.layout).positions if options.layout else None
 
 
 def _program(options: argparse.Namespace) -> Any:
-    """What is watched."""
+    """Return the program to watch."""
     from rbl_gym.studies import replay
     from rbl_gym.studio.watch import program
     from rbl_gym.studio.watch.frames import filter_named
@@ -150,7 +150,7 @@ def _program(options: argparse.Namespace) -> Any:
 
 
 def _episode(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
-    """An episode of an environment, in SCENE where one is given."""
+    """Return an episode of an environment, in SCENE if given."""
     import gymnasium as gym
 
     from rbl_gym.studio.watch import program
@@ -165,7 +165,7 @@ def _episode(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
 
 
 def _simulation(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
-    """An episode of a named scene with the anchors of --layout, or of a building."""
+    """Return an episode of a named scene with the anchors of --layout, or of a building."""
     from rbl_gym.studio.state import open_state
     from rbl_gym.studio.watch import live, program
     from rbl_gym.worlds import scenes
@@ -182,7 +182,7 @@ def _simulation(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
 
 
 def _tables(options: argparse.Namespace, count: int | None) -> dict[str, Any] | None:
-    """The tables of the file or plan that was opened; None: a named scene."""
+    """Return the tables of the opened file or plan; None for a named scene."""
     from rbl_gym.placement import scene_files
     from rbl_gym.placement.plans import toml_text
 
@@ -194,7 +194,7 @@ def _tables(options: argparse.Namespace, count: int | None) -> dict[str, Any] | 
 
 
 def _write_report(problem: Any, anchors: Any, path: str) -> None:
-    """The report of a layout, as `rbl-gym place --layout F --report` writes it."""
+    """Write the report of a layout, as `rbl-gym place --layout F --report` does."""
     from rbl_gym.app import place_pdf
     from rbl_gym.studies.placing import answer
 

@@ -1,4 +1,4 @@
-"""Tables and text on the terminal: by rich where it is installed (extra ``cli``), else plain."""
+"""Tables and text on the terminal: by rich if it is installed (extra ``cli``), else plain."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def has_rich() -> bool:
-    """Whether rich is installed."""
+    """Return whether rich is installed."""
     try:
         import rich  # noqa: F401
     except ImportError:
@@ -15,17 +15,17 @@ def has_rich() -> bool:
 
 
 def new_console(width: int = 130) -> Any:
-    """Standard output: rich's console, or one that prints plain text."""
+    """Return a console for standard output: rich's, or one that prints plain text."""
     if not has_rich():
         return _PlainConsole()
     from rich.console import Console
 
-    # Piped, a table keeps all of its columns.
+    # Piped tables keep all of their columns.
     return Console(width=None if Console().is_terminal else width, highlight=False, markup=False)
 
 
 def new_table(title: str | None = None) -> Any:
-    """A table that `new_console` prints: rich's, or one of plain text with the same methods."""
+    """Return a table for `new_console`: rich's, or plain text with the same methods."""
     if not has_rich():
         return _PlainTable(title)
     from rich.table import Table
@@ -37,12 +37,12 @@ class _PlainConsole:
     """`print` as rich's, without style."""
 
     def print(self, *shown: Any, **_style: Any) -> None:
-        """Text, or tables."""
+        """Print text or tables."""
         print(*shown)
 
 
 class _PlainTable:
-    """Columns, rows and sections as rich's `Table` takes them; `str` gives the text."""
+    """Columns, rows and sections as in rich's `Table`; `str` gives the text."""
 
     def __init__(self, title: str | None) -> None:
         self._title = title
@@ -51,16 +51,16 @@ class _PlainTable:
         self._rows: list[tuple[str, ...] | None] = []  # None: a section ends
 
     def add_column(self, heading: str, justify: str = "left", **_style: Any) -> None:
-        """A column, to the left or to the right."""
+        """Add a column, aligned left or right."""
         self._headings.append(heading)
         self._right.append(justify == "right")
 
     def add_row(self, *cells: str, **_style: Any) -> None:
-        """A row; cells at its end may be missing."""
+        """Add a row; trailing cells may be missing."""
         self._rows.append((*cells, *[""] * (len(self._headings) - len(cells))))
 
     def add_section(self) -> None:
-        """A line below the rows so far."""
+        """Add a line below the rows so far."""
         self._rows.append(None)
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""What the commands share: progress bars, JSON, arguments, extras that are missing."""
+"""Shared by all commands: progress bars, JSON, arguments, missing extras."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rbl_gym.studies.progress import Advance
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
-    """The option --json."""
+    """Add the option --json."""
     parser.add_argument(
         "--json",
         nargs="?",
@@ -27,30 +27,30 @@ def add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def add_seed(parser: argparse.ArgumentParser, of: str = "of all randomness") -> None:
-    """The option --seed."""
+    """Add the option --seed."""
     parser.add_argument("--seed", type=natural, default=0, help=f"{of}, default 0")
 
 
 def add_trials(parser: argparse.ArgumentParser, default: int = 1000, of: str = "") -> None:
-    """The options --trials and --seed."""
+    """Add the options --trials and --seed."""
     parser.add_argument("--trials", type=positive, default=default, help=f"{of}default {default}")
     add_seed(parser)
 
 
 def add_html(parser: argparse.ArgumentParser, shows: str) -> None:
-    """The option --html; `check_html` says before the work whether it can be served."""
+    """Add the option --html; `check_html` checks before the work whether it is available."""
     parser.add_argument("--html", metavar="F", help=f"{shows}; one file, no network")
 
 
 def check_html(options: argparse.Namespace) -> None:
-    """A MissingExtraError where a page is asked for and its library is missing."""
+    """Raise MissingExtraError if a page is requested and its library is missing."""
     if options.html:
         require("plotly", "viz")
 
 
 @contextlib.contextmanager
 def progress(label: str, total: int = 0) -> Iterator[Advance]:
-    """A progress bar on standard error, of `total` steps and those that are announced later."""
+    """Show a progress bar on standard error, with `total` steps and those announced later."""
     if not has_rich():
         yield from _plain_progress(label, total)
         return
@@ -68,7 +68,7 @@ def progress(label: str, total: int = 0) -> Iterator[Advance]:
 
 
 def _plain_progress(label: str, total: int) -> Iterator[Advance]:
-    """A line that is written over, on a terminal only."""
+    """Show a line that is overwritten, on a terminal only."""
     done, shown = 0, ""
 
     def advance(steps: int = 1, *, more: int = 0) -> None:
@@ -85,7 +85,7 @@ def _plain_progress(label: str, total: int) -> Iterator[Advance]:
 
 
 def write_json(result: dict[str, Any], target: str | None) -> bool:
-    """Write figures where asked; returns whether standard output is free for a table."""
+    """Write figures if requested; return whether standard output is free for a table."""
     if target is None:
         return True
     text = json.dumps(result, indent=1, allow_nan=False) + "\n"
@@ -98,7 +98,7 @@ def write_json(result: dict[str, Any], target: str | None) -> bool:
 
 
 def positive(text: str) -> int:
-    """A whole number above zero, for argparse."""
+    """Parse a positive integer, for argparse."""
     value = natural(text)
     if value == 0:
         raise argparse.ArgumentTypeError("must be at least 1, got 0")
@@ -106,7 +106,7 @@ def positive(text: str) -> int:
 
 
 def natural(text: str) -> int:
-    """A whole number, not negative, for argparse."""
+    """Parse a non-negative integer, for argparse."""
     try:
         value = int(text)
     except ValueError:
@@ -117,14 +117,14 @@ def natural(text: str) -> int:
 
 
 def print_files(**files: str | None) -> None:
-    """Where what was written stands, a line each: ``picture: out/x.png``."""
+    """Print the written files, one per line: ``picture: out/x.png``."""
     for label, path in files.items():
         if path:
             print(f"{label}: {path}")
 
 
 def window(text: str) -> tuple[float, float]:
-    """``START:END`` in seconds, for argparse."""
+    """Parse ``START:END`` in seconds, for argparse."""
     start, _, end = text.partition(":")
     try:
         return float(start), float(end)
@@ -133,7 +133,7 @@ def window(text: str) -> tuple[float, float]:
 
 
 def offset(text: str) -> float | str:
-    """Seconds, or ``auto``, for argparse."""
+    """Parse seconds, or ``auto``, for argparse."""
     try:
         return text if text == "auto" else float(text)
     except ValueError:

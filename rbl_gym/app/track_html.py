@@ -1,4 +1,4 @@
-"""A tracked body as one HTML page: space and close-up with a time slider, errors, NEES, tables."""
+"""A tracked body as an HTML page: 3-D view and close-up with a time slider, errors, NEES."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _MOMENTS, _POINTS = 120, 1500
 
 
 def track_figure(story: Story) -> go.Figure:
-    """Space, the body close up, and where truth is known the errors and the NEES; a slider."""
+    """Return the 3-D view, a close-up, and with truth errors and NEES; with a slider."""
     rows = 2 if story.truth is not None else 1
     wide = {"type": "scene", "colspan": 3}
     specs: list[Any] = [[wide, None, None, wide, None, None]]
@@ -98,11 +98,11 @@ def track_figure(story: Story) -> go.Figure:
 
 
 def _thinned(count: int, most: int) -> np.ndarray:
-    """Indices of so many epochs at most, evenly, with the first and the last."""
+    """Return at most this many indices of epochs, evenly spaced, with first and last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-# --- what stays --------------------------------------------------------------------------------
+# --- static part -------------------------------------------------------------------------------
 
 
 def _add_still(shown: go.Figure, story: Story) -> None:
@@ -203,7 +203,7 @@ def _add_curves(shown: go.Figure, story: Story) -> None:
             row=2,
             col=5,
         )
-    # Without the option plotly looks for two axes in the traces of 3-D scenes, too.
+    # Without this option plotly looks for two axes in the traces of 3-D scenes, too.
     where: dict[str, Any] = {"row": 2, "col": 5, "exclude_empty_subplots": False}
     grey = "#868e96"
     shown.add_hrect(low, high, line_width=0, fillcolor=grey, opacity=0.2, **where)
@@ -215,13 +215,13 @@ def _faint(colour: str) -> str:
     return f"rgba({red},{green},{blue},0.16)"
 
 
-# --- what moves --------------------------------------------------------------------------------
+# --- moving part -------------------------------------------------------------------------------
 
 
 def _moving(
     story: Story, k: int, tops: list[tuple[float, float]]
 ) -> list[tuple[Any, tuple[int, int]]]:
-    """Traces of epoch k and their places: always the same ones in the same order."""
+    """Return traces of epoch k and their positions: always the same ones in the same order."""
     known = story.truth is not None and bool(story.truth[2][k])
     first = next(iter(story.beliefs.values()))
     rotation, place = first.rotation[k], first.translation[k]
@@ -299,7 +299,7 @@ def _wire(points: FloatArray, colour: str, name: str, width: float = 4, **style:
 
 
 def _change(trace: Any) -> Any:
-    """Only what changes of a trace."""
+    """Return only the changes of a trace."""
     data = {key: trace[key] for key in ("x", "y", "z") if key in trace}
     return type(trace)(**data)
 
@@ -312,7 +312,7 @@ def _close_title(story: Story) -> str:
 
 
 def _world(story: Story) -> dict[str, Any]:
-    """Axes with equal scales around all that there is; what is flat is given some height."""
+    """Return axes with equal scales around all objects; flat scenes get some height."""
     points = [story.anchors, *(belief.translation for belief in story.beliefs.values())]
     if story.truth is not None:
         points.append(story.truth[1][story.truth[2]])
@@ -330,7 +330,7 @@ def _world(story: Story) -> dict[str, Any]:
         for name, at, s in zip("xyz", middle.tolist(), size.tolist(), strict=True)
     }
     shape = size / size.max()
-    # Flat worlds leave room to be shown larger.
+    # Flat worlds have room to be shown larger.
     ratio = dict(zip("xyz", (shape / np.prod(shape) ** (1 / 6)).tolist(), strict=True))
     camera = {"eye": {"x": 0.85, "y": -1.45, "z": 0.85}, "center": {"x": 0, "y": 0, "z": -0.1}}
     return {"aspectmode": "manual", "aspectratio": ratio, "camera": camera, **scene}
@@ -382,7 +382,7 @@ def _play() -> dict[str, Any]:
 
 
 def anchors_table(story: Story) -> str:
-    """Where the anchors stand."""
+    """Return a table of the anchor positions."""
     rows = [
         [str(name), *map(float, place)]
         for name, place in zip(story.names, story.anchors, strict=True)
@@ -391,7 +391,7 @@ def anchors_table(story: Story) -> str:
 
 
 def log_ticks(low: float, high: float) -> dict[str, Any]:
-    """1, 2 and 5 of every decade, or more of a short axis; plotly's own labels are bare digits."""
+    """Return 1, 2 and 5 of every decade, more on a short axis; plotly's labels are bare digits."""
     digits = (1, 2, 5) if high > 5 * low else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     marks = [float(f"{digit}e{decade}") for decade in decades for digit in digits]

@@ -1,4 +1,4 @@
-"""The pages of `rbl-gym demo` and `rbl-gym replay`: a track in 3-D, charts, tables."""
+"""Pages of `rbl-gym demo` and `rbl-gym replay`: a track in 3-D, charts, tables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _LEGEND = (
 
 
 def demo_page(result: dict[str, Any], example: Example) -> str:
-    """The tracking paper's experiment: one trial to look at, and all of them in figures."""
+    """Write the tracking paper's experiment: one trial, and statistics of all trials."""
     scene, episode = example.trials.scene, example.trials.episode
     beliefs = {
         name: Beliefs(*belief[:3], COLOURS[name]) for name, belief in example.beliefs.items()
@@ -67,7 +67,7 @@ def demo_page(result: dict[str, Any], example: Example) -> str:
 
 
 def _curves(result: dict[str, Any]) -> go.Figure:
-    """RMSE (Fig. 2), MAE (Fig. 3) and mean NEES per step of all trials."""
+    """Return RMSE (Fig. 2), MAE (Fig. 3) and mean NEES per step of all trials."""
     charts = (
         ("rotation_rmse", "rotation RMSE (Frobenius)"),
         ("translation_rmse_m", "translation RMSE (m)"),
@@ -136,11 +136,11 @@ def _curves(result: dict[str, Any]) -> go.Figure:
 
 
 def replay_page(recording: Recording, replayed: Replayed) -> str:
-    """A recording: the track, its errors where truth exists, the figures of the run."""
+    """Write the page of a recording: track, errors (with truth), and figures of the run."""
     settings, track, result = replayed.settings, replayed.track, replayed.figures
     truth = truth_of(recording, track, settings)
     times = track.times - track.times[0]
-    # Pictures in 3-D have seven digits, those of a map need more.
+    # Data of 3-D pictures have seven digits, those of a map need more.
     origin = origin_of(recording)
     places = track.translation - origin
     beliefs = Beliefs(track.rotation, places, track.covariance, COLOURS["iterated EKF"])

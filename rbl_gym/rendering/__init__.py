@@ -1,7 +1,7 @@
-"""Frames of environments, ``render_mode="rgb_array"``: (height, width, 3) of uint8.
+"""Frames of environments for ``render_mode="rgb_array"``: (height, width, 3), uint8.
 
-A `Film` collects what there was to see, epoch by epoch; a frame is drawn from it alone, so that
-the same episode gives the same pixels. Matplotlib is imported by the first frame.
+A `Film` stores what is shown of each epoch. A frame is drawn from the film alone, so that the same
+episode gives the same pixels. Matplotlib is imported with the first frame.
 """
 
 from rbl_gym.rendering.body import film_of, film_of_many, shot

@@ -1,4 +1,4 @@
-"""Frames of a rigid body among anchors: the world, the body close up, errors over the epochs."""
+"""Frames of a rigid body among anchors: the world, a close-up of the body, errors over epochs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LABELS = ("position [m]", "rotation [deg]")
 
 
 def film_of(render_mode: str | None, scene: Scene, title: str | None = None) -> Film | None:
-    """A film of a scene, titled by its name; None where nothing is to be rendered."""
+    """Return a film of a scene, titled by its name; None without rendering."""
     if check_mode(render_mode) is None:
         return None
     return Film(functools.partial(frame, _stage(scene, title)), scene.steps)
@@ -29,7 +29,7 @@ def film_of(render_mode: str | None, scene: Scene, title: str | None = None) -> 
 def film_of_many(
     render_mode: str | None, scene_of: Callable[[int], Scene], steps: int
 ) -> Film | None:
-    """A film of worlds with scenes of their own, whose anchors are padded in the shots."""
+    """Return a film of worlds with different scenes, whose anchors are padded in the shots."""
     if check_mode(render_mode) is None:
         return None
     return Film(functools.partial(_frame_of_many, scene_of), steps)
@@ -74,7 +74,7 @@ def shot(
     translation: FloatArray,
     bound: FloatArray | None = None,
 ) -> Shot:
-    """A shot of worlds: links (B, M, N), anchors (B, M, 3), poses, and maybe bounds (B, 6, 6)."""
+    """Return a shot: links (B, M, N), anchors (B, M, 3), poses, optional bounds (B, 6, 6)."""
     return Shot(anchors, np.asarray(links.any(axis=-1)), Pose(rotation, translation, bound))
 
 
@@ -85,7 +85,7 @@ def frame(
     shots: Sequence[Shot],
     beliefs: Sequence[Pose | None],
 ) -> Image:
-    """The last epoch of a world's episode in space and close up, the errors of all of it."""
+    """Draw the last epoch of an episode in 3-D and close up, and the errors of all epochs."""
     last, belief = (mapped(lambda field: field[world], part) for part in (shots[-1], beliefs[-1]))
     source = (
         "belief" if belief is not None else "bound" if last.truth.covariance is not None else ""
@@ -109,7 +109,7 @@ def frame(
 def _curves(
     world: int, truth: Sequence[Pose], beliefs: Sequence[Pose | None]
 ) -> tuple[FloatArray, FloatArray]:
-    """Errors and three standard deviations (2, K) of position, metres, and rotation, degrees."""
+    """Return errors and three standard deviations (2, K) of position (m) and rotation (deg)."""
     errors, bands = np.full((2, len(truth)), np.nan), np.full((2, len(truth)), np.nan)
     of_belief = any(belief is not None for belief in beliefs)
     shown = beliefs if of_belief else truth
@@ -128,12 +128,12 @@ def _curves(
 
 
 def _lengths(squares: FloatArray) -> FloatArray:
-    """Roots (2, K) of the sums of squares (K, 6): metres, degrees."""
+    """Return roots (2, K) of the sums of squares (K, 6): metres, degrees."""
     return np.sqrt([squares[:, 3:].sum(axis=-1), np.rad2deg(1) ** 2 * squares[:, :3].sum(axis=-1)])
 
 
 def limits_of(band: FloatArray, error: FloatArray) -> tuple[float, float]:
-    """Limits of a logarithmic axis in steps of 1, 3, 10: what is drawn next often has the same."""
+    """Return limits of a logarithmic axis in steps of 1, 3, 10, so that they rarely change."""
     both = np.concatenate([band, error])
     if not np.isfinite(both).any():
         return 0.1, 10.0
@@ -142,7 +142,7 @@ def limits_of(band: FloatArray, error: FloatArray) -> tuple[float, float]:
 
 
 def _step(value: float, below: bool) -> float:
-    """The next of ..., 1, 3, 10, ... below or above a positive value."""
+    """Return the next of ..., 1, 3, 10, ... below or above a positive value."""
     decade = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
     if below:
         return decade * (3 if value >= 3 * decade else 1)

@@ -1,6 +1,6 @@
-"""What frames are drawn with: panels whose still part is drawn once, and a flat view of space.
+"""Drawing tools of frames: panels with a cached static part, and a flat view of 3-D space.
 
-Matplotlib is imported by the functions that need it, never by importing this module.
+Functions that need Matplotlib import it; importing this module does not.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.obstacles import Prisms
 
 Image = NDArray[np.uint8]
-# Truth, belief and bound, anchors, error, what stands in the way.
+# Colours of truth, belief and bound, anchors, error, obstacles.
 INK, BELIEF, ANCHOR, ERROR, OBSTACLE = "#222222", "#1b7f5c", "#d1495b", "#2e86ab", "#6c757d"
 AXES = ("#c0392b", "#27964f", "#2f5fb3")  # of a body: x, y, z
 _DPI = 100
-_ELEVATION, _AZIMUTH = 24.0, -58.0  # where space is seen from, degrees
-# Radius that holds 95 % of a Gaussian in space, in standard deviations (chi-square, 3).
+_ELEVATION, _AZIMUTH = 24.0, -58.0  # view direction of 3-D space, degrees
+# Radius in standard deviations of the 95 % region of a 3-D Gaussian (chi-square, 3).
 RADIUS_95 = math.sqrt(7.814727903251179)
-# The twelve edges of a box by its corners (z fastest); its faces, four corners each.
+# The twelve edges of a box by its corners (z fastest), and its faces with four corners each.
 _BOX_EDGES = np.array(
     [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)]
 )
@@ -34,9 +34,9 @@ _BOX_FACES = np.array(
 
 
 class Panel:
-    """A figure of some pixels; a picture is its still part with artists drawn over it.
+    """A figure of given pixel size; a picture is its static part with artists drawn over it.
 
-    Redrawing axes and labels takes tens of milliseconds, copying their pixels less than one.
+    Drawing axes and labels takes tens of milliseconds, copying their pixels less than one.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -49,12 +49,12 @@ class Panel:
             self._canvas: Any = FigureCanvasAgg(self.figure)
 
     def freeze(self) -> None:
-        """Draw what stays the same; artists that are animated are left out."""
+        """Draw the static part; animated artists are left out."""
         self._canvas.draw()
         self._still = self._canvas.copy_from_bbox(self.figure.bbox)
 
     def paint(self, artists: Iterable[Any], picture: Image) -> None:
-        """The still part with these artists over it, into (height, width, 3)."""
+        """Return the static part with these artists over it, as (height, width, 3)."""
         self._canvas.restore_region(self._still)
         renderer = self._canvas.get_renderer()
         for artist in artists:
@@ -65,7 +65,7 @@ class Panel:
             picture[..., channel] = pixels[..., channel]
 
     def line(self, axes: Any = None, **style: Any) -> Any:
-        """A moving line: in the data of some axes, or in the pixels of the panel."""
+        """Return a moving line, in data coordinates of some axes or in pixels of the panel."""
         from matplotlib.lines import Line2D
         from matplotlib.transforms import IdentityTransform
 
@@ -77,7 +77,7 @@ class Panel:
         return line
 
     def patch(self, axes: Any = None, **style: Any) -> Any:
-        """A moving polygon, as `line`."""
+        """Return a moving polygon, as `line`."""
         from matplotlib.patches import Polygon
         from matplotlib.transforms import IdentityTransform
 
@@ -92,9 +92,9 @@ class Panel:
 
 
 def write(picture: Image, row: int, column: int, text: str, colour: str = "#495057") -> None:
-    """Write a text of 9 points on white into a picture, its upper left corner at a pixel.
+    """Write a text of 9 points on white into a picture, with its upper left corner at a pixel.
 
-    Glyph by glyph from a store of them: matplotlib takes ten milliseconds for a line that changes.
+    Glyphs are copied from a cache: matplotlib takes ten milliseconds for a text that changes.
     """
     for character in text:
         glyph = _glyph(character, colour)
@@ -118,18 +118,18 @@ def _glyph(character: str, colour: str) -> Image:
 
 
 class View:
-    """Space seen from one direction without perspective: points (..., 3) to pixels (..., 2)."""
+    """A parallel projection of 3-D space: points (..., 3) to pixels (..., 2)."""
 
     def __init__(self, origin: FloatArray, matrix: FloatArray) -> None:
         self._origin, self.matrix = origin, matrix
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Pixels (..., 2) of points (..., 3)."""
+        """Return pixels (..., 2) of points (..., 3)."""
         return self._origin + np.asarray(points) @ self.matrix.T
 
 
 def view_of(axes: Any) -> View:
-    """The view of axes in 3-D that have been drawn."""
+    """Return the view of 3-D axes that have been drawn."""
     from mpl_toolkits.mplot3d import proj3d
 
     corners = np.concatenate([np.zeros((1, 3)), np.eye(3)])
@@ -139,7 +139,7 @@ def view_of(axes: Any) -> View:
 
 
 def view_at(place: tuple[float, float], scale: float) -> View:
-    """The same direction, the origin at a pixel, `scale` pixels a metre."""
+    """Return the same view direction with the origin at a pixel, and `scale` pixels per metre."""
     up, around = math.radians(_ELEVATION), math.radians(_AZIMUTH)
     right = [-math.sin(around), math.cos(around), 0.0]
     above = [-math.cos(around) * math.sin(up), -math.sin(around) * math.sin(up), math.cos(up)]
@@ -147,7 +147,7 @@ def view_at(place: tuple[float, float], scale: float) -> View:
 
 
 def space(panel: Panel, area: tuple[float, float, float, float], low: Any, high: Any) -> Any:
-    """Axes in 3-D with equal scales between two corners, as large as an area of the panel allows.
+    """Return 3-D axes with equal scales between two corners, as large as an area allows.
 
     `area`: left, bottom, right, top, from 0 to 1.
     """
@@ -156,11 +156,11 @@ def space(panel: Panel, area: tuple[float, float, float, float], low: Any, high:
     low, high = np.asarray(low, float), np.asarray(high, float)
     axes: Any = panel.figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="ortho")
     extent = high - low
-    # What is flat still needs some height to be drawn in.
+    # A flat scene still needs some height to be drawn.
     extent = np.maximum(extent, 0.02 * extent.max())
     for name, middle, size in zip("xyz", 0.5 * (low + high), extent, strict=True):
         getattr(axes, f"set_{name}lim")(middle - 0.5 * size, middle + 0.5 * size)
-        # Ticks at the corners of the box would collide with those of the next axis.
+        # Ticks at the corners of the box would overlap with those of the next axis.
         few = max(3, round(6 * size / extent.max()))
         ticks = MaxNLocator(few, prune="lower" if name == "z" else "both")
         axis = getattr(axes, f"{name}axis")
@@ -183,7 +183,7 @@ def space(panel: Panel, area: tuple[float, float, float, float], low: Any, high:
 
 
 def _seen(panel: Panel, axes: Any, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Corners (2, 2), pixels, of what axes in 3-D cover: their box, its ticks and labels."""
+    """Return corners (2, 2), pixels, of the area of 3-D axes: box, ticks and labels."""
     panel.freeze()
     points = [view_of(axes)(box_corners(low, high))]
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
@@ -193,7 +193,7 @@ def _seen(panel: Panel, axes: Any, low: FloatArray, high: FloatArray) -> FloatAr
 
 
 def chain(strokes: Iterable[FloatArray]) -> FloatArray:
-    """Strokes (K, d) as one line with gaps of NaN between them."""
+    """Return lines (K, d) as one line with NaN gaps."""
     parts: list[FloatArray] = []
     for stroke in strokes:
         parts += [stroke, np.full((1, stroke.shape[-1]), np.nan)]
@@ -201,29 +201,29 @@ def chain(strokes: Iterable[FloatArray]) -> FloatArray:
 
 
 def gapped(segments: FloatArray) -> FloatArray:
-    """Segments (S, 2, d) as one line with gaps."""
+    """Return segments (S, 2, d) as one line with gaps."""
     gap = np.full((len(segments), 1, segments.shape[-1]), np.nan)
     return np.concatenate([segments, gap], axis=1).reshape(-1, segments.shape[-1])
 
 
 def box_corners(low: Any, high: Any) -> FloatArray:
-    """The eight corners (8, 3) of a box, z fastest."""
+    """Return the eight corners (8, 3) of a box, z fastest."""
     grid = np.meshgrid(*np.stack([low, high], axis=-1), indexing="ij")
     return np.stack(grid, axis=-1).reshape(8, 3)
 
 
 def box_edges(low: Any, high: Any) -> FloatArray:
-    """The edges (12, 2, 3) of a box."""
+    """Return the edges (12, 2, 3) of a box."""
     return box_corners(low, high)[_BOX_EDGES]
 
 
 def box_faces(low: Any, high: Any) -> FloatArray:
-    """The faces (6, 4, 3) of a box."""
+    """Return the faces (6, 4, 3) of a box."""
     return box_corners(low, high)[_BOX_FACES]
 
 
 def prism_faces(prisms: Prisms) -> FloatArray:
-    """The upright faces (F, 4, 3) of prisms."""
+    """Return the vertical faces (F, 4, 3) of prisms."""
     start, end = prisms.corners, np.roll(prisms.corners, -1, axis=1)
     heights = (z[:, None, None] for z in (prisms.low_m, prisms.high_m))
     low, high = (np.broadcast_to(z, (*start.shape[:2], 1)) for z in heights)
@@ -232,9 +232,9 @@ def prism_faces(prisms: Prisms) -> FloatArray:
 
 
 def body_edges(tags: Any) -> NDArray[np.intp]:
-    """Pairs (E, 2) of tags that outline a body: the edges of its hull; of flat bodies, all pairs.
+    """Return pairs (E, 2) of tags that outline a body: edges of the hull; if flat, all pairs.
 
-    Edges between faces of one plane are left out.
+    Edges between coplanar faces are left out.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -257,14 +257,14 @@ def body_edges(tags: Any) -> NDArray[np.intp]:
 
 
 def outline(matrix: FloatArray, covariance: FloatArray, radius: float) -> FloatArray:
-    """Outline (K, 2) of an ellipsoid of `radius` standard deviations, seen by `matrix` (2, 3)."""
+    """Return the outline (K, 2) of an ellipsoid of `radius` std, projected by `matrix` (2, 3)."""
     values, vectors = np.linalg.eigh(matrix @ covariance @ matrix.T)
     circle = _circle()
     return radius * (circle * np.sqrt(np.maximum(values, 0))) @ vectors.T
 
 
 def rings(covariance: FloatArray, radius: float) -> list[FloatArray]:
-    """The three circles (K, 3) of an ellipsoid in the planes of its axes."""
+    """Return the three circles (K, 3) of an ellipsoid in the planes of its axes."""
     values, vectors = np.linalg.eigh(covariance)
     half = radius * vectors * np.sqrt(np.maximum(values, 0))
     return [_circle() @ half[:, [i, j]].T for i, j in ((0, 1), (0, 2), (1, 2))]
@@ -276,6 +276,6 @@ def _circle() -> FloatArray:
 
 
 def round_number(value: float) -> float:
-    """The largest of 1, 2, 5, 10, ... and their tenths that does not exceed a positive value."""
+    """Return the largest of 1, 2, 5, 10, ... and their tenths not above a positive value."""
     decade = 10.0 ** math.floor(math.log10(value))
     return max(step * decade for step in (1, 2, 5) if step * decade <= value * (1 + 1e-12))

@@ -1,4 +1,4 @@
-"""Films: what an environment showed, epoch by epoch, and frames of it."""
+"""Films: what an environment showed at every epoch, and frames of it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SPARE = 50
 
 
 def check_mode(render_mode: str | None) -> str | None:
-    """The render mode, or a ValueError."""
+    """Return the render mode; raises ValueError if it is unknown."""
     if render_mode is not None and not (
         isinstance(render_mode, str) and render_mode in RENDER_MODES
     ):
@@ -27,14 +27,14 @@ def check_mode(render_mode: str | None) -> str | None:
 
 
 class Film:
-    """The episodes of B worlds so far, as they were shown.
+    """The episodes of B worlds so far, as shown.
 
     Parameters
     ----------
     paint
-        Draws a frame of the epochs of one world's episode, its shots, and the beliefs beside them.
+        Draws a frame from the epochs of one world's episode: its shots and beliefs.
     steps
-        Of an episode.
+        Number of steps of an episode.
     """
 
     def __init__(self, paint: Callable[..., Image], steps: int) -> None:
@@ -42,15 +42,15 @@ class Film:
         self._taken: deque[list[Any]] = deque(maxlen=steps + _SPARE)
 
     def take(self, epochs: ArrayLike, shot: Any, belief: Any = None) -> None:
-        """Keep a copy of an epoch: fields have a leading axis of worlds."""
+        """Store a copy of an epoch: fields have a leading axis of worlds."""
         self._taken.append([np.array(epochs), mapped(np.array, shot), mapped(np.array, belief)])
 
     def believe(self, belief: Any) -> None:
-        """The beliefs after the last epoch that was taken."""
+        """Store the beliefs after the last stored epoch."""
         self._taken[-1][2] = mapped(np.array, belief)
 
     def select(self, chosen: np.ndarray) -> None:
-        """Of the last shot, which has a field `measuring` (B, M), only these anchors measure.
+        """Set the anchors that measure in the last shot, in its field `measuring` (B, M).
 
         `chosen` may be padded.
         """
@@ -59,17 +59,17 @@ class Film:
         self._taken[-1][1] = shot._replace(measuring=shot.measuring & chosen)
 
     def frame(self, world: int) -> Image:
-        """A picture of a world as it is now.
+        """Return a picture of a world at its present epoch.
 
-        A wrapper learns of an epoch after the environment; whoever asks in between sees the last
-        epoch of which the belief is known.
+        A wrapper gets an epoch after the environment. In between, the picture shows the last epoch
+        with a known belief.
         """
         if not self._taken:
             raise gym.error.ResetNeeded("nothing to render yet: call reset()")
         episode: list[tuple[int, Any, Any]] = []
         for epochs, shot, belief in reversed(self._taken):
             at = int(epochs[world])
-            # Worlds that wait while others reset are taken again at the same epoch.
+            # Worlds that wait while others reset are stored again at the same epoch.
             if not episode or at != episode[-1][0]:
                 episode.append((at, shot, belief))
             if at == 0:
@@ -82,14 +82,14 @@ class Film:
 
 
 def mapped(function: Callable[[Any], Any], part: Any) -> Any:
-    """A function on every array of nested named tuples; None stays."""
+    """Apply a function to every array of nested named tuples; None does not change."""
     if isinstance(part, tuple):
         return type(part)(*[mapped(function, field) for field in part])
     return None if part is None else function(part)
 
 
 def picture(film: Film | None, num_envs: int | None = None) -> Any:
-    """What ``render()`` returns: a frame, of many worlds a tuple of them, None without a film."""
+    """Return the result of ``render()``: a frame, a tuple of frames, or None without a film."""
     if film is None:
         gym.logger.warn(
             "render() was called without a render mode; give one to gym.make: "
@@ -102,14 +102,14 @@ def picture(film: Film | None, num_envs: int | None = None) -> Any:
 
 
 def tell(env: Any, belief: Any, single: bool = False) -> None:
-    """Show a belief, a named tuple of arrays, in the frames of an environment that is rendered."""
+    """Show a belief, a named tuple of arrays, in the frames of an environment with rendering."""
     film = getattr(env.unwrapped, "film", None)
     if film is not None:
         film.believe(mapped(lambda field: field[None], belief) if single else belief)
 
 
 def select(env: Any, chosen: np.ndarray) -> None:
-    """Show that only some anchors (..., M) of an environment that is rendered measure."""
+    """Show only some anchors (..., M) as measuring, in an environment with rendering."""
     film = getattr(env.unwrapped, "film", None)
     if film is not None:
         film.select(chosen)

@@ -1,4 +1,4 @@
-"""Frames of a planar network: nodes, who sees whom, headings and what is believed of them."""
+"""Frames of a planar network: nodes, links, headings and their estimates."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rbl_gym.rendering.body import limits_of
 from rbl_gym.rendering.drawing import BELIEF, INK, Image, Panel, gapped, write
 from rbl_gym.rendering.film import Film, check_mode, mapped
 
-_LENGTH = 0.055  # of a heading, of the square's side
+_LENGTH = 0.055  # length of a heading, relative to the square's side
 _ARC = np.linspace(-1, 1, 13)
 _TURN = np.linspace(0, 2 * np.pi, 33)
 _RING = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)
@@ -35,10 +35,10 @@ class Network(NamedTuple):
 
 
 class Headings(NamedTuple):
-    """Believed orientations (B, n) and their standard deviations, radians, and places.
+    """Estimated orientations (B, n) and their standard deviations, radians, and positions.
 
-    `positions` (B, n, 2) relative to node 0 and `spread` (B, n, 2, 2), their covariances, None
-    where places are not estimated.
+    `positions` (B, n, 2) are relative to node 0, and `spread` (B, n, 2, 2) are their covariances.
+    Both are None if positions are not estimated.
     """
 
     orientations: FloatArray
@@ -48,7 +48,7 @@ class Headings(NamedTuple):
 
 
 def film_of(render_mode: str | None, side_m: float, n_nodes: int, steps: int) -> Film | None:
-    """A film of networks in a square, None where nothing is to be rendered."""
+    """Return a film of networks in a square; None without rendering."""
     if check_mode(render_mode) is None:
         return None
     return Film(functools.partial(_frame, side_m, n_nodes, steps), steps)
@@ -97,7 +97,7 @@ def _rms(angles: FloatArray) -> float:
 
 
 class _Plan:
-    """The network from above."""
+    """The network in plan."""
 
     def __init__(self, side_m: float, n_nodes: int) -> None:
         self.panel = panel = Panel(panels.LEFT, panels.HEIGHT)
@@ -124,7 +124,7 @@ class _Plan:
         self._first = panel.line(axes, color="white", marker="o", ms=6, ls="", mec=INK, mew=1.4)
 
     def paint(self, last: Network, belief: Headings | None, headline: str, picture: Image) -> None:
-        """One network and its headings, the wedges three standard deviations to either side."""
+        """Draw a network and its headings; wedges are three standard deviations to either side."""
         places, true = last.positions, last.orientations
         i, j = np.nonzero(np.triu(last.links))
         self._links.set_data(*gapped(np.stack([places[i], places[j]], axis=1)).T)
@@ -145,7 +145,7 @@ class _Plan:
         if belief is not None:
             artists.append(self._believed)
         if belief is not None and belief.positions is not None and belief.spread is not None:
-            # Drawn from where node 0 really is.
+            # Drawn from the true position of node 0.
             found = belief.positions + places[0]
             values, vectors = np.linalg.eigh(belief.spread)
             axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -163,7 +163,7 @@ def _along(angles: FloatArray, length: float) -> FloatArray:
 
 @functools.lru_cache(maxsize=3)
 def _legend(source: str, placed: bool) -> Panel:
-    """What the signs mean."""
+    """Draw the legend."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

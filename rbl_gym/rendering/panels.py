@@ -1,4 +1,4 @@
-"""The panels of a frame: the world, the body close up, errors over the epochs."""
+"""The panels of a frame: the world, a close-up of the body, errors over epochs."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ from rbl_gym.rendering.drawing import (
 from rbl_gym.rendering.shots import Pose, Shot, Stage
 
 WIDTH, HEIGHT = 960, 540
-LEFT, TOP = 576, 270  # width of the world's panel, height of the close-up's
+LEFT, TOP = 576, 270  # width of the world's panel, height of the close-up
 _LEGEND: dict[str, Any] = {"fontsize": 8, "frameon": False, "borderaxespad": 0.0}
 
 
 class _World:
-    """Anchors, body, trail and obstacles in the whole of the scene."""
+    """Anchors, body, trail and obstacles in the whole scene."""
 
     def __init__(self, stage: Stage) -> None:
         self.panel = panel = Panel(LEFT, HEIGHT)
@@ -89,7 +89,7 @@ class _World:
     def paint(
         self, path: FloatArray, last: Shot, shown: Pose | None, headline: str, picture: Image
     ) -> None:
-        """`path` (K, 3) up to now; `shown`, what its ellipsoid is drawn of."""
+        """Draw `path` (K, 3) up to now, and the ellipsoid of `shown`."""
         view, body = self._view, last.truth.translation
         stands = np.concatenate([last.anchors, body[None]])
         feet, flat = stands.copy(), path.copy()
@@ -120,13 +120,13 @@ class _World:
 
 
 class _CloseUp:
-    """The body as it is and as it is believed to be, about its true place."""
+    """The body at its true and its estimated pose, around its true position."""
 
     def __init__(self, stage: Stage, source: str) -> None:
         self.panel = panel = Panel(WIDTH - LEFT, TOP)
         self._tags = np.asarray(stage.tags)
         self._edges = body_edges(self._tags)
-        # A body of one tag has no size of its own.
+        # A body with one tag has no size.
         radius = float(np.linalg.norm(self._tags, axis=-1).max()) or 1.0
         self._radius = radius
         self._legend(source)
@@ -171,7 +171,7 @@ class _CloseUp:
         shown: Pose | None,
         picture: Image,
     ) -> None:
-        """`path` (K, 3) up to now, the pose and its belief; `shown`, what is drawn of both."""
+        """Draw `path` (K, 3) up to now, the pose and its belief; `shown` scales both."""
         place = true.translation
         factor, size = self._scales(shown, place)
 
@@ -203,7 +203,7 @@ class _CloseUp:
         write(picture, TOP - 32, 12, f"{self._bar / size:g} m{note}")
 
     def _scales(self, shown: Pose | None, place: FloatArray) -> tuple[float, float]:
-        """By how much errors are enlarged, or all of the view reduced, so that both fit."""
+        """Return the magnification of errors, or the reduction of the view, so that both fit."""
         if shown is None or shown.covariance is None:
             return 1.0, 1.0
         widest = RADIUS_95 * math.sqrt(float(np.linalg.eigvalsh(shown.covariance[3:, 3:])[-1]))
@@ -216,7 +216,7 @@ class _CloseUp:
 
 
 class _Strips:
-    """Errors inside what three standard deviations promise, over the epochs."""
+    """Errors within three standard deviations, over the epochs."""
 
     def __init__(
         self,
@@ -250,7 +250,7 @@ class _Strips:
             axes.grid(alpha=0.3, lw=0.5)
             axes.set_ylabel(label, fontsize=8)
             self._bands.append(panel.patch(axes, fc=BELIEF, ec="none", alpha=0.22))
-            # Few points want marks.
+            # Few points need markers.
             mark = {"marker": "o", "ms": 4} if steps <= 16 else {}
             self._errors.append(panel.line(axes, color=ERROR, lw=1.4, **mark))
             if row == len(limits) - 1:
@@ -271,7 +271,7 @@ class _Strips:
     def paint(
         self, epochs: np.ndarray, errors: FloatArray, bands: FloatArray, picture: Image
     ) -> None:
-        """Errors and bands (R, K), a row for each strip, at epochs (K,)."""
+        """Draw errors and bands (R, K), a row for each strip, at epochs (K,)."""
         for row, (low, patch, line) in enumerate(
             zip(self._floor, self._bands, self._errors, strict=True)
         ):
@@ -283,18 +283,18 @@ class _Strips:
                 edge = np.append(top, np.full(len(x), low))
                 patch.set_xy(np.column_stack([np.append(x, x[::-1]), edge]))
             patch.set_visible(bool(known.any()))
-            # An error below the axis runs along it rather than out of sight.
+            # Draw an error below the axis along the axis, not out of sight.
             line.set_data(epochs, np.maximum(errors[row], low))
         self.panel.paint([*self._bands, *self._errors], picture)
 
 
 def empty() -> tuple[Image, Image, Image, Image]:
-    """A frame to draw in, and its three parts: left, upper right, lower right."""
+    """Return an empty frame and its three parts: left, upper right, lower right."""
     picture = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
     return picture, picture[:, :LEFT], picture[:TOP, LEFT:], picture[TOP:, LEFT:]
 
 
-# Few are in use at a time: those of a scene, and of its axes' last limits.
+# Few are in use at a time: those of a scene, and of the last limits of its axes.
 world = functools.lru_cache(maxsize=8)(_World)
 close_up = functools.lru_cache(maxsize=8)(_CloseUp)
 strips = functools.lru_cache(maxsize=16)(_Strips)

@@ -1,4 +1,4 @@
-"""Frames of a placement: region, racks and anchors in space and in plan, the score so far."""
+"""Frames of a placement: region, racks and anchors in 3-D and in plan, the score so far."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from rbl_gym.rendering.drawing import (
 )
 from rbl_gym.rendering.film import Film, check_mode
 
-# Colours of the expected error: from metres to centimetres, a step every half decade.
+# Colours of the expected error, from metres to centimetres, two per decade.
 _STEPS_M = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
 _COLOURS = ("#440154", "#3b528b", "#21918c", "#5ec962", "#d7c51a", "#f2a05c")
 _NAMES = ("to 3 cm", "10 cm", "30 cm", "1 m", "3 m", "more")
 
 
 class Layout(NamedTuple):
-    """B problems, their anchors (B, M, 3), and how many of them stand already."""
+    """B problems, their anchors (B, M, 3), and the numbers of anchors placed so far."""
 
     context: Context
     anchors: FloatArray
@@ -44,7 +44,7 @@ class Layout(NamedTuple):
 
 
 def film_of(render_mode: str | None, task: PlacementTask) -> Film | None:
-    """A film of a task, None where nothing is to be rendered."""
+    """Return a film of a task; None without rendering."""
     if check_mode(render_mode) is None:
         return None
     return Film(functools.partial(_frame, task), task.n_anchors)
@@ -53,7 +53,7 @@ def film_of(render_mode: str | None, task: PlacementTask) -> Film | None:
 def film_of_many(
     render_mode: str | None, task_of: Callable[[int], PlacementTask], steps: int
 ) -> Film | None:
-    """A film of worlds with tasks of their own, whose anchors and boxes are padded."""
+    """Return a film of worlds with different tasks, whose anchors and boxes are padded."""
     if check_mode(render_mode) is None:
         return None
     return Film(functools.partial(_frame_of_many, task_of), steps)
@@ -80,7 +80,7 @@ def _frame(
     context = Context(*(field[world] for field in last.context))
     anchors = last.anchors[world, : int(last.placed[world])]
     errors = _errors(task, context, anchors)
-    # One-shot tasks place all at once: the curve is that of the anchors in their order.
+    # One-shot tasks place all anchors at once: the curve adds them in their order.
     counts = np.arange(1, len(anchors) + 1)
     scores = np.array([placement.score(task, context, anchors[:k]) for k in counts])
     headline = f"{len(anchors)} of {task.n_anchors} anchors"
@@ -103,7 +103,7 @@ def _frame(
 
 
 def _errors(task: PlacementTask, context: Context, anchors: FloatArray) -> FloatArray:
-    """Expected tag error b (P,) at the task's poses."""
+    """Return expected tag errors b (P,) at the task's poses."""
     information = task.prior_information
     if len(anchors):
         information = information + placement.information(task, context, anchors)
@@ -112,12 +112,12 @@ def _errors(task: PlacementTask, context: Context, anchors: FloatArray) -> Float
 
 
 def _boxes(task: PlacementTask) -> int:
-    """How many boxes block sight in every problem."""
+    """Return the number of boxes that block sight in every problem."""
     return len(task.scene.obstacles) + task.racks
 
 
 class _Points:
-    """Places coloured by their error: a line of markers for every colour."""
+    """Positions coloured by their error: a line of markers for every colour."""
 
     def __init__(self, panel: Panel, axes: Any = None) -> None:
         self.lines = [
@@ -126,14 +126,14 @@ class _Points:
         ]
 
     def set(self, places: FloatArray, errors: FloatArray) -> None:
-        """Places (P, 2) and errors (P,)."""
+        """Set positions (P, 2) and errors (P,)."""
         which = np.searchsorted(_STEPS_M, errors)
         for index, line in enumerate(self.lines):
             line.set_data(*places[which == index].T)
 
 
 class _World:
-    """The problem and its anchors in space."""
+    """The problem and its anchors in 3-D."""
 
     def __init__(self, task: PlacementTask) -> None:
         from matplotlib.lines import Line2D
@@ -181,7 +181,7 @@ class _World:
         headline: str,
         picture: Image,
     ) -> None:
-        """A problem, the anchors (K, 3) that stand, errors (P,) at its places (P, 3)."""
+        """Draw a problem, the placed anchors (K, 3), and errors (P,) at its positions (P, 3)."""
         view = self._view
         low, high = context.centre - context.half, context.centre + context.half
         feet = anchors.copy()
@@ -203,7 +203,7 @@ class _World:
 
 
 class _Plan:
-    """The same from above."""
+    """The problem and its anchors in plan."""
 
     def __init__(self, task: PlacementTask) -> None:
         low, high = _corners(task)
@@ -242,7 +242,7 @@ class _Plan:
         errors: FloatArray,
         picture: Image,
     ) -> None:
-        """As `_World.paint`; anchors carry their numbers."""
+        """Draw as `_World.paint`, with the numbers of the anchors."""
         around = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         region = context.centre[:2] + around * context.half[:2]
         self._region.set_data(*region.T)
@@ -259,7 +259,7 @@ class _Plan:
 
 
 def _corners(task: PlacementTask) -> tuple[FloatArray, FloatArray]:
-    """What is shown: the body's volume, and where anchors may stand."""
+    """Return the corners of the view: the body's volume and the legal anchor positions."""
     corners = np.array([*task.scene.volume.bounds(), *task.scene.anchor_region.bounds()])
     return corners.min(axis=0), corners.max(axis=0)
 

@@ -1,4 +1,4 @@
-"""What frames are drawn from: poses, what is seen of an epoch, what stays the same."""
+"""Data of frames: poses, the visible part of an epoch, the static part."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Pose(NamedTuple):
 
 
 class Shot(NamedTuple):
-    """What there is to see of B worlds at an epoch: anchors (B, M, 3) and which of them measure.
+    """The visible part of B worlds at an epoch: anchors (B, M, 3), and which of them measure.
 
-    `truth` carries the bound, if there is one.
+    `truth` has the bound as covariance, if there is one.
     """
 
     anchors: FloatArray
@@ -31,7 +31,7 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True)
 class Stage:
-    """What stays the same in the frames of a scene: corners, body, obstacles, seconds a step."""
+    """The static part of the frames of a scene: corners, body, obstacles, seconds per step."""
 
     name: str
     low: tuple[float, ...]

@@ -1,4 +1,4 @@
-"""Conformance of estimators: `check_filter` and `check_locator` for your tests."""
+"""Conformance tests of estimators: `check_filter` and `check_locator` for your tests."""
 
 from rbl_gym.testing.checks import (
     check_filter,

@@ -1,7 +1,7 @@
-"""Conformance of estimators: what a package that brings its own runs in its tests.
+"""Conformance tests of estimators, for packages that bring their own.
 
-`check_filter` and `check_locator` try an estimator on small worlds of their own and raise an
-AssertionError that says what it did and what it should do. They import no estimator.
+`check_filter` and `check_locator` run an estimator in small worlds. They raise an AssertionError
+that says what the estimator did and what it should do. They import no estimator.
 
 >>> from rbl_gym import estimators
 >>> from rbl_gym.testing import check_filter, check_locator
@@ -52,50 +52,50 @@ _EPOCHS, _TRIALS = 12, 64
 def check_filter(
     make_filter: Callable[..., Any], *, skip: Sequence[str] = (), seed: int = 0
 ) -> None:
-    """Check that a filter does what `rbl_gym.estimators.Filter` says.
+    """Check that a filter conforms to `rbl_gym.estimators.Filter`.
 
     Parameters
     ----------
     make_filter
-        Called as ``make_filter(tags=..., noise=..., process=...)``; the same that is registered
-        or named by an entry point of the group ``rbl_gym.filters``. One whose attribute `reads` is
-        ``"inertial"`` is told the readings of a default `InertialSensor` in place of twists.
+        Called as ``make_filter(tags=..., noise=..., process=...)``; the factory that is registered
+        or named by an entry point of the group ``rbl_gym.filters``. A filter whose attribute
+        `reads` is ``"inertial"`` gets the readings of a default `InertialSensor` instead of twists.
     skip
         Checks to leave out, by the names below.
     seed
-        Of the worlds it is tried in.
+        Seed of the test worlds.
 
     Raises
     ------
     AssertionError
-        With what is wrong, by check: ``interface``, ``shapes`` (of beliefs, for no, one and two
+        If a check fails. The checks are ``interface``, ``shapes`` (of beliefs, for no, one and two
         leading axes), ``pose`` (proper rotations, covariances symmetric and positive definite),
-        ``batching`` (a batch is a loop), ``purity`` (arguments and states are never changed),
-        ``determinism``, ``pickling``, ``invariance`` (the world moved and turned), ``links``
-        (a missing link has no weight), ``noise`` (the law of an epoch is an argument of
-        `update`, for that epoch alone), ``nan`` (is refused by a ValueError), ``nees`` (the
-        belief is honest and better than the prior).
+        ``batching`` (a batch gives the same as a loop), ``purity`` (arguments and states are never
+        changed), ``determinism``, ``pickling``, ``invariance`` (to translation and rotation of the
+        world), ``links`` (a missing link has no weight), ``noise`` (the noise law of an epoch is an
+        argument of `update`, only for that epoch), ``nan`` (raises ValueError), ``nees`` (the
+        belief is consistent and better than the prior).
     """
     _try_all(_FILTER_CHECKS, make_filter, skip, seed)
 
 
 def check_locator(locate: Callable[..., Any], *, skip: Sequence[str] = (), seed: int = 0) -> None:
-    """Check that a static estimator does what `rbl_gym.estimators.locate` says.
+    """Check that a static estimator conforms to `rbl_gym.estimators.locate`.
 
     Parameters
     ----------
     locate
-        Called as ``locate(ranges, anchors, tags, noise, links=...)``; what it returns has the
-        attributes `rotation`, `translation` and `covariance`. A method of the entry-point group
+        Called as ``locate(ranges, anchors, tags, noise, links=...)``; its result has the attributes
+        `rotation`, `translation` and `covariance`. A method of the entry-point group
         ``rbl_gym.locators`` is checked as ``functools.partial(estimators.locate,
         method="its-name")``.
     skip, seed
-        As of `check_filter`.
+        As in `check_filter`.
 
     Raises
     ------
     AssertionError
-        With what is wrong; the checks are those of `check_filter`.
+        If a check fails; the checks are those of `check_filter`.
     """
     _try_all(_LOCATOR_CHECKS, locate, skip, seed)
 
@@ -288,7 +288,7 @@ def _filter_nees(make_filter: Any, rng: np.random.Generator) -> None:
 
 
 def _reads_sensor(filter: Any) -> bool:
-    """Whether `predict` is told inertial readings in place of the twist."""
+    """Return whether `predict` takes inertial readings instead of the twist."""
     return getattr(filter, "reads", "twist") == "inertial"
 
 
@@ -302,7 +302,7 @@ def _made(make_filter: Callable[..., Any], noise: ranging.NoiseLaw = NOISE) -> A
 
 
 def _beliefs(filter: Any, epochs: Epochs, anchors: FloatArray | None = None) -> list[Any]:
-    """The belief after every epoch."""
+    """Return the belief after every epoch."""
     anchors = ANCHORS if anchors is None else anchors
     state = call("initial", filter.initial, *epochs.prior)
     beliefs = []

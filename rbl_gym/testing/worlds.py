@@ -1,4 +1,4 @@
-"""Small worlds and single checks behind `rbl_gym.testing`; each raises an AssertionError."""
+"""Small worlds and single checks of `rbl_gym.testing`; each check raises AssertionError."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import bodies, rotations
 from rbl_gym.measurements import inertial, ranging
 
-# Neither coplanar, nor when any one of them is left out.
+# Not coplanar, even if any one of them is left out.
 ANCHORS = np.array([[-6, -5, 0.5], [6, -5, 4], [6, 5, 0], [-6, 5, 3.5], [0, -6, 2], [1, 6, 5.0]])
 TAGS = bodies.octahedron(1.0)
 NOISE, PROCESS = ranging.RangeNoise(0.05), motion.ProcessNoise(0.1, 0.1)
 DT = 0.1
 SENSOR = inertial.InertialSensor()
 _PRIOR_STD = np.array([0.1, 0.1, 0.1, 0.2, 0.2, 0.2])
-# Results of one computation in another order may differ by so much, in units of themselves.
+# Tolerance between results computed in different order, relative.
 _SAME = 1e-6
-# Average NEES per degree of freedom that is still sane, without any model error.
+# Largest acceptable average NEES per degree of freedom, without any model error.
 _NEES = (1 / 3, 3.0)
 _FIELDS = ("rotation", "translation", "covariance")
 
 
 class Epochs(NamedTuple):
-    """A batch of bodies over some epochs, (K, B, ...) but for the prior (B, ...).
+    """A batch of bodies over some epochs, (K, B, ...), except for the prior (B, ...).
 
-    `twists` is what `predict` is told: twists (K, B, 6), or inertial readings (K, B, S, 6).
+    `twists` is the input of `predict`: twists (K, B, 6), or inertial readings (K, B, S, 6).
     """
 
     rotation: FloatArray
@@ -44,14 +44,14 @@ class Epochs(NamedTuple):
 def draw_epochs(
     rng: np.random.Generator, batch: tuple[int, ...], count: int, sensed: bool = False
 ) -> Epochs:
-    """Bodies that drift and turn among `ANCHORS`, their ranges, and a prior drawn around them.
+    """Draw bodies that move among `ANCHORS`, their ranges, and a prior around their poses.
 
-    `sensed`: they carry an inertial sensor, and the process noise does not move them.
+    With `sensed` they have an inertial sensor, and the process noise does not move them.
     """
     twists = np.zeros((*batch, count, 6))
     twists[..., 1:, :] = 0.5 * rng.standard_normal((*batch, 1, 6))
     start = rotations.random(rng, batch), rng.uniform(-2, 2, (*batch, 3))
-    # No motion leads to the first epoch: its twist is of no interval.
+    # No motion leads to the first epoch, so its twist belongs to no interval.
     trajectory = motion.Trajectory(*start, twists[..., 1:, :])
     normals = None if sensed else rng.standard_normal((*batch, count - 1, 6))
     path = motion.simulate(trajectory, DT, PROCESS, normals)
@@ -71,13 +71,13 @@ def draw_epochs(
 
 
 def _sensed(rng: np.random.Generator, path: motion.Path, twists: FloatArray) -> FloatArray:
-    """Readings (..., K, S, 6) of the interval that ends at each epoch; zeros at the first."""
+    """Return readings (..., K, S, 6) of the intervals that end at the epochs; zeros at first."""
     *batch, count, _ = twists.shape
     first = np.zeros((*batch, 1, SENSOR.samples(DT), 6))
     if count == 1:
         return first
     step = DT / SENSOR.samples(DT)
-    # Within an interval the turn goes on about the same axis of the world.
+    # Within an interval the body rotates about a fixed axis of the world frame.
     middle = step * (np.arange(SENSOR.samples(DT)) + 0.5)[:, None]
     turns = rotations.exp(middle * twists[..., 1:, None, :3])
     at = turns @ path.rotation[..., :-1, None, :, :]
@@ -90,13 +90,13 @@ def _sensed(rng: np.random.Generator, path: motion.Path, twists: FloatArray) -> 
 
 
 def require(condition: Any, message: str) -> None:
-    """An AssertionError with the message, also under ``python -O``."""
+    """Raise AssertionError with the message if false, also under ``python -O``."""
     if not condition:
         raise AssertionError(message)
 
 
 def call(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """What a function returns; what it raises on arguments that are right is a failure."""
+    """Return a function's result; an exception for valid arguments is a failure."""
     try:
         return function(*arguments, **options)
     except Exception as error:
@@ -108,19 +108,19 @@ def call(name: str, function: Callable[..., Any], *arguments: Any, **options: An
 
 
 def trial(epochs: Epochs, index: int) -> Epochs:
-    """One trial of a batch with one axis."""
+    """Return one trial of a batch with one axis."""
     rotation, translation, covariance = (array[index] for array in epochs.prior)
     rows = [array[:, index] for array in epochs[:4]]
     return Epochs(rows[0], rows[1], rows[2], rows[3], (rotation, translation, covariance))
 
 
 def take(pose: Any, index: int) -> dict[str, FloatArray]:
-    """One trial of a belief."""
+    """Return one trial of a belief."""
     return {name: np.asarray(getattr(pose, name))[index] for name in _FIELDS}
 
 
 def moved_world(rng: np.random.Generator, level: bool = False) -> tuple[FloatArray, FloatArray]:
-    """A turn (3, 3), about the vertical alone if `level`, and a shift (3,) of the world."""
+    """Return a rotation (3, 3), only about the vertical if `level`, and a translation (3,)."""
     turn = rotations.random(rng)
     if level:
         turn = rotations.exp(rotations.log(turn) * np.array([0.0, 0.0, 1.0]))
@@ -128,7 +128,7 @@ def moved_world(rng: np.random.Generator, level: bool = False) -> tuple[FloatArr
 
 
 def moved(pose: Any, turn: FloatArray, shift: FloatArray) -> dict[str, FloatArray]:
-    """A belief as it is in the world that was turned and shifted."""
+    """Return a belief in the rotated and translated world."""
     both = np.kron(np.eye(2), turn)
     return {
         "rotation": turn @ pose.rotation,
@@ -138,7 +138,7 @@ def moved(pose: Any, turn: FloatArray, shift: FloatArray) -> dict[str, FloatArra
 
 
 def check_shapes(name: str, pose: Any, batch: tuple[int, ...], fields: Sequence[str]) -> None:
-    """Float arrays of the shapes that leading axes `batch` ask for."""
+    """Check for float arrays with the shapes for leading axes `batch`."""
     cores = {"rotation": (3, 3), "translation": (3,), "covariance": (6, 6), "matrix": (3, 3)}
     for field in fields:
         value = getattr(pose, field, None)
@@ -151,7 +151,7 @@ def check_shapes(name: str, pose: Any, batch: tuple[int, ...], fields: Sequence[
 
 
 def check_pose(name: str, pose: Any) -> None:
-    """A proper rotation, and a covariance that is symmetric and positive definite."""
+    """Check for a proper rotation, and a symmetric positive definite covariance."""
     Q, P = np.asarray(pose.rotation), np.asarray(pose.covariance)
     require(np.isfinite(Q).all(), f"{name}.rotation must be finite, got {Q}")
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max()
@@ -166,7 +166,7 @@ def check_pose(name: str, pose: Any) -> None:
 
 
 def check_same(rule: str, expected: Any, found: Any, tolerance: float = _SAME) -> None:
-    """The same pose and covariance, to a tolerance in units of themselves (0: the same bytes)."""
+    """Check for equal pose and covariance up to a relative tolerance (0: the same bytes)."""
     for field in _FIELDS:
         want = np.asarray(expected[field] if isinstance(expected, dict)
                           else getattr(expected, field))  # fmt: skip
@@ -178,7 +178,7 @@ def check_same(rule: str, expected: Any, found: Any, tolerance: float = _SAME) -
 
 
 def check_pure(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """What a function returns, after a look whether it changed what it was given."""
+    """Return a function's result, after checking that its arguments did not change."""
     before = [pickle.dumps(value) for value in (*arguments, *options.values())]
     result = call(name, function, *arguments, **options)
     for k, (value, old) in enumerate(zip((*arguments, *options.values()), before, strict=True)):
@@ -189,7 +189,7 @@ def check_pure(name: str, function: Callable[..., Any], *arguments: Any, **optio
 
 
 def check_links(estimate: Callable[[FloatArray, FloatArray, Any], Any], ranges: FloatArray) -> None:
-    """`estimate` (ranges, anchors, links) gives a link that is False no weight."""
+    """Check that `estimate` (ranges, anchors, links) gives no weight to a link that is False."""
     full = np.ones(ranges.shape, dtype=np.bool_)
     plain = estimate(ranges, ANCHORS, None)
     check_same("links all True must mean the same as none", plain, estimate(ranges, ANCHORS, full))
@@ -207,7 +207,7 @@ def check_links(estimate: Callable[[FloatArray, FloatArray, Any], Any], ranges: 
 def check_refuses_nan(
     name: str, function: Callable[..., Any], arguments: Sequence[str], values: Sequence[Any]
 ) -> None:
-    """A ValueError on NaN in any one of the arguments."""
+    """Check that NaN in any one of the arguments raises ValueError."""
     for k, argument in enumerate(arguments):
         wrong = [np.array(value, dtype=np.float64) for value in values]
         wrong[k].flat[0] = math.nan
@@ -223,7 +223,7 @@ def check_refuses_nan(
 
 
 def check_nees(poses: Sequence[Any], rotation: FloatArray, translation: FloatArray) -> None:
-    """Average NEES per degree of freedom within sane limits."""
+    """Check that the average NEES per degree of freedom is acceptable."""
     values = []
     for k, pose in enumerate(poses):
         error = metrics.pose_error(pose.rotation, pose.translation, rotation[k], translation[k])
