@@ -1,4 +1,4 @@
-"""Cramer-Rao bounds: of the pose, along a track, with nuisances, with bad links, from angles."""
+"""Compute Cramer-Rao bounds: one pose, tracks, nuisances, unreliable links, angles."""
 
 from rbl_gym.bounds.information import (
     information_at,

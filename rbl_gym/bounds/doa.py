@@ -1,4 +1,4 @@
-"""Cramer-Rao bounds of the pose from directions of arrival at one base station.
+"""Compute Cramer-Rao bounds of the pose from directions of arrival at one base station.
 
 Shapes, the pose error (w, v) and the order of the 6 x 6 matrices are those of `bounds`.
 """
@@ -14,7 +14,7 @@ from rbl_gym.measurements import bearing, ranging
 
 __all__ = ["doa_crb", "doa_information"]
 
-# Behind the doors: what comes to it was checked.
+# Internal functions without checks: their arguments were checked.
 _TAG_POSITIONS = kernel(ranging.tag_positions)
 
 
@@ -25,16 +25,16 @@ def doa_information(
     noise: bearing.AngleNoise,
     station: ArrayLike | None = None,
 ) -> FloatArray:
-    """Fisher information (..., 6, 6) of one epoch of directions of arrival about the pose.
+    """Return the Fisher information (..., 6, 6) of one epoch of directions about the pose.
 
     Parameters
     ----------
     tags, rotation, translation
         (..., N, 3), (..., 3, 3), (..., 3); metres.
     noise
-        Law of the angles.
+        Noise law of the angles.
     station
-        Place (..., 3) of the base station; None: the origin.
+        Position (..., 3) of the base station; None: the origin.
     """
     tags = check_array("tags", tags, ("N", 3))
     rotation = rotations.check_rotation("rotation", rotation)
@@ -49,7 +49,7 @@ def doa_information(
 def doa_information_at(
     tags: FloatArray, rotation: FloatArray, translation: FloatArray, noise: bearing.AngleNoise
 ) -> FloatArray:
-    """`doa_information` on arrays that are known to be good, seen from the origin."""
+    """Compute `doa_information` from checked arrays, with the station at the origin."""
     positions = _TAG_POSITIONS(rotation, translation, tags)
     return bounds.lift(bounds.tag_jacobian(rotation, tags), bearing.information(positions, noise))
 
@@ -62,16 +62,16 @@ def doa_crb(
     prior_information: ArrayLike | None = None,
     station: ArrayLike | None = None,
 ) -> FloatArray:
-    """Constrained Cramer-Rao bound (..., 6, 6) of the pose from directions of arrival.
+    """Return the constrained Cramer-Rao bound (..., 6, 6) of the pose from directions of arrival.
 
-    On the pose error (w, v) the constraint ``R^T R = I`` is built in: ``sqrt(2 tr P_w)`` bounds
-    the Frobenius RMSE of R and ``sqrt(tr P_v)`` the RMSE of t, as the DOA paper has them.
-    Arguments as `doa_information`, and `prior_information` (..., 6, 6).
+    The pose error (w, v) includes the constraint ``R^T R = I``. ``sqrt(2 tr P_w)`` bounds the
+    Frobenius RMSE of R and ``sqrt(tr P_v)`` the RMSE of t, as in the DOA paper. Arguments as in
+    `doa_information`, and `prior_information` (..., 6, 6).
 
     Raises
     ------
     ValueError
-        As `doa_information`, and where the information is singular, with its rank.
+        As in `doa_information`, and if the information is singular; the message gives its rank.
     """
     information = doa_information(tags, rotation, translation, noise, station)
     if prior_information is not None:

@@ -1,4 +1,4 @@
-"""Prior of a body with an inertial sensor: 15 states, or 17 with the tilt of gravity."""
+"""Define the prior of a body with an inertial sensor: 15 states, or 17 with the tilt of gravity."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ def prior_information(
     speed_m_s: float,
     gravity_tilt_rad: float = 0.0,
 ) -> FloatArray:
-    """Information (..., n, n) before the first ranges: of pose, velocity, biases, and the tilt.
+    """Return the prior information (..., n, n) of pose, velocity, biases, and the tilt.
 
     Parameters
     ----------
     pose_covariance
-        (..., 6, 6) of the prior of the pose.
+        (..., 6, 6), prior of the pose.
     sensor, speed_m_s, gravity_tilt_rad
-        As of `estimators.iekf.inertial.InertialEkf`; n is 15, or 17 with a tilt.
+        As in `estimators.iekf.inertial.InertialEkf`; n is 15, or 17 with a tilt.
     """
     pose = check_array("pose_covariance", pose_covariance, (6, 6))
     tilt = [gravity_tilt_rad] * (2 * (gravity_tilt_rad > 0))

@@ -1,4 +1,4 @@
-"""Fisher information of one epoch of ranges about the pose, on SO(3) x R^3.
+"""Compute the Fisher information of one epoch of ranges about the pose, on SO(3) x R^3.
 
 The pose error is ``(w, v)``: ``Q_hat = exp(w) Q`` (world frame, rad), ``t_hat = t + v`` (m);
 information is 6 x 6 in that order.
@@ -31,7 +31,7 @@ from rbl_gym.measurements import offsets, ranging
 
 __all__ = ["lift", "range_information", "range_jacobian", "tag_jacobian"]
 
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _HAT = kernel(rotations.hat)
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
@@ -39,7 +39,7 @@ _NOTHING, _ONE = np.zeros((6, 6)), np.ones((1, 1))
 
 
 def tag_jacobian(rotation: FloatArray, tags: FloatArray) -> FloatArray:
-    """Derivative (..., N, 3, 6) of the tag positions by the pose error: ``[-[Q c_n]x, I]``."""
+    """Return derivative (..., N, 3, 6) of tag positions by the pose error, ``[-[Q c_n]x, I]``."""
     turned = tags @ np.swapaxes(rotation, -1, -2)
     J = np.zeros((*turned.shape, 6))
     J[..., :3] = -_HAT(turned)
@@ -48,7 +48,7 @@ def tag_jacobian(rotation: FloatArray, tags: FloatArray) -> FloatArray:
 
 
 def lift(J: FloatArray, per_tag: FloatArray) -> FloatArray:
-    """Pose information ``sum_n J_n^T U_n J_n`` from that of each tag's position (..., N, 3, 3)."""
+    """Return the pose information ``sum_n J_n^T U_n J_n`` from that of each tag (..., N, 3, 3)."""
     stacked = (*J.shape[:-3], 3 * J.shape[-3], 6)
     weighted = per_tag @ J
     rows = weighted.reshape((*weighted.shape[:-3], *stacked[-2:]))
@@ -58,12 +58,12 @@ def lift(J: FloatArray, per_tag: FloatArray) -> FloatArray:
 def range_jacobian(
     anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Distances (..., M, N) and their derivative by the pose error, transposed: (..., 6, M N).
+    """Return distances (..., M, N) and the transposed derivative (..., 6, M N) by the pose error.
 
-    The derivative of a distance by (w, v) is ``(Q c x u, u)``, u the unit vector from anchor to
-    tag (zero where both coincide). Components come first, so that every step runs along memory.
+    The derivative of a distance by (w, v) is ``(Q c x u, u)``, with the unit vector u from
+    anchor to tag (zero if both coincide). Components come first, so that all steps are contiguous.
 
-    Arguments as `range_information`.
+    Arguments as in `range_information`.
     """
     turned = tags @ np.swapaxes(rotation, -1, -2)
     positions = turned + translation[..., None, :]
@@ -92,38 +92,38 @@ def range_information(
     offset: str | None = None,
     anchor_std_m: ArrayLike = 0.0,
 ) -> FloatArray:
-    """Fisher information (..., 6, 6) of one epoch of ranges about the pose.
+    """Return the Fisher information (..., 6, 6) of one epoch of ranges about the pose.
 
-    The variance is taken at the true range; what its own dependence on the range would tell
-    is left out, as in the papers.
+    The variance is taken at the true range. The information from its dependence on the range is
+    neglected, as in the papers.
 
     Parameters
     ----------
     anchors, tags, rotation, translation
         (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3); metres.
     noise
-        Law of the ranges.
+        Noise law of the ranges.
     links
         Mask (..., M, N), True = measured.
     model
-        ``"raw"``: of the ranges. ``"squared"``: of what is left of the squared ranges once
-        ``|s|^2`` is projected out, that is of all the papers' linear estimators and filters;
-        with the prior of the 12 states brought to the pose, the unitarily constrained bound
-        of the tracking paper's model.
+        ``"raw"``: information of the ranges. ``"squared"``: information of the squared ranges
+        after ``|s|^2`` is projected out, as in all linear estimators and filters of the papers.
+        With the prior of the 12 states transformed to the pose, this is the unitarily constrained
+        bound of the model of the tracking paper.
     tag_std_m
-        Standard deviation of the tags' places on the body, per axis: a nuisance, marginalised.
+        Standard deviation of the tag positions on the body, per axis: a nuisance, marginalised.
     offset
-        Whose ranges have an unknown offset in common (`measurements.offsets`): ``"tag"``,
-        ``"anchor"``, or ``"epoch"``; None: no ranges. Of raw ranges, with tags at known places.
+        Ranges of one ``"tag"``, ``"anchor"`` or ``"epoch"`` share an unknown offset
+        (`measurements.offsets`); None: no offset. For raw ranges with known tag positions.
     anchor_std_m
-        Standard deviation of the anchors' places: one, one for each anchor (M,), or for each of
-        their axes (M, 3). A nuisance with that prior, which all ranges of an anchor share,
-        marginalised. Of raw ranges, with tags at known places.
+        Standard deviation of the anchor positions: one, one per anchor (M,), or one per axis
+        (M, 3). A nuisance with this prior, shared by all ranges of an anchor, marginalised. For
+        raw ranges with known tag positions.
 
     Raises
     ------
     ValueError
-        On a wrong shape or a value that is not finite.
+        If a shape is wrong or a value is not finite.
     """
     check_one_of("model", model, ("raw", "squared"))
     offsets.check_offset(offset)
@@ -151,7 +151,7 @@ def range_information(
 
 
 def anchor_deviations(anchor_std_m: ArrayLike, anchors: int) -> FloatArray | None:
-    """Standard deviations (M, 3) of one number, (M,) or (M, 3); None where all are zero."""
+    """Return standard deviations (M, 3) from one number, (M,) or (M, 3); None if all are zero."""
     std = check_array("anchor_std_m", anchor_std_m, ())
     if (std < 0).any():
         raise ValueError(f"anchor_std_m must not be negative, got {std.min():g}")
@@ -175,10 +175,10 @@ def information_at(
     offset: str | None = None,
     anchor_std: FloatArray | None = None,
 ) -> FloatArray:
-    """`range_information` on arrays that are known to be good.
+    """Compute `range_information` from checked arrays.
 
-    `share` (..., M, N): of its information that each link has, None: all of it. `anchor_std`
-    (M, 3); None: the anchors' places are known.
+    `share` (..., M, N): share of its information that each link has; None: all of it. `anchor_std`
+    (M, 3); None: the anchor positions are known.
     """
     share = _ONE if share is None else share
     if anchor_std is not None and offset is not None:
@@ -216,7 +216,7 @@ def _information(
     law: FloatArray,
     share: FloatArray,
 ) -> FloatArray:
-    """A prior's information (..., 6, 6) and that of ranges, whose law is told by its numbers."""
+    """Return prior information (..., 6, 6) plus that of ranges with a law given by its numbers."""
     noise = ranging.law_of(law)
     return prior + _range_information(anchors, tags, rotation, translation, noise, share)
 
@@ -232,7 +232,7 @@ def _offset_information(
     share: FloatArray,
     offset: int,
 ) -> FloatArray:
-    """`_information` of ranges with unknown offsets, by the code of their kind."""
+    """Compute `_information` of ranges with unknown offsets, by the code of their kind."""
     noise, kind = ranging.law_of(law), offsets.name_of(offset)
     return prior + _range_information(anchors, tags, rotation, translation, noise, share, kind)
 
@@ -248,7 +248,7 @@ def _anchor_information(
     share: FloatArray,
     anchor_std: FloatArray,
 ) -> FloatArray:
-    """`_information` of ranges to anchors whose places are known to standard deviations (M, 3)."""
+    """Compute `_information` for anchor positions with standard deviations (M, 3)."""
     noise = ranging.law_of(law)
     return prior + _surveyed_information(
         anchors, tags, rotation, translation, noise, share, anchor_std
@@ -264,10 +264,10 @@ def _surveyed_information(
     share: FloatArray,
     anchor_std: FloatArray,
 ) -> FloatArray:
-    """``sum_m (H_m - C_m (I + U_m)^-1 C_m^T)``: each anchor's place is taken out by itself.
+    """Return ``sum_m (H_m - C_m (I + U_m)^-1 C_m^T)``: anchor positions are eliminated.
 
-    H_m, U_m and C_m: information of its ranges about the pose, about its place in standard
-    deviations, and across.
+    H_m, U_m and C_m: information of its ranges about the pose, about its position in units of the
+    prior standard deviations, and the cross term.
     """
     distance, J = range_jacobian(anchors, tags, rotation, translation)
     weight = inverse_variance(noise.variance(distance), distance) * share
@@ -298,7 +298,7 @@ def _range_information(
     return (J * flat) @ np.swapaxes(J, -1, -2)
 
 
-# --- the pose together with what else is not known -----------------------------------------------
+# --- the pose together with nuisances -----------------------------------------------
 
 
 def weighted_rows(
@@ -312,11 +312,11 @@ def weighted_rows(
     anchor_std: FloatArray | None,
     further: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (..., 6 + q, M N) of ranges by the pose and nuisances, and weights (..., M N).
+    """Return derivatives (..., 6 + q, M N) by pose and nuisances, and weights (..., M N).
 
-    Nuisances count in standard deviations of their priors: the places of anchors, 3 M of them by
-    `anchor_std` (M, 3), then those by whose derivatives (G, M N) `further` says. With an `offset`
-    the derivatives are those less the weighted mean of their group.
+    Nuisances are in units of their prior standard deviations: first the 3 M coordinates of anchors
+    with `anchor_std` (M, 3), then those with the derivatives (G, M N) `further`. With an `offset`,
+    the weighted mean of their group is subtracted from the derivatives.
     """
     distance, J = range_jacobian(anchors, tags, rotation, translation)
     weight = inverse_variance(noise.variance(distance), distance) * share
@@ -337,7 +337,7 @@ def weighted_rows(
 
 
 def information_of_rows(rows: FloatArray, weight: FloatArray) -> FloatArray:
-    """Information (..., 6 + q, 6 + q) of weighted rows, with the unit priors of q nuisances."""
+    """Return the information (..., 6 + q, 6 + q) of weighted rows, plus q unit priors."""
     information = (rows * weight[..., None, :]) @ np.swapaxes(rows, -1, -2)
     own = np.arange(6, information.shape[-1])
     information[..., own, own] += 1.0
@@ -345,7 +345,7 @@ def information_of_rows(rows: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def marginal(joint: FloatArray, states: int) -> FloatArray:
-    """Information about the first states alone: ``J_aa - J_ab J_bb^-1 J_ba``."""
+    """Return the information on the first states alone: ``J_aa - J_ab J_bb^-1 J_ba``."""
     cross = joint[..., :states, states:]
     told = np.linalg.solve(joint[..., states:, states:], np.swapaxes(cross, -1, -2))
     found = joint[..., :states, :states] - cross @ told

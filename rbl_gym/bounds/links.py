@@ -1,4 +1,4 @@
-"""Cramer-Rao bounds where links are lost, or take a reflected path.
+"""Compute Cramer-Rao bounds for links that are lost or take a reflected path.
 
 Shapes, the pose error (w, v) and the order of the 6 x 6 matrices are those of `bounds`. A random
 path is a mixture of densities, whose information about the range is an integral.
@@ -25,12 +25,12 @@ from rbl_gym.measurements import ranging
 
 __all__ = ["expected_information", "nlos_efficiency", "realised_crb"]
 
-# Nodes of the trapezoid rule on +-9 standard deviations; such integrands converge exponentially.
+# Nodes of the trapezoid rule on +-9 standard deviations, which converges exponentially here.
 _NODES = np.linspace(-9.0, 9.0, 721)
-# Draws, or biases, beyond which no memory suffices.
+# Maximum number of draws, or biases, limited by memory.
 _MOST = 10**6
 _ALL_MEASURE = ranging.LinkModel()
-# Links whose integrals are taken at once.
+# Number of links whose integrals are computed at once.
 _BLOCK = 512
 
 
@@ -45,27 +45,27 @@ def expected_information(
     nlos_std_m: float | None = None,
     nlos_known: bool = False,
 ) -> FloatArray:
-    """Mean Fisher information (..., 6, 6) of one epoch over the fates of its links.
+    """Return the Fisher information (..., 6, 6) of one epoch, averaged over random links.
 
-    Its inverse bounds the error averaged over lost links too, but not tightly: the mean of the
+    Its inverse also bounds the error averaged over lost links, but not tightly: the mean of the
     bounds is above the bound of the mean information (`realised_crb`).
 
     Parameters
     ----------
     anchors, tags, rotation, translation, noise
-        As `bounds.range_information`.
+        As in `bounds.range_information`.
     link_model
-        What happens to links: `drop_probability`, `reach_m`, `nlos_probability`, `nlos_bias_m`.
+        Random links: `drop_probability`, `reach_m`, `nlos_probability`, `nlos_bias_m`.
     nlos_std_m
-        Standard deviation of a reflected path's bias about ``nlos_bias_m``, metres; None: nothing
-        is known of it, and a reflected range tells nothing.
+        Standard deviation of the bias of a reflected path about ``nlos_bias_m``, metres; None: the
+        bias is unknown, and a reflected range gives no information.
     nlos_known
-        Whether the receiver is told which ranges took a reflected path.
+        Whether the receiver knows which ranges took a reflected path.
 
     Raises
     ------
     ValueError
-        As `bounds.range_information`.
+        As in `bounds.range_information`.
     """
     _check_laws(noise, link_model)
     if nlos_std_m is not None:
@@ -94,15 +94,15 @@ def realised_crb(
     draws: int = 1000,
     prior_information: ArrayLike | None = None,
 ) -> FloatArray:
-    """Cramer-Rao bound (..., 6, 6) averaged over which links measure, each draw its own bound.
+    """Return the Cramer-Rao bound (..., 6, 6), averaged over draws of the measured links.
 
-    What a filter that sees which ranges are missing can reach on average; reflected paths do not
-    enter. Arguments as `bounds.pose_crb`; `draws` realisations by `rng`.
+    This is the bound on average for a filter that knows which ranges are missing. Reflected paths
+    are not included. Arguments as in `bounds.pose_crb`; `draws` realisations from `rng`.
 
     Raises
     ------
     ValueError
-        As `bounds.pose_crb`: also where the links of a single draw do not determine the pose.
+        As in `bounds.pose_crb`, and if the links of one draw do not determine the pose.
     """
     _check_laws(noise, link_model)
     check_generator("rng", rng)
@@ -124,7 +124,7 @@ def nlos_efficiency(
     *,
     known: bool = False,
 ) -> FloatArray:
-    """Share (...) of its information that a link keeps if its path is reflected by chance.
+    """Return the share (...) of its information that a link with random reflections keeps.
 
     The noise is ``(1 - p) N(0, s^2) + p N(bias, s^2 + bias_std^2)``; the Fisher information of
     its density about the range is compared with ``1 / s^2``.
@@ -132,10 +132,10 @@ def nlos_efficiency(
     Parameters
     ----------
     probability
-        Of a reflected path, p.
+        Probability p of a reflected path.
     bias_m, bias_std_m
-        Mean and standard deviation of what it adds; standard deviation None: nothing is known
-        of the bias, and the share is ``1 - p``.
+        Mean and standard deviation of its bias. Standard deviation None: the bias is unknown, and
+        the share is ``1 - p``.
     std_m
         Standard deviation s (...) of the range, metres.
     known
@@ -144,8 +144,8 @@ def nlos_efficiency(
     Raises
     ------
     ValueError
-        On a probability outside [0, 1], or standard deviations that are not positive (`std_m`)
-        or negative.
+        If the probability is outside [0, 1], `std_m` is not positive, or another standard
+        deviation is negative.
     """
     p = check_number("probability", probability, low=0.0, high=1.0)
     bias_m = check_number("bias_m", bias_m)
@@ -169,12 +169,12 @@ def nlos_efficiency(
 
 
 def _mixture_information(p: float, shift: FloatArray, width: FloatArray) -> FloatArray:
-    """Fisher information (K,) about its place of ``(1 - p) N(0, 1) + p N(shift, width^2)``."""
+    """Return the location information (K,) of ``(1 - p) N(0, 1) + p N(shift, width^2)``."""
     shift, width = shift[:, None], width[:, None]
     step = _NODES[1] - _NODES[0]
     bell = np.exp(-0.5 * _NODES**2) * step / np.sqrt(2 * np.pi)
     total = np.zeros(len(shift))
-    # The mean squared score, over each component of the mixture in turn.
+    # The mean squared score, integrated over each component of the mixture separately.
     for weight, x in (
         (1 - p, np.broadcast_to(_NODES, (len(shift), len(_NODES)))),
         (p, shift + width * _NODES),
@@ -201,7 +201,7 @@ def _checked(
 def _distances(
     anchors: FloatArray, tags: FloatArray, rotation: FloatArray, translation: FloatArray
 ) -> FloatArray:
-    """Distances (..., M, N) of checked places."""
+    """Return distances (..., M, N) of checked positions."""
     return kernel(ranging.distances)(
         anchors, kernel(ranging.tag_positions)(rotation, translation, tags)
     )

@@ -1,7 +1,7 @@
-"""How information about a body's states passes an interval of motion: three laws of motion.
+"""Propagate information on body states over an interval, for three laws of motion.
 
-Each says for how many states it is, and `predict`s the joint information of these and of further
-ones, which stand still. The pose comes first of the states; its error is global.
+Each law has a number of states, and `predict`s the joint information of these and of further
+constant states. The pose is first among the states; its error is global.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ class Motion(Protocol):
     """The motion of the interval that ends at an epoch."""
 
     def checked(self) -> Motion:
-        """The same as arrays; a ValueError that names what is wrong."""
+        """Return the same with arrays; raise ValueError for invalid arguments."""
         ...
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """How many states a body may have."""
+        """Return the possible numbers of body states."""
         ...
 
     @property
     def seconds(self) -> FloatArray:
-        """Length (...) of the interval."""
+        """Return the length (...) of the interval."""
         ...
 
     def predict(self, J: FloatArray, states: int, rotation: FloatArray) -> FloatArray:
-        """Information (..., n, n) after the interval, which ends at this rotation.
+        """Return the information (..., n, n) after the interval, which ends at this rotation.
 
-        Of J's n states the first `states` are the body's. NaN where J is singular and has to be
-        regular.
+        The first `states` of the n states of J are those of the body. NaN if J is singular but must
+        be regular.
         """
         ...
 
 
 class KnownTwist(NamedTuple):
-    """The twist is told: 6 states, those of the pose.
+    """Motion with known twist: 6 states, those of the pose.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class KnownTwist(NamedTuple):
     dt
         Seconds.
     process
-        Noise of the motion.
+        Process noise.
     """
 
     twist: ArrayLike
@@ -69,7 +69,7 @@ class KnownTwist(NamedTuple):
     sizes = (6,)
 
     def checked(self) -> KnownTwist:
-        """As `Motion`."""
+        """See `Motion`."""
         dt = check_array("dt", self.dt, ())
         if (dt < 0).any():
             raise ValueError(f"dt must not be negative, got {self.dt}")
@@ -78,16 +78,16 @@ class KnownTwist(NamedTuple):
 
     @property
     def seconds(self) -> FloatArray:
-        """As `Motion`."""
+        """See `Motion`."""
         return np.asarray(self.dt, dtype=np.float64)
 
     def predict(self, J: FloatArray, states: int, rotation: FloatArray) -> FloatArray:
-        """As `posterior.predict_information`, for a singular J too."""
+        """See `posterior.predict_information`; J may be singular."""
         return predict_information(J, np.asarray(self.twist), self.dt, self.process)
 
 
 class UnknownTwist(NamedTuple):
-    """The twist is a state, and may be read by a sensor: 12 states, pose and twist.
+    """Motion with unknown twist, possibly measured by a sensor: 12 states, pose and twist.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class UnknownTwist(NamedTuple):
     dt, process, law
         Seconds, and the laws of pose and twist.
     sensor
-        Reads the twist of the interval; None: nobody does.
+        Sensor of the twist of the interval; None: not measured.
     """
 
     twist: ArrayLike
@@ -108,7 +108,7 @@ class UnknownTwist(NamedTuple):
     sizes = (12,)
 
     def checked(self) -> UnknownTwist:
-        """As `Motion`."""
+        """See `Motion`."""
         move, dt = check_array("twist", self.twist, (6,)), check_number("dt", self.dt, low=0.0)
         check_laws(self.law, self.process)
         if not isinstance(self.sensor, TwistSensor | None):
@@ -117,11 +117,11 @@ class UnknownTwist(NamedTuple):
 
     @property
     def seconds(self) -> FloatArray:
-        """As `Motion`."""
+        """See `Motion`."""
         return np.asarray(self.dt, dtype=np.float64)
 
     def predict(self, J: FloatArray, states: int, rotation: FloatArray) -> FloatArray:
-        """The inverse of `twist.predict_covariance`, after what the sensor tells."""
+        """Return the inverse of `twist.predict_covariance`, after the sensor update."""
         move = np.asarray(self.twist)
         if self.sensor is not None:
             told = self.sensor.information(move)
@@ -133,15 +133,15 @@ class UnknownTwist(NamedTuple):
 
 
 class InertialMotion(NamedTuple):
-    """An inertial sensor is read: 15 states of `motion.navigation`, 17 with the tilt of gravity.
+    """Motion with an inertial sensor: 15 states of `motion.navigation`, 17 with gravity tilt.
 
     Attributes
     ----------
     readings, steps
-        Readings (..., S, 6) without bias, and seconds of each sample, as
+        Readings (..., S, 6) without bias, and the duration of each sample in seconds, as in
         `navigation.preintegrate`.
     sensor
-        Law of their noise.
+        Noise of the sensor.
     """
 
     readings: ArrayLike
@@ -151,7 +151,7 @@ class InertialMotion(NamedTuple):
     sizes = (15, 17)
 
     def checked(self) -> InertialMotion:
-        """As `Motion`."""
+        """See `Motion`."""
         readings = check_array("readings", self.readings, ("S", 6))
         if not isinstance(self.sensor, InertialSensor):
             raise ValueError(f"sensor must be an InertialSensor, got {self.sensor!r:.80}")
@@ -159,11 +159,11 @@ class InertialMotion(NamedTuple):
 
     @property
     def seconds(self) -> FloatArray:
-        """As `Motion`."""
+        """See `Motion`."""
         return np.asarray(self.steps).sum(axis=-1)
 
     def predict(self, J: FloatArray, states: int, rotation: FloatArray) -> FloatArray:
-        """The inverse of what `navigation.propagate` makes of that of J."""
+        """Return the inverse of the covariance that `navigation.propagate` computes from J^-1."""
         readings, steps = np.asarray(self.readings), np.asarray(self.steps)
         law, no_bias = self.sensor.numbers, np.zeros(6)
         moved = navigation.integrate(readings, steps, no_bias, law)
@@ -176,7 +176,7 @@ class InertialMotion(NamedTuple):
 
 
 def inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a symmetric matrix (..., n, n), NaN where there is none."""
+    """Return the inverse of a symmetric matrix (..., n, n), NaN if it is singular."""
     try:
         with np.errstate(all="ignore"):
             return symmetric(np.linalg.inv(matrix))

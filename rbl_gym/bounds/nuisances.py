@@ -1,10 +1,10 @@
-"""What ranges depend on besides the pose and is not known either: anchors' places, biases, offsets.
+"""Include unknowns besides the pose in the bounds: anchor positions, biases, offsets.
 
-Nuisances with a prior join the states of the body, and count in standard deviations of it: their
-prior is ``N(0, I)``, whatever they are. Anchors' places and constant biases stand still from epoch
-to epoch, so that a recursion (`posterior.posterior_step`) learns them; slow biases fade. The
-marginal information of the pose is the Schur complement. A white offset has no prior and no
-states: it is taken out within its epoch.
+Nuisances with a prior are added to the states of the body, in units of their prior standard
+deviations. Their prior is therefore always ``N(0, I)``. Anchor positions and constant biases do
+not change between epochs, so that a recursion (`posterior.posterior_step`) estimates them. Slow
+biases decorrelate. The marginal information of the pose is the Schur complement. A white offset
+has no prior and no states: it is eliminated within its epoch.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ __all__ = [
 ]  # fmt: skip
 
 GROUPS = ("link", "anchor", "tag", "common")
-# A bias that keeps less than this of itself over an interval counts as one that keeps so much.
+# Minimum correlation of a bias over an interval.
 _LEAST_KEPT = 1e-6
 _ONE = np.ones((1, 1))
-# States of nuisances beyond which no memory suffices.
+# Maximum number of nuisance states, limited by memory.
 _MOST = 10**5
 
 
 class RangeEpoch(NamedTuple):
-    """One epoch of ranges at the truth.
+    """One epoch of ranges at the true pose.
 
     Attributes
     ----------
     anchors, tags, rotation, translation
         (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3); metres. The pose is the true one.
     noise
-        Law of the ranges.
+        Noise law of the ranges.
     links
         Mask (..., M, N), True = measured; None: all.
     """
@@ -64,7 +64,7 @@ class RangeEpoch(NamedTuple):
     links: ArrayLike | None = None
 
     def checked(self) -> RangeEpoch:
-        """The same as arrays of float64; a ValueError that names what is wrong."""
+        """Return the same with float64 arrays; raise ValueError for invalid arguments."""
         anchors = check_array("anchors", self.anchors, ("M", 3))
         tags = check_array("tags", self.tags, ("N", 3))
         rotation = rotations.check_rotation("rotation", self.rotation)
@@ -79,17 +79,17 @@ class RangeEpoch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Nuisances:
-    """What is not known besides the states of the body.
+    """The unknowns besides the states of the body.
 
     Parameters
     ----------
     offset
-        Whose ranges have an unknown offset in common, new at every epoch (`measurements.offsets`).
+        Which ranges share an unknown offset, independent at every epoch (`measurements.offsets`).
     anchor_std_m
-        Standard deviation of the anchors' places: one, one for each anchor (M,), or for each of
-        their axes (M, 3). They do not change.
+        Standard deviation of the anchor positions: one, one per anchor (M,), or one per axis
+        (M, 3). The positions are constant.
     bias
-        Law of biases of the ranges, constant or slow; None: there are none.
+        Law of range biases, constant or slow; None: no biases.
     groups
         Which ranges share a bias: ``"link"`` (M N biases, in the order of the ranges),
         ``"anchor"`` (M), ``"tag"`` (N), ``"common"`` (1).
@@ -97,7 +97,7 @@ class Nuisances:
     Raises
     ------
     ValueError
-        On a value that is none of these.
+        If a value is not one of these.
     """
 
     offset: str | None = None
@@ -114,11 +114,11 @@ class Nuisances:
         check_one_of("groups", self.groups, GROUPS)
 
     def anchor_std(self, anchors: int) -> FloatArray | None:
-        """Standard deviations (M, 3) of the anchors' places; None: these are known."""
+        """Return standard deviations (M, 3) of the anchor positions; None: they are known."""
         return fisher.anchor_deviations(self.anchor_std_m, anchors)
 
     def bias_rows(self, anchors: int, tags: int) -> FloatArray | None:
-        """Derivative (G, M N) of the ranges by the biases, in standard deviations."""
+        """Return the derivative (G, M N) of the ranges by the biases, in prior deviations."""
         law, links = self.bias, anchors * tags
         if law is None:
             return None
@@ -133,13 +133,16 @@ class Nuisances:
         return np.concatenate(scaled) if scaled else None
 
     def count(self, anchors: int, tags: int) -> int:
-        """How many states the nuisances have, for so many anchors and tags."""
+        """Return the number of nuisance states for these numbers of anchors and tags."""
         rows = self.bias_rows(anchors, tags)
         places = 0 if self.anchor_std(anchors) is None else 3 * anchors
         return places + (0 if rows is None else len(rows))
 
     def faded(self, J: FloatArray, biases: int, dt: ArrayLike) -> FloatArray:
-        """Joint information (..., n, n) after `dt` seconds: its last states, the biases, fade."""
+        """Return the joint information (..., n, n) after `dt` seconds.
+
+        Biases (last states) decorrelate.
+        """
         if self.bias is None or self.bias.time_s is None or biases == 0:
             return J
         n = J.shape[-1]
@@ -152,23 +155,23 @@ class Nuisances:
 
 
 def epoch_information(epoch: RangeEpoch, nuisances: Nuisances | None = None) -> FloatArray:
-    """Joint Fisher information (..., 6 + q, 6 + q) of one epoch about the pose and its nuisances.
+    """Return the joint Fisher information (..., 6 + q, 6 + q) of one epoch on pose and nuisances.
 
-    Of the ranges alone, without the nuisances' prior.
+    It is that of the ranges alone, without the prior of the nuisances.
 
     Parameters
     ----------
     epoch
-        What was measured.
+        The measured ranges.
     nuisances
-        Their q states come in this order: places of the anchors (x, y, z of the first, then of
-        the next), biases by groups, the bias common to all. All in standard deviations of their
-        priors.
+        The order of their q states is: anchor positions (x, y, z of the first, then of the next),
+        biases by group, the bias common to all. All are in units of their prior standard
+        deviations.
 
     Raises
     ------
     ValueError
-        As `bounds.range_information`.
+        As in `bounds.range_information`.
     """
     epoch, nuisances = RangeEpoch(*epoch).checked(), nuisances or Nuisances()
     return information_of(epoch, nuisances, epoch.links)  # pyright: ignore[reportArgumentType]
@@ -177,7 +180,10 @@ def epoch_information(epoch: RangeEpoch, nuisances: Nuisances | None = None) -> 
 def information_of(
     epoch: RangeEpoch, nuisances: Nuisances, share: FloatArray | BoolArray | None
 ) -> FloatArray:
-    """`epoch_information` of a checked epoch; `share` (..., M, N) as `information_at`."""
+    """Compute `epoch_information` of a checked epoch.
+
+    `share` (..., M, N) as in `information_at`.
+    """
     anchors, tags, rotation, translation = (np.asarray(array) for array in epoch[:4])
     places = anchors, tags, rotation, translation
     shape = anchors.shape[-2], tags.shape[-2]
@@ -191,14 +197,14 @@ def information_of(
 
 
 def with_nuisances(information: ArrayLike, count: int) -> FloatArray:
-    """Joint information (..., n + q, n + q) of the body's states and of q nuisances' prior.
+    """Return joint information (..., n + q, n + q) of body states and the prior of q nuisances.
 
     Parameters
     ----------
     information
-        (..., n, n), of the prior of the body's states.
+        (..., n, n), of the prior of the body states.
     count
-        q, as `Nuisances.count` says.
+        q, as from `Nuisances.count`.
     """
     J, count = (
         check_array("information", information, ("n", "n")),
@@ -214,9 +220,9 @@ def with_nuisances(information: ArrayLike, count: int) -> FloatArray:
 
 
 def with_epoch(J: FloatArray, told: FloatArray, states: int) -> FloatArray:
-    """Joint information J about so many states of the body and q nuisances, with an epoch's.
+    """Add the information of an epoch to joint information J on body states and q nuisances.
 
-    `told` (..., 6 + q, 6 + q) is about the pose, which comes first of the states, and nuisances.
+    `told` (..., 6 + q, 6 + q) is on the pose, which is first among the states, and the nuisances.
     """
     n, batch = J.shape[-1], np.broadcast_shapes(J.shape[:-2], told.shape[:-2])
     result = np.broadcast_to(J, (*batch, n, n)).copy()
@@ -226,12 +232,12 @@ def with_epoch(J: FloatArray, told: FloatArray, states: int) -> FloatArray:
 
 
 def marginal_information(joint: ArrayLike, states: int = 6) -> FloatArray:
-    """Information (..., n, n) about the first `states` of a joint one: the Schur complement.
+    """Return the information (..., n, n) on the first `states`: the Schur complement.
 
     Raises
     ------
     ValueError
-        On what is not square, has fewer states, or is singular in the others.
+        If the matrix is not square, has fewer states, or is singular in the other states.
     """
     joint = check_array("joint", joint, ("n", "n"))
     if joint.shape[-1] != joint.shape[-2] or joint.shape[-1] < states:
@@ -253,19 +259,19 @@ def epoch_crb(
     nuisances: Nuisances | None = None,
     prior_information: ArrayLike | None = None,
 ) -> FloatArray:
-    """Cramer-Rao bound (..., 6, 6) of the pose from one epoch of ranges with nuisances.
+    """Return the Cramer-Rao bound (..., 6, 6) of the pose from one epoch with nuisances.
 
     Parameters
     ----------
     epoch, nuisances
-        As of `epoch_information`.
+        As in `epoch_information`.
     prior_information
         (..., 6, 6) of the pose, if any.
 
     Raises
     ------
     ValueError
-        As `bounds.pose_crb`.
+        As in `bounds.pose_crb`.
     """
     joint = epoch_information(epoch, nuisances)
     own = np.arange(6, joint.shape[-1])

@@ -1,4 +1,4 @@
-"""Cramer-Rao bound of the pose from one epoch of ranges, and the score of a covariance.
+"""Compute the Cramer-Rao bound of the pose from one epoch, and the score of a covariance.
 
 The pose error is ``(w, v)``: ``Q_hat = exp(w) Q`` (world frame, rad), ``t_hat = t + v`` (m);
 information and covariance are 6 x 6 in that order.
@@ -17,7 +17,8 @@ from rbl_gym.measurements import ranging
 
 __all__ = ["information_rank", "pose_crb", "score", "symmetric"]
 
-# J_n as a linear function of (c_n, 1), c_n turned: J_n[i, a] = sum_k (c_n, 1)[k] _BY_POSE[k, i, a].
+# J_n as a linear function of (c_n, 1), c_n rotated: J_n[i, a] = sum_k (c_n, 1)[k] _BY_POSE[k, i,
+# a].
 _BY_POSE = np.zeros((4, 3, 6))
 _BY_POSE[:3, :, :3] = -rotations.hat(np.eye(3))
 _BY_POSE[3, :, 3:] = np.eye(3)
@@ -38,17 +39,17 @@ def pose_crb(
     offset: str | None = None,
     anchor_std_m: ArrayLike = 0.0,
 ) -> FloatArray:
-    """Cramer-Rao bound (..., 6, 6) of the pose from one epoch of ranges.
+    """Return the Cramer-Rao bound (..., 6, 6) of the pose from one epoch of ranges.
 
-    The inverse of `range_information` plus the prior information (..., 6, 6), if any. Never a
-    pseudo-inverse: it would reward anchors that see nothing.
+    It is the inverse of `range_information` plus the prior information (..., 6, 6), if any. A
+    pseudo-inverse is not used, because it would favour anchors without information.
 
-    Arguments as `range_information`, and `prior_information` (..., 6, 6).
+    Arguments as in `range_information`, and `prior_information` (..., 6, 6).
 
     Raises
     ------
     ValueError
-        As `range_information`, and where the information is singular, with its rank.
+        As in `range_information`, and if the information is singular; the message gives its rank.
     """
     information = range_information(
         anchors, tags, rotation, translation, noise, links,
@@ -60,7 +61,7 @@ def pose_crb(
 
 
 def inverted(information: FloatArray, more: str) -> FloatArray:
-    """Inverse of a pose's information, or a ValueError that names its rank and what it lacks."""
+    """Return the inverse of pose information; raise ValueError with the rank if it is singular."""
     rank = information_rank(information)
     if (rank < 6).any():
         where = tuple(int(i) for i in np.argwhere(rank < 6)[0])
@@ -72,10 +73,10 @@ def inverted(information: FloatArray, more: str) -> FloatArray:
 
 
 def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.ndarray:
-    """Number (...) of directions an information matrix (..., n, n) determines, free of units."""
+    """Return the number (...) of directions determined by information (..., n, n); unit-free."""
     n = information.shape[-1]
-    # With a unit diagonal no eigenvalue exceeds n: a determinant bounds the smallest one, and
-    # spares most matrices the eigenvalues.
+    # With a unit diagonal no eigenvalue exceeds n. The determinant then bounds the smallest one,
+    # so that most matrices need no eigenvalues.
     _, regular = regular_inverse(information, 2 * tolerance * n ** (n - 1))
     rank, open_ = np.full(information.shape[:-2], n), ~np.asarray(regular)
     if open_.any():
@@ -88,10 +89,11 @@ def information_rank(information: FloatArray, tolerance: float = 1e-11) -> np.nd
 
 @compiled("pose_bound:regular_inverse")
 def regular_inverse(matrix: FloatArray, least: float) -> tuple[FloatArray, BoolArray]:
-    """Inverse of symmetric matrices (..., n, n), and whether (...) each is regular for certain.
+    """Return the inverse of symmetric matrices (..., n, n), and whether (...) each is regular.
 
-    That is, positive definite and, scaled to a unit diagonal, of a determinant above `least`. Of
-    others the inverse is NaN; one that holds NaN counts as regular, and is NaN too.
+    Regular means positive definite and, scaled to a unit diagonal, with a determinant above
+    `least`. Otherwise the inverse is NaN. A matrix with NaN counts as regular, and its inverse is
+    NaN too.
     """
     n, diagonal = matrix.shape[-1], np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where(diagonal <= 0, 1.0, diagonal))
@@ -107,21 +109,21 @@ def regular_inverse(matrix: FloatArray, least: float) -> tuple[FloatArray, BoolA
 
 
 def symmetric(matrix: FloatArray) -> FloatArray:
-    """The symmetric part, to keep rounding from growing in recursions."""
+    """Return the symmetric part, so that rounding errors do not grow in recursions."""
     return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
 
 
 @checked(covariance=(6, 6), rotation=(3, 3), tags=("N", 3))
 def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> FloatArray:
-    """Root mean square tag error b (...) in metres that a pose covariance (..., 6, 6) implies.
+    """Return the root mean square tag error b (...), metres, of a pose covariance (..., 6, 6).
 
     ``b^2 = mean_n tr(J_n P J_n^T)``, ``J_n = [-[Q c_n]x, I]``: one number for position and
-    orientation together.
+    orientation.
     """
     turned = np.asarray(tags, dtype=np.float64) @ np.swapaxes(np.asarray(rotation), -1, -2)
     extended = np.ones((*turned.shape[:-1], 4))
     extended[..., :3] = turned
-    # The sum of J_n^T J_n is linear in the tags' second moments.
+    # The sum of J_n^T J_n is linear in the second moments of the tags.
     moments = np.swapaxes(extended, -1, -2) @ extended
     square = moments.reshape((*moments.shape[:-2], 16)) @ _BY_MOMENTS
     square = square.reshape((*square.shape[:-1], 6, 6)) / turned.shape[-2]
@@ -130,8 +132,11 @@ def score(covariance: FloatArray, rotation: ArrayLike, tags: ArrayLike) -> Float
 
 
 def root_of_trace(trace: ArrayLike) -> FloatArray:
-    """The score (...) from its square, which is a trace; NaN and negative ones are refused."""
-    # True of NaN too.
+    """Return the score (...) from its square, a trace.
+
+    Raise ValueError if it is NaN or negative.
+    """
+    # Also True for NaN.
     if not np.min(trace) >= 0:
         raise ValueError(f"covariance must be positive and finite, got a trace of {np.min(trace)}")
     return np.asarray(np.sqrt(trace))

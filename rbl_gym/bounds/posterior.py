@@ -1,4 +1,4 @@
-"""Steps of the posterior Cramer-Rao bound of a pose: prediction, and an epoch with its score."""
+"""Compute steps of the posterior Cramer-Rao bound: prediction, and one epoch with its score."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from rbl_gym.motion.kinematics import ProcessNoise
 
 __all__ = ["predict_covariance", "predict_information"]
 
-# Behind the door: what comes to it was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _EXP = kernel(rotations.exp)
 
 
 def predict_information(
     J: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
 ) -> FloatArray:
-    """Information after a step of motion, ``(F J^-1 F^T + Q)^-1``, also for a singular J.
+    """Return the information after a step, ``(F J^-1 F^T + Q)^-1``, also for a singular J.
 
-    Arguments as `predict_covariance`, with information J (..., n, n) for P. States beyond the six
-    of the pose stand still.
+    Arguments as in `predict_covariance`, with information J (..., n, n) instead of P. States beyond
+    the six of the pose are constant.
     """
     # F is a rotation: with T = F J F^T this is (I + T Q)^-1 T.
     turned = _turn(J, twist, dt)
@@ -37,20 +37,20 @@ def predict_information(
 def predict_covariance(
     P: FloatArray, twist: FloatArray, dt: ArrayLike, process: ProcessNoise
 ) -> FloatArray:
-    """Pose covariance after a step of motion, ``F P F^T + Q``, ``F = blkdiag(exp(w dt), I)``.
+    """Return the pose covariance after a step, ``F P F^T + Q``, ``F = blkdiag(exp(w dt), I)``.
 
     Parameters
     ----------
     P, twist
         (..., 6, 6) and (..., 6).
     dt, process
-        Seconds, and the noise of the motion.
+        Seconds, and the process noise.
     """
     return _turn(P, twist, dt) + process.covariance(twist, dt)
 
 
 def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
-    """``F matrix F^T`` of a symmetric matrix: the error is global, so its rotation part turns."""
+    """Return ``F matrix F^T``, F rotates the rotation part of the error, which is global."""
     step = _EXP(twist[..., :3] * np.asarray(dt, float)[..., None])
     top = step @ matrix[..., :3, :]
     turned = np.empty((*top.shape[:-2], *matrix.shape[-2:]))
@@ -61,7 +61,7 @@ def _turn(matrix: FloatArray, twist: FloatArray, dt: ArrayLike) -> FloatArray:
     return turned
 
 
-# --- a step and its score, behind the doors of environments: nothing is checked --------------
+# --- a step and its score, for environments: nothing is checked --------------
 
 
 @compiled("pose_bound:step_of_ranges")
@@ -77,25 +77,25 @@ def step_of_ranges(
     law: FloatArray,
     share: FloatArray | BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Information (..., 6, 6) after an epoch of ranges, and the score (...) of its inverse.
+    """Return information (..., 6, 6) after an epoch of ranges, and the score (...) of its inverse.
 
     Parameters
     ----------
     prior
-        Information (..., 6, 6) after the epoch before.
+        Information (..., 6, 6) after the previous epoch.
     twist, dt, std
-        Known twist (..., 6) and length of the interval from there, 0 where there is none; standard
-        deviations (6,) of the motion after 1 s.
+        Known twist (..., 6) and length of the interval since then, 0 for no interval; standard
+        deviations (6,) of the process noise after 1 s.
     anchors, tags, rotation, translation
         (..., M, 3), (..., N, 3), (..., 3, 3), (..., 3) at this epoch; the pose is the true one.
     law
         Numbers of the noise law (`ranging.numbers_of`).
     share
-        (..., M, N), of its information that each link has.
+        (..., M, N), share of its information that each link has.
 
     Returns
     -------
-    NaN is the score of information that is not positive definite.
+    The score is NaN if the information is not positive definite.
     """
     noise = ranging.law_of(law)
     told = information.information_at(anchors, tags, rotation, translation, noise, share)
@@ -114,7 +114,7 @@ def step_of_angles(
     translation: FloatArray,
     angle_std: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """`step_of_ranges`, of angles at a station (..., 3) with this standard deviation in radians."""
+    """Compute `step_of_ranges` for angles at a station (..., 3), standard deviation in radians."""
     noise = bearing.AngleNoise(angle_std)
     places = ranging.tag_positions(rotation, translation - station, tags)
     of_tags = bearing.information(places, noise)

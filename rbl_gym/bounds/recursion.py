@@ -1,4 +1,4 @@
-"""The posterior Cramer-Rao recursion (Tichavsky et al. 1998), of any motion and with nuisances."""
+"""Compute the posterior Cramer-Rao recursion (Tichavsky et al. 1998), with nuisances."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ def posterior_step(
     motion: Motion | None,
     nuisances: Nuisances | None = None,
 ) -> FloatArray:
-    """One step of the recursion at the truth: information after the epoch.
+    """Return the information after one step of the recursion, at the true pose.
 
     Parameters
     ----------
     J
-        Joint information (..., n + q, n + q) of the epoch before: n states of the body, of which
-        the first six are the pose, then q nuisances in standard deviations of their priors. At a
-        start that of the prior, `with_nuisances`.
+        Joint information (..., n + q, n + q) of the previous epoch: n states of the body, of which
+        the first six are the pose, then q nuisances in units of their prior standard deviations.
+        At the start it is that of the prior, `with_nuisances`.
     epoch
-        What is measured.
+        The measured ranges.
     motion
-        Of the interval that ends at the epoch: a `KnownTwist` (n = 6), an `UnknownTwist` (12), an
-        `InertialMotion` (15 or 17); None: there is none, and J is about the same time.
+        Motion of the interval that ends at the epoch: a `KnownTwist` (n = 6), an `UnknownTwist`
+        (12), an `InertialMotion` (15 or 17); None: no interval, J is at the same time.
     nuisances
-        What else is not known; their states as of `epoch_information`.
+        Further unknowns; their states are those of `epoch_information`.
 
     Returns
     -------
-    Information (..., n + q, n + q); `marginal_information` of it, or the first rows of its
-    inverse, bound the pose.
+    Information (..., n + q, n + q). The inverse of its `marginal_information`, or the first block
+    of its inverse, bounds the pose.
 
     Raises
     ------
     ValueError
-        On wrong shapes or values, and on a singular J where the motion has more states than the
+        If a shape or value is wrong, or J is singular and the motion has more states than the
         pose.
     """
     J = check_array("J", J, ("n", "n"))
@@ -80,16 +80,16 @@ def posterior_crb_step(
     process: ProcessNoise,
     links: ArrayLike | None = None,
 ) -> FloatArray:
-    """`posterior_step` of a pose alone, whose twist is told, with everything else known.
+    """Compute `posterior_step` of a pose with known twist and without nuisances.
 
     Parameters
     ----------
     J
-        Posterior information (..., 6, 6) of the epoch before.
+        Posterior information (..., 6, 6) of the previous epoch.
     anchors, tags, rotation, translation, noise, links
-        At the new epoch, as of `RangeEpoch`.
+        At the new epoch, as in `RangeEpoch`.
     twist, dt, process
-        Of the interval that ends there, as of `KnownTwist`.
+        Of the interval that ends there, as in `KnownTwist`.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""The smoothing Cramer-Rao bound: of every epoch of a log, from all ranges before and after it.
+"""Compute the smoothing Cramer-Rao bound: of every epoch of a log, from all ranges of the log.
 
 The information about all epochs together is block-tridiagonal. With ``e' = F e + n``, n of
 covariance Q, an interval adds ``F^T Q^-1 F``, ``-F^T Q^-1`` and ``Q^-1`` to the blocks of its two
-ends; ranges and the prior add to the diagonal. The blocks of its inverse are the bounds.
+ends; ranges and the prior add to the diagonal. The diagonal blocks of the inverse are the bounds.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from rbl_gym.motion.unknown_twist import WanderingTwist, check_laws
 
 __all__ = ["smoothing_crb"]
 
-# Standard deviation (rad, m, rad/s, m/s) that an interval has at least on every axis: what moves
-# by nothing at all would have infinite information.
+# Minimum standard deviation of an interval (rad, m, rad/s, m/s) on every axis. Without noise, the
+# information would be infinite.
 LEAST_STD = 1e-6
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
@@ -41,41 +41,41 @@ def smoothing_crb(
     law: WanderingTwist | None = None,
     offset: str | None = None,
 ) -> FloatArray:
-    """Cramer-Rao bound of the poses of K epochs from the ranges of all of them, at the truth.
+    """Return the Cramer-Rao bound of the poses of K epochs from all ranges, at the true poses.
 
     Parameters
     ----------
     anchors, tags
-        (M, 3), or (..., K, M, 3) where they move, and (N, 3), metres.
+        (M, 3), or (..., K, M, 3) if they move, and (N, 3), metres.
     rotation, translation
         True poses (..., K, 3, 3) and (..., K, 3).
     noise
-        Law of the ranges.
+        Noise law of the ranges.
     twists
         True twists (..., K - 1, 6) of the intervals between epochs, rad/s and m/s.
     dt
-        Their lengths, a number or (..., K - 1) seconds.
+        Lengths of the intervals, a number or (..., K - 1) seconds.
     process
-        Noise of the motion.
+        Process noise.
     prior_covariance
-        (..., 6, 6), of the pose of the first epoch before its ranges.
+        (..., 6, 6), prior of the pose at the first epoch.
     links
         (..., K, M, N), True where a range is measured; None: all.
     law
-        Of a twist that is not known; None: it is.
+        Law of an unknown twist; None: the twist is known.
     offset
-        Whose ranges have an unknown offset in common, new at every epoch, as of
+        Which ranges share an unknown offset, independent at every epoch, as in
         `range_information`.
 
     Returns
     -------
-    Covariances (..., K, 6, 6) of the pose error; (..., K, 12, 12) of pose and twist with a law,
-    as of `bounds.UnknownTwist`.
+    Covariances (..., K, 6, 6) of the pose error; with a law (..., K, 12, 12) of pose and twist,
+    as in `bounds.UnknownTwist`.
 
     Raises
     ------
     ValueError
-        On wrong shapes or values.
+        If a shape or value is wrong.
     """
     twists = check_array("twists", twists, ("K", 6))
     dt = np.broadcast_to(check_array("dt", dt, ()), twists.shape[:-1])
@@ -110,7 +110,7 @@ def smoothing_crb(
 def _transition(
     twist: FloatArray, dt: FloatArray, process: ProcessNoise, law: WanderingTwist | None
 ) -> tuple[FloatArray, FloatArray]:
-    """F and Q of intervals of their own lengths (...), as of `bounds.twist.predict_covariance`."""
+    """Return F and Q of intervals with lengths (...), as in `bounds.twist.predict_covariance`."""
     n, dt = 6 if law is None else 12, dt[..., None]
     F, G = (np.broadcast_to(np.eye(n), (*twist.shape[:-1], n, n)).copy() for _ in range(2))
     F[..., :3, :3] = _EXP(twist[..., :3] * dt)

@@ -1,4 +1,4 @@
-"""Weights of ranges, and Fisher information about the place of each tag by itself."""
+"""Compute weights of ranges, and the Fisher information about the position of each single tag."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from rbl_gym.measurements import ranging
 
 __all__ = ["directions"]
 
-# Behind the doors: what comes to it was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _DISTANCES = kernel(ranging.distances)
 
 
 def directions(anchors: FloatArray, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances (..., M, N) and unit vectors (..., M, N, 3) from anchors to positions.
+    """Return distances (..., M, N) and unit vectors (..., M, N, 3) from anchors to positions.
 
-    The unit vector is zero where an anchor and a position coincide.
+    The unit vector is zero if an anchor and a position coincide.
     """
     difference = positions[..., None, :, :] - anchors[..., :, None, :]
     distance = np.sqrt(np.einsum("...i,...i->...", difference, difference))
@@ -24,14 +24,14 @@ def directions(anchors: FloatArray, positions: FloatArray) -> tuple[FloatArray, 
 
 
 def check_variance(noise: ranging.NoiseLaw, distance: FloatArray) -> None:
-    """A ValueError where a law has no variance at a distance (..., M, N) that is not zero."""
+    """Raise ValueError if a law has zero variance at a nonzero distance (..., M, N)."""
     inverse_variance(noise.variance(distance), distance)
 
 
 def inverse_variance(variance: FloatArray, distance: FloatArray) -> FloatArray:
-    """Weights (..., M, N) of ranges, squared or not: what an anchor on a tag measures has none.
+    """Return weights (..., M, N) of ranges, squared or not; zero if anchor and tag coincide.
 
-    There the range has no gradient: that link tells nothing.
+    There the range has no gradient, and the link gives no information.
     """
     with np.errstate(divide="ignore"):
         weight = np.where(distance > 0, 1 / variance, 0.0)
@@ -44,7 +44,7 @@ def inverse_variance(variance: FloatArray, distance: FloatArray) -> FloatArray:
 def raw_tag_information(
     anchors: FloatArray, positions: FloatArray, noise: ranging.NoiseLaw, links: BoolArray | None
 ) -> FloatArray:
-    """Information (..., N, 3, 3) of the ranges about the place of each tag."""
+    """Return the information (..., N, 3, 3) of the ranges about the position of each tag."""
     distance, unit = directions(anchors, positions)
     weight = inverse_variance(noise.variance(distance), distance)
     weight = weight if links is None else weight * links
@@ -54,7 +54,7 @@ def raw_tag_information(
 def squared_tag_information(
     anchors: FloatArray, positions: FloatArray, noise: ranging.NoiseLaw, links: BoolArray | None
 ) -> FloatArray:
-    """Information ``4 A Pi_n A^T`` (..., N, 3, 3) about each tag, |s|^2 projected out."""
+    """Return information ``4 A Pi_n A^T`` (..., N, 3, 3) about each tag, |s|^2 projected out."""
     distance = _DISTANCES(anchors, positions)
     weight = inverse_variance(noise.squared_range_variance(distance), distance)
     weight = weight if links is None else weight * links
@@ -63,7 +63,7 @@ def squared_tag_information(
 
 
 def weighted_spread(anchors: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Anchors less their weighted mean (..., N, M, 3), and the same times the weights (..., M, N).
+    """Return anchors minus their weighted mean (..., N, M, 3), and this times weights (..., M, N).
 
     Their product ``A Pi A^T`` is the projection of the common unknown ``|s|^2`` out of the
     squared ranges, without forming Pi.

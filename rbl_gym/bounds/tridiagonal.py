@@ -1,9 +1,9 @@
-"""Block-tridiagonal information: of states in a row, each tied to its neighbours alone.
+"""Solve with block-tridiagonal information, as of a chain of states coupled to neighbours.
 
 ``H`` has diagonal blocks ``D_k`` (n, n) and blocks ``U_k = H_{k,k+1}`` above them. Elimination from
-the first block on gives the pivots ``S_k = D_k - U_{k-1}^T S_{k-1}^-1 U_{k-1}``; the blocks of the
-inverse follow from the last one back, ``P_k = S_k^-1 + G_k P_{k+1} G_k^T`` with
-``G_k = S_k^-1 U_k``: the recursion of Rauch, Tung and Striebel in terms of information.
+the first block gives the pivots ``S_k = D_k - U_{k-1}^T S_{k-1}^-1 U_{k-1}``; the blocks of the
+inverse follow backwards from the last one, ``P_k = S_k^-1 + G_k P_{k+1} G_k^T`` with ``G_k = S_k^-1
+U_k``: the recursion of Rauch, Tung and Striebel in terms of information.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ __all__ = ["inverse_blocks", "solve_blocks"]
 
 @compiled("block_tridiagonal:solve")
 def solve_blocks(diagonal: FloatArray, above: FloatArray, right: FloatArray) -> FloatArray:
-    """The solution (..., K, n, c) of ``H x = right``; NaN where H is not positive definite.
+    """Return the solution (..., K, n, c) of ``H x = right``; NaN if H is not positive definite.
 
     Parameters
     ----------
     diagonal, above
-        D and U, (..., K, n, n); the last block of `above` is not read.
+        D and U, (..., K, n, n); the last block of `above` is not used.
     right
         (..., K, n, c).
     """
@@ -42,9 +42,9 @@ def solve_blocks(diagonal: FloatArray, above: FloatArray, right: FloatArray) -> 
 
 @compiled("block_tridiagonal:invert")
 def inverse_blocks(diagonal: FloatArray, above: FloatArray) -> FloatArray:
-    """Diagonal blocks (..., K, n, n) of ``H^-1``; NaN where H is not positive definite.
+    """Return the diagonal blocks (..., K, n, n) of ``H^-1``; NaN if H is not positive definite.
 
-    Arguments as `solve_blocks`.
+    Arguments as in `solve_blocks`.
     """
     P = _inverse_pivots(diagonal, above)
     for k in reversed(range(len(P) - 1)):
@@ -66,7 +66,7 @@ def _inverse_pivots(diagonal: FloatArray, above: FloatArray) -> list[FloatArray]
 
 
 def _inverse(S: FloatArray) -> FloatArray:
-    """Inverse (..., n, n) by the Cholesky factor of the matrix with a unit diagonal."""
+    """Return the inverse (..., n, n), by Cholesky factorisation with a unit diagonal."""
     diagonal = np.einsum("...ii->...i", S)
     good = np.isfinite(S).all(axis=(-2, -1)) & (diagonal > 0).all(axis=-1)
     scale = np.sqrt(np.where(good[..., None], diagonal, 1.0))

@@ -1,4 +1,4 @@
-"""Prediction of pose and twist (12 states) under `motion.unknown_twist`."""
+"""Predict pose and twist (12 states) under `motion.unknown_twist`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rbl_gym.motion.unknown_twist import WanderingTwist
 
 __all__ = ["predict_covariance"]
 
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
@@ -22,11 +22,11 @@ def predict_covariance(
     process: ProcessNoise,
     law: WanderingTwist | None,
 ) -> FloatArray:
-    """Covariance (..., n, n) of n >= 12 states after `dt` seconds of an estimated twist (..., 6).
+    """Return the covariance (..., n, n) of n >= 12 states after `dt` s of a twist (..., 6).
 
-    ``F P F^T + Q`` where F takes ``(w, v)`` to ``(exp(W dt) w + dt Jl dW, v + dt dV)``; states
-    beyond the twelve stand still. Without a law the twist is known: all beyond six stand still.
-    `process` adds its noise to the pose.
+    The twist is estimated. The covariance is ``F P F^T + Q``, where F maps ``(w, v)`` to ``(exp(W
+    dt) w + dt Jl dW, v + dt dV)``. States beyond the twelve are constant. Without a law the twist
+    is known, and all states beyond six are constant. `process` adds its noise to the pose.
     """
     wander = None if law is None else law.std() ** 2
     return covariance_after(P, twist, dt, process.std() ** 2, wander)
@@ -35,7 +35,7 @@ def predict_covariance(
 def covariance_after(
     P: FloatArray, twist: FloatArray, dt: float, process: FloatArray, wander: FloatArray | None
 ) -> FloatArray:
-    """`predict_covariance` by variances (6,) after 1 s; `wander` None: the twist is known."""
+    """Compute `predict_covariance` from variances (6,) after 1 s; `wander` None: known twist."""
     turn = twist[..., :3] * dt
     step, jacobian = _EXP(turn), _LEFT_JACOBIAN(turn)
     n = P.shape[-1]
@@ -44,8 +44,8 @@ def covariance_after(
     if wander is not None:
         F[..., :3, 6:9] = dt * jacobian
         F[..., 3:6, 9:12] = dt * np.eye(3)
-    # The noise in the frame of the turn: of an acceleration q the change of speed has variance
-    # q dt, the way q dt^3 / 3, and their covariance is q dt^2 / 2.
+    # The noise in the rotated frame. For an acceleration of density q, the change of velocity has
+    # the variance q dt, the displacement q dt^3 / 3, and their covariance is q dt^2 / 2.
     of_twist = np.zeros(6) if wander is None else wander
     Q = np.zeros((n, n))
     Q[range(6), range(6)] = dt * process + dt**3 / 3 * of_twist

@@ -1,7 +1,7 @@
-"""Mirror poses: reflected at the plane of the anchors, a body keeps its ranges.
+"""Compute mirror poses: a body reflected in the plane of the anchors has the same ranges.
 
-Where the anchors lie in a plane and the body is flat, the image explains all ranges exactly as
-well. Where either is nearly so, it explains them nearly as well.
+If the anchors lie in a plane and the body is flat, the mirror pose explains all ranges exactly
+equally well. If either is nearly flat, it explains them nearly as well.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ __all__ = ["Plane", "mirror_pose", "plane_of"]
 
 
 class Plane(NamedTuple):
-    """The plane nearest to some points: a point of it, its unit normal, and how the points lie.
+    """The plane closest to some points: a point of it, its unit normal, and the points' spread.
 
     Attributes
     ----------
     point, normal
-        (3,) each; the normal points up, and where it is level to the positive side.
+        (3,) each; the normal points up or, if it is horizontal, to the positive side.
     thickness, width
-        Root mean square distance of the points from the plane, and in it along the narrower of
-        the two principal axes, metres.
+        Root mean square distance of the points from the plane, and their spread in the plane along
+        the narrower of the two principal axes, metres.
     """
 
     point: FloatArray
@@ -36,19 +36,19 @@ class Plane(NamedTuple):
 
 
 def plane_of(points: ArrayLike) -> Plane:
-    """The plane of least squares through points (P, 3).
+    """Return the least-squares plane through points (P, 3).
 
     Raises
     ------
     ValueError
-        On a wrong shape or numbers that are not finite.
+        If the shape is wrong or values are not finite.
     """
     points = check_array("points", points, ("P", 3))
     centre = points.mean(axis=0)
     spread = (points - centre) / np.sqrt(len(points))
     values, axes = np.linalg.eigh(spread.T @ spread)
     normal = axes[:, 0]
-    # The last axis that is not 0 decides the sign.
+    # The last nonzero component determines the sign.
     leading = normal[np.flatnonzero(np.abs(normal) > 1e-9)[-1]]
     thickness, width = np.sqrt(np.maximum(values[:2], 0.0))
     return Plane(centre, normal * np.sign(leading), float(thickness), float(width))
@@ -61,11 +61,11 @@ def mirror_pose(
     anchors: ArrayLike,
     tags: ArrayLike,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The image of poses in the plane of the anchors, with its covariance.
+    """Return the mirror images of poses in the plane of the anchors, with their covariance.
 
-    The tags are reflected in that plane, and the body is put on them: with S the reflection in
-    the plane of the anchors and B that in the plane of the tags, ``Q' = S Q B``, and the tags'
-    centre is reflected. Of a body that is not flat, the image is the best fit.
+    The tags are reflected in this plane, and the body is fitted to them. With S the reflection in
+    the plane of the anchors and B that in the plane of the tags, ``Q' = S Q B``, and the centre of
+    the tags is reflected. If the body is not flat, the image is the best fit.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def mirror_pose(
     Raises
     ------
     ValueError
-        On wrong shapes or numbers that are not finite.
+        If a shape is wrong or values are not finite.
     """
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
@@ -87,7 +87,7 @@ def mirror_pose(
     image = S @ rotation @ B
     centre = translation + rotation @ body.point - plane.point
     image_translation = centre @ S + plane.point - image @ body.point
-    # w' = -S w, and v' = S (v + w x Q (c - B c)) for the tags' centre c.
+    # w' = -S w, and v' = S (v + w x Q (c - B c)) for the centre c of the tags.
     arm = rotation @ (body.point - B @ body.point)
     T = np.zeros(np.broadcast_shapes(covariance.shape, (*rotation.shape[:-2], 6, 6)))
     T[..., :3, :3], T[..., 3:, 3:] = -S, S

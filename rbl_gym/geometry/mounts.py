@@ -1,7 +1,7 @@
-"""Where anchors may stand in a building: walls, ceilings, columns, areas, points.
+"""Define the allowed anchor positions in a building: walls, ceilings, columns, areas, points.
 
-All of it is cut into pieces: a segment, a triangle or a point in the plan, between two heights.
-`placement.mounting` makes them from a file, without what is forbidden or covered.
+Mounts are split into pieces: a segment, a triangle or a point in the plan, between two heights.
+`placement.mounting` makes them from a file, without forbidden or covered parts.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from rbl_gym.kernels import compiled
 
 __all__ = ["Mounts"]
 
-# A strip of wall that is lower than this is drawn from as if it were so high, metres.
+# Points are drawn from a lower strip of wall as if it had this height, metres.
 _LEAST_HEIGHT_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Mounts(Faced):
-    """A region of pieces.
+    """A region that consists of pieces.
 
     Parameters
     ----------
     pieces
-        (K, 8): three corners in the plan, x, y each, and the lower and upper height, metres. Of a
-        triangle the corners differ, of a segment the last two are the same, of a point all.
+        (K, 8): three corners in the plan, x, y each, and the lower and upper height, metres. The
+        corners of a triangle differ; the last two of a segment are equal; all of a point are equal.
     piece_face
-        (K,) int: on which face each piece lies.
+        (K,) int: the face of each piece.
     faces
-        The mounts before anything was cut out of them.
+        The mounts before parts were removed.
     """
 
     pieces: FloatArray
@@ -41,7 +41,7 @@ class Mounts(Faced):
     faces: Faces  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner (3,) of the smallest box around it."""
+        """Return the lower and upper corner (3,) of the bounding box."""
         return self._corners
 
     @functools.cached_property
@@ -55,9 +55,9 @@ class Mounts(Faced):
 
     @functools.cached_property
     def measure(self) -> FloatArray:
-        """(K,): how much is drawn from each piece.
+        """Return the weight (K,) of each piece when points are drawn.
 
-        Square metres of wall and of plan; a point counts as one.
+        It is the area in square metres, of wall or of plan; a point has the weight one.
         """
         a, b, c = self._plan
         height = np.maximum(self.pieces[:, 7] - self.pieces[:, 6], _LEAST_HEIGHT_M)
@@ -68,14 +68,14 @@ class Mounts(Faced):
 
     @property
     def _plan(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The three corners (K, 2) of the pieces."""
+        """Return the three corners (K, 2) of the pieces."""
         return self.pieces[:, 0:2], self.pieces[:, 2:4], self.pieces[:, 4:6]
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
-        """Points (..., 3) from uniforms (..., 3): as many in a piece as its `measure` says."""
+        """Return points (..., 3) from uniforms (..., 3); pieces are weighted by `measure`."""
         total = np.cumsum(self.measure)
         place = uniforms[..., 0] * total[-1]
-        # Not behind the last by rounding.
+        # Rounding must not lead beyond the last.
         piece = np.minimum(np.searchsorted(total, place, side="right"), len(total) - 1)
         along = (1 - (total[piece] - place) / self.measure[piece]).clip(0.0, 1.0)[..., None]
         a, b, c = (corner[piece] for corner in self._plan)
@@ -88,37 +88,40 @@ class Mounts(Faced):
         return np.concatenate([plan, (low + up * (high - low))[..., None]], axis=-1)
 
     def project(self, points: FloatArray) -> FloatArray:
-        """The nearest legal points (..., 3)."""
+        """Return the nearest legal points (..., 3)."""
         return nearest_point(points, self.pieces)[0]
 
     def place(self, action: FloatArray) -> FloatArray:
-        """The legal points (..., 3) nearest to those that actions name: [-1, 1]^3 is `bounds`."""
+        """Return the legal points (..., 3) nearest to those of actions.
+
+        [-1, 1]^3 maps to `bounds`.
+        """
         low, high = self.bounds()
         cut = np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
         return self.project(0.5 * (low + high) + cut * (0.5 * (high - low)))
 
     def action(self, points: FloatArray) -> FloatArray:
-        """An inverse of `place`: the points in units of the half size of `bounds`."""
+        """Return actions that `place` maps to the points: in units of the half size of `bounds`."""
         low, high = self.bounds()
         half = 0.5 * (high - low)
         away = points - 0.5 * (low + high)
         return np.where(half > 0, away / np.where(half > 0, half, 1.0), 0.0)
 
     def face_of(self, points: FloatArray) -> np.ndarray:
-        """Index (...) of the face on which legal points (..., 3) stand: that of the nearest."""
+        """Return the index (...) of the face nearest to legal points (..., 3)."""
         return self.piece_face[nearest_point(points, self.pieces)[1]]
 
     def normal(self, points: FloatArray) -> FloatArray:
-        """Direction (..., 3) into which anchors at points (..., 3) look.
+        """Return the direction (..., 3) that anchors at points (..., 3) face.
 
-        Zero where that is not said, and further than a centimetre from every piece.
+        It is zero if the mount has no direction, and at more than a centimetre from every piece.
         """
         legal, piece = nearest_point(points, self.pieces)
         near = np.sqrt(((legal - points) ** 2).sum(axis=-1, keepdims=True)) <= 0.01
         return np.where(near, self.faces.normal[self.piece_face[piece]], 0.0)
 
     def listed(self) -> FloatArray | None:
-        """All legal points (K, 3), where every mount is a list of points; else None."""
+        """Return all legal points (K, 3) if every mount is a list of points; else None."""
         if (self.pieces[:, 0:4] != self.pieces[:, 2:6]).any():
             return None
         if (self.pieces[:, 6] != self.pieces[:, 7]).any():
@@ -128,7 +131,7 @@ class Mounts(Faced):
 
 @compiled("mounts:nearest_point")
 def nearest_point(points: FloatArray, pieces: FloatArray) -> tuple[FloatArray, np.ndarray]:
-    """The point of the pieces nearest to each point (..., 3), and in which piece (...) it lies.
+    """Return the point of the pieces nearest to each point (..., 3), and the piece index (...).
 
     Arguments as in `Mounts`.
     """

@@ -1,4 +1,4 @@
-"""Obstacles that take information from links: boxes and prisms, batched.
+"""Model obstacles that reduce the information of links: boxes and prisms, batched.
 
 A box is a row of six numbers, centre and half size of an axis-aligned box, metres. A prism is a
 polygon in the plan between two heights. A segment that only touches an obstacle is not blocked.
@@ -20,17 +20,17 @@ from rbl_gym.kernels import compiled
 
 __all__ = ["Obstacles", "Prisms", "held_by", "in_sight", "inside", "share_behind"]
 
-# A way inside a prism that is no longer than this is a touch, metres: links begin at its faces.
+# A path inside a prism up to this length only touches it, metres: links begin at its faces.
 _LEAST_WAY_M = 1e-6
-# From so many on a link asks a grid which of them stand on its way: of boxes alone, of all.
+# From this number of obstacles a link uses a grid to find those on its path: boxes only, all.
 _MANY_BOXES, _MANY = 64, 12
-# A link that is shorter than this in the plan is vertical, metres.
+# A link with a smaller length in the plan is vertical, metres.
 _VERTICAL_M = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Prisms:
-    """Polygons in the plan, each between two heights; made by `of`, which checks them.
+    """Polygons in the plan, each between two heights; construct with `of`, which checks them.
 
     Parameters
     ----------
@@ -39,8 +39,8 @@ class Prisms:
     low_m, high_m
         (K,), metres.
     share
-        (K,): share of its information that a link through one keeps. NaN: the one that obstacles
-        without their own have in common.
+        (K,): share of its information that a link through the prism keeps. NaN: the common share of
+        obstacles.
     """
 
     corners: FloatArray = field(default_factory=lambda: np.empty((0, 1, 2)))
@@ -56,13 +56,13 @@ class Prisms:
         high_m: ArrayLike,
         share: ArrayLike = np.nan,
     ) -> Prisms:
-        """Prisms of polygons (V, 2) of any numbers of corners; the others (K,) or one for all.
+        """Return prisms from polygons (V, 2) of any numbers of corners; others (K,) or one for all.
 
         Raises
         ------
         ValueError
-            On a polygon that crosses itself or has no area, heights that do not rise, a share
-            outside of 0 to 1.
+            If a polygon crosses itself or has no area, the heights do not increase, or a share is
+            outside [0, 1].
         """
         rings = [check_polygon(f"polygons[{i}]", ring) for i, ring in enumerate(polygons)]
         found = cls.packed(rings, low_m, high_m, share)
@@ -81,7 +81,7 @@ class Prisms:
         high_m: ArrayLike,
         share: ArrayLike = np.nan,
     ) -> Prisms:
-        """As `of`, of what has been checked."""
+        """Return prisms as `of` does, from checked arguments."""
         if not rings:
             return cls()
         most = max(map(len, rings))
@@ -90,15 +90,15 @@ class Prisms:
         return cls(corners, *(np.broadcast_to(column, len(rings)).copy() for column in columns))
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of prisms."""
         return len(self.corners)
 
     def __eq__(self, other: object) -> bool:
-        """Whether others are the same, number by number."""
+        """Return whether all values are equal."""
         return isinstance(other, Prisms) and self._key == other._key
 
     def __hash__(self) -> int:
-        """Of the numbers."""
+        """Return a hash of the values."""
         return hash(self._key)
 
     @functools.cached_property
@@ -108,9 +108,9 @@ class Prisms:
 
     @functools.cached_property
     def limits(self) -> FloatArray:
-        """(K, 7): least and largest x, y, z of each, and its share, as `share_behind` takes them.
+        """Return (K, 7): minimum and maximum x, y, z of each, and its share, for `share_behind`.
 
-        Heights are drawn in by a nanometre: a link along a face touches it.
+        Heights are reduced by a nanometre, so that a link along a face only touches it.
         """
         low, high = self.corners.min(axis=1), self.corners.max(axis=1)
         heights = self.low_m + TOUCH_M, self.high_m - TOUCH_M
@@ -123,19 +123,19 @@ NO_PRISMS = Prisms()
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Boxes and prisms in the way of links, and what is left of a link behind them.
+    """Boxes and prisms between anchors and tags, and the share of information of blocked links.
 
-    Scenes, placement, its checks and transfer all ask this class. Obstacles without a share of
-    their own (all boxes are) leave `blocked_information` of a link, however many of them it
-    meets; the shares of prisms that have one multiply, with that and with each other. A prism
-    counts once, however often a link enters it.
+    Scenes, placement, its checks and transfer all use this class. A link through obstacles without
+    an own share (all boxes) keeps `blocked_information`, whatever their number. Shares of prisms
+    are multiplied with it and with each other. A prism counts once, even if a link enters it
+    several times.
 
     Parameters
     ----------
     boxes
         (..., K, 6), centres and half sizes, metres; K may be 0.
     blocked_information
-        Share of its information that a link without line of sight keeps: the variance of its
+        Share of its information that a link without line of sight keeps. The variance of its
         ranges is divided by it. 0: such a link gives no range.
     prisms
         The prisms, the same for all leading axes of the boxes.
@@ -146,31 +146,31 @@ class Obstacles:
     prisms: Prisms = field(default_factory=Prisms)
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
+        """Return whether there are any obstacles."""
         return self.boxes.shape[-2] > 0 or len(self.prisms) > 0
 
     def __len__(self) -> int:
-        """How many boxes and prisms there are."""
+        """Return the number of boxes and prisms."""
         return self.boxes.shape[-2] + len(self.prisms)
 
     def share(self, anchors: FloatArray, points: FloatArray) -> FloatArray:
-        """Share (..., P, M) of its information that a link from each anchor to each point has.
+        """Return the share (..., P, M) of its information that each link keeps.
 
-        Anchors (..., M, 3) and points (..., P, 3), metres: the link is that of a body with its
-        origin there, or of a tag.
+        Links go from anchors (..., M, 3) to points (..., P, 3), metres. A point is the origin of a
+        body, or a tag.
         """
         if self._are_few_boxes:
             return np.where(in_sight(anchors, points, self.boxes), 1.0, self.blocked_information)
         return self._share(anchors, points, self.blocked_information)
 
     def sees(self, anchors: FloatArray, points: FloatArray) -> BoolArray:
-        """Whether nothing takes information from each link, (..., P, M); arguments as `share`."""
+        """Return whether each link keeps all information, (..., P, M); arguments as in `share`."""
         if self._are_few_boxes:
             return in_sight(anchors, points, self.boxes)
         return self._share(anchors, points, 0.0) == 1.0
 
     def contain(self, points: FloatArray) -> BoolArray:
-        """Which points (..., 3) lie in or on one of the boxes (K, 6), or inside of a prism."""
+        """Return which points (..., 3) lie in or on one of the boxes (K, 6), or inside a prism."""
         if self._are_few_boxes:
             return inside(points, self.boxes)
         return held_by(points, self.boxes, self.prisms.corners, self.prisms.limits)
@@ -187,7 +187,7 @@ class Obstacles:
 
     @functools.cached_property
     def _grid(self) -> PlanGrid:
-        """Which obstacles stand where, the boxes counted first."""
+        """Return the grid of obstacles, boxes first."""
         if self.boxes.ndim > 2 or len(self) < _MANY:
             return one_cell(len(self))
         low, high = (self.boxes[:, :2] + sign * self.boxes[:, 3:5] for sign in (-1, 1))
@@ -198,7 +198,7 @@ class Obstacles:
 
 
 def check_obstacles(obstacles: object) -> FloatArray:
-    """Obstacles (K, 6) as an array, K may be 0; or a ValueError."""
+    """Return obstacles (K, 6) as an array, K may be 0; or raise ValueError."""
     array = as_float("obstacles", obstacles)
     if array.size == 0:
         return np.empty((0, 6))
@@ -212,7 +212,7 @@ def check_obstacles(obstacles: object) -> FloatArray:
 
 @compiled("sight:in_sight")
 def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> BoolArray:
-    """Which points each anchor sees past boxes, (..., P, M) booleans.
+    """Return whether boxes leave each anchor in sight of each point, (..., P, M) booleans.
 
     A segment that only touches a box is not blocked; one that ends inside a box is.
 
@@ -227,15 +227,15 @@ def in_sight(anchors: FloatArray, points: FloatArray, obstacles: FloatArray) -> 
     boxes = obstacles[..., None, None, :, :]
     along, away = end - start, boxes[..., :3] - start
     low, high = (away - boxes[..., 3:]) / along, (away + boxes[..., 3:]) / along
-    # Places along the segment where it enters and leaves; along a face the quotients are 0/0,
-    # and NaN never blocks.
+    # Parameters of entry and exit along the segment. Along a face the quotients are 0/0, and NaN
+    # never blocks.
     enter = np.minimum(low, high).max(axis=-1, initial=0.0)
     leave = np.maximum(low, high).min(axis=-1, initial=1.0)
     return ~(enter < leave).any(axis=-1)
 
 
 def inside(points: FloatArray, obstacles: FloatArray) -> BoolArray:
-    """Which points (..., 3) lie in or on a box of (K, 6)."""
+    """Return which points (..., 3) lie in or on a box of (K, 6)."""
     away = np.abs(points[..., None, :] - obstacles[:, :3]) - obstacles[:, 3:]
     return np.asarray((away.max(axis=-1) <= 1e-9).any(axis=-1))
 
@@ -244,9 +244,9 @@ def inside(points: FloatArray, obstacles: FloatArray) -> BoolArray:
 def held_by(
     points: FloatArray, boxes: FloatArray, corners: FloatArray, limits: FloatArray
 ) -> BoolArray:
-    """Which points (..., 3) a box (K, 6) holds, or a prism further than a micrometre inside.
+    """Return which points (..., 3) lie in a box (K, 6), or in a prism deeper than a micrometre.
 
-    Arguments as `share_behind`.
+    Arguments as in `share_behind`.
     """
     found = np.asarray(inside(points, boxes))
     heights = points[..., 2]
@@ -268,28 +268,28 @@ def share_behind(
     starts: np.ndarray,
     members: np.ndarray,
 ) -> FloatArray:
-    """Share (..., P, M) of a link's information that boxes and prisms leave.
+    """Return the share (..., P, M) of link information left by boxes and prisms.
 
-    A link meets a prism where, between the heights, its way in the plan runs inside the polygon
-    for more than a micrometre.
+    A link meets a prism if, between the heights, its path in the plan runs inside the polygon for
+    more than a micrometre.
 
     Parameters
     ----------
     anchors, points, boxes
-        As `in_sight`.
+        As in `in_sight`.
     corners, limits
         (K, V, 2) and (K, 7), of `Prisms`.
     blocked
-        What obstacles without their own share leave, once.
+        Share left by all obstacles without an own share together.
     cells, starts, members
-        Of a `plan_grid.PlanGrid` of the boxes and the prisms; only the kernel looks at it.
+        Arrays of a `plan_grid.PlanGrid` of the boxes and prisms; only used by the kernel.
     """
     free = in_sight.textbook(anchors, points, boxes)
     start, end = np.broadcast_arrays(anchors[..., None, :, :], points[..., :, None, :])
     own = np.ones(start.shape[:-1])
     least, most = np.minimum(start, end), np.maximum(start, end)
     for polygon, limit in zip(corners, limits, strict=True):
-        # Most links pass beside its bounding box.
+        # Most links miss its bounding box.
         near = ((least < limit[1:6:2]) & (most > limit[0:6:2])).all(axis=-1)
         met = np.zeros_like(near)
         met[near] = _meets(start[near], end[near], polygon, limit[4], limit[5])
@@ -303,11 +303,11 @@ def share_behind(
 def _meets(
     start: FloatArray, end: FloatArray, polygon: FloatArray, low: float, high: float
 ) -> BoolArray:
-    """Which segments (S, 3) run inside of a prism.
+    """Return which segments (S, 3) run inside a prism.
 
-    The line of the segment, moved by nothing to its left and to its right, is inside the polygon
-    between odd and even crossings of its edges. What both have in common is inside: along an
-    edge one of them is not.
+    The line of the segment, shifted infinitesimally to the left and to the right, is inside the
+    polygon between odd and even crossings of its edges. The segment is inside where both shifted
+    lines are. Along an edge, one of them is outside.
     """
     along = end - start
     length = np.sqrt((along**2).sum(axis=-1))
@@ -319,7 +319,7 @@ def _meets(
     vertical = square < _VERTICAL_M**2
     dx, dy = (np.where(vertical, unit, along[:, i])[:, None] for i, unit in ((0, 1.0), (1, 0.0)))
     x, y = polygon[:, 0] - start[:, :1], polygon[:, 1] - start[:, 1:2]
-    # Where each corner stands along the line, and on which side of it.
+    # Position of each corner along the line, and its side.
     ahead, side = dx * x + dy * y, dx * y - dy * x
     reach = np.sqrt(dx * dx + dy * dy)
     side = np.where(np.abs(side) <= TOUCH_M * reach, 0.0, side)
@@ -337,6 +337,6 @@ def _meets(
         (right[:, None] < middle).sum(axis=-1) % 2 == 1
     )
     found = ((np.diff(stops, axis=1) * length[:, None] > _LEAST_WAY_M) & within).any(axis=1)
-    # A vertical link stands at one place in the plan.
+    # A vertical link is one point in the plan.
     through = (leave - enter) * length > _LEAST_WAY_M
     return np.where(vertical, through & contains(polygon, start[:, :2], TOUCH_M), found)

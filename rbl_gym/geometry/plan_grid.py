@@ -1,4 +1,4 @@
-"""Cells in the plan that say which obstacles stand where: a link asks those on its way only."""
+"""Index obstacles by cells in the plan, so that a link checks only those on its path."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import numpy as np
 
 from rbl_gym.checks import FloatArray
 
-# Cells for each obstacle, and at most so many along either axis.
+# Cells per obstacle, and the maximum number along either axis.
 _CELLS, _MOST = 1.0, 200
-# Obstacles reach so far beyond their own cells, metres, and as a share of the whole extent.
+# Margin around obstacles, metres, and as a share of the whole extent.
 _MARGIN_M, _MARGIN = 1e-6, 1e-12
 
 
 class PlanGrid(NamedTuple):
-    """A grid of square cells; those at the edge reach to infinity.
+    """A grid of square cells; the cells at the edge extend to infinity.
 
     Attributes
     ----------
@@ -32,13 +32,13 @@ class PlanGrid(NamedTuple):
 
 
 def one_cell(count: int) -> PlanGrid:
-    """The grid of one cell, with all of `count` obstacles."""
+    """Return a grid of one cell, with all of `count` obstacles."""
     cells = np.array([0.0, 0.0, 1.0, 1.0, 1.0])
     return PlanGrid(cells, np.array([0, count]), np.arange(count))
 
 
 def plan_grid(low: FloatArray, high: FloatArray) -> PlanGrid:
-    """The grid of obstacles between corners (K, 2) in the plan, metres."""
+    """Return the grid of obstacles between corners (K, 2) in the plan, metres."""
     count = len(low)
     origin, extent = low.min(axis=0), np.ptp([low.min(axis=0), high.max(axis=0)], axis=0)
     side = max(np.sqrt(extent.prod() / (_CELLS * count)), extent.max() / _MOST, 1e-3)

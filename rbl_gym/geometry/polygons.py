@@ -1,4 +1,4 @@
-"""Simple polygons in the plan: checks, and which points they hold. Corners (V, 2), metres."""
+"""Check simple polygons in the plan, and test which points they contain. Corners (V, 2), metres."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from rbl_gym.checks import BoolArray, FloatArray, check_array
 
 __all__ = ["area", "check_line", "check_polygon", "contains", "ears"]
 
-# Corners nearer to each other than this are one, and lines that come so close touch, metres.
+# Corners closer than this are identical, and lines closer than this touch, metres.
 TOUCH_M = 1e-9
 
 
 def area(polygon: FloatArray) -> float:
-    """Area in square metres; positive where the corners run counter-clockwise."""
-    # About the first corner: far from the origin the products lose digits.
+    """Return the area in square metres; positive if the corners are counter-clockwise."""
+    # Relative to the first corner: far from the origin the products lose digits.
     x, y = (polygon - polygon[0]).T
     return float(0.5 * (x @ np.roll(y, -1) - y @ np.roll(x, -1)))
 
 
 def check_line(name: str, line: ArrayLike, closed: bool = False) -> FloatArray:
-    """A line of at least two corners (V, 2), those that repeat the one before left out.
+    """Return a line of at least two corners (V, 2), without repeated corners.
 
     Raises
     ------
     ValueError
-        On what is no list of [x, y], or has no length.
+        If it is not a list of [x, y], or has no length.
     """
     points = check_array(name, line, ("V", 2))
     if points.ndim != 2:
@@ -42,15 +42,15 @@ def check_line(name: str, line: ArrayLike, closed: bool = False) -> FloatArray:
 
 
 def check_polygon(name: str, polygon: ArrayLike) -> FloatArray:
-    """The corners (V, 2) of a simple polygon, counter-clockwise and without a repeated one.
+    """Return the corners (V, 2) of a simple polygon, counter-clockwise and without repetitions.
 
-    Clockwise polygons are turned round, a last corner that repeats the first is left out.
+    Clockwise polygons are reversed. A last corner that repeats the first is left out.
 
     Raises
     ------
     ValueError
-        If it is no list of [x, y], has no area, or crosses or touches itself; the message says
-        where.
+        If it is not a list of [x, y], has no area, or crosses or touches itself. The message names
+        the position.
     """
     ring = check_line(name, polygon, closed=True)
     extent = float(np.ptp(ring, axis=0).max())
@@ -61,7 +61,7 @@ def check_polygon(name: str, polygon: ArrayLike) -> FloatArray:
 
 
 def _check_simple(name: str, ring: FloatArray) -> None:
-    """No two edges meet but neighbours at their common corner."""
+    """Raise ValueError if edges meet, except for neighbours at their common corner."""
     count = len(ring)
     start, end = ring, np.roll(ring, -1, axis=0)
     along = end - start
@@ -73,7 +73,7 @@ def _check_simple(name: str, ring: FloatArray) -> None:
         where = end[back.argmax()]
         raise ValueError(f"{name} must not fold back on itself, as it does at {_show(where)}")
     for i in range(count - 2):
-        # Edges i and j, from the next but one to the last that is no neighbour.
+        # Edge i, and edges j from the next but one to the last that is not a neighbour.
         j = np.arange(i + 2, count - (i == 0))
         off = _distance(start[i], end[i], start[j], end[j])
         if len(j) and off.min() <= TOUCH_M:
@@ -85,7 +85,7 @@ def _check_simple(name: str, ring: FloatArray) -> None:
 
 
 def _distance(a: FloatArray, b: FloatArray, starts: FloatArray, ends: FloatArray) -> FloatArray:
-    """Distances (J,) between a segment and others (J, 2); 0 where they cross."""
+    """Return distances (J,) between a segment and others (J, 2); 0 if they cross."""
     sides = _cross(b - a, starts - a), _cross(b - a, ends - a)
     others = _cross(ends - starts, a - starts), _cross(ends - starts, b - starts)
     crossing = (sides[0] * sides[1] < 0) & (others[0] * others[1] < 0)
@@ -97,7 +97,7 @@ def _distance(a: FloatArray, b: FloatArray, starts: FloatArray, ends: FloatArray
 
 
 def to_segment(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Distances (...) of points (..., 2) from segments between (..., 2), metres."""
+    """Return distances (...) of points (..., 2) from segments between (..., 2), metres."""
     along, away = end - start, points - start
     square = (along**2).sum(axis=-1)
     share = ((along * away).sum(axis=-1) / np.where(square > 0, square, 1.0)).clip(0.0, 1.0)
@@ -105,9 +105,9 @@ def to_segment(points: FloatArray, start: FloatArray, end: FloatArray) -> FloatA
 
 
 def contains(polygon: FloatArray, points: FloatArray, margin_m: float = 1e-6) -> BoolArray:
-    """Which points (..., 2) lie inside of a polygon (V, 2), and not within a margin of its edge.
+    """Return which points (..., 2) lie in a polygon (V, 2), and not within a margin of its edge.
 
-    A negative margin counts those on the edge and so far outside of it too.
+    A negative margin also includes points on the edge, and outside up to this distance.
     """
     reach = max(0.0, -margin_m)
     low, high = polygon.min(axis=0) - reach, polygon.max(axis=0) + reach
@@ -116,7 +116,7 @@ def contains(polygon: FloatArray, points: FloatArray, margin_m: float = 1e-6) ->
     start, end = polygon, np.roll(polygon, -1, axis=0)
     x, y = near[:, None, 0], near[:, None, 1]
     above = start[:, 1] > y
-    # Of edges that a ray in x meets, how many lie ahead: odd inside.
+    # A ray along x crosses an odd number of edges if it starts inside.
     crosses = above != (end[:, 1] > y)
     height = np.where(crosses, end[:, 1] - start[:, 1], 1.0)
     ahead = start[:, 0] + (y - start[:, 1]) / height * (end - start)[:, 0] > x
@@ -135,7 +135,7 @@ def _show(point: FloatArray) -> str:
 
 
 def ears(corners: FloatArray) -> np.ndarray:
-    """Triangles (V - 2, 3) of a simple polygon (V, 2), indices of its corners: by cutting ears."""
+    """Return triangles (V - 2, 3), corner indices, of a simple polygon (V, 2), by ear clipping."""
 
     def turn(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
         u, v = b - a, c - a
@@ -153,7 +153,7 @@ def ears(corners: FloatArray) -> np.ndarray:
             sides = [turn(corners[p], corners[q], others) for p, q in pairs]
             if turn(*corners[[a, b, c]]) > 0 and not (np.min(sides, axis=0) >= 0).any():
                 break
-        else:  # what is left has no area
+        else:  # the rest has no area
             break
         found.append([a, b, c])
         left.remove(b)

@@ -1,8 +1,8 @@
-"""Where anchors may stand: boxes, the walls and ceiling of a room, shells.
+"""Define regions of allowed anchor positions: boxes, walls and ceiling of a room, shells.
 
 A region draws points from uniforms, and projects any point onto itself; arrays (..., 3). Its
-faces say where on it a point stands: on which wall, how that is turned, what it is called.
-`geometry.mounts` holds regions of any shape.
+faces give the wall of a point, with orientation and name. `geometry.mounts` holds regions of any
+shape.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from rbl_gym.kernels import compiled
 __all__ = ["REGIONS", "Box", "Faces", "Region", "Shell", "Walls"]
 
 Triple = tuple[float, float, float]
-# A point further than this from every face stands on none, metres.
+# A point at a larger distance from every face belongs to none, metres.
 _NEAR_M = 0.01
 
 
 class Faces(NamedTuple):
-    """Boxes of one, two or three sides within which a region lies.
+    """Boxes with one, two or three dimensions that contain a region.
 
     Attributes
     ----------
     origin
-        (K, 3), a corner of each, metres.
+        (K, 3), a corner of each box, metres.
     axes
-        (K, 3, 3): the directions of its sides from there, rows of unit length.
+        (K, 3, 3): the directions of its sides from this corner, rows of unit length.
     extents
-        (K, 3): the lengths of its sides, metres; 0 where it is flat.
+        (K, 3): the lengths of its sides, metres; 0 if it is flat.
     normal
-        (K, 3): direction into which anchors on it look, of unit length; zero: into all.
+        (K, 3): direction that anchors on it face, of unit length; zero: all directions.
     cost
-        (K,): of an anchor on it.
+        (K,): cost of an anchor on it.
     names
-        K texts.
+        K names.
     """
 
     origin: FloatArray
@@ -53,13 +53,13 @@ class Faces(NamedTuple):
 
     @classmethod
     def of(cls, rows: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike, str]]) -> Faces:
-        """Faces at cost 1, a row for each: origin, axes, extents, normal, name."""
+        """Return faces with cost 1, one row for each: origin, axes, extents, normal, name."""
         *arrays, names = zip(*rows, strict=True)
         origin, axes, extents, normal = (np.array(array, float) for array in arrays)
         return cls(origin, axes, extents, normal, np.ones(len(names)), names)
 
     def nearest(self, points: FloatArray) -> tuple[np.ndarray, FloatArray]:
-        """Index (...) of the face nearest to each point (..., 3), and the distance, metres."""
+        """Return index (...) and distance in metres of the face nearest to each point (..., 3)."""
         away = points[..., None, :] - self.origin
         along = np.einsum("kij,...kj->...ki", self.axes, away).clip(0.0, self.extents)
         away = away - np.einsum("kij,...ki->...kj", self.axes, along)
@@ -69,86 +69,86 @@ class Faces(NamedTuple):
 
 
 class Faced:
-    """What a region knows of its points by its `faces`: a field, or computed once."""
+    """Properties of the points of a region from its `faces`: a field, or computed once."""
 
     if TYPE_CHECKING:
 
         @property
         def faces(self) -> Faces:
-            """The faces within which the region lies."""
+            """Return the faces that contain the region."""
             ...
 
     def face_of(self, points: FloatArray) -> np.ndarray:
-        """Index (...) of the face on which legal points (..., 3) stand: the nearest."""
+        """Return the index (...) of the face nearest to legal points (..., 3)."""
         return self.faces.nearest(points)[0]
 
     def normal(self, points: FloatArray) -> FloatArray:
-        """Direction (..., 3) into which anchors at points (..., 3) look.
+        """Return the direction (..., 3) that anchors at points (..., 3) face.
 
-        Zero where that is not said, and further than a centimetre from every face.
+        It is zero if the face has no direction, and at more than a centimetre from every face.
         """
         face, distance = self.faces.nearest(points)
         return np.where((distance <= _NEAR_M)[..., None], self.faces.normal[face], 0.0)
 
     def cost(self, points: FloatArray) -> FloatArray:
-        """Cost (...) of anchors at points (..., 3)."""
+        """Return the cost (...) of anchors at points (..., 3)."""
         return self.faces.cost[self.face_of(points)]
 
     def names(self, points: FloatArray) -> list[str]:
-        """Names of the faces on which points (M, 3) stand."""
+        """Return the names of the faces of points (M, 3)."""
         return [self.faces.names[face] for face in self.face_of(points)]
 
     def listed(self) -> FloatArray | None:
-        """All legal points (K, 3), where they are a list; None: there is no end of them."""
+        """Return all legal points (K, 3) if they are a list; None: a continuous region."""
         return None
 
 
 class Region(Protocol):
-    """What every region offers."""
+    """Interface of regions."""
 
     @property
     def faces(self) -> Faces:
-        """The faces within which the region lies."""
+        """Return the faces that contain the region."""
         ...
 
     def face_of(self, points: FloatArray) -> np.ndarray:
-        """Index (...) of the face on which legal points (..., 3) stand."""
+        """Return the index (...) of the face of legal points (..., 3)."""
         ...
 
     def normal(self, points: FloatArray) -> FloatArray:
-        """Direction (..., 3) into which anchors at points look; zero: into all."""
+        """Return the direction (..., 3) that anchors at points face; zero: all directions."""
         ...
 
     def cost(self, points: FloatArray) -> FloatArray:
-        """Cost (...) of anchors at points (..., 3)."""
+        """Return the cost (...) of anchors at points (..., 3)."""
         ...
 
     def names(self, points: FloatArray) -> list[str]:
-        """Names of the faces on which points (M, 3) stand."""
+        """Return the names of the faces of points (M, 3)."""
         ...
 
     def listed(self) -> FloatArray | None:
-        """All legal points (K, 3), where they are a list."""
+        """Return all legal points (K, 3) if they are a list."""
         ...
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner (3,) of the smallest box around it."""
+        """Return the lower and upper corner (3,) of the bounding box."""
         ...
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
-        """Points (..., 3) uniform over the region from uniforms (..., 3) on [0, 1)."""
+        """Return points (..., 3), uniform over the region, from uniforms (..., 3) on [0, 1)."""
         ...
 
     def project(self, points: FloatArray) -> FloatArray:
-        """The nearest legal points (..., 3)."""
+        """Return the nearest legal points (..., 3)."""
         ...
 
     def place(self, action: FloatArray) -> FloatArray:
-        """Legal points (..., 3) that actions (..., 3) name, cut to [-1, 1]."""
+        """Return the legal points (..., 3) of actions (..., 3), which are clipped to [-1, 1]."""
         ...
 
     def action(self, points: FloatArray) -> FloatArray:
-        """Actions (..., 3) that `place` takes to legal points (..., 3)."""
+        """Return the actions (..., 3) that `place` maps to legal points (..., 3)."""
         ...
 
 
@@ -173,12 +173,12 @@ class Box(Faced):
         _check_corners(self, flat=True)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner, not to be written to."""
+        """Return the lower and upper corner; read-only."""
         return self._corners
 
     @property
     def faces(self) -> Faces:
-        """One, the box itself."""
+        """Return one face, the box itself."""
         return self._known_faces
 
     @functools.cached_property
@@ -187,12 +187,12 @@ class Box(Faced):
         return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "box")])
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
-        """Uniform in the box."""
+        """Return points uniform in the box."""
         low, high = self.bounds()
         return low + uniforms * (high - low)
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Every coordinate clipped."""
+        """Return points with every coordinate clipped."""
         low, high = self._corners
         return np.minimum(np.maximum(points, low), high)
 
@@ -201,7 +201,7 @@ class Box(Faced):
         return _fixed(self.low), _fixed(self.high)
 
     def place(self, action: FloatArray) -> FloatArray:
-        """The box is [-1, 1]^3."""
+        """Return points of actions; [-1, 1]^3 maps to the box."""
         middle, half = self._middle
         return middle + _cut(action) * half
 
@@ -210,7 +210,7 @@ class Box(Faced):
         return _middle(*self._corners)
 
     def action(self, points: FloatArray) -> FloatArray:
-        """Inverse of `place`; zero along an axis without extent."""
+        """Return actions of points, the inverse of `place`; zero along an axis without extent."""
         return _unscaled(points, *self.bounds())
 
 
@@ -225,7 +225,7 @@ class Walls(Faced):
         _check_corners(self, flat=False)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper corner of the room, not to be written to."""
+        """Return the lower and upper corner of the room; read-only."""
         return self._corners
 
     @functools.cached_property
@@ -234,7 +234,7 @@ class Walls(Faced):
 
     @property
     def faces(self) -> Faces:
-        """The walls to the west, east, south and north, and the ceiling."""
+        """Return the walls to the west, east, south and north, and the ceiling."""
         return self._known_faces
 
     @functools.cached_property
@@ -250,7 +250,7 @@ class Walls(Faced):
         return Faces.of(rows)
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
-        """Uniform by area; the first uniform chooses the surface and its first coordinate."""
+        """Return points uniform by area; the first uniform selects the surface and a coordinate."""
         low, high = self.bounds()
         x, y, z = high - low
         area = np.cumsum([y * z, y * z, x * z, x * z, x * y])
@@ -266,35 +266,35 @@ class Walls(Faced):
         return np.where(axes[face] == np.arange(3), values[face], points)
 
     def project(self, points: FloatArray) -> FloatArray:
-        """The nearest point of a wall or the ceiling."""
+        """Return the nearest points of a wall or the ceiling."""
         return _project_on_walls(points, *self._corners)
 
     def place(self, action: FloatArray) -> FloatArray:
-        """Where the ray from the middle of the room along the action meets a wall or the ceiling.
+        """Return the point where the ray from the room centre along the action meets a surface.
 
-        A ray that points down is cut at the floor's height; one to the floor itself goes to the
-        nearest legal point.
+        The surface is a wall or the ceiling. A ray that points down ends at the height of the
+        floor; one to the floor itself goes to the nearest legal point.
         """
         return place_on_walls(action, *self._corners)
 
     def action(self, points: FloatArray) -> FloatArray:
-        """An inverse of `place`: the point itself, in units of the room's half size."""
+        """Return actions that `place` maps to points: the points in units of the half size."""
         return _unscaled(points, *self.bounds())
 
 
 def _faces(low: FloatArray, high: FloatArray) -> tuple[np.ndarray, FloatArray]:
-    """The axis (5,) on which each wall and the ceiling stands, and where (..., 5)."""
+    """Return the axis (5,) normal to each wall and the ceiling, and its coordinate (..., 5)."""
     values = low[..., 0], high[..., 0], low[..., 1], high[..., 1], high[..., 2]
     return np.array([0, 0, 1, 1, 2]), np.stack(values, axis=-1)
 
 
 @compiled("walls:project")
 def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """`Walls.project` in rooms between two corners (..., 3)."""
+    """Compute `Walls.project` in rooms between two corners (..., 3)."""
     axes, values = _faces(low, high)
     inside = np.minimum(np.maximum(points, low), high)
     outside = (points - inside) ** 2
-    # Squared distance to each surface; below the floor the nearest gap alone misleads.
+    # Squared distance to each surface. Below the floor, the smallest gap alone is misleading.
     squares = outside.sum(axis=-1)[..., None] - outside[..., axes]
     face = (squares + (points[..., axes] - values) ** 2).argmin(axis=-1)[..., None]
     values = np.broadcast_to(values, squares.shape)
@@ -304,7 +304,7 @@ def _project_on_walls(points: FloatArray, low: FloatArray, high: FloatArray) -> 
 
 @compiled("walls:place")
 def place_on_walls(action: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """`Walls.place` in rooms between two corners (..., 3)."""
+    """Compute `Walls.place` in rooms between two corners (..., 3)."""
     action = _cut(action)
     middle, half = _middle(low, high)
     reach = np.maximum(np.abs(action[..., :2]).max(axis=-1), action[..., 2])
@@ -325,12 +325,12 @@ class Shell(Faced):
         check_number("outer_m", self.outer_m, low=inner_m)
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
-        """The cube around the outer sphere."""
+        """Return the cube around the outer sphere."""
         return np.full(3, -self.outer_m), np.full(3, self.outer_m)
 
     @property
     def faces(self) -> Faces:
-        """One, the cube around the outer sphere."""
+        """Return one face, the cube around the outer sphere."""
         return self._known_faces
 
     @functools.cached_property
@@ -339,7 +339,7 @@ class Shell(Faced):
         return Faces.of([(low, np.eye(3), high - low, np.zeros(3), "shell")])
 
     def draw(self, uniforms: FloatArray) -> FloatArray:
-        """Uniform by volume."""
+        """Return points uniform by volume."""
         z = 2 * uniforms[..., 0] - 1
         angle = 2 * np.pi * uniforms[..., 1]
         flat = np.sqrt(1 - z**2)
@@ -348,30 +348,30 @@ class Shell(Faced):
         return np.cbrt(cubes)[..., None] * direction
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Radius clipped; the origin goes to the inner sphere along x."""
+        """Return points with clipped radius; the origin goes to the inner sphere along x."""
         radius = np.linalg.norm(points, axis=-1, keepdims=True)
         legal = np.clip(radius, self.inner_m, self.outer_m)
         outward = points * (legal / np.where(radius > 0, radius, 1.0))
         return np.where(radius > 0, outward, self.inner_m * np.eye(3)[0])
 
     def place(self, action: FloatArray) -> FloatArray:
-        """The action's direction (x for zero), its length from the inner to the outer sphere."""
+        """Return points in the direction of actions (x for zero); their length sets the radius."""
         action = _cut(action)
         length = np.linalg.norm(action, axis=-1, keepdims=True)
-        # Shorter ones lose their direction in the squares.
+        # The squares of shorter ones underflow, and the direction is lost.
         far = length > 1e-150
         direction = np.where(far, action / np.where(far, length, 1), np.eye(3)[0])
         radius = self.inner_m + (self.outer_m - self.inner_m) * np.minimum(length, 1.0)
         return radius * direction
 
     def action(self, points: FloatArray) -> FloatArray:
-        """Inverse of `place`; a point on the inner sphere keeps a trace of its direction."""
+        """Return the inverse of `place`; a point on the inner sphere gives a tiny action."""
         radius = np.linalg.norm(points, axis=-1, keepdims=True)
         length = (radius - self.inner_m) / max(self.outer_m - self.inner_m, 1e-12)
         return points / np.where(radius > 0, radius, 1.0) * np.clip(length, 1e-12, 1.0)
 
 
-# The regions by the names that scene files and overrides give them.
+# Regions by their names in scene files and overrides.
 REGIONS = {"box": Box, "walls": Walls, "shell": Shell}
 
 
@@ -382,16 +382,16 @@ def _fixed(corner: Triple) -> FloatArray:
 
 
 def _cut(action: FloatArray) -> FloatArray:
-    """The action in [-1, 1]^3, in full precision."""
+    """Return the action clipped to [-1, 1]^3, in full precision."""
     return np.minimum(np.maximum(action, -1.0, dtype=np.float64), 1.0)
 
 
 def _middle(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Middle and half size of a box: [-1, 1]^3 scales to it."""
+    """Return centre and half size of a box: [-1, 1]^3 scales to it."""
     return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _unscaled(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Points in units of a box's half size, zero along an axis without extent."""
+    """Return points in units of the half size of a box, zero along an axis without extent."""
     middle, half = _middle(low, high)
     return np.where(half > 0, (points - middle) / np.where(half > 0, half, 1.0), 0.0)

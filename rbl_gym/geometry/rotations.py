@@ -1,4 +1,4 @@
-"""Rotations as 3 x 3 matrices: exponential, logarithm, Jacobians, nearest rotation; batched.
+"""Compute with rotations as 3 x 3 matrices: exponential, logarithm, Jacobians; batched.
 
 All functions broadcast over leading axes. A rotation vector ``w`` (rad) acts from the left
 and in the world frame, ``exp(w) @ Q``, which is the error convention of the whole package:
@@ -22,17 +22,17 @@ __all__ = [
     "yaw",
 ]  # fmt: skip
 
-# Above this squared angle the closed forms are exact enough.
+# Above this squared angle the closed forms are accurate.
 _SMALL_SQUARED_ANGLE = 1e-4
-# Up to this squared angle the Taylor series below are exact to rounding, and take less time.
+# Up to this squared angle the Taylor series below are exact to rounding, and faster.
 _SERIES_SQUARED_ANGLE = 0.25
-# Of sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2, the highest power first.
+# Series of sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 in x^2, highest power first.
 _SERIES = [[(-1) ** n / math.factorial(2 * n + k) for n in range(6, -1, -1)] for k in (1, 2, 3)]
 
 
 @checked(w=(3,))
 def hat(w: ArrayLike) -> FloatArray:
-    """Cross-product matrix ``[w]x`` of shape (..., 3, 3), with ``hat(w) @ v == cross(w, v)``."""
+    """Return the cross-product matrix ``[w]x`` (..., 3, 3): ``hat(w) @ v == cross(w, v)``."""
     w = np.asarray(w, dtype=np.float64)
     W = np.zeros((*w.shape, 3))
     W[..., 0, 1], W[..., 0, 2], W[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
@@ -42,7 +42,10 @@ def hat(w: ArrayLike) -> FloatArray:
 
 @checked(W=(3, 3))
 def vee(W: ArrayLike) -> FloatArray:
-    """Vector (..., 3) of the skew-symmetric part of ``W`` (..., 3, 3); inverse of `hat`."""
+    """Return the vector (..., 3) of the skew-symmetric part of ``W`` (..., 3, 3).
+
+    Inverse of `hat`.
+    """
     W = np.asarray(W, dtype=np.float64)
     return 0.5 * np.stack(
         [
@@ -55,7 +58,7 @@ def vee(W: ArrayLike) -> FloatArray:
 
 
 def coefficients(squared: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 as functions (...) of x^2 (...)."""
+    """Return sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 as functions (...) of x^2 (...)."""
     small = np.asarray(squared < _SERIES_SQUARED_ANGLE)
     if small.all():
         return _taylor(squared)
@@ -72,7 +75,7 @@ def coefficients(squared: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def _taylor(s: Any) -> tuple[Any, Any, Any]:
-    """`coefficients` of a small x^2, an array or a float."""
+    """Return `coefficients` for a small x^2, an array or a float."""
     sums = []
     for highest, *rest in _SERIES:
         total = highest * s
@@ -84,7 +87,7 @@ def _taylor(s: Any) -> tuple[Any, Any, Any]:
 
 
 def inverse_coefficient(squared: FloatArray) -> FloatArray:
-    """(1 - x / (2 tan(x / 2))) / x^2 as a function (...) of x^2 (...)."""
+    """Return (1 - x / (2 tan(x / 2))) / x^2 as a function (...) of x^2 (...)."""
     small = squared < _SMALL_SQUARED_ANGLE
     safe = np.where(small, 1.0, squared)
     x = np.sqrt(safe)
@@ -99,7 +102,7 @@ def _series(
     diagonal: FloatArray,
     out: FloatArray | None = None,
 ) -> FloatArray:
-    """``diagonal * I + a [w]x + b w w^T``, the common form of exp and its Jacobians."""
+    """Return ``diagonal * I + a [w]x + b w w^T``, the common form of exp and its Jacobians."""
     M = np.empty((*w.shape, 3)) if out is None else out
     for i, (j, k) in enumerate(((1, 2), (2, 0), (0, 1))):
         M[..., i, i] = diagonal + b * (w[..., i] * w[..., i])
@@ -110,7 +113,7 @@ def _series(
 
 
 def _one_series(w: FloatArray, a: float, b: float, diagonal: float) -> FloatArray:
-    """`_series` of a single vector (3,), in plain floats: a tenth of the time of array calls."""
+    """Compute `_series` of one vector (3,) in plain floats: a tenth of the time of array calls."""
     x, y, z = w.tolist()
     xy, xz, yz = b * (x * y), b * (x * z), b * (y * z)
     ax, ay, az = a * x, a * y, a * z
@@ -124,7 +127,7 @@ def _one_series(w: FloatArray, a: float, b: float, diagonal: float) -> FloatArra
 
 
 def _one_coefficients(w: FloatArray) -> tuple[float, float, float, float]:
-    """x^2 and its `coefficients` for a single vector (3,)."""
+    """Return x^2 and its `coefficients` for a single vector (3,)."""
     s = sum(x * x for x in w.tolist())
     if s < _SMALL_SQUARED_ANGLE:
         return s, *_taylor(s)
@@ -135,9 +138,9 @@ def _one_coefficients(w: FloatArray) -> tuple[float, float, float, float]:
 
 @checked(w=(3,))
 def exp(w: ArrayLike, out: FloatArray | None = None) -> FloatArray:
-    """Rotation matrix (..., 3, 3) of the rotation vector ``w`` (..., 3) in radians (Rodrigues).
+    """Return the rotation matrix (..., 3, 3) of the rotation vector ``w`` (..., 3) in radians.
 
-    `out`: an array to write it into, in any memory order.
+    Rodrigues' formula. `out`: an array for the result, in any memory order.
     """
     w = np.asarray(w, dtype=np.float64)
     if w.ndim == 1 and out is None:
@@ -150,10 +153,10 @@ def exp(w: ArrayLike, out: FloatArray | None = None) -> FloatArray:
 
 @checked(w=(3,))
 def cayley(w: ArrayLike) -> FloatArray:
-    """Rotation (..., 3, 3) by ``2 atan(|w| / 2)`` about ``w`` (..., 3), the Cayley transform.
+    """Return the Cayley transform of ``w`` (..., 3): a rotation by ``2 atan(|w| / 2)`` about it.
 
-    ``(I - X)^-1 (I + X)`` with ``X = hat(w) / 2``. It agrees with `exp` to second order in w,
-    needs no sine, and does not reach half turns.
+    The result (..., 3, 3) is ``(I - X)^-1 (I + X)`` with ``X = hat(w) / 2``. It agrees with `exp`
+    to second order in w, needs no sine, and does not reach rotations by 180 degrees.
     """
     w = np.asarray(w, dtype=np.float64)
     quarter = 0.25 * np.einsum("...i,...i->...", w, w)
@@ -163,7 +166,7 @@ def cayley(w: ArrayLike) -> FloatArray:
 
 @checked(w=(3,))
 def left_jacobian(w: ArrayLike) -> FloatArray:
-    """Left Jacobian (..., 3, 3): ``exp(w + d) = exp(Jl(w) d) exp(w)`` to first order in d."""
+    """Return the left Jacobian (..., 3, 3): ``exp(w + d) = exp(Jl(w) d) exp(w)`` to first order."""
     w = np.asarray(w, dtype=np.float64)
     if w.ndim == 1:
         s, _, b, c = _one_coefficients(w)
@@ -175,7 +178,7 @@ def left_jacobian(w: ArrayLike) -> FloatArray:
 
 @checked(w=(3,))
 def left_jacobian_inverse(w: ArrayLike) -> FloatArray:
-    """Inverse of `left_jacobian`: ``log(exp(d) exp(w)) = w + Jl(w)^-1 d`` to first order in d.
+    """Return the inverse of `left_jacobian`: ``log(exp(d) exp(w)) = w + Jl(w)^-1 d``, first order.
 
     Finite for ``|w| < 2 pi``, hence for everything that `log` returns.
     """
@@ -195,9 +198,10 @@ def left_jacobian_inverse(w: ArrayLike) -> FloatArray:
 
 @checked(Q=(3, 3))
 def log(Q: ArrayLike) -> FloatArray:
-    """Rotation vector (..., 3), ``|w| <= pi``, of the rotation matrix ``Q`` (..., 3, 3).
+    """Return the rotation vector (..., 3), ``|w| <= pi``, of the rotation matrix ``Q`` (..., 3, 3).
 
-    Accurate near the identity by the skew-symmetric part, near pi by the unit quaternion.
+    Near the identity it is computed from the skew-symmetric part, near pi from the unit quaternion,
+    and so is accurate at both.
     """
     Q = np.asarray(Q, dtype=np.float64)
     if Q.ndim == 2:
@@ -213,7 +217,7 @@ def log(Q: ArrayLike) -> FloatArray:
 
 
 def _one_log(Q: FloatArray) -> FloatArray:
-    """`log` of a single matrix (3, 3), in plain floats."""
+    """Compute `log` of a single matrix (3, 3), in plain floats."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = Q.tolist()
     cosine = 0.5 * (xx + yy + zz - 1)
     if cosine < -0.9:
@@ -225,7 +229,7 @@ def _one_log(Q: FloatArray) -> FloatArray:
 
 
 def _wide_log(Q: FloatArray) -> FloatArray:
-    """`log` of turns by more than 154 degrees: the sine of the half angle carries the axis."""
+    """Compute `log` above 154 degrees: the sine of the half angle determines the axis."""
     q = kernel(quaternion)(Q)
     sine = np.sqrt(np.einsum("...i,...i->...", q[..., 1:], q[..., 1:]))
     return (2 * np.arctan2(sine, q[..., 0]) / sine)[..., None] * q[..., 1:]
@@ -233,7 +237,7 @@ def _wide_log(Q: FloatArray) -> FloatArray:
 
 @checked(Q=(3, 3))
 def quaternion(Q: ArrayLike) -> FloatArray:
-    """Unit quaternion (..., 4) as (w, x, y, z) with w >= 0 of the rotation ``Q`` (..., 3, 3)."""
+    """Return the unit quaternion (..., 4), (w, x, y, z) with w >= 0, of ``Q`` (..., 3, 3)."""
     Q = np.asarray(Q, dtype=np.float64)
     x, y, z = Q[..., 0, 0], Q[..., 1, 1], Q[..., 2, 2]
     # The symmetric 4 x 4 matrix 4 q q^T; its row of largest diagonal is q up to scale.
@@ -255,7 +259,7 @@ def quaternion(Q: ArrayLike) -> FloatArray:
 
 
 def from_quaternion(q: ArrayLike) -> FloatArray:
-    """Rotation matrix (..., 3, 3) of a quaternion (..., 4) in the order (w, x, y, z).
+    """Return the rotation matrix (..., 3, 3) of a quaternion (..., 4) in the order (w, x, y, z).
 
     Raises
     ------
@@ -277,7 +281,7 @@ def from_quaternion(q: ArrayLike) -> FloatArray:
 
 @checked(yaw=(), pitch=(), roll=())
 def from_euler_zyx(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
-    """Rotation ``Rz(yaw) Ry(pitch) Rx(roll)``, angles in radians, broadcast together."""
+    """Return the rotation ``Rz(yaw) Ry(pitch) Rx(roll)``, angles in radians, broadcast together."""
     yaw, pitch, roll = np.broadcast_arrays(yaw, pitch, roll)
     axes = np.eye(3)
     angles = (yaw[..., None] * axes[2], pitch[..., None] * axes[1], roll[..., None] * axes[0])
@@ -286,24 +290,24 @@ def from_euler_zyx(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatAr
 
 @checked(Q=(3, 3))
 def yaw(Q: ArrayLike) -> FloatArray:
-    """Heading of the body's x axis in the world's xy plane, radians, ``atan2(Q10, Q00)``."""
+    """Return the heading of the body x axis in the world xy plane, radians, ``atan2(Q10, Q00)``."""
     Q = np.asarray(Q, dtype=np.float64)
     return np.arctan2(Q[..., 1, 0], Q[..., 0, 0])
 
 
 @checked(M=(3, 3))
 def nearest(M: ArrayLike) -> FloatArray:
-    """Proper rotation nearest to ``M`` (..., 3, 3) in Frobenius norm.
+    """Return the proper rotation nearest to ``M`` (..., 3, 3) in the Frobenius norm.
 
-    The polar factor with the smallest singular direction flipped where it would be a
-    reflection, ``U diag(1, 1, det(U V^T)) V^T``.
+    It is the polar factor, with the smallest singular direction flipped if it would be a
+    reflection: ``U diag(1, 1, det(U V^T)) V^T``.
     """
     return _nearest(M)
 
 
 @compiled("rotation_fits:nearest")
 def _nearest(M: FloatArray) -> FloatArray:
-    """`nearest` by its singular values."""
+    """Compute `nearest` from the singular value decomposition."""
     U, _, Vt = np.linalg.svd(M)
     U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return U @ Vt
@@ -311,28 +315,31 @@ def _nearest(M: FloatArray) -> FloatArray:
 
 @checked(Q_hat=(3, 3), Q=(3, 3))
 def error(Q_hat: ArrayLike, Q: ArrayLike) -> FloatArray:
-    """Global rotation error ``w`` (..., 3) with ``Q_hat = exp(w) Q``; its norm is the angle."""
+    """Return the global rotation error ``w`` (..., 3), ``Q_hat = exp(w) Q``.
+
+    Its norm is the angle.
+    """
     return kernel(log)(np.asarray(Q_hat) @ np.swapaxes(np.asarray(Q), -1, -2))
 
 
 @checked(u=(3,), v=(3,))
 def angle_between(u: ArrayLike, v: ArrayLike) -> FloatArray:
-    """Angle in radians between vectors (..., 3), by atan2: exact near 0 and pi."""
+    """Return the angle in radians between vectors (..., 3), by atan2: exact near 0 and pi."""
     u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
     return np.arctan2(np.linalg.norm(np.cross(u, v), axis=-1), np.einsum("...i,...i->...", u, v))
 
 
 def random(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> FloatArray:
-    """Rotations (\\*shape, 3, 3), uniform on SO(3)."""
+    """Return random rotations (\\*shape, 3, 3), uniform on SO(3)."""
     return from_quaternion(rng.standard_normal((*shape, 4)))
 
 
-# By how much entries of Q Q^T of a rotation may be off the identity.
+# Tolerance on the entries of Q Q^T minus the identity.
 ORTHOGONAL = 1e-6
 
 
 def check_rotation(name: str, Q: ArrayLike, *, tolerance: float = ORTHOGONAL) -> FloatArray:
-    """`Q` as float64 (..., 3, 3) proper rotations, or a ValueError that says what is wrong."""
+    """Return `Q` as float64 (..., 3, 3) proper rotations, or raise ValueError."""
     Q = check_array(name, Q, (3, 3))
     defect = np.abs(Q @ np.swapaxes(Q, -1, -2) - np.eye(3)).max(initial=0.0)
     if defect > tolerance:

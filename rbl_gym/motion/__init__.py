@@ -1,4 +1,4 @@
-"""Motion: kinematics, process noise, trajectories; the law of an unknown twist."""
+"""Model motion: kinematics, process noise, trajectories, and unknown twists."""
 
 from rbl_gym.motion.kinematics import (
     Path,

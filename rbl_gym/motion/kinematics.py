@@ -1,8 +1,8 @@
-"""Motion of a rigid body: kinematics of the tracking paper, process noise, trajectories.
+"""Model the motion of a rigid body: kinematics of the tracking paper, noise, trajectories.
 
 A twist (..., 6) is the angular velocity in the world frame [rad/s] and the velocity [m/s].
-Kinematics (tracking paper, (10)-(15), Omega carrying the time step tau):
-``Q_k = exp(omega tau) Q_{k-1}``, ``t_k = t_{k-1} + v tau``.
+Kinematics (tracking paper, (10)-(15), where Omega includes the time step tau): ``Q_k = exp(omega
+tau) Q_{k-1}``, ``t_k = t_{k-1} + v tau``.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ __all__ = [
 ]  # fmt: skip
 
 _MOST_STEPS = 10**9
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
 def six(rotation: Axes, translation: Axes) -> FloatArray:
-    """Six numbers (..., 6): those of the rotation's axes, then those of the translation's."""
+    """Return six numbers (..., 6): for the axes of the rotation, then of the translation."""
     parts = [np.asarray(part, dtype=np.float64) for part in (rotation, translation)]
     batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     return np.concatenate([np.broadcast_to(part, (*batch, 3)) for part in parts], axis=-1)
@@ -46,18 +46,18 @@ def six(rotation: Axes, translation: Axes) -> FloatArray:
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Random part of the motion: standard deviations after 1 s; the variance grows with time.
+    """Process noise of the motion: standard deviations after 1 s; the variance grows with time.
 
     Parameters
     ----------
     rotation_rad, translation_m
-        A float, or three of them for the world's axes (a planar body has zeros among them), or
-        (..., 3) with leading axes: each trial has its own (`IteratedEkf` takes such).
+        A float, or three floats for the world axes (some are zero for a planar body), or (..., 3)
+        with leading axes for individual trials (accepted by `IteratedEkf`).
 
     Raises
     ------
     ValueError
-        If a value is negative or not finite, or there are neither 1 nor 3 of a trial.
+        If a value is negative or not finite, or there are not 1 or 3 values per trial.
     """
 
     rotation_rad: Axes = 0.0
@@ -75,14 +75,14 @@ class ProcessNoise:
             ) from error
 
     def std(self) -> FloatArray:
-        """The standard deviations (..., 6) after 1 s: rotation (rad), then translation (m)."""
+        """Return standard deviations (..., 6) after 1 s: rotation (rad), then translation (m)."""
         return self._std.copy()
 
     def covariance(self, twist: FloatArray, dt: ArrayLike) -> FloatArray:
-        """Covariance (..., 6, 6) that one step adds to the pose error (w, v).
+        """Return the covariance (..., 6, 6) that one step adds to the pose error (w, v).
 
-        ``dt blkdiag(Jl S_w Jl^T, S_v)`` with Jl the left Jacobian of the step's rotation:
-        the noise is on the angular velocity, the error on the rotation it makes.
+        It is ``dt blkdiag(Jl S_w Jl^T, S_v)`` with Jl the left Jacobian of the rotation of the
+        step: the noise acts on the angular velocity, the error is that of the rotation.
         """
         dt = np.asarray(dt, dtype=np.float64)[..., None]
         jacobian = _LEFT_JACOBIAN(twist[..., :3] * dt)
@@ -92,7 +92,7 @@ class ProcessNoise:
         covariance[..., :3, :3] = (jacobian * variance[..., None, :3]) @ np.swapaxes(
             jacobian, -1, -2
         )
-        # Every seventh entry of the 36 is on the diagonal.
+        # Every seventh of the 36 entries is on the diagonal.
         covariance.reshape((*covariance.shape[:-2], 36))[..., 21::7] = variance[..., 3:]
         return covariance
 
@@ -102,12 +102,12 @@ class ProcessNoise:
 
     @functools.cached_property
     def _variance(self) -> FloatArray:
-        """The six variances after 1 s."""
+        """Return the six variances after 1 s."""
         return self._std**2
 
 
 def check_process(process: ProcessNoise) -> None:
-    """A ValueError where something else than the noise of a motion came."""
+    """Raise ValueError if the argument is not a process noise."""
     if not callable(getattr(process, "covariance", None)):
         raise ValueError(f"process must be a motion.ProcessNoise, got {process!r:.80}")
 
@@ -131,7 +131,7 @@ class Path(NamedTuple):
 def propagate(
     rotation: FloatArray, translation: FloatArray, twist: FloatArray, dt: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """`rotation` (..., 3, 3), `translation` (..., 3) after `dt` s of the same `twist` (..., 6)."""
+    """Return `rotation` (..., 3, 3), `translation` (..., 3) after `dt` s of a `twist` (..., 6)."""
     dt = np.asarray(dt, dtype=np.float64)[..., None]
     return _EXP(twist[..., :3] * dt) @ rotation, translation + twist[..., 3:] * dt
 
@@ -139,16 +139,16 @@ def propagate(
 def simulate(
     trajectory: Trajectory, dt: float, process: ProcessNoise, normals: FloatArray | None = None
 ) -> Path:
-    """True poses along a trajectory with process noise on every step.
+    """Simulate true poses along a trajectory with process noise on every step.
 
     Parameters
     ----------
     trajectory
         Start and nominal twists.
     dt
-        Step, seconds; a ValueError where it is not positive.
+        Step, seconds; ValueError if it is not positive.
     process
-        Law of the noise; it acts on the twist, with variance growing with time.
+        Process noise; it acts on the twist, with a variance that grows with time.
     normals
         Standard normals (..., T, 6); None: no process noise.
     """
@@ -173,7 +173,7 @@ def _walk(
     std: FloatArray,
     dt: ArrayLike,
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (..., T, 3, 3) and (..., T, 3) after each of T steps; `std` (..., 6) after 1 s."""
+    """Return poses (..., T, 3, 3), (..., T, 3) after each step; `std` (..., 6) after 1 s."""
     dt = np.asarray(dt, dtype=np.float64)[..., None, None]
     steps = dt * (twists + normals * (std[..., None, :] / np.sqrt(dt)))
     batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1], steps.shape[:-2])
@@ -189,7 +189,7 @@ def _walk(
 
 
 def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike) -> FloatArray:
-    """Twists (..., T, 6) that lead from each pose to the next, dt a scalar or (..., T)."""
+    """Return the twists (..., T, 6) from each pose to the next; dt is a scalar or (..., T)."""
     dt = np.asarray(dt, dtype=np.float64)[..., None]
     turn = rotations.error(rotation[..., 1:, :, :], rotation[..., :-1, :, :])
     return np.concatenate([turn / dt, np.diff(translation, axis=-2) / dt], axis=-1)
@@ -198,7 +198,7 @@ def twists_between(rotation: FloatArray, translation: FloatArray, dt: ArrayLike)
 def constant_twist(
     rotation: ArrayLike, translation: ArrayLike, twist: ArrayLike, steps: int
 ) -> Trajectory:
-    """The same `twist` for `steps` from `rotation`, `translation` on: the tracking paper's."""
+    """Return `steps` of one `twist` from `rotation`, `translation`, as in the tracking paper."""
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
     twist = check_array("twist", twist, (6,))
@@ -216,12 +216,13 @@ def random_twist(
     rng: np.random.Generator,
     hold: int = 10,
 ) -> Trajectory:
-    """Constant speed in a direction, and a turn rate about an axis, drawn anew every `hold` steps.
+    """Return a trajectory whose direction and rotation axis are redrawn every `hold` steps.
 
-    Speed and turn rate are exact (directions are uniform on the sphere), so that the reach of
-    the body stays bounded by ``speed * time``.
+    Speed and turn rate are constant and directions are uniform on the sphere. The distance from the
+    start is therefore bounded by ``speed * time``.
 
-    From a pose (`rotation`, `translation`) on, at `speed_m_s` and `turn_rate_rad_s`; `rng` draws.
+    It starts at a pose (`rotation`, `translation`), with `speed_m_s` and `turn_rate_rad_s`; `rng`
+    is the source of randomness.
     """
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
@@ -238,7 +239,7 @@ def random_twist(
 def held_twists(
     directions: FloatArray, turn_rate_rad_s: float, speed_m_s: float, steps: int, hold: int
 ) -> FloatArray:
-    """Twists (..., T, 6) along turn axes and directions (..., K, 2, 3), `hold` steps for each."""
+    """Return twists (..., T, 6) for axes and directions (..., K, 2, 3), `hold` steps for each."""
     units = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     twists = units * np.array([turn_rate_rad_s, speed_m_s])[:, None]
     twists = twists.reshape((*directions.shape[:-2], 6))
@@ -253,12 +254,12 @@ def waypoints(
     steps: int,
     spin_rad_s: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Trajectory:
-    """Constant speed along the polyline through `points`, resting at its end, constant spin.
+    """Return a trajectory with constant speed and spin along a polyline, at rest at its end.
 
     Parameters
     ----------
     rotation
-        At the start (..., 3, 3).
+        Start rotation (..., 3, 3).
     points
         (..., K, 3), K >= 2; the first is the start.
     speed_m_s, dt, steps
@@ -281,7 +282,7 @@ def between_waypoints(
     rotation: FloatArray, points: FloatArray, speed_m_s: float, dt: float, steps: int,
     spin: FloatArray,
 ) -> Trajectory:  # fmt: skip
-    """`waypoints`, of what the caller has checked."""
+    """Compute `waypoints` from arguments that the caller has checked."""
     places = _along(points, speed_m_s * dt * np.arange(steps + 1))
     velocity = (places[..., 1:, :] - places[..., :-1, :]) / dt
     batch = np.broadcast_shapes(spin.shape[:-1], velocity.shape[:-2])
@@ -292,11 +293,11 @@ def between_waypoints(
 
 @compiled("epoch:along")
 def _along(points: FloatArray, travelled: FloatArray) -> FloatArray:
-    """Places (..., T, 3) on polylines (..., K, 3) at the distances `travelled` (T,), rising."""
+    """Return positions (..., T, 3) on polylines (..., K, 3) at distances `travelled` (T,)."""
     step = np.diff(points, axis=-2)
     legs = np.linalg.norm(step, axis=-1)
     reached = np.cumsum(legs, axis=-1)
-    # The leg at an epoch is the number of ends reached by then.
+    # The segment at an epoch is the number of segment ends passed by then.
     leg = (reached[..., None, :] <= travelled[:, None]).sum(axis=-1)
     leg = np.minimum(leg, legs.shape[-1] - 1)
     before = np.take_along_axis(reached - legs, leg, axis=-1)
@@ -307,7 +308,7 @@ def _along(points: FloatArray, travelled: FloatArray) -> FloatArray:
 
 
 def lawn_mower_points(low: ArrayLike, high: ArrayLike, spacing_m: float) -> FloatArray:
-    """Way-points (K, 3) of parallel lanes along x, `spacing_m` apart, at the mid height."""
+    """Return way-points (K, 3) of parallel lanes along x, `spacing_m` apart, at the mid height."""
     low, high = check_array("low", low, (3,)), check_array("high", high, (3,))
     spacing_m = check_number("spacing_m", spacing_m, low=1e-9)
     if (low > high).any():
@@ -326,7 +327,7 @@ def orbit(
     steps: int,
     phase: ArrayLike = 0.0,
 ) -> Trajectory:
-    """A horizontal circle, the body's x axis along the motion; `phase` (rad) may be batched.
+    """Return a horizontal circle, the body x axis along the motion; `phase` (rad) may be batched.
 
     `centre` (..., 3), `radius_m`, `speed_m_s`; `steps` of `dt` seconds.
     """
@@ -349,7 +350,7 @@ def orbit(
 def recorded(
     times: ArrayLike, rotation: ArrayLike, translation: ArrayLike, dt: float
 ) -> Trajectory:
-    """A recorded track, resampled every `dt` seconds: linear in position, geodesic in rotation.
+    """Resample a recorded track every `dt` seconds: linear in position, geodesic in rotation.
 
     Parameters
     ----------
@@ -380,15 +381,15 @@ def recorded(
 def interpolate(
     times: FloatArray, rotation: FloatArray, translation: FloatArray, at: FloatArray
 ) -> Path:
-    """Poses at the times `at`, linear in position, geodesic in rotation; the ends are held.
+    """Interpolate poses at times `at`: linear in position, geodesic in rotation; ends are held.
 
-    The known ones: `times` (K,), `rotation` (K, 3, 3), `translation` (K, 3).
+    The known poses are `times` (K,), `rotation` (K, 3, 3), `translation` (K, 3).
     """
     final = len(times) - 1
     before = np.clip(np.searchsorted(times, at, side="right") - 1, 0, final)
     after = np.minimum(before + 1, final)
     gap = times[after] - times[before]
-    # The last pose has no neighbour: its gap is 0, and so is the fraction.
+    # The last pose has no successor: its gap is 0, and so is the fraction.
     fraction = (at - times[before]) / np.where(gap > 0, gap, np.inf)
     fraction = np.clip(fraction, 0.0, 1.0)[..., None]
     turn = rotations.error(rotation[after], rotation[before])

@@ -1,16 +1,14 @@
-"""Inertial navigation: from readings of a gyroscope and an accelerometer to pose and velocity.
+"""Inertial navigation: compute pose and velocity from gyroscope and accelerometer readings.
 
-Over a sample of h seconds the readings, less their biases (w, f), count as constant:
+Over a sample of h seconds the readings minus their biases, (w, f), are taken as constant:
 
-    Q' = Q exp(w h)
-    s  = Q exp(w h / 2) f                    specific force in the world, at mid-turn
-    v' = v + (g + s) h
-    t' = t + v h + (g + s) h^2 / 2
+    Q' = Q exp(w h) s  = Q exp(w h / 2) f                    specific force in the world frame, at
+    mid-rotation v' = v + (g + s) h t' = t + v h + (g + s) h^2 / 2
 
 Readings between two epochs are preintegrated (Forster et al., IEEE T-RO 33, 2017): integrated from
-``Q = I, t = v = 0`` without gravity, which depends on the biases alone. The error of a state is
-estimate less truth, of the rotation global, ``Q_hat = exp(e) Q``, in the order rotation, place,
-velocity, bias of the gyroscope, bias of the accelerometer, and what else there is.
+``Q = I, t = v = 0`` without gravity. The result depends only on the biases. The error of a state is
+estimate minus truth; for the rotation it is global, ``Q_hat = exp(e) Q``. The order is rotation,
+position, velocity, gyroscope bias, accelerometer bias, and further states.
 """
 
 from __future__ import annotations
@@ -27,27 +25,27 @@ from rbl_gym.measurements.inertial import InertialSensor
 
 __all__ = ["Preintegrated", "attitude", "gravity", "preintegrate"]
 
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _EXP, _HAT = kernel(rotations.exp), kernel(rotations.hat)
 _LEFT_JACOBIAN = kernel(rotations.left_jacobian)
 
 
 class Preintegrated(NamedTuple):
-    """What readings between two epochs say of the motion, in the frame of the body at the first.
+    """The motion between two epochs from readings, in the body frame at the first epoch.
 
     Attributes
     ----------
     rotation, translation, velocity
-        (..., 3, 3), (..., 3), (..., 3): where it leads from the identity, without gravity.
+        (..., 3, 3), (..., 3), (..., 3): the state reached from the identity, without gravity.
     jacobian
         (..., 9, 6): derivative of the errors of rotation (global), translation and velocity by
         the biases of gyroscope and accelerometer.
     covariance
-        (..., 9, 9) of these errors by the white noise of the readings.
+        (..., 9, 9) of these errors due to the white noise of the readings.
     duration
         Seconds (...).
     bias
-        (..., 6) that was taken off the readings.
+        (..., 6) that was subtracted from the readings.
     """
 
     rotation: FloatArray
@@ -59,7 +57,7 @@ class Preintegrated(NamedTuple):
     bias: FloatArray
 
     def corrected(self, bias: FloatArray) -> Preintegrated:
-        """The same to first order with other biases (..., 6) taken off."""
+        """Return the first-order result for other biases (..., 6)."""
         change = (self.jacobian @ (bias - self.bias)[..., None])[..., 0]
         return self._replace(
             rotation=_EXP(change[..., :3]) @ self.rotation,
@@ -71,23 +69,24 @@ class Preintegrated(NamedTuple):
 def preintegrate(
     readings: ArrayLike, steps: ArrayLike, bias: ArrayLike, sensor: InertialSensor
 ) -> Preintegrated:
-    """Readings between two epochs, preintegrated.
+    """Preintegrate the readings between two epochs.
 
     Parameters
     ----------
     readings
         (..., S, 6), rad/s and m/s^2 in the body frame.
     steps
-        Seconds of each sample, (..., S) or one for all; samples of no length tell nothing.
+        Duration of each sample, seconds, (..., S) or one for all; samples of zero duration have
+        no effect.
     bias
-        (..., 6) to take off.
+        (..., 6) to subtract.
     sensor
-        Law of the noise.
+        Noise of the sensor.
 
     Raises
     ------
     ValueError
-        On wrong shapes, negative steps, NaN.
+        If a shape is wrong, a step is negative, or a value is NaN.
     """
     if not isinstance(sensor, InertialSensor):
         raise ValueError(f"sensor must be an InertialSensor, got {sensor!r:.80}")
@@ -98,7 +97,7 @@ def preintegrate(
 
 
 def check_steps(steps: ArrayLike, readings: FloatArray, name: str = "steps") -> FloatArray:
-    """Lengths (..., S) of the samples of readings (..., S, 6), or a ValueError with `name`."""
+    """Return durations (..., S) of the samples of readings (..., S, 6), or raise with `name`."""
     steps = check_array(name, steps, ())
     if (steps < 0).any():
         raise ValueError(f"{name} must not be negative, got {steps.min():g}")
@@ -113,9 +112,9 @@ def check_steps(steps: ArrayLike, readings: FloatArray, name: str = "steps") -> 
 def integrate(
     readings: FloatArray, steps: FloatArray, bias: FloatArray, law: FloatArray
 ) -> Preintegrated:
-    """`preintegrate` behind its door; `law` as `InertialSensor.numbers`.
+    """Compute `preintegrate` without checks; `law` is `InertialSensor.numbers`.
 
-    The noise of a sample acts at mid-turn, where it is as good as isotropic.
+    The noise of a sample acts at mid-rotation, where it is nearly isotropic.
     """
     batch = np.broadcast_shapes(readings.shape[:-2], steps.shape[:-1], bias.shape[:-1])
     rotation = np.broadcast_to(np.eye(3), (*batch, 3, 3))
@@ -158,12 +157,12 @@ def integrate(
 
 
 def gravity(tilt: ArrayLike, magnitude: float) -> FloatArray:
-    """Gravity (..., 3) in a world whose z axis is off the vertical by ``exp((tilt, 0))``.
+    """Return gravity (..., 3) in a world frame tilted from the vertical by ``exp((tilt, 0))``.
 
     Parameters
     ----------
     tilt
-        Rotation vector's x and y (..., 2), radians.
+        The x and y components (..., 2) of the rotation vector, radians.
     magnitude
         m/s^2.
     """
@@ -171,12 +170,12 @@ def gravity(tilt: ArrayLike, magnitude: float) -> FloatArray:
 
 
 def _level(tilt: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3) about the world's x and y."""
+    """Return rotation vectors (..., 3) about the x and y axes of the world."""
     return np.concatenate([tilt, np.zeros_like(tilt[..., :1])], axis=-1)
 
 
 def gravity_jacobian(tilt: FloatArray, magnitude: float) -> FloatArray:
-    """Derivative (..., 3, 2) of `gravity` by the tilt."""
+    """Return the derivative (..., 3, 2) of `gravity` by the tilt."""
     down = gravity(tilt, magnitude)
     return -(_HAT(down) @ _LEFT_JACOBIAN(_level(tilt)))[..., :2]
 
@@ -191,13 +190,13 @@ def propagate(
     steps: FloatArray,
     law: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """State and covariance after the samples of an interval.
+    """Return state and covariance after the samples of an interval.
 
     Parameters
     ----------
     rotation, translation, extra, covariance
         (..., 3, 3), (..., 3), (..., K), (..., 6 + K, 6 + K). `extra`: velocity, biases, the tilt
-        of gravity (2) if the last of `law` is not 0, and what stands still.
+        of gravity (2) if the last entry of `law` is not 0, and constant states.
     readings, steps
         (..., S, 6) and seconds (..., S).
     law
@@ -242,30 +241,29 @@ def propagate(
 def attitude(
     readings: ArrayLike, sensor: InertialSensor, acceleration_m_s2: float = 0.5
 ) -> tuple[FloatArray, FloatArray]:
-    """Attitude of a body from the mean specific force of some readings; the heading is open.
+    """Estimate the attitude of a body, without heading, from the mean specific force of readings.
 
     Parameters
     ----------
     readings
-        (..., S, 6), while the body does not accelerate much.
+        (..., S, 6), while the acceleration of the body is small.
     sensor
-        Deviation of its bias.
+        Sensor with the standard deviation of its bias.
     acceleration_m_s2
-        Standard deviation of the body's mean acceleration, per axis.
+        Standard deviation of the mean acceleration of the body, per axis.
 
     Returns
     -------
     rotation
-        (..., 3, 3), with yaw 0: ``exp((0, 0, yaw)) @ rotation`` is as good.
+        (..., 3, 3), with yaw 0: ``exp((0, 0, yaw)) @ rotation`` is equally likely.
     covariance
-        (..., 3, 3) of its global error about x and y, radians; about z it is that of a heading
-        uniform on the circle.
+        (..., 3, 3) of its global error, radians. About z it is the variance of a uniform heading.
 
     Raises
     ------
     ValueError
-        On wrong shapes, and where the mean force is far from gravity: the body falls, or the
-        units are wrong.
+        If a shape is wrong, or the mean force is far from gravity: the body falls, or the units
+        are wrong.
     """
     readings = check_array("readings", readings, ("S", 6))
     wide = check_number("acceleration_m_s2", acceleration_m_s2, low=0.0)
@@ -277,7 +275,7 @@ def attitude(
             f"{float(magnitude.flat[0]):.3g} (is it in units of g, or without gravity?)"
         )
     up = force / magnitude
-    # The row of the rotation that is the world's vertical; yaw 0: the body's x axis has no y.
+    # The row of the rotation that is the world vertical. Yaw 0: the body x axis has no y component.
     roll = np.arctan2(up[..., 1], up[..., 2])
     pitch = np.arctan2(-up[..., 0], np.hypot(up[..., 1], up[..., 2]))
     rotation = rotations.from_euler_zyx(0.0, pitch, roll)

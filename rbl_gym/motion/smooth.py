@@ -1,8 +1,9 @@
-"""Smooth motion: what an inertial sensor on a body feels along a path.
+"""Interpolate smooth motion, to simulate an inertial sensor along a path.
 
-A path of poses at times has no acceleration. Two curves give it one: cubic splines through the
-poses (`through`), and uniform cubic B-splines that poses only pull on (`bspline`), in the
-cumulative form on SO(3) (Sommer et al., CVPR 2020), which round the corners of a polyline.
+A path of poses at discrete times does not define an acceleration. Two curves do: cubic splines
+through the poses (`through`), and uniform cubic B-splines with the poses as control points
+(`bspline`), in the cumulative form on SO(3) (Sommer et al., CVPR 2020). The latter round the
+corners of a polyline.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from rbl_gym.geometry import rotations
 
 __all__ = ["SmoothMotion", "bspline", "from_function", "through"]
 
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _EXP, _ERROR = kernel(rotations.exp), kernel(rotations.error)
 
 
 class SmoothMotion(NamedTuple):
-    """A body at some times (..., T).
+    """The motion of a body at times (..., T).
 
     Attributes
     ----------
@@ -45,24 +46,25 @@ class SmoothMotion(NamedTuple):
 def bspline(
     rotation: ArrayLike, translation: ArrayLike, spacing_s: float, times: ArrayLike
 ) -> SmoothMotion:
-    """A uniform cubic B-spline of poses: it starts at the first, and passes near the others.
+    """Evaluate a uniform cubic B-spline of poses, which starts at the first one.
 
-    Position, velocity and acceleration are continuous, as are rotation, turn rate and its
-    derivative; what the poses do at a constant twist, it does too.
+    It passes near the other poses. Position, velocity and acceleration are continuous, as are
+    rotation, turn rate and its derivative. Poses with a constant twist are reproduced.
 
     Parameters
     ----------
     rotation, translation
-        Control poses (..., K, 3, 3), (..., K, 3), K >= 2, turns of less than 180 degrees apart.
+        Control poses (..., K, 3, 3), (..., K, 3), K >= 2, consecutive rotations less than 180
+        degrees apart.
     spacing_s
-        Seconds between them; the first is at 0.
+        Time between the poses, seconds; the first is at 0.
     times
         (T,) seconds from 0 to ``(K - 2) spacing_s``.
 
     Raises
     ------
     ValueError
-        On wrong shapes, or times outside.
+        If a shape is wrong, or a time is outside.
     """
     R = rotations.check_rotation("rotation", rotation)
     p = check_array("translation", translation, ("K", 3))
@@ -80,14 +82,14 @@ def bspline(
             f"times must be (T,) from 0 to {(count - 2) * spacing_s:g}, got {times.min():g} to "
             f"{times.max():g}"
         )
-    # One more pose before the first, so that the curve starts there.
+    # An extra pose before the first one, so that the curve starts there.
     p = np.concatenate([2 * p[..., :1, :] - p[..., 1:2, :], p], axis=-2)
     turns = _ERROR(R[..., 1:, :, :], R[..., :-1, :, :])
     before = _EXP(-turns[..., :1, :]) @ R[..., :1, :, :]
     R = np.concatenate([before, R], axis=-3)
     turns = np.concatenate([turns[..., :1, :], turns], axis=-2)
     moves = np.diff(p, axis=-2)
-    # Of the four poses around a time the first is i.
+    # i is the first of the four poses around a time.
     i = np.clip(np.floor(at).astype(int), 0, max(count - 3, 0))
     u = (at - i)[:, None]
     shares = (5 + 3 * u - 3 * u**2 + u**3, 1 + 3 * u + 3 * u**2 - 2 * u**3, u**3)
@@ -96,7 +98,7 @@ def bspline(
     Q, place = R[..., i, :, :], p[..., i, :]
     turn_rate = speed = acceleration = np.zeros_like(place)
     for k in range(3):
-        # The last control may be missing where its share is 0.
+        # The last control pose may be missing if its weight is 0.
         j = np.minimum(i + k, count - 1)
         turn, move = turns[..., j, :], moves[..., j, :]
         step = _EXP(shares[k] / 6 * turn)
@@ -114,9 +116,9 @@ def bspline(
 def through(
     times: ArrayLike, rotation: ArrayLike, translation: ArrayLike, at: ArrayLike
 ) -> SmoothMotion:
-    """Cubic splines through the poses of one body: continuous to the second derivative.
+    """Evaluate cubic splines through the poses of one body, with continuous second derivatives.
 
-    What noise the poses have, the accelerations have many times.
+    Noise of the poses is strongly amplified in the accelerations.
 
     Parameters
     ----------
@@ -128,7 +130,7 @@ def through(
     Raises
     ------
     ValueError
-        On wrong shapes, times that do not increase, and times outside.
+        If a shape is wrong, times do not increase, or a time is outside.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -156,21 +158,21 @@ def through(
 def from_function(
     pose: Callable[[FloatArray], tuple[ArrayLike, ArrayLike]], at: ArrayLike, step_s: float = 1e-3
 ) -> SmoothMotion:
-    """The motion of a smooth function of time, by central differences of fourth order.
+    """Return the motion of a smooth function of time, by fourth-order central differences.
 
     Parameters
     ----------
     pose
-        From times (T,) to a rotation (..., T, 3, 3) and a translation (..., T, 3).
+        Function from times (T,) to a rotation (..., T, 3, 3) and a translation (..., T, 3).
     at
         Times (T,), seconds.
     step_s
-        Of the differences: errors grow with its fourth power, those of rounding with 1 / step^2.
+        Step of the differences: errors grow with its fourth power, rounding with 1 / step^2.
 
     Raises
     ------
     ValueError
-        On what is no pose.
+        If the function does not return poses.
     """
     at = check_array("at", at, ("T",))
     step_s = check_number("step_s", step_s, low=1e-9)

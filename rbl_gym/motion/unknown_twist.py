@@ -1,14 +1,14 @@
-"""A body whose twist nobody tells: its law, trajectories drawn from it, the bound of 12 states.
+"""Model a body with unknown twist: its law, simulated trajectories, and its 12 states.
 
-The twist (angular velocity in the world frame, then velocity) wanders by white acceleration;
-the pose follows it:
+The twist (angular velocity in the world frame, then velocity) is a random walk driven by white
+acceleration. The pose follows it:
 
     Q[k+1] = exp(W[k] dt + n_w) Q[k],   t[k+1] = t[k] + V[k] dt + n_v,   twist[k+1] = twist[k] + n_a
 
-with ``(n, n_a)`` of a step jointly Gaussian as an acceleration that is white over the step makes
-them: variances ``q dt^3 / 3`` and ``q dt``, covariance ``q dt^2 / 2``. What a `ProcessNoise` adds
-to the pose comes on top, on the twist's side of the left Jacobian as everywhere. The error of the
-12 states is ``(w, v, dW, dV)``: that of the pose as everywhere, then estimate less truth.
+with ``(n, n_a)`` of a step jointly Gaussian for an acceleration that is white over the step:
+variances ``q dt^3 / 3`` and ``q dt``, covariance ``q dt^2 / 2``. A `ProcessNoise` is added to the
+pose, on the twist side of the left Jacobian as in the rest of the package. The error of the 12
+states is ``(w, v, dW, dV)``: the usual pose error, then estimate minus truth of the twist.
 """
 
 from __future__ import annotations
@@ -45,22 +45,21 @@ FRAMES = ("world", "body")
 
 @dataclass(frozen=True)
 class WanderingTwist:
-    """Law of an unknown twist.
+    """The law of an unknown twist.
 
-    All fields are a float, or three of them for the world's axes (a planar body has zeros among
-    them).
+    All fields are a float, or three floats for the world axes (some are zero for a planar body).
 
     Parameters
     ----------
     turn_rate_rad_s, speed_m_s
-        Standard deviations of the first angular velocity and velocity about zero, per axis.
+        Standard deviations of the initial angular velocity and velocity about zero, per axis.
     turn_acceleration, acceleration
-        By how much they wander: standard deviations of their change after 1 s (rad/s, m/s).
+        Standard deviations of their change after 1 s (rad/s, m/s).
 
     Raises
     ------
     ValueError
-        If a value is negative or not finite, or there are neither 1 nor 3.
+        If a value is negative or not finite, or there are not 1 or 3 values.
     """
 
     turn_rate_rad_s: Axes = 0.5
@@ -73,25 +72,25 @@ class WanderingTwist:
             object.__setattr__(self, name, check_axes(name, getattr(self, name)))
 
     def prior_std(self) -> FloatArray:
-        """Standard deviations (6,) of the first twist."""
+        """Return the standard deviations (6,) of the initial twist."""
         return six(self.turn_rate_rad_s, self.speed_m_s)
 
     def std(self) -> FloatArray:
-        """Standard deviations (6,) of the twist's change after 1 s."""
+        """Return the standard deviations (6,) of the change of the twist after 1 s."""
         return six(self.turn_acceleration, self.acceleration)
 
 
 @dataclass(frozen=True)
 class TwistSensor:
-    """A gyroscope and a speedometer with white noise, read once an interval.
+    """A gyroscope and a velocity sensor with white noise, read once per interval.
 
     Parameters
     ----------
     gyro_std_rad_s, speed_std_m_s
         Standard deviation of a reading, per axis; None: not measured.
     frame
-        Axes of the readings: ``"world"``, as twists are everywhere in this package, or
-        ``"body"``, as a sensor on the body has them.
+        Axes of the readings: ``"world"``, as for all twists in this package, or ``"body"``, as for
+        a sensor on the body.
     """
 
     gyro_std_rad_s: float | None = None
@@ -105,25 +104,25 @@ class TwistSensor:
                 check_number(name, getattr(self, name), low=1e-12)
 
     def std(self) -> FloatArray:
-        """Standard deviations (6,) of a reading of the twist, infinite where it is not measured."""
+        """Return the standard deviations (6,) of a twist reading, infinite if not measured."""
         values = (self.gyro_std_rad_s, self.speed_std_m_s)
         return np.repeat([np.inf if value is None else value for value in values], 3)
 
     def read(self, rotation: FloatArray, twist: FloatArray) -> FloatArray:
-        """What the sensor would read (..., 6) of a twist (..., 6) without noise."""
+        """Return the noise-free reading (..., 6) of a twist (..., 6)."""
         if self.frame == "world":
             return twist
         return _turned(np.swapaxes(rotation, -1, -2), twist)
 
     def in_world(self, rotation: FloatArray, reading: FloatArray) -> FloatArray:
-        """A reading (..., 6) turned to the world's axes by a rotation (..., 3, 3)."""
+        """Return a reading (..., 6) rotated to world axes by a rotation (..., 3, 3)."""
         return reading if self.frame == "world" else _turned(rotation, reading)
 
     def jacobian(self, twist: FloatArray) -> FloatArray:
-        """Derivative (..., 6, 12) of the reading, turned to the world, by the error of the states.
+        """Return the derivative (..., 6, 12) of the reading, in world axes, by the state error.
 
-        In the body frame the reading depends on the rotation: ``Q_hat Q^T W = W - w x W``, so that
-        the error of the prediction is ``dW + W x w``.
+        In the body frame the reading depends on the rotation: ``Q_hat Q^T W = W - w x W``.
+        Therefore the error of the prediction is ``dW + W x w``.
         """
         H = np.zeros((*twist.shape[:-1], 6, 12))
         H[..., 6:] = np.eye(6)
@@ -133,13 +132,13 @@ class TwistSensor:
         return H
 
     def information(self, twist: FloatArray) -> FloatArray:
-        """Fisher information (..., 12, 12) of one reading about the states."""
+        """Return the Fisher information (..., 12, 12) of one reading about the states."""
         H = self.jacobian(twist)
         return np.swapaxes(H, -1, -2) @ (H / self.std()[:, None] ** 2)
 
 
 class WanderingPath(NamedTuple):
-    """Poses and twists at T + 1 epochs; the twist is that of the interval that begins there."""
+    """Poses and twists at T + 1 epochs; each twist is that of the interval after the epoch."""
 
     rotation: FloatArray  # (..., T + 1, 3, 3)
     translation: FloatArray  # (..., T + 1, 3) metres
@@ -155,23 +154,23 @@ def simulate_wandering(
     steps: int,
     rng: np.random.Generator,
 ) -> WanderingPath:
-    """Trajectories drawn from the law, one for each start (..., 3, 3), (..., 3).
+    """Simulate trajectories from the law, one for each start (..., 3, 3), (..., 3).
 
     Parameters
     ----------
     rotation, translation
-        The starts (..., 3, 3), (..., 3).
+        Start poses (..., 3, 3), (..., 3).
     law, process
-        Of the twist, and what comes on top of the pose.
+        Law of the twist, and the process noise added to the pose.
     dt, steps
-        Seconds of a step, and how many.
+        Length of a step in seconds, and the number of steps.
     rng
         Source of all randomness.
 
     Raises
     ------
     ValueError
-        On wrong shapes or values, and on laws or generators that are none.
+        If a shape or value is wrong, or a law or generator is invalid.
     """
     rotation = rotations.check_rotation("rotation", rotation)
     translation = check_array("translation", translation, (3,))
@@ -188,8 +187,8 @@ def simulate_wandering(
     for k in range(steps):
         z = rng.standard_normal((3, *batch, 6))
         change = np.sqrt(dt) * law.std() * z[0]
-        # Of the place an acceleration reaches, half the change of speed times dt is explained by
-        # that change; what is left has variance q dt^3 / 12.
+        # The change of velocity explains dt / 2 times itself of the change of position. The
+        # remainder has the variance q dt^3 / 12.
         moved = 0.5 * dt * change + np.sqrt(dt**3 / 12) * law.std() * z[1]
         moved = moved + np.sqrt(dt) * process.std() * z[2] + dt * twists[k]
         Q[k + 1] = rotations.exp(moved[..., :3]) @ Q[k]
@@ -204,13 +203,13 @@ def simulate_wandering(
 
 
 def check_laws(law: WanderingTwist, process: ProcessNoise) -> None:
-    """Raise ValueError where the law of the twist or the process noise is of the wrong type."""
+    """Raise ValueError if the law of the twist or the process noise has the wrong type."""
     if not isinstance(law, WanderingTwist):
         raise ValueError(f"law must be a WanderingTwist, got {law!r:.80}")
     check_process(process)
 
 
 def _turned(rotation: FloatArray, twist: FloatArray) -> FloatArray:
-    """Both halves (..., 6) of a twist turned."""
+    """Return a twist (..., 6) with both halves rotated."""
     halves = twist.reshape((*twist.shape[:-1], 2, 3)) @ np.swapaxes(rotation, -1, -2)
     return halves.reshape((*halves.shape[:-2], 6))

@@ -158,9 +158,9 @@ def read_runs(
 ) -> dict[str, Recording]:
     """Read the runs of a log, each as a recording, keyed by column `run` in the order of the file.
 
-    Arguments as in `read_recording`, with the same errors. A log without this column is one run with
-    the name ``""``. If the truth has this column too, each run has its own truth. A truth without
-    time and with a single pose per run belongs to a body at rest.
+    Arguments as in `read_recording`, with the same errors. A log without this column is one run
+    with the name ``""``. If the truth has this column too, each run has its own truth. A truth
+    without time and with a single pose per run belongs to a body at rest.
     """
     files = _Files(
         ranges, anchors, tags, truth, calibration, carrier, relative, odometry, imu, imu_frame,
