@@ -1,10 +1,10 @@
-"""Compiled forms of what is computed most: plain loops over one trial, broadcast by numba.
+"""Compiled forms of the most frequent computations: plain loops over one trial, by numba.
 
-Every function on a hot path has a textbook form in NumPy, which stands where it is used, and may
-have a kernel of the same signature here. `compiled` joins the two: where numba is installed
-(extra ``fast``) a call runs the kernel, elsewhere the textbook form. ``RBL_GYM_COMPILED=0``
-switches the kernels off. A kernel is compiled at its first call and kept on disk; importing
-`rbl_gym` never imports numba.
+Every function on a hot path has a textbook form in NumPy, in the module that uses it. It may also
+have a kernel here with the same signature, which numba broadcasts. `compiled` joins the two: if
+numba is installed (extra ``fast``) a call runs the kernel, otherwise the textbook form.
+``RBL_GYM_COMPILED=0`` turns the kernels off. A kernel is compiled at its first call and stored on
+disk. Importing `rbl_gym` never imports numba.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ import numpy as np
 __all__ = ["Compiled", "compile_all", "compiled", "enabled"]
 
 
-# A context in which NumPy warns of nothing.
+# A context in which NumPy emits no warnings.
 _QUIET = contextvars.copy_context()
 _QUIET.run(np.seterr, all="ignore")
 
 
 @functools.cache
 def enabled() -> bool:
-    """Whether calls run kernels: numba is there, and ``RBL_GYM_COMPILED`` is not 0."""
+    """Return whether calls run kernels: numba is installed, and ``RBL_GYM_COMPILED`` is not 0."""
     if os.environ.get("RBL_GYM_COMPILED", "1") == "0" or find_spec("numba") is None:
         return False
     try:
         importlib.import_module("numba")
     except ImportError as error:
-        # numba refuses versions of NumPy that are newer than itself.
+        # numba does not support versions of NumPy that are newer than itself.
         warnings.warn(f"numba does not import, kernels are off: {error}", stacklevel=2)
         return False
     return True
@@ -49,10 +49,10 @@ def _under_errstate(function: Callable[..., Any], *args: Any) -> Any:
 
 
 class Compiled:
-    """A function with a textbook form and a kernel, made by `compiled`.
+    """A function with a textbook form and a kernel, created by `compiled`.
 
-    It takes positional arguments only, and runs with floating point warnings off: NaN in gives
-    NaN out, and whoever calls says what that means. It pickles by its name, as functions do.
+    It takes positional arguments only, and runs with floating-point warnings off: NaN inputs give
+    NaN outputs, which callers must handle. Like functions, it is pickled by name.
 
     Attributes
     ----------
@@ -72,21 +72,25 @@ class Compiled:
 
     @property
     def kernel(self) -> Callable[..., Any]:
-        """The compiled form; ModuleNotFoundError without numba."""
+        """The compiled form; raises ModuleNotFoundError without numba."""
         module, function = self.name.split(":")
         return getattr(importlib.import_module(f"rbl_gym.kernels.{module}"), function).build()
 
     def __call__(self, *args: Any) -> Any:
-        """The kernel or the textbook form of the arguments."""
+        """Apply the kernel or the textbook form to the arguments."""
         run = self._run or self._choose()
         try:
             return run(*args)
         except RuntimeError:
-            # Another thread is in the quiet context; it calls nothing of ours, which could be us.
+            # Another thread is in the quiet context. It calls none of our functions, which could be
+            # this one.
             return _under_errstate(self.kernel if enabled() else self.textbook, *args)
 
     def _choose(self) -> Callable[..., Any]:
-        """The form to run, from the first call on; in a tenth of errstate's time if compiled."""
+        """Choose the form at the first call.
+
+        The context of compiled forms takes a tenth of the time of errstate.
+        """
         if enabled():
             self._run = functools.partial(_QUIET.run, self.kernel)
         else:
@@ -98,20 +102,20 @@ class Compiled:
 
 
 def compiled(name: str) -> Callable[[Callable[..., Any]], Compiled]:
-    """A decorator of a textbook form: calls run the kernel `name`, where there is one to run.
+    """Return a decorator of a textbook form: calls run the kernel `name` if it is available.
 
     Parameters
     ----------
     name
-        ``"module:function"``, of a function in this package that `rbl_gym.kernels.jit.gufunc`
-        decorates. It takes the same arguments as the textbook form, which has to broadcast over
-        leading axes as the kernel does.
+        ``"module:function"`` of a function in this package decorated with
+        `rbl_gym.kernels.jit.gufunc`. It takes the same arguments as the textbook form. The textbook
+        form must broadcast over leading axes as the kernel does.
     """
     return functools.partial(Compiled, name)
 
 
 def compile_all() -> None:
-    """Compile every kernel that is not on disk yet; nothing where kernels are off."""
+    """Compile every kernel that is not on disk yet; does nothing if kernels are off."""
     if not enabled():
         return
     for module in pkgutil.iter_modules(__path__):

@@ -1,4 +1,4 @@
-"""Information of ranges to anchors whose places are not known exactly, one body.
+"""Information of ranges to anchors with uncertain positions, for one body.
 
 The textbook form is in `rbl_gym.bounds.information`.
 """
@@ -23,10 +23,11 @@ def information(
     prior: Any, anchors: Any, tags: Any, rotation: Any, translation: Any, law: Any, share: Any,
     anchor_std: Any, told: Any,
 ) -> None:  # fmt: skip
-    """A prior's information and that of ranges, each anchor's place taken out by itself.
+    """Add the information of ranges to a prior's, marginalizing each anchor's position.
 
-    With J the derivative by the pose and ``p = -std u`` that by the place in standard deviations,
-    an anchor tells ``H - C^T (I + U)^-1 C``: H, U and C the weighted sums of J J^T, p p^T, p J^T.
+    Let J be the derivative by the pose and ``p = -std u`` that by the anchor's position in standard
+    deviations. An anchor contributes ``H - C^T (I + U)^-1 C``, where H, U and C are the weighted
+    sums of J J^T, p p^T and p J^T.
     """
     J, p, solved = np.empty(6), np.empty(3), np.empty(3)
     U, L, C = np.empty((3, 3)), np.empty((3, 3)), np.empty((6, 3))

@@ -1,4 +1,4 @@
-"""Prediction and update of a pose with an unknown twist and biased links, one body.
+"""Prediction and update of a pose with an unknown twist and biased links, for one body.
 
 The textbook forms are `estimators/iekf/augmented.py` and `estimators/costs/bias_cost.py`.
 """
@@ -24,9 +24,9 @@ from rbl_gym.kernels.pose_filter import keep_wide
 from rbl_gym.kernels.pose_solver import copy_pose, mirror
 from rbl_gym.kernels.range_cost import loss_of
 
-# No step is longer (rad, m) on any axis.
+# Largest step (rad, m) on any axis.
 _LONGEST = 1e12
-# Weights that change by no more than this between two poses are those of both.
+# Weights that change by no more than this between two poses are considered equal.
 _SAME_SHARE = 0.01
 
 
@@ -37,7 +37,7 @@ _SAME_SHARE = 0.01
 def predict(
     Q0, t0, extra0, P0, twist, dt, variance, wander, laws, n_twist, Q, t, extra, P
 ):  # fmt: skip
-    """Pose, twist and biases after a step: ``F P F^T + G Q G^T``, biases forgotten."""
+    """Predict pose, twist and biases: ``F P F^T + G Q G^T`` with decaying biases."""
     turn, J, both = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     kept = np.empty(max(1, laws.shape[0]))
     size = P0.shape[0]
@@ -80,8 +80,8 @@ def predict(
             P[i, j] = value
         for j in range(first, size):
             P[i, j] *= kept[(j - first) // links]
-    # Of an acceleration q the change of speed has variance q dt, the way q dt^3 / 3, and their
-    # covariance is q dt^2 / 2.
+    # With acceleration noise q, the velocity change has variance q dt, the displacement q dt^3 / 3,
+    # and their covariance is q dt^2 / 2.
     for i in range(3):
         for j in range(3):
             both[i, j] = J[i, j] * (dt * variance[j] + reach * wander[j])
@@ -117,7 +117,7 @@ def innovation(
     Q: Any, t: Any, Q0: Any, t0: Any, told: Any, slope: Any, chosen: Any, anchors: Any, tags: Any,
     e: Any, D: Any, nu: Any, H: Any,
 ) -> None:  # fmt: skip
-    """nu (L,), H = -dnu (L, 6) by (w, v), e (6,) and its derivative's rotation D (3, 3)."""
+    """Compute nu (L,), H = -dnu (L, 6) by (w, v), e (6,) and the rotation D (3, 3) of de."""
     for i in range(3):
         e[3 + i] = t[i] - t0[i]
         for j in range(3):
@@ -131,7 +131,7 @@ def innovation(
         y = Q[1, 0] * tags[n, 0] + Q[1, 1] * tags[n, 1] + Q[1, 2] * tags[n, 2]
         z = Q[2, 0] * tags[n, 0] + Q[2, 1] * tags[n, 1] + Q[2, 2] * tags[n, 2]
         ux, uy, uz = x + t[0] - anchors[m, 0], y + t[1] - anchors[m, 1], z + t[2] - anchors[m, 2]
-        # Where an anchor stands on a tag the difference is zero, and so are all the terms.
+        # If an anchor coincides with a tag the difference is zero, and so are all terms.
         distance = math.sqrt(max(ux * ux + uy * uy + uz * uz, 1e-200))
         ux, uy, uz = ux / distance, uy / distance, uz / distance
         value = told[k] - distance
@@ -151,7 +151,7 @@ def innovation(
 
 @helper
 def linearize(e: Any, D: Any, nu: Any, H: Any, W: Any, information: Any, g: Any, A: Any) -> float:
-    """The cost at a pose; its gradient and the lower half of its Hessian into g and A."""
+    """Return the cost at a pose; write its gradient and lower half of the Hessian to g and A."""
     cost = 0.0
     for i in range(6):
         pull = 0.0
@@ -164,7 +164,7 @@ def linearize(e: Any, D: Any, nu: Any, H: Any, W: Any, information: Any, g: Any,
         g[i] = D[0, i] * x + D[1, i] * y + D[2, i] * z
     for i in range(6):
         for j in range(i + 1):
-            # D^T I D, D being blkdiag(D, I).
+            # D^T I D, where D is blkdiag(D, I).
             total = 0.0
             if i < 3:
                 for a in range(3):
@@ -193,7 +193,7 @@ def linearize(e: Any, D: Any, nu: Any, H: Any, W: Any, information: Any, g: Any,
 
 @helper
 def weigh(own: Any, variance: Any, share: Any, L: Any, W: Any) -> bool:
-    """``W = (own + R)^-1``, R the variances, of each link as much more as its share is less."""
+    """Compute ``W = (own + R)^-1`` with variances R of the links, divided by their shares."""
     for i in range(own.shape[0]):
         for j in range(i + 1):
             L[i, j] = own[i, j]
@@ -205,7 +205,7 @@ def weigh(own: Any, variance: Any, share: Any, L: Any, W: Any) -> bool:
 
 @helper
 def shares(nu: Any, H: Any, own: Any, variance: Any, P: Any, loss: Any, share: Any) -> float:
-    """Weights of the innovations at a pose of covariance P; the most they changed."""
+    """Compute weights of the innovations at a pose of covariance P; return their largest change."""
     most = 0.0
     for k in range(nu.shape[0]):
         expected = own[k, k] + variance[k]
@@ -226,7 +226,7 @@ def update(
     Q0, t0, extra0, P0, ranges, weights, anchors, tags, start_Q, start_t, start_P, iterations,
     loss, n_twist, Q, t, extra, P,
 ):  # fmt: skip
-    """The most likely pose of an epoch whose ranges carry biases, and what follows from it."""
+    """Compute the most likely pose of an epoch whose ranges have biases, and further results."""
     size, n_tags = P0.shape[0], tags.shape[0]
     n_links = weights.shape[0] * n_tags
     first = 6 + n_twist
@@ -296,7 +296,7 @@ def update(
         elif again:
             break
         sound = weigh(own, variance, share, L, W) and sound
-        # Damped Gauss-Newton as `pose_solver.solve`.
+        # Damped Gauss-Newton as in `pose_solver.solve`.
         cost, decrease, damping = 0.0, 0.0, 0.0
         copy_pose(Q, t, new_Q, new_t)
         for k in range(iterations + 1):
@@ -338,7 +338,7 @@ def update(
     invert_factored6(L6, pose)
     if not sound:
         fill(math.nan, pose)
-    # Of the extra states: what the ranges tell given the pose, then what the pose tells.
+    # Of the extra states: information of the ranges given the pose, then that of the pose.
     K = size - 6
     wide = np.empty((K, 2 * count + 12))
     told_by, gain = wide[:, :count], wide[:, count : 2 * count]

@@ -1,4 +1,4 @@
-"""How good a belief is: errors, NEES and score at once. The textbook form is `rbl_gym.metrics`."""
+"""Errors, NEES and score of a belief together. The textbook form is `rbl_gym.metrics`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def judge(
     rotation_hat: Any, translation_hat: Any, covariance: Any, rotation: Any, translation: Any,
     tags: Any, rotation_error: Any, position_error: Any, tag_error: Any, nees: Any, score: Any,
 ) -> None:  # fmt: skip
-    """Angle, distance, RMS tag displacement, ``e^T P^-1 e``, and the score b of the covariance."""
+    """Compute angle, distance, RMS tag displacement, ``e^T P^-1 e`` and score b of P."""
     work = np.empty((7, 6))
     L, e, turn = work[:6], work[6], work[:3, :3]
     for i in range(3):

@@ -1,7 +1,7 @@
 """Block-tridiagonal systems: solution, and diagonal blocks of the inverse; plain loops.
 
-Blocks are copied into arrays of their own, whose rows lie along memory: the innermost loops add
-multiples of rows to rows, which compilers turn into vector instructions.
+Blocks are copied to contiguous arrays. The innermost loops add multiples of rows to rows, which
+compilers vectorize.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rbl_gym.kernels.jit import gufunc, helper
 
 @helper
 def _factor(D: Any) -> None:
-    """The upper factor R of ``D = R^T R`` in place of D's upper half; NaN where there is none."""
+    """Replace the upper half of D by the upper factor R of ``D = R^T R``; NaN if not positive."""
     n = D.shape[0]
     for p in range(n):
         pivot = D[p, p]
@@ -33,7 +33,7 @@ def _factor(D: Any) -> None:
 
 @helper
 def _forward(R: Any, B: Any) -> None:
-    """``R^-T B`` in place of B, R upper triangular."""
+    """Replace B by ``R^-T B``, where R is upper triangular."""
     n, m = B.shape
     for i in range(n):
         for k in range(i):
@@ -48,7 +48,7 @@ def _forward(R: Any, B: Any) -> None:
 
 @helper
 def _backward(R: Any, B: Any) -> None:
-    """``R^-1 B`` in place of B, R upper triangular."""
+    """Replace B by ``R^-1 B``, where R is upper triangular."""
     n, m = B.shape
     for i in range(n - 1, -1, -1):
         for k in range(i + 1, n):
@@ -63,7 +63,7 @@ def _backward(R: Any, B: Any) -> None:
 
 @helper
 def _subtract_product(A: Any, B: Any, out: Any, upper: bool) -> None:
-    """``out -= A^T B``, or its upper half alone."""
+    """Compute ``out -= A^T B``, or only its upper half."""
     for p in range(A.shape[0]):
         for i in range(A.shape[1]):
             share = A[p, i]
@@ -74,7 +74,7 @@ def _subtract_product(A: Any, B: Any, out: Any, upper: bool) -> None:
 
 @helper
 def _factor_all(diagonal: Any, above: Any, R: Any, W: Any) -> None:
-    """Factors R (K, n, n) of the pivots, and ``W = R^-T above`` (K, n, n)."""
+    """Return factors R (K, n, n) of the pivots, and ``W = R^-T above`` (K, n, n)."""
     K, n = diagonal.shape[0], diagonal.shape[1]
     for k in range(K):
         for i in range(n):
@@ -137,7 +137,7 @@ def invert(diagonal: Any, above: Any, inverse: Any) -> None:
                 for j in range(p + 1):
                     new[i, j] += share * T[p, j]
         if k + 1 < K:
-            # With G = pivot^-1 above the block is pivot^-1 + G P G^T; G holds its transpose.
+            # With G = pivot^-1 above, the block is pivot^-1 + G P G^T; G stores its transpose.
             _backward(R[k], W[k])
             for i in range(n):
                 for j in range(n):

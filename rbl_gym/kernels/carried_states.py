@@ -1,4 +1,4 @@
-"""States beside the pose of one body: once its pose is known better, and as time passes.
+"""States other than the pose of one body: update with the pose, and prediction.
 
 The textbook forms are `augmented.py` and `inertial.py` in `estimators/iekf/`.
 """
@@ -19,7 +19,7 @@ from rbl_gym.kernels.linear_algebra import cholesky6, fill, invert_factored6, mu
 def carry(
     Q0: Any, t0: Any, x0: Any, P0: Any, Q: Any, t: Any, new: Any, x: Any, P: Any
 ) -> None:  # fmt: skip
-    """Further states by their correlation with the pose, and the covariance of all."""
+    """Update further states by their correlation with the pose, and the joint covariance."""
     k = x0.shape[0]
     room, D, turn, e = np.empty((3, 6, 6)), np.empty((3, 3)), np.empty((3, 3)), np.empty(6)
     own, L, inverse = room[0], room[1], room[2]
@@ -48,7 +48,7 @@ def carry(
                 total += P0[6 + i, m] * inverse[m, j]
             gain[i, j] = total
             x[i] += total * e[j]
-        # An error of the new pose is one of the old times blkdiag(Jl^-1, I).
+        # An error of the new pose is one of the old pose times blkdiag(Jl^-1, I).
         for j in range(3):
             slope[i, j] = gain[i, 0] * D[0, j] + gain[i, 1] * D[1, j] + gain[i, 2] * D[2, j]
             slope[i, 3 + j] = gain[i, 3 + j]
@@ -68,7 +68,7 @@ def carry(
 
 @gufunc("(k),(p,p),(l,c),(),()->(k),(p,p)", "ffffiff")
 def fade(x0: Any, P0: Any, laws: Any, dt: float, n_twist: int, x: Any, P: Any) -> None:
-    """Biases of the links after `dt` seconds: towards zero, and wandering."""
+    """Predict biases of the links over `dt` seconds: decay towards zero, and random walk."""
     n, count, start = P0.shape[0], laws.shape[0], 6 + n_twist
     links = (n - start) // count
     kept = np.empty(n)

@@ -1,4 +1,4 @@
-"""Eigenvectors of small symmetric matrices by Jacobi's rotations, and what follows from them."""
+"""Eigenvectors of small symmetric matrices by Jacobi rotations, and their applications."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _SWEEPS = 30
 
 @helper
 def eigen(A: Any, V: Any) -> None:
-    """Turn a symmetric matrix into its eigenvalues, on its diagonal, and V into the vectors.
+    """Replace a symmetric matrix by its eigenvalues, on the diagonal; write the vectors to V.
 
-    The columns of V belong to the values, in no order.
+    The columns of V correspond to the values, in no particular order.
     """
     n = A.shape[0]
     for i in range(n):
@@ -28,7 +28,7 @@ def eigen(A: Any, V: Any) -> None:
             size = max(size, abs(A[i, i]))
             for j in range(i):
                 off = max(off, abs(A[i, j]))
-        # False of NaN too.
+        # Also false for NaN.
         if not off > 1e-16 * size:
             break
         for p in range(n - 1):
@@ -53,7 +53,7 @@ def eigen(A: Any, V: Any) -> None:
 
 @helper
 def nearest_rotation(M: Any, Q: Any) -> None:
-    """The proper rotation Q nearest to M (3, 3): Horn's quaternion, the longest of his matrix."""
+    """Return the proper rotation Q nearest to M (3, 3): largest eigenvector of Horn's matrix."""
     K, V = np.empty((4, 4)), np.empty((4, 4))
     K[0, 0] = M[0, 0] + M[1, 1] + M[2, 2]
     K[1, 1] = M[0, 0] - M[1, 1] - M[2, 2]

@@ -1,6 +1,6 @@
-"""The world's side of an epoch: the body moves, ranges and angles are taken.
+"""The simulation of an epoch: motion of the body, ranges and angles.
 
-Random numbers come in as standard normals. The textbook forms are `rbl_gym.motion.simulate`,
+Random numbers are given as standard normals. The textbook forms are `rbl_gym.motion.simulate`,
 `rbl_gym.worlds.simulation` and `rbl_gym.measurements.bearing`.
 """
 
@@ -21,7 +21,7 @@ def walk(
     rotation: Any, translation: Any, twists: Any, normals: Any, std: Any, dt: float,
     rotations_after: Any, translations_after: Any,
 ) -> None:  # fmt: skip
-    """Poses after each of T steps of nominal twists with noise, std (6,) after 1 s."""
+    """Return poses after each of T steps of nominal twists with noise, std (6,) after 1 s."""
     turn = np.empty((3, 3))
     root = math.sqrt(dt)
     x = y = z = 0.0
@@ -50,7 +50,7 @@ def walk(
 
 @gufunc("(k,d),(t)->(t,d)")
 def along(points: Any, travelled: Any, places: Any) -> None:
-    """Places on a polyline at distances from its start, rising; its end beyond it."""
+    """Return positions on a polyline at increasing distances from its start; clipped to its end."""
     leg, reached, length = -1, 0.0, 0.0
     for k in range(travelled.shape[0]):
         while leg < 0 or (travelled[k] >= reached and leg < points.shape[0] - 2):
@@ -68,7 +68,7 @@ def along(points: Any, travelled: Any, places: Any) -> None:
 
 @gufunc("(m,d),(m,d),()->(m,d)")
 def move(places: Any, velocity: Any, reach: float, moved: Any) -> None:
-    """Places after a step of `reach` along each velocity, of which no more than length 1 counts."""
+    """Return positions after a step of `reach` along each velocity, cut to length 1."""
     for m in range(places.shape[0]):
         square = 0.0
         for i in range(places.shape[1]):
@@ -100,7 +100,7 @@ def measure(
     rotation: Any, translation: Any, tags: Any, anchors: Any, normals: Any, law: Any,
     longest: float, ranges: Any, distances: Any,
 ) -> None:  # fmt: skip
-    """Noisy ranges of all links, none beyond the longest, and the distances behind them."""
+    """Measure noisy ranges of all links, clipped to the longest, and return true distances."""
     for n in range(tags.shape[0]):
         x, y, z = tag_position(rotation, translation, tags, n)
         reference = reference_of(law, n)
@@ -118,7 +118,7 @@ def measure(
 def measure_angles(
     rotation: Any, translation: Any, tags: Any, station: Any, normals: Any, std: float, angles: Any
 ) -> None:
-    """Noisy angles to the x and z axis of all tags, folded back into [0, pi]; k is 2."""
+    """Measure noisy angles to the x and z axis of all tags, folded into [0, pi]; k is 2."""
     for n in range(tags.shape[0]):
         x, y, z = tag_position(rotation, translation, tags, n)
         x, y, z = x - station[0], y - station[1], z - station[2]

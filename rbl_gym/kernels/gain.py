@@ -1,4 +1,4 @@
-"""Share of a link's information by range and angle; the textbook form is `placement.gain`."""
+"""Information fraction of links by range and angle; the textbook form is `placement.gain`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _step(inside: float, edge: float) -> tuple[float, float]:
 def share_and_slope(
     gain: Any, dx: float, dy: float, dz: float, nx: float, ny: float, nz: float
 ) -> tuple[float, float, float, float]:
-    """The share of a link of offset d, and its derivative by d; n is the mount's normal."""
+    """Return the fraction of a link with offset d, and its derivative by d; n is the normal."""
     distance = math.sqrt(dx * dx + dy * dy + dz * dz)
     share, along = 1.0, 0.0
     if gain[0] < math.inf:

@@ -1,7 +1,8 @@
-"""How the functions that kernels call are compiled: once each, as LLVM code, for kernels to link.
+"""Compilation of the functions that kernels call: once each, as LLVM code for linking.
 
-numba compiles a function anew for every literal and every memory layout of its arguments, and turns
-each of them into machine code that never runs: all kernels together take twice as long.
+By default numba compiles a function again for every literal and every memory layout of its
+arguments, and generates machine code for each that never runs. All kernels together then take twice
+as long.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 import numba
 from numba.core.types import Array, BaseFunction, BaseTuple, Boolean, Number, unliteral
 
-try:  # private names of numba's: without them compiling takes longer
+try:  # private names of numba: without them compilation takes longer
     from llvmlite.binding import parse_assembly
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
@@ -24,27 +25,27 @@ try:  # private names of numba's: without them compiling takes longer
 except ImportError:
     Compiler = JITCodeLibrary = None
 
-# numba's annotations leave out options that it takes.
+# The type annotations of numba omit some of its options.
 _njit: Any = numba.njit
 
 
 def _as_any(kind: Any) -> Any:
-    """The one type of an argument: no literal, and arrays of any strides."""
+    """Return a common type of an argument: no literal, and arrays of any strides."""
     kind = unliteral(kind)
     return kind.copy(layout="A") if isinstance(kind, Array) else kind
 
 
 def _counts_references(function: types.FunctionType) -> bool:
-    """Whether a helper makes arrays (it names `np`), or is given them by one that returns some."""
+    """Return whether a helper creates arrays (it names `np`), or gets them from one that does."""
     names = function.__code__.co_names
     called = (function.__globals__.get(name) for name in names)
     return "np" in names or any(getattr(one, "gives_arrays", False) for one in called)
 
 
 def compile_helper(function: Any, unrolled: bool, **options: Any) -> Callable[..., Any]:
-    """A function for kernels to call; not for Python, to which it has no entry.
+    """Return a function for kernels to call; it has no entry point for Python.
 
-    `unrolled`: once for each layout, and optimized to the end before it is put into its callers.
+    `unrolled` compiles once for each layout, and optimizes completely before inlining.
     """
     if Compiler is not None:
         options["pipeline_class"] = _UnrolledCompiler if unrolled else _HelperCompiler
@@ -52,7 +53,7 @@ def compile_helper(function: Any, unrolled: bool, **options: Any) -> Callable[..
         error_model="numpy",
         no_cpython_wrapper=True,
         no_cfunc_wrapper=True,
-        # Else each array is counted in and out in every function that it passes.
+        # Otherwise references to each array are counted in every function that gets it.
         _nrt=_counts_references(function),
         **options,
     )(function)
@@ -65,9 +66,9 @@ def compile_helper(function: Any, unrolled: bool, **options: Any) -> Callable[..
 
 @contextlib.contextmanager
 def types_remembered() -> Iterator[None]:
-    """Within, what an operator gives of numbers or of elements of arrays is looked up once.
+    """Context in which the result types of operators are looked up only once.
 
-    numba tries all that it knows of an operator again at every place, a quarter of its time.
+    Otherwise numba tries all signatures of an operator at every place, a quarter of its time.
     """
     find: Any = BaseFunction.get_call_type
     known: dict[Any, Any] = {}
@@ -95,7 +96,7 @@ def _is_plain(kind: Any) -> bool:
 
 @contextlib.contextmanager
 def optimizing(level: int) -> Iterator[None]:
-    """Within, the optimizer works at a level from 0 to 3."""
+    """Context in which the optimizer works at a level from 0 to 3."""
     before: Any = numba.config.OPT
     numba.config.OPT = type(before)(level)
     try:
@@ -106,7 +107,7 @@ def optimizing(level: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_code() -> Iterator[None]:
-    """Within, whatever is compiled stays LLVM code; other threads wait with theirs."""
+    """Context in which compiled code stays LLVM code; compilations in other threads wait."""
     if Compiler is None:
         yield
         return
@@ -116,31 +117,31 @@ def as_code() -> Iterator[None]:
         try:
             yield
         finally:
-            del codegen._library_class  # that of the instance
+            del codegen._library_class  # deletes the attribute of the instance
 
 
 if Compiler is not None:
 
     class _Code(JITCodeLibrary):  # pyright: ignore[reportGeneralTypeIssues]
-        """Functions as LLVM code: what links them makes machine code of it."""
+        """Functions as LLVM code; the libraries that link them generate machine code."""
 
         @property
         def codegen(self) -> Any:
             return self
 
         def set_env(self, name: str, env: Any) -> None:
-            """Nothing: the code is nowhere yet."""
+            """Do nothing: the code is not in memory yet."""
 
         def magic_tuple(self) -> Any:
-            """Which machine the code is for, as the key on disk says."""
+            """Return the target machine, as in the key on disk."""
             return self._codegen.magic_tuple()
 
         def get_pointer_to_function(self, name: str) -> int | None:
-            """What a call from Python runs: a function of CPython's that raises TypeError."""
+            """Return the code of a call from Python: a CPython function that raises TypeError."""
             return ctypes.cast(ctypes.pythonapi.PyErr_BadArgument, ctypes.c_void_p).value
 
         def serialize_using_object_code(self) -> Any:
-            """For the disk the names that loading looks for: the code is in what linked it."""
+            """Return only the names that loading needs: the code is in the linking library."""
             names = [one.name for one in self._final_module.global_variables]
             lines = [f'@"{name}" = common global i64 0' for name in names if "NumbaEnv" in name]
             return self.name, "bitcode", parse_assembly("\n".join(lines)).as_bitcode()

@@ -1,6 +1,6 @@
-"""How kernels are compiled and kept: numba, without fast mathematics, on disk by their contents.
+"""Compilation and storage of kernels: numba, without fast math, cached by contents.
 
-Only modules of kernels import this one; it imports numba.
+Only modules of kernels import this one. It imports numba.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _TYPES = {"f": numba.float64, "i": numba.int64, "b": numba.boolean}
 
 
 def contents_hash(folder: Path) -> str:
-    """Hash of all modules in a folder."""
+    """Return a hash of all modules in a folder."""
     digest = hashlib.sha256()
     for file in sorted(folder.glob("*.py")):
         digest.update(file.name.encode())
@@ -38,14 +38,14 @@ def contents_hash(folder: Path) -> str:
 
 
 def _keyed(base: Any, stamp: str) -> Any:
-    """A place of numba's for cached kernels, for ours alone, where `stamp` tells stale ones."""
+    """Return a cache locator of numba for our kernels only; `stamp` detects stale ones."""
 
     class Locator(base):
         def get_source_stamp(self) -> str:
             return stamp
 
         def get_disambiguator(self) -> str:
-            # In place of the line number: no second file where a kernel has moved.
+            # Instead of the line number: no second file if a kernel has moved.
             return "kernel"
 
         @classmethod
@@ -57,11 +57,11 @@ def _keyed(base: Any, stamp: str) -> Any:
 
 
 def _find_cache() -> Path | None:
-    """The folder in which kernels are kept; None: they are not.
+    """Return the folder of cached kernels; None if they are not cached.
 
-    numba takes a kernel for stale when its own file changes; ours are when any file of this
-    package does. Nothing public lets us say so: where the private names are gone, or no folder
-    can be written, every process compiles anew.
+    numba considers a kernel stale if its own file changes. Ours are stale if any file of this
+    package changes. There is no public interface for this. If the private names are missing, or no
+    folder is writable, every process compiles again.
     """
     try:
         from numba.core import caching
@@ -90,20 +90,20 @@ _KEPT = _CACHE is not None
 
 @contextlib.contextmanager
 def _alone() -> Iterator[None]:
-    """One process compiles at a time, and the others find on disk what it made.
+    """Context in which only one process compiles; the others then load its results from disk.
 
-    A kernel is kept in several files. Those of one process call functions by names that those of
-    another do not have: a mixture crashes the interpreter.
+    A kernel is stored in several files. Those of one process call functions by names that those of
+    another do not have. A mixture crashes the interpreter.
     """
     with _lock_file() as file:
         if file is not None and fcntl is not None:
-            fcntl.flock(file, fcntl.LOCK_EX)  # released as the file closes
+            fcntl.flock(file, fcntl.LOCK_EX)  # released when the file closes
         yield
 
 
 @contextlib.contextmanager
 def _in_haste() -> Iterator[None]:
-    """Without collecting garbage, which takes a seventh of the time, as compilers make much."""
+    """Context without garbage collection, which takes a seventh of the compilation time."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -114,10 +114,10 @@ def _in_haste() -> Iterator[None]:
 
 
 def _compile(function: Callable[..., Any], signature: str, arguments: tuple[Any, ...]) -> Any:
-    """A generalized ufunc of a function.
+    """Return a generalized ufunc of a function.
 
-    numba compiles the function, then the loop over trials with it inside: the optimizer's whole
-    work is left to the second.
+    numba compiles the function, then the loop over trials with the function inlined. Only the
+    second step is optimized.
     """
     made: Any = numba.guvectorize(signature, cache=_KEPT)(function)
     with optimizing(1), as_code():
@@ -144,23 +144,24 @@ def helper(function: F) -> F:
 
 
 def inlined(function: F, unrolled: bool = False) -> F:
-    """A `helper` that is compiled into its callers: for innermost ones, with few places of call.
+    """Compile a `helper` that is inlined: for inner functions with few call sites.
 
-    A call takes 0.1 us and more, as an array is passed as seven numbers. `unrolled` is for loops of
-    a known length over matrices: unrolled before they are put into callers they take less time.
+    A call takes 0.1 us or more, because an array is passed as seven numbers. `unrolled` is for
+    loops of known length over matrices: they are faster if unrolled before inlining.
     """
     return cast(F, compile_helper(function, unrolled, forceinline=True))
 
 
 def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
-    """A decorator: the function, which writes its last arguments, as a generalized ufunc.
+    """Return a decorator that makes a generalized ufunc; the function writes its last arguments.
 
-    The function stays what it is; its attribute ``build()`` compiles it, once.
+    The function itself does not change; its attribute ``build()`` compiles it, once.
 
     Parameters
     ----------
     signature
-        As NumPy's, such as ``"(d,d),(d),()->(d)"``; an output ``()`` is written as ``out[0]``.
+        Signature as in NumPy, such as ``"(d,d),(d),()->(d)"``; an output ``()`` is written as
+        ``out[0]``.
     types
         One letter for each argument: f (float64), i (int64) or b (bool). Empty: all f.
     """
@@ -174,13 +175,13 @@ def gufunc(signature: str, types: str = "") -> Callable[[F], F]:
             letters = types or "f" * len(ranks)
             arguments = []
             for place, (letter, rank) in enumerate(zip(letters, ranks, strict=True)):
-                # Outputs are arrays even where they have no axes.
+                # Outputs are arrays even if they have no axes.
                 rank = rank if place < inputs else max(rank, 1)
                 kind = _TYPES[letter]
                 arguments.append(kind[(slice(None),) * rank] if rank else kind)
             with _alone(), _in_haste(), types_remembered():
                 made = _compile(function, signature, tuple(arguments))
-            # What numba wraps around NumPy's own takes a microsecond a call.
+            # The wrapper of numba around NumPy's ufunc takes a microsecond per call.
             return getattr(made, "ufunc", made)
 
         function.build = build  # pyright: ignore[reportFunctionMemberAccess]

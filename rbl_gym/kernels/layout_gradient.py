@@ -20,15 +20,15 @@ def square_and_gradient(
     anchors: Any, normals: Any, rotation: Any, translation: Any, weights: Any, prior: Any,
     tags: Any, law: Any, gain: Any, share: Any, square: Any, gradient: Any,
 ) -> None:  # fmt: skip
-    """Weighted sum of b^2 over the poses, and its derivative by the places of the anchors.
+    """Return the weighted sum of b^2 over poses, and its derivative by the anchor positions.
 
-    With ``K = P (mean_n J_n^T J_n) P`` and ``q = J_n^T d``, a link of weight g takes
-    ``g q^T K q`` from b^2; its slope by the anchor is that of g and of ``d = s_n - a_m``.
+    With ``K = P (mean_n J_n^T J_n) P`` and ``q = J_n^T d``, a link of weight g reduces b^2 by ``g
+    q^T K q``. The derivative by the anchor includes those of g and of ``d = s_n - a_m``.
     """
     n_anchors, n_tags = anchors.shape[0], tags.shape[0]
     work, K = np.empty((3, 6, 6)), np.empty((6, 6))
     information, L, P = work[0], work[1], work[2]
-    # The gain of each link at a pose and its slope, and its share with the gain.
+    # The gain of each link at a pose and its derivative, and its information with the gain.
     gains, shares = np.empty((n_tags, n_anchors, 4)), np.empty((n_anchors, n_tags))
     limited = gain[0] < math.inf or gain[2] > -2
     total = 0.0
@@ -93,7 +93,7 @@ def square_and_gradient(
 
 @helper
 def _spread(P: Any, rotation: Any, tags: Any, work: Any, K: Any) -> None:
-    """``K = P (mean_n J_n^T J_n) P``; the first two of `work` are room."""
+    """Compute ``K = P (mean_n J_n^T J_n) P``; the first two of `work` are workspace."""
     C, product = work[0], work[1]
     for i in range(6):
         for j in range(6):

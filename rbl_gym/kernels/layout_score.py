@@ -18,7 +18,7 @@ from rbl_gym.kernels.pose_bound import (
 
 @gufunc("(p,s,s),(p,d,d),(n,d),(p)->()")
 def weighted_square(information: Any, rotation: Any, tags: Any, weight: Any, square: Any) -> None:
-    """Sum of b^2 over the poses by their weights, of the information at each."""
+    """Return the sum of b^2 over the poses, weighted, from the information at each."""
     work = np.empty((2, 6, 6))
     total = 0.0
     for k in range(rotation.shape[0]):
@@ -31,7 +31,7 @@ def mean_square(
     anchors: Any, rotation: Any, translation: Any, tags: Any, prior: Any, law: Any, share: Any,
     square: Any,
 ) -> None:  # fmt: skip
-    """Mean of b^2 over the poses; `share` is what each anchor's sight leaves its links."""
+    """Return the mean of b^2 over the poses; `share` has each anchor's information fraction."""
     work = np.empty((3, 6, 6))
     shares = np.empty((anchors.shape[0], tags.shape[0]))
     total = 0.0
@@ -47,7 +47,7 @@ def _pose_square(
     anchors: Any, rotation: Any, translation: Any, tags: Any, prior: Any, law: Any, share: Any,
     shares: Any, work: Any,
 ) -> float:  # fmt: skip
-    """b^2 of a pose; leaves its covariance in ``work[2]``."""
+    """Return b^2 of a pose; write its covariance to ``work[2]``."""
     information, L, P = work[0], work[1], work[2]
     for m in range(anchors.shape[0]):
         for n in range(tags.shape[0]):

@@ -1,6 +1,6 @@
-"""Small symmetric positive matrices: Cholesky factor, solution, inverse; plain loops.
+"""Small symmetric positive definite matrices: Cholesky factor, solution, inverse.
 
-The diagonal of a factor holds its inverse: whoever solves multiplies by it.
+The diagonal of a factor stores its inverse, so that solving only multiplies.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from typing import Any
 
 from rbl_gym.kernels.jit import helper, inlined
 
-# A pivot that rounding leaves below this share of its diagonal entry is raised to it.
+# A smaller pivot, as a fraction of its diagonal entry, is due to rounding and raised to this.
 PIVOT_FLOOR = 1e-14
 
 
 @functools.cache
 def of_size(size: int) -> tuple[Callable[..., Any], ...]:
-    """`cholesky`, `solve_factored` and `invert_factored` for matrices of `size` rows.
+    """Return `cholesky`, `solve_factored` and `invert_factored` for matrices of `size` rows.
 
-    With a size that is known when they are compiled they take a little more than half the time.
-    None of them reads above a diagonal. 0: of any size.
+    If the size is known at compilation they take little more than half the time. None of them reads
+    above a diagonal. 0 means any size.
     """
     in_place = functools.partial(inlined, unrolled=True)
 
     @in_place
     def cholesky(A: Any, L: Any) -> bool:
-        """Lower factor of A into L; whether all pivots were good.
+        """Write the lower factor of A to L; return whether all pivots were positive.
 
-        A pivot that is not positive is raised to a floor, so that a singular matrix has an
-        enormous inverse; a NaN stays one.
+        A pivot that is not positive is raised to a floor, so that a singular matrix has a very
+        large inverse. NaN stays NaN.
         """
         n = size if size > 0 else A.shape[0]
         good = True
@@ -54,7 +54,7 @@ def of_size(size: int) -> tuple[Callable[..., Any], ...]:
 
     @in_place
     def solve_factored(L: Any, b: Any, x: Any) -> None:
-        """The solution x of ``L L^T x = b``; x may be b."""
+        """Compute the solution x of ``L L^T x = b``; x may be b."""
         n = size if size > 0 else L.shape[0]
         for i in range(n):
             total = b[i]
@@ -69,9 +69,9 @@ def of_size(size: int) -> tuple[Callable[..., Any], ...]:
 
     @in_place
     def invert_factored(L: Any, P: Any) -> None:
-        """``P = (L L^T)^-1``, both halves; L becomes its own inverse.
+        """Compute ``P = (L L^T)^-1``, both halves; L is replaced by its inverse.
 
-        The factor is inverted, not blocks of the matrix: those lose a vague prior's digits.
+        This inverts the factor. Block inversion would lose the digits of a vague prior.
         """
         n = size if size > 0 else L.shape[0]
         for i in range(n):
@@ -97,9 +97,9 @@ cholesky6, solve_factored6, invert_factored6 = of_size(6)
 
 @helper
 def factor_semidefinite(A: Any, L: Any) -> None:
-    """Lower factor ``L L^T = A`` of any rank, the diagonal itself in L, zeros above it.
+    """Compute a lower factor ``L L^T = A`` of any rank; its diagonal is stored, zeros above.
 
-    A column without a pivot is zero: of a semidefinite matrix nothing is left in it.
+    A column without a pivot is zero, because in a semidefinite matrix the rest of it is zero.
     """
     n = A.shape[0]
     for j in range(n):
@@ -120,7 +120,7 @@ def factor_semidefinite(A: Any, L: Any) -> None:
 
 @helper
 def multiply(A: Any, B: Any, out: Any) -> None:
-    """``out = A B`` of matrices; `out` is neither of them."""
+    """Compute ``out = A B`` of matrices; `out` is neither of them."""
     for i in range(A.shape[0]):
         for j in range(B.shape[1]):
             total = 0.0
@@ -131,7 +131,7 @@ def multiply(A: Any, B: Any, out: Any) -> None:
 
 @helper
 def multiply_transposed(A: Any, B: Any, out: Any) -> None:
-    """``out = A B^T`` of matrices; `out` is neither of them."""
+    """Compute ``out = A B^T`` of matrices; `out` is neither of them."""
     for i in range(A.shape[0]):
         for j in range(B.shape[0]):
             total = 0.0
@@ -142,7 +142,7 @@ def multiply_transposed(A: Any, B: Any, out: Any) -> None:
 
 @helper
 def fill(value: float, out: Any) -> None:
-    """``out[:] = value`` of a matrix: numba takes a second to compile the slice."""
+    """Set ``out[:] = value`` of a matrix; numba takes a second to compile the slice."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             out[i, j] = value

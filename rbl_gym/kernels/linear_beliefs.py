@@ -1,6 +1,6 @@
-"""From the 12 states of the linear filters to poses: the constraint of UC-KF, and beliefs.
+"""Poses from the 12 states of the linear filters: the constraint of UC-KF, and beliefs.
 
-The textbook forms stand in `estimators/linear/`.
+The textbook forms are in `estimators/linear/`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _cholesky12, _, _ = of_size(12)
 
 @helper
 def _split(state: Any, translation: Any, matrix: Any) -> None:
-    """The translation and the matrix of a state."""
+    """Return the translation and the matrix of a state."""
     for k in range(3):
         translation[k] = state[9 + k]
         for i in range(3):
@@ -30,7 +30,7 @@ def _split(state: Any, translation: Any, matrix: Any) -> None:
 
 @helper
 def _rotation_of(state: Any, Q: Any) -> None:
-    """The proper rotation nearest to the columns in a state; Q may not share its memory."""
+    """Compute the proper rotation nearest to the columns in a state; Q may not share its memory."""
     work = np.empty((4, 3))
     _split(state, work[3], work[:3])
     nearest_rotation(work[:3], Q)
@@ -45,7 +45,7 @@ def _store(Q: Any, state: Any) -> None:
 
 @gufunc("(p),(p,p)->(p)")
 def coupled_fit(mean: Any, P: Any, fitted: Any) -> None:
-    """The pose nearest to a linear posterior in its own covariance, (23) of the tracking paper."""
+    """Fit the pose to a linear posterior in its covariance's norm, (23) of the tracking paper."""
     work = np.empty((21, 9))
     L, W, Q = work[:9], work[9:18], work[18:21, :3]
     _cholesky9(P, L)
@@ -67,15 +67,15 @@ def coupled_fit(mean: Any, P: Any, fitted: Any) -> None:
 def decoupled_fit(
     mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, fitted: Any
 ) -> None:
-    """Rotation of centred tags (26), then the translation (27), from a prior and an epoch.
+    """Fit the rotation of centred tags (26), then the translation (27), to prior and epoch.
 
-    Weights are common to all tags.
+    Weights are the same for all tags.
     """
     work = np.empty((30, 9))
     L, W, Q, V = work[:9], work[9:18], work[18:21, :3], work[21:24, :3]
     y, G, target, small = work[24:28, :3], work[28, :6], work[29], work[18:21, 3:6]
     spread(anchors, weights, 0, G)
-    # The rotation: target = q + W^-1 y of the tags about their centroid.
+    # The rotation: target = q + W^-1 y of the tags relative to their centroid.
     centred = np.empty_like(tags)
     for i in range(3):
         centre = 0.0
@@ -102,7 +102,7 @@ def decoupled_fit(
     _rotation_of(target, Q)
     fit_rotation(W, target, Q)
     _store(Q, fitted)
-    # The translation: t + (P_t^-1 + N G)^-1 of what this rotation leaves of the squared ranges.
+    # The translation: t + (P_t^-1 + N G)^-1 times the rest of the squared ranges.
     for i in range(9, 12):
         fitted[i] = mean[i]
     innovation(fitted, ranges, anchors, tags, weights, tags, y)
@@ -117,7 +117,7 @@ def decoupled_fit(
 
 @helper
 def _add_symmetric(A: Any, s: float, G: Any) -> None:
-    """``A += s G`` of 3 x 3 matrices, G by its upper triangle."""
+    """Compute ``A += s G`` of 3 x 3 matrices, G by its upper triangle."""
     A[0, 0] += s * G[0]
     A[0, 1] += s * G[1]
     A[0, 2] += s * G[2]
@@ -134,9 +134,9 @@ def projected_belief(
     mean: Any, P: Any, like: Any, size: Any, rotation: Any, translation: Any, covariance: Any,
     matrix: Any,
 ) -> None:  # fmt: skip
-    """The pose with the nearest rotation, its covariance ``J^+ P J^+T``, and the matrix itself.
+    """Compute the pose with the nearest rotation, its covariance ``J^+ P J^+T``, and the matrix.
 
-    `like` (3,) and `size` (6,) only say how large the results are.
+    `like` (3,) and `size` (6,) only define the shapes of the results.
     """
     _split(mean, translation, matrix)
     nearest_rotation(matrix, rotation)
@@ -169,9 +169,9 @@ def constrained_belief(
     mean: Any, P: Any, like: Any, size: Any, rotation: Any, translation: Any, covariance: Any,
     matrix: Any,
 ) -> None:  # fmt: skip
-    """The pose in the state, its covariance ``(J^T P^-1 J)^-1`` on SO(3), and the matrix itself.
+    """Compute the pose in the state, its covariance ``(J^T P^-1 J)^-1`` on SO(3), and the matrix.
 
-    As `projected_belief`.
+    Arguments as in `projected_belief`.
     """
     _split(mean, translation, matrix)
     nearest_rotation(matrix, rotation)

@@ -1,8 +1,8 @@
-"""The Kalman filters of 12 states on squared ranges: prediction, update, constraint, belief.
+"""Kalman filters of 12 states on squared ranges: prediction, update, constraint, belief.
 
-The state is ``[vec Q; t]``, columns of Q first; s_n = Q c_n + t are the tags. Weights are inverse
-variances of the squared ranges, (M, 1) where all tags share them, else (M, N); zero where a link is
-lost. The textbook forms stand in `estimators/linear/`.
+The state is ``[vec Q; t]``, columns of Q first. The tags are s_n = Q c_n + t. Weights are inverse
+variances of the squared ranges, (M, 1) if all tags share them, otherwise (M, N), and zero for lost
+links. The textbook forms are in `estimators/linear/`.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.linear_algebra import factor_semidefinite, fill, of_size
 
 _STATES = 12
-# No length is as large.
+# Larger than any length.
 HUGE = 1e50
 _cholesky, _, _invert_factored = of_size(_STATES)
 
 
 @gufunc("(p),(s),()->(p)")
 def predict_mean(mean: Any, twist: Any, dt: float, new_mean: Any) -> None:
-    """``x <- F x + [0; v dt]``, F = blkdiag(R, R, R, I), ``R = exp(w dt)`` of the twist (w, v)."""
+    """Compute ``x <- F x + [0; v dt]`` with the twist (w, v).
+
+    F is blkdiag(R, R, R, I) with ``R = exp(w dt)``.
+    """
     R = np.empty((3, 3))
     rotations.exp(dt * twist[0], dt * twist[1], dt * twist[2], R)
     for i in range(3):
@@ -37,7 +40,7 @@ def predict_mean(mean: Any, twist: Any, dt: float, new_mean: Any) -> None:
 
 @gufunc("(p,p),(s),(),(p)->(p,p)")
 def predict_covariance(P: Any, twist: Any, dt: float, rate: Any, new_P: Any) -> None:
-    """``P <- F P F^T + dt diag(rate)``, F as of `predict_mean`."""
+    """Compute ``P <- F P F^T + dt diag(rate)``, F as in `predict_mean`."""
     work = np.empty((2, 3, 3))
     R, half = work[0], work[1]
     rotations.exp(dt * twist[0], dt * twist[1], dt * twist[2], R)
@@ -69,7 +72,7 @@ def predict_covariance(P: Any, twist: Any, dt: float, rate: Any, new_P: Any) -> 
 
 @helper
 def _weighted_mean(anchors: Any, weights: Any, column: int) -> tuple[float, float, float]:
-    """Weighted mean of the anchors."""
+    """Compute the weighted mean of the anchors."""
     total = x = y = z = 0.0
     for m in range(anchors.shape[0]):
         w = weights[m, column]
@@ -84,7 +87,7 @@ def _weighted_mean(anchors: Any, weights: Any, column: int) -> tuple[float, floa
 
 @helper
 def spread(anchors: Any, weights: Any, column: int, G: Any) -> None:
-    """Upper triangle of ``G = 4 A Pi A^T``, what the anchors tell about the place of a tag."""
+    """Compute the upper triangle of ``G = 4 A Pi A^T``, the information about a tag position."""
     x, y, z = _weighted_mean(anchors, weights, column)
     xx = xy = xz = yy = yz = zz = 0.0
     for m in range(anchors.shape[0]):
@@ -143,11 +146,11 @@ def _add_information(H: Any, anchors: Any, tags: Any, weights: Any) -> None:
 def innovation(
     mean: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, arms: Any, y: Any
 ) -> None:
-    """``y = sum_n c_e kron (b_n - G_n s_n)`` (4, 3), from squared ranges less those expected.
+    """Compute ``y = sum_n c_e kron (b_n - G_n s_n)`` (4, 3) from squared range residuals.
 
-    ``b_n - G_n s_n = -2 sum_m w (a_m - a) (r_mn^2 - |a_m - s_n|^2)``, a the weighted mean of the
-    anchors: what |s_n|^2 adds to each square drops out. `arms` are the c_n of c_e = [c_n; 1],
-    the tags or those about their centroid.
+    ``b_n - G_n s_n = -2 sum_m w (a_m - a) (r_mn^2 - |a_m - s_n|^2)``, where a is the weighted mean
+    of the anchors. The term |s_n|^2 of each square cancels. `arms` are the c_n of c_e = [c_n; 1]:
+    the tags, or the tags relative to their centroid.
     """
     for k in range(4):
         for i in range(3):
@@ -191,13 +194,13 @@ def _take_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) 
 
 @gufunc("(p,p),(m,d),(n,d),(m,w)->(p,p)")
 def update_covariance(P: Any, anchors: Any, tags: Any, weights: Any, new_P: Any) -> None:
-    """``(P^-1 + information)^-1``: the covariance after an epoch, which needs no ranges."""
+    """Compute ``(P^-1 + information)^-1``, the posterior covariance, which needs no ranges."""
     _take_covariance(P, anchors, tags, weights, new_P)
 
 
 @gufunc("(p,p)->(p,p)")
 def inverse(matrix: Any, inverted: Any) -> None:
-    """Inverse of a symmetric positive definite matrix of the filter's size."""
+    """Compute the inverse of a symmetric positive definite matrix of the filter's size."""
     L = np.empty((_STATES, _STATES))
     _cholesky(matrix, L)
     _invert_factored(L, inverted)
@@ -221,15 +224,15 @@ def _take_mean(
 def update_mean(
     mean: Any, P: Any, ranges: Any, anchors: Any, tags: Any, weights: Any, new_mean: Any
 ) -> None:
-    """``x + P y``: the mean after an epoch, with the covariance P after it."""
+    """Compute ``x + P y``, the posterior mean, with the posterior covariance P."""
     _take_mean(mean, P, ranges, anchors, tags, weights, new_mean)
 
 
 @helper
 def _weigh(ranges: Any, law: Any, weights: Any) -> bool:
-    """Inverse variances of the squared ranges of a law; whether all ranges are such.
+    """Compute inverse variances of the squared ranges; return whether all ranges are positive.
 
-    `weights` (M, 1) where a reference tag tells them, else (M, N).
+    `weights` has shape (M, 1) for a law with a reference tag, otherwise (M, N).
     """
     sound, first = True, max(int(law[3]), 0)
     for m in range(ranges.shape[0]):
@@ -265,9 +268,9 @@ def update(
     mean: Any, P: Any, ranges: Any, law: Any, anchors: Any, tags: Any, vague_entry: float,
     new_mean: Any, new_P: Any,
 ) -> None:  # fmt: skip
-    """Mean and covariance after an epoch without lost links, by the numbers of its law.
+    """Compute mean and covariance after an epoch without lost links, from the law's numbers.
 
-    NaN where a range is not positive or the prior says nothing.
+    NaN if a range is not positive or the prior has no information.
     """
     weights = np.empty((ranges.shape[0], ranges.shape[1] if law[3] < 0 else 1))
     if _weigh(ranges, law, weights) and not _says_nothing(P, anchors, vague_entry):
@@ -281,16 +284,16 @@ def update(
 
 @gufunc("(m,n),(m,d),(n,d),(m,w),(p)->(p),(p,p)")
 def compress(ranges: Any, anchors: Any, tags: Any, weights: Any, like: Any, z: Any, H: Any) -> None:
-    """Twelve measurements z with unit noise and their matrix H, that tell what an epoch does.
+    """Compute twelve measurements z with unit noise, and their H, equivalent to an epoch.
 
-    ``H^T H`` is the information and ``H^T z`` its vector, H the transposed Cholesky factor. `like`
-    (12,) only tells how large the results are.
+    ``H^T H`` is the information and ``H^T z`` its vector, where H is the transposed Cholesky
+    factor. `like` (12,) only defines the shapes of the results.
     """
     work = np.zeros((3, _STATES, _STATES))
     L, information, y = work[0], work[1], work[2, :4, :3]
     _add_information(information, anchors, tags, weights)
     factor_semidefinite(information, L)
-    # The innovation of a state of zeros.
+    # The innovation for a state of zeros.
     innovation(work[2, 4], ranges, anchors, tags, weights, tags, y)
     for i in range(_STATES):
         total = y[i // 3, i % 3]
@@ -303,5 +306,5 @@ def compress(ranges: Any, anchors: Any, tags: Any, weights: Any, like: Any, z: A
 
 @gufunc("(p,p),(m,d),()->()", "fffb")
 def is_vague(P: Any, anchors: Any, vague_entry: float, vague: Any) -> None:
-    """Whether a covariance says nothing: of an entry of Q, or beyond the anchors' extent."""
+    """Return whether a covariance is uninformative: of an entry of Q, or beyond the extent."""
     vague[0] = _says_nothing(P, anchors, vague_entry)

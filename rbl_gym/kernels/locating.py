@@ -1,4 +1,4 @@
-"""Maximum likelihood of one body's pose, searched for where the first solution is in doubt.
+"""Maximum-likelihood pose of one body, with a global search if the first solution is doubtful.
 
 The textbook form is `estimators/locating/maximum_likelihood.py`.
 """
@@ -18,27 +18,27 @@ from rbl_gym.kernels.range_cost import set_huber
 
 _cholesky3, _solve3, _invert3 = of_size(3)
 
-# A cost this many standard deviations above its chi-square mean calls for a search.
+# A cost this many standard deviations above its chi-square mean starts a global search.
 SUSPICIOUS = 5.0
-# So does a rotation that the ranges leave this uncertain (rad): there may be other minima.
+# So does a rotation with this standard deviation (rad): there may be other minima.
 UNCERTAIN_RAD = 0.2
-# So do anchors whose spread is this flat, and fewer than this many.
+# So do anchors whose spread is this flat, and fewer anchors than this.
 FLAT, FEW_ANCHORS = 0.05, 5
-# A search starts from so many rotations at each place, the cheapest of the net, and follows so
-# many of the minima that it comes near.
+# Numbers of rotations at each position, the best of the net, from which a search starts, and of
+# approximate minima that it refines.
 STARTS, MINIMA = 5, 8
-# Poses whose tags are closer than these shares of the body's size are the same: on the way to a
-# minimum, and at it.
+# Poses whose tags are closer than these fractions of the body's size are the same: before
+# convergence, and after it.
 NEAR, SAME = 2e-2, 1e-3
-# Poses within 3 sigma of the best cost are alternatives to it.
+# Poses with a cost within 3 sigma of the best one are alternatives.
 RIVAL_COST = 4.5
 
 
 @gufunc("(m,n),(m,n),(m,d),(n,d)->(d,d),(d)")
 def points_start(ranges, weights, anchors, tags, Q, t):
-    """A pose from the squared ranges: each tag by itself, then the rotation that fits them.
+    """Compute a pose from the squared ranges: each tag separately, then the rotation that fits.
 
-    NaN where fewer than three tags are determined.
+    NaN if fewer than three tags are determined.
     """
     fill(math.nan, Q)
     t[0] = t[1] = t[2] = math.nan
@@ -79,7 +79,8 @@ def points_start(ranges, weights, anchors, tags, Q, t):
                         G[i, j] += 4 * across * (anchors[m, j] - mean[j])
         good = _cholesky3(G, L)
         for i in range(3):
-            # A pivot this small beside its diagonal entry, or that beside the others: no rank 3.
+            # A pivot this small relative to its diagonal entry, or that to the others, means rank
+            # below 3.
             good = good and L[i, i] * L[i, i] * G[i, i] < 1e11
             good = good and G[i, i] > 1e-22 * (G[0, 0] + G[1, 1] + G[2, 2])
         if good:
@@ -108,7 +109,7 @@ def points_start(ranges, weights, anchors, tags, Q, t):
 
 @helper
 def in_doubt(H: Any, cost: float, weights: Any, anchors: Any) -> bool:
-    """Whether a solution may not be the global one: poor geometry, or a cost too high."""
+    """Return whether a solution may not be global: poor geometry, or a high cost."""
     n_anchors = anchors.shape[0]
     if n_anchors < FEW_ANCHORS:
         return True
@@ -141,10 +142,10 @@ def in_doubt(H: Any, cost: float, weights: Any, anchors: Any) -> bool:
 
 @helper
 def candidate_places(ranges: Any, weights: Any, anchors: Any, places: Any) -> None:
-    """Places (3, 3) of the tags' centre: linear, and on both sides of the anchors' plane.
+    """Compute positions (3, 3) of the tags' centre: linear, and on both sides of a plane.
 
-    From the mean squared range of every anchor; the plane is that of least spread of the
-    anchors, across which the linear solution knows little or nothing.
+    They follow from the mean squared range of every anchor. The plane is that of the anchors with
+    the smallest spread across it, where the linear solution is poor or undefined.
     """
     n_anchors, n_tags = ranges.shape
     squared, d = np.zeros(n_anchors), np.empty(n_anchors)
@@ -195,7 +196,7 @@ def candidate_places(ranges: Any, weights: Any, anchors: Any, places: Any) -> No
                 places[0, i] += V[i, j] * along
                 if j != low:
                     places[1, i] += V[i, j] * along
-    # What is left of the squared ranges in the plane is the squared height over it.
+    # The rest of the squared ranges in the plane is the squared height above it.
     height = 0.0
     for m in range(n_anchors):
         if squared[m] >= 0:
@@ -203,7 +204,7 @@ def candidate_places(ranges: Any, weights: Any, anchors: Any, places: Any) -> No
             for i in range(3):
                 height -= (anchors[m, i] - places[1, i]) ** 2 / seen
     height = math.sqrt(max(height, 0.0))
-    # Which side comes first must not depend on the sign of an eigenvector.
+    # The order of the sides must not depend on the sign of an eigenvector.
     largest = 0
     for i in range(1, 3):
         if abs(V[i, low]) > abs(V[largest, low]):
@@ -217,7 +218,7 @@ def candidate_places(ranges: Any, weights: Any, anchors: Any, places: Any) -> No
 
 @helper
 def cost_at(Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any) -> float:
-    """Half the sum of squared whitened residuals."""
+    """Return half the sum of squared whitened residuals."""
     total = 0.0
     for n in range(tags.shape[0]):
         x = Q[0, 0] * tags[n, 0] + Q[0, 1] * tags[n, 1] + Q[0, 2] * tags[n, 2] + t[0]
@@ -233,12 +234,12 @@ def cost_at(Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any) 
 
 @helper
 def order_of(costs: Any, order: Any) -> None:
-    """The places of the smallest costs, best first, ties as they come; as many as there is room."""
+    """Compute indices of the smallest costs, best first, stable, as many as the output holds."""
     taken = np.zeros(len(costs), np.bool_)
     for k in range(len(order)):
         best = -1
         for i in range(len(costs)):
-            # NaN last.
+            # NaN comes last.
             if not taken[i] and (best < 0 or costs[i] < costs[best] or costs[best] != costs[best]):
                 best = i
         taken[best] = True
@@ -247,7 +248,7 @@ def order_of(costs: Any, order: Any) -> None:
 
 @helper
 def distance_of_tags(Q: Any, t: Any, R: Any, s: Any, tags: Any) -> float:
-    """The longest way of a tag from one pose to another, squared."""
+    """Return the largest squared distance of a tag between two poses."""
     longest = 0.0
     for n in range(tags.shape[0]):
         total = 0.0
@@ -262,7 +263,7 @@ def distance_of_tags(Q: Any, t: Any, R: Any, s: Any, tags: Any) -> float:
 
 @helper
 def body_size(tags: Any, centre: Any) -> float:
-    """The longest way from the tags' centre to a tag, squared."""
+    """Return the largest squared distance from the tags' centre to a tag."""
     longest = 0.0
     for n in range(tags.shape[0]):
         total = 0.0
@@ -276,7 +277,7 @@ def body_size(tags: Any, centre: Any) -> float:
 def starts(
     ranges: Any, weights: Any, anchors: Any, tags: Any, net: Any, centre: Any, Qs: Any, ts: Any
 ) -> None:
-    """The cheapest rotations of the net at each of three places, as poses (3 STARTS, ...)."""
+    """Compute the best rotations of the net at three positions, as poses (3 STARTS, ...)."""
     places, cost, order = np.empty((3, 3)), np.empty(len(net)), np.empty(STARTS, np.int64)
     candidate_places(ranges, weights, anchors, places)
     t = np.empty((len(net), 3))
@@ -297,7 +298,7 @@ def search(
     ranges: Any, weights: Any, anchors: Any, tags: Any, net: Any, has_first: bool,
     Q: Any, t: Any, other_Q: Any, other_t: Any, other_cost: Any, room: Any,
 ) -> tuple[float, bool]:  # fmt: skip
-    """The best of many local solves and its rivals; `has_first`: (Q, t) is a solution already."""
+    """Find the best of many local solutions and alternatives; `has_first`: (Q, t) is a solution."""
     centre, loss = np.zeros(3), room[3]
     set_huber(loss, math.inf)
     for n in range(tags.shape[0]):
@@ -313,7 +314,7 @@ def search(
         count -= 1
     order = np.empty(count, np.int64)
     for stage in range(2):
-        # Coarsely from all starts; to the end from what is new among where that led.
+        # Coarsely from all starts; then completely from the distinct results.
         for s in range(count):
             if stage == 0 or counted[s]:
                 costs[s], good[s] = solve(
@@ -329,7 +330,7 @@ def search(
             if stage == 0:
                 new = kept < MINIMA
             else:
-                # Of minima that are as cheap as the best, only as many as there is room for.
+                # If more minima are as good as the best, keep as many as the output holds.
                 new = counted[s] and kept <= len(other_cost)
                 new = new and (k == 0 or (good[s] and costs[s] < costs[order[0]] + RIVAL_COST))
             least = (SAME if stage else NEAR) ** 2 * size
@@ -345,7 +346,7 @@ def search(
                     copy_pose(Qs[s], ts[s], other_Q[kept - 2], other_t[kept - 2])
                     other_cost[kept - 2] = costs[s]
     copy_pose(Qs[order[0]], ts[order[0]], Q, t)
-    # Where many poses are nearly as good the way along the valley is long.
+    # If many poses are nearly as good, the valley of the cost is long.
     return solve(
         Q, t, False, Q, t, room[2], ranges, weights, anchors, tags, loss, 0, 100, 1e-6, room
     )
@@ -359,7 +360,7 @@ def most_likely_pose(
     ranges, weights, anchors, tags, start_Q, start_t, net, slots,
     Q, t, cost, g, H, converged, other_Q, other_t, other_cost,
 ):  # fmt: skip
-    """The most likely pose, and others about as likely."""
+    """Compute the most likely pose, and others that are about as likely."""
     for k in range(len(slots)):
         other_cost[k] = math.inf
         for i in range(3):

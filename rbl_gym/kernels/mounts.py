@@ -9,7 +9,7 @@ from rbl_gym.kernels.jit import gufunc
 
 @gufunc("(d),(k,c)->(d),()", "fffi")
 def nearest_point(point: Any, pieces: Any, legal: Any, piece: Any) -> None:
-    """The nearest point of the pieces, and in which it lies."""
+    """Compute the nearest point of the pieces, and the index of its piece."""
     least, piece[0] = -1.0, 0
     px, py, pz = point[0], point[1], point[2]
     for k in range(pieces.shape[0]):

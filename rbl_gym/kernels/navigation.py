@@ -1,4 +1,4 @@
-"""Inertial navigation of one body: readings integrated, the covariance carried along.
+"""Inertial navigation of one body: integration of readings, propagation of covariance.
 
 The textbook form is in `rbl_gym.motion.navigation`.
 """
@@ -15,7 +15,7 @@ from rbl_gym.kernels.jit import gufunc, helper, inlined
 
 @inlined
 def cross(x: float, y: float, z: float, M: Any, out: Any) -> None:
-    """``out = [s]x M`` of s = (x, y, z)."""
+    """Compute ``out = [s]x M`` of s = (x, y, z)."""
     for j in range(3):
         a, b, c = M[0, j], M[1, j], M[2, j]
         out[0, j] = y * c - z * b
@@ -27,12 +27,12 @@ def cross(x: float, y: float, z: float, M: Any, out: Any) -> None:
 def integrate(
     readings: Any, steps: Any, extra: Any, law: Any, Q: Any, moved: Any, J: Any, N: Any, room: Any
 ) -> tuple[float, float]:
-    """Preintegrate: seconds and the variance of the rotation are returned; room (6, 3, 3).
+    """Preintegrate; return the time and the variance of the rotation; `room` is (6, 3, 3).
 
-    moved (4, 3): place, velocity, l and m. J (5, 3, 3): derivatives of rotation, place, velocity by
-    the gyroscope's bias, of place and velocity by the accelerometer's. The noise is isotropic, so
-    that the covariance of the rotation is a number, and those of place and velocity with it are
-    ``-[l]x`` and ``-[m]x``. N (3, 3, 3): covariances tt, tv, vv.
+    moved (4, 3): position, velocity, l and m. J (5, 3, 3): derivatives of rotation, position and
+    velocity by the gyroscope's bias, of position and velocity by the accelerometer's. The noise is
+    isotropic. The covariance of the rotation is therefore a number, and those of position and
+    velocity with it are ``-[l]x`` and ``-[m]x``. N (3, 3, 3): covariances tt, tv, vv.
     """
     half, A, B, D, E, U = room[0], room[1], room[2], room[3], room[4], room[5]
     seconds = turned = 0.0
@@ -47,7 +47,7 @@ def integrate(
                 N[k, i, j] = 0.0
     for k in range(readings.shape[0]):
         h = steps[k]
-        if h < 1e-100:  # no length, and 1 / h is finite beyond
+        if h < 1e-100:  # zero length; 1 / h is finite above
             continue
         seconds += h
         hh = 0.5 * h * h
@@ -55,14 +55,14 @@ def integrate(
         y = h * (readings[k, 1] - extra[4])
         z = h * (readings[k, 2] - extra[5])
         fx, fy, fz = readings[k, 3] - extra[6], readings[k, 4] - extra[7], readings[k, 5] - extra[8]
-        # exp and left Jacobian of half the turn, and the Jacobian of the whole of it.
+        # exp and left Jacobian of half the rotation, and the Jacobian of the whole rotation.
         s = x * x + y * y + z * z
         a, b, c = rotations.coefficients(0.25 * s)
         rotations.series(0.5 * x, 0.5 * y, 0.5 * z, a, b, 1 - 0.25 * b * s, E)
         rotations.compose(Q, E, half)
         rotations.series(0.5 * x, 0.5 * y, 0.5 * z, b, c, 1 - 0.25 * c * s, D)
         rotations.compose(Q, D, B)
-        # Of the whole turn, from those of half of it.
+        # The whole rotation, from its halves.
         b, c = 0.5 * a * a, 0.25 * (c + a * b)
         rotations.series(x, y, z, b, c, 1 - c * s, D)
         rotations.compose(Q, D, A)
@@ -76,7 +76,7 @@ def integrate(
             for j in range(3):
                 U[i, j] = 0.5 * h * B[i, j] - J[0, i, j]
                 J[0, i, j] -= h * A[i, j]
-        # The force's derivatives, by the errors that it had before the sample.
+        # Derivatives of the force, by the errors before the sample.
         cross(fx, fy, fz, U, D)
         for i in range(3):
             for j in range(3):
@@ -84,7 +84,7 @@ def integrate(
                 J[2, i, j] += h * D[i, j]
                 J[3, i, j] += h * J[4, i, j] - hh * half[i, j]
                 J[4, i, j] -= h * half[i, j]
-        # Noise of the turn, and of the force; W and X: covariances of the force with v and t.
+        # Noise of the rotation, and of the force; W and X: covariances of the force with v and t.
         g, r = law[0] * h, law[1] / h
         share, square = turned + 0.25 * g, turned + 0.5 * g
         dot_l = fx * moved[2, 0] + fy * moved[2, 1] + fz * moved[2, 2]
@@ -121,7 +121,7 @@ def integrate(
 
 @helper
 def carry(F: Any, lean: Any, T: float, tilted: bool, gone: Any, M: Any, count: int, out: Any):
-    """The rows (9, count) that move over the interval, of columns of M."""
+    """Compute the rows (9, count) that change over the interval, of columns of M."""
     for i in range(3):
         a, b, c = F[0, i, 0], F[0, i, 1], F[0, i, 2]
         for j in range(count):
@@ -155,7 +155,7 @@ def carry(F: Any, lean: Any, T: float, tilted: bool, gone: Any, M: Any, count: i
 
 @gufunc("(d,d),(d),(k),(p,p),(s,c),(s),(q)->(d,d),(d),(k),(p,p)")
 def propagate(Q0, t0, extra, P0, readings, steps, law, Q, t, after, P):
-    """State and covariance after the samples of an interval."""
+    """Compute state and covariance after the samples of an interval."""
     n = P0.shape[0]
     # Fewer allocations: each takes as long as a small product.
     room, rows, before = np.empty((25, 3, 3)), np.empty((2, 9, n)), np.empty((n, n))
@@ -188,7 +188,7 @@ def propagate(Q0, t0, extra, P0, readings, steps, law, Q, t, after, P):
         down = down_x if i == 0 else (down_y if i == 1 else down_z)
         t[i] = t0[i] + extra[i] * T + 0.5 * down * T * T + gone[0, i]
         after[i] += down * T + gone[1, i]
-    # The rows that move, of F P0; then their columns. Copies lie in one piece: quicker to run over.
+    # The rows of F P0 that change; then their columns. Contiguous copies are faster.
     for i in range(n):
         for j in range(n):
             before[i, j] = P0[i, j]
@@ -197,7 +197,7 @@ def propagate(Q0, t0, extra, P0, readings, steps, law, Q, t, after, P):
         for j in range(n):
             before[j, i] = rows[0, i, j]
     carry(F, lean, T, tilted, gone, before, 9, rows[1])
-    # Noise, turned into the world; the walks of the biases.
+    # Noise, rotated to the world frame; random walks of the biases.
     for b in range(3):
         row, column = (3, 6, 6)[b], (3, 3, 6)[b]
         rotations.compose(R, N[b], half)

@@ -1,7 +1,7 @@
-"""Ranges with an unknown offset in common, one body: what they tell, and their cost.
+"""Ranges with a common unknown offset, for one body: their information and cost.
 
 The textbook forms are `rbl_gym.measurements.offsets` in `rbl_gym.bounds.information` and in
-`estimators/costs/range_cost.py`. Kinds of offset: 1 by tag, 2 by anchor, 3 of the epoch.
+`estimators/costs/range_cost.py`. Kinds of offset: 1 per tag, 2 per anchor, 3 per epoch.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from rbl_gym.kernels.jit import gufunc, helper
 from rbl_gym.kernels.noise_laws import reference_of, weight
 from rbl_gym.kernels.range_cost import is_plain, loss_of, squared_residuals
 
-# Steps to the offset that a loss other than squares likes best.
+# Steps to the best offset for a loss other than squares.
 STEPS = 20
 
 
 @helper
 def group_of(m: int, n: int, offset: int) -> int:
-    """Which offset a link has."""
+    """Return the index of a link's offset."""
     if offset == 1:
         return n
     return m if offset == 2 else 0
@@ -30,9 +30,9 @@ def group_of(m: int, n: int, offset: int) -> int:
 
 @helper
 def derivative(translation: Any, x: float, y: float, z: float, anchor: Any, J: Any) -> float:
-    """Distance of a tag at (x, y, z) from an anchor; its derivative by the pose error into J."""
+    """Return the distance of a tag at (x, y, z) from an anchor; write its pose derivative to J."""
     dx, dy, dz = x - anchor[0], y - anchor[1], z - anchor[2]
-    # Where both coincide the difference is zero, and so are all the terms.
+    # If both coincide the difference is zero, and so are all terms.
     distance = math.sqrt(max(dx * dx + dy * dy + dz * dz, 1e-200))
     dx, dy, dz = dx / distance, dy / distance, dz / distance
     x, y, z = x - translation[0], y - translation[1], z - translation[2]
@@ -46,11 +46,10 @@ def add_centred(
     Q: Any, t: Any, anchors: Any, tags: Any, weights: Any, residuals: Any, offset: int, g: Any,
     H: Any,
 ) -> None:  # fmt: skip
-    """Add the gradient and the information of ranges of known weights and residuals (M, N).
+    """Add gradient and information of ranges with known weights and residuals (M, N).
 
-    With ``C = J - h / s``, ``h = sum w J`` and ``s = sum w`` of a group, the information is
-    ``sum w C C^T``, of which the lower half is added to H (6, 6), and the gradient
-    ``sum w x C``.
+    With ``C = J - h / s``, ``h = sum w J`` and ``s = sum w`` of a group, the information is ``sum w
+    C C^T``. Its lower half is added to H (6, 6). The gradient is ``sum w x C``.
     """
     groups = max(anchors.shape[0], tags.shape[0])
     mean, total, J = np.zeros((groups, 6)), np.zeros(groups), np.empty(6)
@@ -78,7 +77,7 @@ def add_centred(
 
 @helper
 def medians(residuals: Any, weights: Any, offset: int, found: Any) -> None:
-    """Medians of the residuals of each group, the lower one of two; 0 of an empty one."""
+    """Compute the median of each group's residuals, the lower one of two; 0 if empty."""
     sorted_, count = np.empty(residuals.size), 0
     for k in range(len(found)):
         count = 0
@@ -99,7 +98,7 @@ def take_out(
     Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
     shifted: Any,
 ) -> None:  # fmt: skip
-    """Ranges with the likeliest offsets at a pose taken out: `shifted` (M, N)."""
+    """Subtract the most likely offsets at a pose from the ranges: `shifted` (M, N)."""
     groups = max(anchors.shape[0], tags.shape[0])
     found, mean, total = np.zeros(groups), np.empty(groups), np.empty(groups)
     residuals = np.zeros(ranges.shape)
@@ -138,7 +137,7 @@ def linearize_shifted(
     Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
     g: Any, H: Any,
 ) -> float:  # fmt: skip
-    """`range_cost.linearize` of ranges with offsets."""
+    """Compute `range_cost.linearize` of ranges with offsets."""
     shifted, left = np.empty(ranges.shape), np.zeros(ranges.shape)
     take_out(Q, t, ranges, weights, anchors, tags, loss, offset, shifted)
     plain, cost = is_plain(loss), 0.0
@@ -167,7 +166,7 @@ def squared_residuals_of(
     Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
     out: Any,
 ) -> None:  # fmt: skip
-    """Squared whitened residuals (M, N), 0 where a link is missing; `offset` 0: there is none."""
+    """Compute squared whitened residuals (M, N), 0 for missing links; `offset` 0: no offsets."""
     if offset == 0:
         squared_residuals(Q, t, ranges, weights, anchors, tags, out)
         return
@@ -180,7 +179,7 @@ def squared_residuals_of(
 def information(
     prior, anchors, tags, rotation, translation, law, share, offset, told
 ):  # fmt: skip
-    """A prior's information and that of ranges with offsets, of which each link has a share."""
+    """Add the information of ranges with offsets, times each link's fraction, to a prior's."""
     weights, nothing, g = np.empty(share.shape), np.zeros(share.shape), np.zeros(6)
     for n in range(tags.shape[0]):
         reference = reference_of(law, n)

@@ -1,4 +1,4 @@
-"""Predicted errors at a place, over turns of the body.
+"""Predicted errors at a position, over rotations of the body.
 
 The textbook form is `rbl_gym.studies.placing.requirements`.
 """
@@ -20,7 +20,7 @@ def mean_squares(
     base: Any, part: Any, rotation: Any, tags: Any,
     position: Any, rotated: Any, tag: Any, horizontal: Any, height: Any, heading: Any,
 ) -> None:  # fmt: skip
-    """Means over the turns of the squares of the six figures, of the information base + part."""
+    """Compute mean squares of the six errors over the rotations, for information base + part."""
     F, L, P = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     position[0] = rotated[0] = tag[0] = horizontal[0] = height[0] = heading[0] = 0.0
     n_turns = base.shape[0]
@@ -44,7 +44,7 @@ def mean_squares(
 
 @gufunc("(t,s,s),(t,s,s)->(),(),()")
 def asked_squares(base: Any, part: Any, horizontal: Any, height: Any, heading: Any) -> None:
-    """`mean_squares` of what zones ask for, from the last columns of the factor's inverse alone."""
+    """Compute `mean_squares` of the required errors from the factor inverse's last columns."""
     F, L = np.empty((6, 6)), np.empty((6, 6))
     across = up = turn = 0.0
     n_turns = base.shape[0]
@@ -55,8 +55,8 @@ def asked_squares(base: Any, part: Any, horizontal: Any, height: Any, heading: A
         if not cholesky6(F, L):
             horizontal[0] = height[0] = heading[0] = math.nan
             return
-        # Of the lower factor's inverse, whose diagonal is that of L; variances are the squares
-        # of its columns.
+        # Of the lower factor's inverse, whose diagonal is that of L; variances are the squared
+        # norms of its columns.
         c55, c44, c33, c22 = L[5, 5], L[4, 4], L[3, 3], L[2, 2]
         c54 = -c55 * L[5, 4] * c44
         c43 = -c44 * L[4, 3] * c33

@@ -29,7 +29,7 @@ def range_information(
     prior: Any, anchors: Any, tags: Any, rotation: Any, translation: Any, law: Any, share: Any,
     information: Any,
 ) -> None:  # fmt: skip
-    """A prior's information and that of ranges, of which each link has a share."""
+    """Add the information of ranges, times each link's fraction, to a prior's information."""
     for i in range(6):
         for j in range(6):
             information[i, j] = prior[i, j]
@@ -74,7 +74,7 @@ def _add_lifted(
     H: Any, x: float, y: float, z: float,
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
 ) -> None:  # fmt: skip
-    """Add ``J^T U J`` to the upper half of H, ``J = [-[c]x, I]`` of the arm c = (x, y, z)."""
+    """Add ``J^T U J`` to the upper half of H, with ``J = [-[c]x, I]`` of c = (x, y, z)."""
     # Rows of [c]x U.
     a0, a1, a2 = y * xz - z * xy, y * yz - z * yy, y * zz - z * yz
     b0, b1, b2 = z * xx - x * xz, z * xy - x * yz, z * xz - x * zz
@@ -104,7 +104,7 @@ def _add_lifted(
 
 @helper
 def _mirror_upper(H: Any) -> None:
-    """The lower half of a symmetric matrix from its upper one."""
+    """Copy the upper half of a symmetric matrix to its lower half."""
     for i in range(6):
         for j in range(i):
             H[i, j] = H[j, i]
@@ -112,9 +112,9 @@ def _mirror_upper(H: Any) -> None:
 
 @helper
 def _predict(J: Any, twist: Any, dt: float, std: Any, work: Any, predicted: Any) -> None:
-    """``(F J^-1 F^T + Q)^-1`` as ``L (I + L^T Q L)^-1 L^T`` with ``L L^T = F J F^T``.
+    """Compute ``(F J^-1 F^T + Q)^-1`` as ``L (I + L^T Q L)^-1 L^T`` with ``L L^T = F J F^T``.
 
-    Symmetric all the way, and for a singular J too. work is (4, 6, 6).
+    All steps are symmetric and also valid for a singular J. work is (4, 6, 6).
     """
     turned, L, A, small = work[0], work[1], work[2], work[3]
     R, jacobian, Q = small[:3, :3], small[:3, 3:], small[3:, :3]
@@ -127,7 +127,7 @@ def _predict(J: Any, twist: Any, dt: float, std: Any, work: Any, predicted: Any)
             for k in range(3):
                 total += dt * std[k] * std[k] * jacobian[i, k] * jacobian[j, k]
             Q[i, j] = total
-    # Rows turned, then columns.
+    # Rotate rows, then columns.
     for i in range(3):
         for j in range(6):
             A[i, j] = R[i, 0] * J[0, j] + R[i, 1] * J[1, j] + R[i, 2] * J[2, j]
@@ -168,7 +168,7 @@ def _predict(J: Any, twist: Any, dt: float, std: Any, work: Any, predicted: Any)
 
 @helper
 def tag_square(P: Any, rotation: Any, tags: Any) -> float:
-    """Mean over the tags of ``tr(J_n P J_n^T)``, from the lower triangle of P."""
+    """Return the mean of ``tr(J_n P J_n^T)`` over the tags, from the lower triangle of P."""
     total = 0.0
     for n in range(tags.shape[0]):
         a, b, c = tags[n, 0], tags[n, 1], tags[n, 2]
@@ -183,7 +183,7 @@ def tag_square(P: Any, rotation: Any, tags: Any) -> float:
 
 @helper
 def square_of_information(J: Any, rotation: Any, tags: Any, work: Any) -> float:
-    """`tag_square` of the inverse of J; NaN where J is not positive definite. work is (2, 6, 6)."""
+    """Return `tag_square` of J^-1; NaN if J is not positive definite. work is (2, 6, 6)."""
     L, P = work[0], work[1]
     if not cholesky6(J, L):
         return math.nan
@@ -196,7 +196,7 @@ def step_of_ranges(
     prior: Any, twist: Any, dt: float, std: Any, anchors: Any, tags: Any, rotation: Any,
     translation: Any, law: Any, share: Any, information: Any, score: Any,
 ) -> None:  # fmt: skip
-    """A step of the posterior Cramer-Rao recursion with ranges, and the score after it."""
+    """Do a step of the posterior Cramer-Rao recursion with ranges; compute the score after it."""
     work = np.empty((4, 6, 6))
     _predict(prior, twist, dt, std, work, information)
     add_range_information(information, anchors, tags, rotation, translation, law, share)
@@ -208,7 +208,7 @@ def step_of_angles(
     prior: Any, twist: Any, dt: float, std: Any, station: Any, tags: Any, rotation: Any,
     translation: Any, angle_std: float, information: Any, score: Any,
 ) -> None:  # fmt: skip
-    """A step of the posterior Cramer-Rao recursion with angles, and the score after it."""
+    """Do a step of the posterior Cramer-Rao recursion with angles; compute the score after it."""
     work = np.empty((4, 6, 6))
     _predict(prior, twist, dt, std, work, information)
     _add_angle_information(
@@ -217,7 +217,7 @@ def step_of_angles(
     score[0] = math.sqrt(square_of_information(information, rotation, tags, work))
 
 
-# As near to the station (m) no direction is one: its gradient counts as zero.
+# Closer to the station (m) than this a direction is undefined: its gradient counts as zero.
 _NOWHERE = 1e-50
 
 
@@ -225,7 +225,7 @@ _NOWHERE = 1e-50
 def _add_angle_information(
     information: Any, station: Any, tags: Any, rotation: Any, translation: Any, weight: float
 ) -> None:
-    """Add what the angles to the x and the z axis tell about the pose."""
+    """Add the information of the angles to the x and the z axis about the pose."""
     for n in range(tags.shape[0]):
         a, b, c = tag_position(rotation, translation, tags, n)
         x, y, z = a - station[0], b - station[1], c - station[2]
@@ -257,7 +257,7 @@ def _add_angle_information(
 
 @gufunc("(n,n),()->(n,n),()", "fffb")
 def regular_inverse(matrix: Any, least: float, inverse: Any, regular: Any) -> None:
-    """The inverse, NaN where with a unit diagonal the determinant would be below `least`."""
+    """Compute the inverse; NaN if the determinant at unit diagonal is below `least`."""
     n = matrix.shape[0]
     scale, unit, L = np.empty(n), np.empty((n, n)), np.empty((n, n))
     for i in range(n):
@@ -267,7 +267,7 @@ def regular_inverse(matrix: Any, least: float, inverse: Any, regular: Any) -> No
     good, determinant = cholesky(unit, L), 1.0
     for i in range(n):
         determinant /= L[i, i] * L[i, i]
-    # A NaN stays one.
+    # NaN stays NaN.
     regular[0] = determinant != determinant or (good and determinant > least)
     if not regular[0]:
         fill(math.nan, inverse)

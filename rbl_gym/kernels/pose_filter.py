@@ -1,4 +1,4 @@
-"""Prediction and update of the iterated EKF, one body.
+"""Prediction and update of the iterated EKF, for one body.
 
 The textbook forms are `pose_steps.py` and `robust_update.py` in `estimators/iekf/`.
 """
@@ -17,28 +17,28 @@ from rbl_gym.kernels.offsets import squared_residuals_of
 from rbl_gym.kernels.pose_solver import copy_pose, mirror, room_to_solve, solve
 from rbl_gym.kernels.range_cost import loss_of, set_huber
 
-# No length is as large.
+# Larger than any length.
 HUGE = 1e50
-# Whitened residual at which Huber's loss turns from squares to absolute values.
+# Whitened residual at which Huber's loss changes from squares to absolute values.
 HUBER = 1.5
-# Standard deviations beyond which a link contradicts a pose.
+# Number of standard deviations beyond which a link contradicts a pose.
 GATE = 4.0
-# What `robust` may be: squares, Huber's loss with a gate, the loss of ranges that err late.
+# Values of `robust`: squares, Huber's loss with a gate, the loss for late ranges.
 SQUARES, GATED, LATE = 0, 1, 2
-# Whitened residual from which on a range that may be late counts less, and what is left of its
-# weight where it is late.
+# Whitened residual above which a possibly late range is weighted less, and the remaining fraction
+# of its weight if it is late.
 LATE_HUBER, LATE_SHARE = 1.0, 0.5
-# Where the gate at the prior was wrong: first with care, as Huber's pose is biased.
+# After a wrong gate at the prior: first a wide one, as the pose of Huber's loss is biased.
 CUTOFFS = (6.0, GATE)
-# A pose that more than this share of the links contradict is itself in doubt: all links count.
+# If more than this fraction of the links contradicts a pose, the pose is doubtful: use all links.
 LARGEST_SHARE_OUT = 0.5
-# Tags this thin beside their length (squared) are as good as in a line.
+# Tags this thin relative to their length (squared) count as collinear.
 THIN = 0.01
 
 
 @gufunc("(d,d),(d),(p,p),(p),(),(p)->(d,d),(d),(p,p)")
 def predict(Q0, t0, P0, twist, dt, variance, Q, t, P):
-    """Pose and covariance after a step: ``F P F^T + dt G S G^T``."""
+    """Predict pose and covariance: ``F P F^T + dt G S G^T``."""
     turn, J, half = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     x, y, z = twist[0] * dt, twist[1] * dt, twist[2] * dt
     rotations.exp(x, y, z, turn)
@@ -65,7 +65,7 @@ def predict(Q0, t0, P0, twist, dt, variance, Q, t, P):
 
 @helper
 def invert(A: Any, L: Any, out: Any) -> bool:
-    """Inverse of a symmetric positive matrix, L to work in; where it is none, NaN and False."""
+    """Compute the inverse of a positive definite matrix, workspace L; else NaN and return False."""
     good = cholesky6(A, L)
     if good:
         invert_factored6(L, out)
@@ -76,10 +76,10 @@ def invert(A: Any, L: Any, out: Any) -> bool:
 
 @helper
 def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, signed: bool, weights: Any) -> bool:
-    """Weights of an epoch: shares over variances; False where a number is none that can be.
+    """Compute weights of an epoch: fractions over variances; return False for invalid numbers.
 
-    `shares` are 0 where nothing was measured. `law` has the numbers of `noise_laws`, of an epoch
-    without lost links; or it is of the kind 2, where the shares are the weights.
+    `shares` are 0 for missing links. `law` has the numbers of `noise_laws`, for an epoch without
+    lost links; or it is of kind 2, with the weights themselves in `shares`.
     """
     squared_range, given = law[0] == 1, law[0] == 2
     floor, growth, reference = law[1] * law[1], law[2] * law[2], int(law[3])
@@ -109,7 +109,7 @@ def weigh(ranges: Any, shares: Any, law: Any, anchors: Any, signed: bool, weight
 
 @helper
 def count_beyond(squared: Any, cutoff: float) -> int:
-    """Links whose squared whitened residual is beyond a cutoff."""
+    """Return the number of links whose squared whitened residual is beyond a cutoff."""
     count = 0
     for m in range(squared.shape[0]):
         for n in range(squared.shape[1]):
@@ -120,10 +120,10 @@ def count_beyond(squared: Any, cutoff: float) -> int:
 
 @helper
 def leave_out(P0: Any, squared: Any, tags: Any, width: float, kept: Any) -> int:
-    """Set the weights of links that contradict the prior to zero; how many, none of too many.
+    """Set weights of links that contradict the prior to zero, unless too many; return how many.
 
-    `squared` and the weights `kept` are those of the prior. The variance of an innovation is at
-    most that of the range and the square of `width` times ``sqrt(tr P_v) + |c| sqrt(tr P_w)``.
+    `squared` and the weights `kept` are those at the prior. The variance of an innovation is at
+    most that of the range plus the square of `width` times ``sqrt(tr P_v) + |c| sqrt(tr P_w)``.
     """
     of_rotation = math.sqrt(P0[0, 0] + P0[1, 1] + P0[2, 2])
     of_place = math.sqrt(P0[3, 3] + P0[4, 4] + P0[5, 5])
@@ -148,7 +148,7 @@ def leave_out(P0: Any, squared: Any, tags: Any, width: float, kept: Any) -> int:
 
 @helper
 def is_wrong(squared: Any, weights: Any, kept: Any) -> bool:
-    """Whether a pose tells otherwise than `leave_out` did, of links in or out."""
+    """Return whether a pose contradicts the choice of `leave_out`, for any link."""
     for m in range(squared.shape[0]):
         for n in range(squared.shape[1]):
             if (squared[m, n] > GATE * GATE) != (kept[m, n] != weights[m, n]):
@@ -158,7 +158,7 @@ def is_wrong(squared: Any, weights: Any, kept: Any) -> bool:
 
 @helper
 def data_cost(squared: Any, loss: Any) -> float:
-    """Cost of squared whitened residuals."""
+    """Return the cost of squared whitened residuals."""
     total = 0.0
     for m in range(squared.shape[0]):
         for n in range(squared.shape[1]):
@@ -168,7 +168,7 @@ def data_cost(squared: Any, loss: Any) -> float:
 
 @helper
 def carry(A: Any, information: Any, sign: float, H: Any) -> None:
-    """``H += sign A^T I A`` of matrices (6, 6)."""
+    """Compute ``H += sign A^T I A`` of matrices (6, 6)."""
     for j in range(6):
         for i in range(6):
             for k in range(6):
@@ -180,9 +180,9 @@ def carry(A: Any, information: Any, sign: float, H: Any) -> None:
 
 @helper
 def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any) -> None:
-    """Let the prior's information turn with the body where the tags heard are about in a line.
+    """Rotate the prior's information with the body if the measured tags are nearly collinear.
 
-    `estimators/costs/unseen_directions.py` says why.
+    For the reason see `estimators/costs/unseen_directions.py`.
     """
     cx = cy = cz = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
     heard = 0
@@ -212,7 +212,7 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
             return
         cx, cy, cz = sx / heard, sy / heard, sz / heard
     trace = xx + yy + zz
-    # The sum of products of two eigenvalues, over the square of their sum.
+    # The sum of products of two eigenvalues, divided by the square of their sum.
     pairs = xx * yy + yy * zz + xx * zz - xy * xy - xz * xz - yz * yz
     if not pairs <= THIN * trace * trace:
         return
@@ -231,7 +231,7 @@ def keep_wide(Q0: Any, information: Any, Q: Any, weights: Any, tags: Any, H: Any
         D[3 + i, 3 + i] = T[3 + i, 3 + i] = 1.0
         for j in range(3):
             D[i, j], T[i, j] = turned[i, j], back[i, j]
-    # [Q0 c]x back - [Q c]x: an error about the tags' centre is the same in the body's frame.
+    # [Q0 c]x back - [Q c]x: an error about the tags' centre is the same in the body frame.
     for j in range(3):
         T[3, j] = a[1] * back[2, j] - a[2] * back[1, j]
         T[4, j] = a[2] * back[0, j] - a[0] * back[2, j]
@@ -269,11 +269,12 @@ def update(
     P,
     cost,
 ):
-    """The most likely pose of an epoch near a start, its covariance, and the cost there.
+    """Compute the most likely pose of an epoch near a start, its covariance, and its cost.
 
-    `robust` as GATED leaves out links that the prior contradicts (stage 0). Where the pose that
-    follows tells otherwise, it starts again with Huber's loss on all of them (1), and leaves out
-    those beyond each cutoff (2 and 3). As LATE it goes from Huber's loss to the redescending one.
+    With `robust` GATED, links that the prior contradicts are left out (stage 0). If the resulting
+    pose contradicts this choice, the update starts again with Huber's loss on all links (1), and
+    leaves out those beyond each cutoff (2 and 3). With LATE it goes from Huber's loss to the
+    redescending one.
     """
     room = room_to_solve()
     H, information, loss, L = room[1], room[2], room[3], room[4]
@@ -299,7 +300,7 @@ def update(
                 kept[m, n] = weights[m, n]
                 links += weights[m, n] > 0
         squared_residuals_of(Q0, t0, ranges, weights, anchors, tags, loss, offset, squared)
-        # An offset is told by the other ranges, which are as uncertain.
+        # An offset is determined by the other ranges, which are as uncertain.
         leave_out(P0, squared, tags, 1.0 if offset == 0 else 2.0, kept)
     for stage in range(4):
         if stage == 1 and robust == LATE:
@@ -331,7 +332,7 @@ def update(
     if not invert(H, L, P):
         total = math.nan
     if robust == GATED:
-        # A link that contradicts the pose costs so much and no more, whoever left it out.
+        # A link that contradicts the pose has a limited cost, however it was left out.
         of_prior = total
         if offset != 0:
             squared_residuals_of(Q, t, ranges, kept, anchors, tags, loss, offset, squared)

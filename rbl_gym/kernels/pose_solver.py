@@ -1,4 +1,4 @@
-"""The most likely pose of one body near a start: damped Gauss-Newton on SO(3) x R^3.
+"""Most likely pose of one body near a start: damped Gauss-Newton on SO(3) x R^3.
 
 The textbook forms are `levenberg_marquardt.py` and `map_problem.py` in `estimators/costs/`.
 """
@@ -15,7 +15,7 @@ from rbl_gym.kernels.offsets import linearize_shifted
 from rbl_gym.kernels.range_cost import linearize
 from rbl_gym.kernels.rotations import compose, exp, left_jacobian_inverse, log
 
-# No step is longer (rad, m) on any axis.
+# Largest step (rad, m) on any axis.
 _LONGEST = 1e12
 
 
@@ -23,10 +23,10 @@ _LONGEST = 1e12
 def add_prior(
     Q: Any, t: Any, Q0: Any, t0: Any, information: Any, D: Any, e: Any, g: Any, H: Any
 ) -> float:
-    """Add a prior's gradient and Hessian; its cost, half of ``e^T I e``.
+    """Add a prior's gradient and Hessian; return its cost, half of ``e^T I e``.
 
-    ``e = (log(Q Q0^T), t - t0)`` and its derivative is ``blkdiag(Jl^-1, I)``. D (3, 3) and e (6,)
-    are room to work in.
+    ``e = (log(Q Q0^T), t - t0)``, and its derivative is ``blkdiag(Jl^-1, I)``. D (3, 3) and e (6,)
+    are workspace.
     """
     at_prior = True
     for i in range(3):
@@ -78,11 +78,11 @@ def solve(
     ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, offset: int,
     iterations: int, tolerance: float, room: Any,
 ) -> tuple[float, bool]:  # fmt: skip
-    """Move the pose (Q, t) to the least cost near it; the cost there, and whether it converged.
+    """Move the pose (Q, t) to the nearest minimum; return its cost and whether it converged.
 
-    `offset` is the kind of the ranges' offsets, as in `kernels.offsets`, 0 for none.
-    `room` comes from `room_to_solve`; its first two become the gradient and the Hessian (its
-    lower half) there.
+    `offset` is the kind of the ranges' offsets, as in `kernels.offsets`, 0 for none. `room` comes
+    from `room_to_solve`. Its first two arrays become the gradient and the lower half of the Hessian
+    at the minimum.
     """
     g, H, _, _, L, new_g, new_H, new_Q, new_t, turn, D, step, e = room
     copy_pose(Q, t, new_Q, new_t)
@@ -96,7 +96,7 @@ def solve(
             )
         if has_prior:
             new += add_prior(new_Q, new_t, Q0, t0, information, D, e, new_g, new_H)
-        # A step of 1e-4 standard deviations changes the cost by less than rounding may.
+        # A step of 1e-4 standard deviations changes the cost by less than rounding errors.
         if k == 0 or new <= cost * (1 + 1e-12) or decrease < 1e-8:
             cost = new
             damping = 0.1 * damping if damping > 1e-5 else 0.0
@@ -107,7 +107,8 @@ def solve(
                     H[i, j] = new_H[i, j]
         else:
             damping = max(10 * damping, 1e-3)
-        # Damping shortens the step by about 1 + damping: a short step alone proves nothing.
+        # Damping shortens the step by about 1 + damping: a short step alone does not prove
+        # convergence.
         converged = k > 0 and decrease < tolerance * tolerance
         if converged or k == iterations:
             break
@@ -131,10 +132,10 @@ def solve(
 
 @inlined
 def room_to_solve() -> Any:
-    """Arrays to work in, of two that are allocated, as that takes its time.
+    """Return workspace from two allocations, because allocations are slow.
 
-    A gradient (6,), a Hessian (6, 6); an information (6, 6), a loss (6,) and a factor (6, 6) that
-    `solve` is given or leaves alone; what it needs besides.
+    A gradient (6,) and a Hessian (6, 6); an information (6, 6), a loss (6,) and a factor (6, 6),
+    inputs of `solve` or unused; and its further workspace.
     """
     large, small = np.empty((5, 6, 6)), np.empty((3, 3, 3))
     rows = large[4]
@@ -155,7 +156,7 @@ def copy_pose(Q0: Any, t0: Any, Q: Any, t: Any) -> None:
 
 @helper
 def take_linearization(room: Any, g: Any, H: Any) -> None:
-    """The gradient and the whole Hessian that `solve` left."""
+    """Copy the gradient and the whole Hessian that `solve` computed."""
     for i in range(6):
         g[i] = room[0][i]
         for j in range(i + 1):
@@ -164,7 +165,7 @@ def take_linearization(room: Any, g: Any, H: Any) -> None:
 
 @helper
 def mirror(H: Any) -> None:
-    """The upper half of a symmetric matrix from its lower one."""
+    """Copy the lower half of a symmetric matrix to its upper half."""
     for i in range(H.shape[0]):
         for j in range(i):
             H[j, i] = H[i, j]
@@ -178,7 +179,7 @@ def minimize(
     start_Q, start_t, Q0, t0, information, ranges, weights, anchors, tags, loss, offset,
     iterations, tolerance, Q, t, cost, g, H, converged,
 ):  # fmt: skip
-    """`solve` from a start; without a prior where its information is zero."""
+    """Run `solve` from a start; without a prior if its information is zero."""
     copy_pose(start_Q, start_t, Q, t)
     has_prior = False
     room = room_to_solve()

@@ -1,4 +1,4 @@
-"""Whether what a filter starts from is a pose and a covariance. Checked by `estimators.inputs`."""
+"""Checks of the initial pose and covariance of a filter, for `estimators.inputs`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from rbl_gym.kernels.linear_algebra import cholesky
 def is_sound(
     rotation: Any, covariance: Any, off_orthogonal: float, off_symmetric: float, sound: Any
 ) -> None:
-    """Whether a rotation is one, and a covariance symmetric and positive definite."""
+    """Return whether a rotation is valid, and a covariance symmetric and positive definite."""
     Q, good = rotation, True
     for i in range(3):
         for j in range(i + 1):
             product = Q[i, 0] * Q[j, 0] + Q[i, 1] * Q[j, 1] + Q[i, 2] * Q[j, 2]
-            # False of NaN too.
+            # Also false for NaN.
             good = good and abs(product - (1.0 if i == j else 0.0)) <= off_orthogonal
     x = Q[0, 1] * Q[1, 2] - Q[0, 2] * Q[1, 1]
     y = Q[0, 2] * Q[1, 0] - Q[0, 0] * Q[1, 2]

@@ -1,7 +1,7 @@
 """The cost of one body's ranges at a pose, its gradient and Gauss-Newton Hessian.
 
-The textbook form is `estimators/costs/range_cost.py`. Matrices are written below and on the
-diagonal only; a link of weight 0 was not measured, and its range may be anything.
+The textbook form is `estimators/costs/range_cost.py`. Matrices are written only on and below the
+diagonal. A link of weight 0 was not measured, and its range may have any value.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from rbl_gym.kernels.jit import helper, inlined
 
 @inlined
 def loss_of(squared: float, late: bool, loss: Any) -> tuple[float, float]:
-    """Cost of a squared whitened residual, and the share of its weight that is left.
+    """Return the cost of a squared whitened residual, and the remaining fraction of its weight.
 
-    `loss` is (threshold, cutoff, scale, power, late): Huber's up to a cutoff, or that of Geman
-    and McClure where the scale is finite, or the redescending one where the power is 2. A range
-    that is late, longer than expected, has a share of its own of all that.
+    `loss` is (threshold, cutoff, scale, power, late): Huber's loss up to a cutoff, or that of Geman
+    and McClure if the scale is finite, or the redescending one if the power is 2. A late range,
+    which is longer than expected, has its own fraction of all that.
     """
     threshold, cutoff, scale = loss[0], loss[1], loss[2]
     if scale < math.inf:
@@ -44,7 +44,7 @@ def loss_of(squared: float, late: bool, loss: Any) -> tuple[float, float]:
 
 @inlined
 def set_huber(loss: Any, threshold: float) -> None:
-    """Huber's loss into `loss`; half the square where the threshold is infinite."""
+    """Write Huber's loss to `loss`; half the square if the threshold is infinite."""
     loss[0] = threshold
     loss[1] = loss[2] = math.inf
     loss[3] = loss[4] = 1.0
@@ -52,7 +52,7 @@ def set_huber(loss: Any, threshold: float) -> None:
 
 @inlined
 def is_plain(loss: Any) -> bool:
-    """Whether a loss is half the square."""
+    """Return whether a loss is half the square."""
     return loss[0] == math.inf and loss[1] == math.inf and loss[2] == math.inf
 
 
@@ -60,10 +60,10 @@ def is_plain(loss: Any) -> bool:
 def linearize(
     Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, loss: Any, g: Any, H: Any
 ) -> float:
-    """The cost; the gradient (6,) and the Hessian (6, 6) by (w, v) into g and H.
+    """Return the cost; write gradient (6,) and Hessian (6, 6) by (w, v) to g and H.
 
-    With u the unit vectors from anchors to a tag, ``S = sum_m w u u^T`` is the information about
-    its place, ``f = sum_m w (d - r) u`` the force on it, and ``[[Q c]x; I]`` takes both to the
+    With unit vectors u from anchors to a tag, ``S = sum_m w u u^T`` is the information about its
+    position, and ``f = sum_m w (d - r) u`` the gradient there. ``[[Q c]x; I]`` maps both to the
     pose.
     """
     plain = is_plain(loss)
@@ -83,7 +83,7 @@ def linearize(
             if weight == 0.0:
                 continue
             ux, uy, uz = tx - anchors[m, 0], ty - anchors[m, 1], tz - anchors[m, 2]
-            # Where an anchor stands on a tag the difference is zero, and so are all the terms.
+            # If an anchor coincides with a tag the difference is zero, and so are all terms.
             square = max(ux * ux + uy * uy + uz * uz, 1e-200)
             distance = math.sqrt(square)
             residual = distance - ranges[m, n]
@@ -93,7 +93,7 @@ def linearize(
                 part, share = loss_of(weight * residual * residual, residual < 0, loss)
                 cost += part
                 weight *= share
-            # The weight of the difference, which is no unit vector: a root less to divide by.
+            # The weight of the difference, which is not a unit vector: one root less to divide by.
             weight /= square
             pull = weight * distance * residual
             fx += pull * ux
@@ -112,7 +112,7 @@ def linearize(
         g[3] += fx
         g[4] += fy
         g[5] += fz
-        # [p]x S, whose transposed is the block of translation by rotation.
+        # [p]x S, whose transpose is the block of translation by rotation.
         axx, axy, axz = y * szx - z * syx, y * szy - z * syy, y * szz - z * szy
         ayx, ayy, ayz = z * sxx - x * szx, z * syx - x * szy, z * szx - x * szz
         azx, azy, azz = x * syx - y * sxx, x * syy - y * syx, x * szy - y * szx
@@ -144,7 +144,7 @@ def linearize(
 def squared_residuals(
     Q: Any, t: Any, ranges: Any, weights: Any, anchors: Any, tags: Any, out: Any
 ) -> None:
-    """Squared whitened residuals (M, N), 0 where a link is missing."""
+    """Compute squared whitened residuals (M, N), 0 for missing links."""
     for n in range(tags.shape[0]):
         x = Q[0, 0] * tags[n, 0] + Q[0, 1] * tags[n, 1] + Q[0, 2] * tags[n, 2] + t[0]
         y = Q[1, 0] * tags[n, 0] + Q[1, 1] * tags[n, 1] + Q[1, 2] * tags[n, 2] + t[1]

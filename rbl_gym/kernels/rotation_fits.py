@@ -1,4 +1,4 @@
-"""Rotations nearest to a matrix: in Frobenius norm, and in a norm of its own (9 x 9).
+"""Rotations nearest to a matrix, in Frobenius norm and in a weighted norm (9 x 9).
 
 The textbook forms are `rbl_gym.geometry.rotations.nearest` and
 `procrustes` in `estimators/linear/least_squares.py`.
@@ -16,21 +16,21 @@ from rbl_gym.kernels.jit import gufunc, helper
 
 # Determinant at unit norm (at most 0.19) above which the polar iteration is exact to 1e-13.
 _WELL_CONDITIONED = 1e-3
-# After a step this short nothing is left to gain; Newton's own, undamped, square the error.
+# After a step this short nothing more is gained; undamped Newton steps square the error.
 _SHORT_STEP, _SHORT_NEWTON_STEP, _ITERATIONS = 1e-12, 1e-8, 30
-# A step past a quarter turn leaves the region that the quadratic model speaks of.
+# A step beyond a quarter turn leaves the region where the quadratic model is valid.
 _LONGEST_STEP = 1.5
 
 
 @gufunc("(d,d)->(d,d)")
 def nearest(matrix: Any, rotation: Any) -> None:
-    """The proper rotation nearest to a matrix in Frobenius norm; NaN stays NaN."""
+    """Compute the proper rotation nearest to a matrix in Frobenius norm; NaN stays NaN."""
     nearest_rotation(matrix, rotation)
 
 
 @helper
 def nearest_rotation(matrix: Any, Q: Any) -> None:
-    """`nearest`; Q is not the matrix."""
+    """Compute `nearest`; Q is not the same array as the matrix."""
     largest = total = norm = 0.0
     for i in range(3):
         for j in range(3):
@@ -56,7 +56,7 @@ def nearest_rotation(matrix: Any, Q: Any) -> None:
 
 @helper
 def _cofactor_row(Q: Any, i: int, j: int, k: int) -> tuple[float, float, float, float]:
-    """Row i of the cofactors, the cross product of rows j and k; and the determinant."""
+    """Compute row i of the cofactors, the cross product of rows j and k; return the determinant."""
     x = Q[j, 1] * Q[k, 2] - Q[j, 2] * Q[k, 1]
     y = Q[j, 2] * Q[k, 0] - Q[j, 0] * Q[k, 2]
     z = Q[j, 0] * Q[k, 1] - Q[j, 1] * Q[k, 0]
@@ -65,9 +65,9 @@ def _cofactor_row(Q: Any, i: int, j: int, k: int) -> tuple[float, float, float, 
 
 @helper
 def _polar(Q: Any) -> None:
-    """Orthogonal polar factor by Higham's iteration ``X <- (g X + X^-T / g) / 2``, in place.
+    """Compute the orthogonal polar factor by ``X <- (g X + X^-T / g) / 2`` (Higham), in place.
 
-    The scale g makes the first steps long, the last ones converge quadratically without it.
+    The scale g makes the first steps long. The last steps converge quadratically without it.
     """
     change = 1.0
     while change > 1e-8:
@@ -102,10 +102,10 @@ def _polar(Q: Any) -> None:
 
 @helper
 def _nearest_by_quaternion(Q: Any) -> None:
-    """The nearest rotation of any matrix, reflections and singular ones too, in place.
+    """Compute the nearest rotation of any matrix, also reflected or singular, in place.
 
-    The eigenvector of the largest eigenvalue of Horn's 4 x 4 matrix is its quaternion; Jacobi's
-    rotations find it.
+    Its quaternion is the eigenvector of the largest eigenvalue of Horn's 4 x 4 matrix, computed by
+    Jacobi rotations.
     """
     work = np.empty((2, 4, 4))
     K, V = work[0], work[1]
@@ -139,7 +139,7 @@ def _nearest_by_quaternion(Q: Any) -> None:
 
 @helper
 def _jacobi_rotation(K: Any, V: Any, p: int, q: int) -> None:
-    """Turn rows and columns p, q of K so that ``K[p, q]`` is zero, and the columns of V."""
+    """Rotate rows and columns p, q of K so that ``K[p, q]`` is zero, and the columns of V."""
     theta = 0.5 * (K[q, q] - K[p, p]) / K[p, q]
     t = 1 / (abs(theta) + math.sqrt(theta * theta + 1))
     if theta < 0:
@@ -159,7 +159,7 @@ def _jacobi_rotation(K: Any, V: Any, p: int, q: int) -> None:
 
 @gufunc("(p,p),(p),(d,d)->(d,d),()")
 def procrustes(weight: Any, target: Any, start: Any, rotation: Any, cost: Any) -> None:
-    """Rotation that minimises ``(vec Q - q)^T W (vec Q - q) / 2`` near a start, and that cost."""
+    """Find a rotation minimizing ``(vec Q - q)^T W (vec Q - q) / 2`` near a start; its cost."""
     for i in range(3):
         for j in range(3):
             rotation[i, j] = start[i, j]
@@ -168,9 +168,10 @@ def procrustes(weight: Any, target: Any, start: Any, rotation: Any, cost: Any) -
 
 @helper
 def fit_rotation(W: Any, target: Any, Q: Any) -> float:
-    """Newton's method on SO(3) from Q, in place; returns the cost of `procrustes`.
+    """Run Newton's method on SO(3) from Q, in place; return the cost of `procrustes`.
 
-    Exact Hessian, damped where it is not positive or the cost would rise; ``Q <- exp(w) Q``.
+    The Hessian is exact, and damped if it is not positive definite or the cost would increase. ``Q
+    <- exp(w) Q``.
     """
     work = np.empty((5, 9))
     pull, new_pull = work[0], work[1]
@@ -179,7 +180,7 @@ def fit_rotation(W: Any, target: Any, Q: Any) -> float:
     cost = _pull(W, target, Q, pull)
     damping = 0.0
     for _ in range(_ITERATIONS):
-        # Rows of T: what a turn about each axis makes of vec Q.
+        # Rows of T: the derivatives of vec Q by a rotation about each axis.
         g0 = g1 = g2 = 0.0
         c00 = c01 = c02 = c11 = c12 = c22 = 0.0
         for k in range(3):
@@ -191,7 +192,7 @@ def fit_rotation(W: Any, target: Any, Q: Any) -> float:
             g0 += y * c - z * b
             g1 += z * a - x * c
             g2 += x * b - y * a
-            # The curvature of vec Q along the turns, sym(q p^T) - (q^T p) I.
+            # The curvature of vec Q along the rotations, sym(q p^T) - (q^T p) I.
             c00 -= y * b + z * c
             c11 -= x * a + z * c
             c22 -= x * a + y * b
@@ -204,7 +205,7 @@ def fit_rotation(W: Any, target: Any, Q: Any) -> float:
         h01, h02, h12 = h01 + c01, h02 + c02, h12 + c12
         largest = max(abs(h00), abs(h01), abs(h02), abs(h11), abs(h12), abs(h22))
         lack = 1e-9 * scale - _smallest_eigenvalue(h00, h01, h02, h11, h12, h22)
-        # Of a weight that is rounding only, as of tags in one point, nothing else is certain.
+        # If the weight is only rounding errors, as for coincident tags, nothing else is certain.
         shift = 1.5 * max(0.0, lack) + damping * scale + 1e-15 * largest + 1e-300
         h00, h11, h22 = h00 + shift, h11 + shift, h22 + shift
         # The inverse by cofactors.
@@ -239,7 +240,7 @@ def fit_rotation(W: Any, target: Any, Q: Any) -> float:
 
 @helper
 def _pull(W: Any, target: Any, Q: Any, pull: Any) -> float:
-    """``W (vec Q - q)``; returns the cost."""
+    """Compute ``W (vec Q - q)``; return the cost."""
     cost = 0.0
     for i in range(9):
         total = 0.0
@@ -253,7 +254,7 @@ def _pull(W: Any, target: Any, Q: Any, pull: Any) -> float:
 
 @helper
 def _gauss(W: Any, T: Any) -> tuple[float, float, float, float, float, float]:
-    """Upper triangle of ``T W T^T``."""
+    """Compute the upper triangle of ``T W T^T``."""
     xx = xy = xz = yy = yz = zz = 0.0
     for i in range(9):
         a = b = c = 0.0
@@ -273,7 +274,7 @@ def _gauss(W: Any, T: Any) -> tuple[float, float, float, float, float, float]:
 
 @helper
 def _smallest_eigenvalue(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
-    """Of the symmetric matrix with rows (a, b, c), (b, d, e), (c, e, f), by its angle."""
+    """Return it for a symmetric matrix with rows (a, b, c), (b, d, e), (c, e, f), by angle."""
     mean = (a + d + f) / 3
     x, y, z = a - mean, d - mean, f - mean
     p = math.sqrt((x * x + y * y + z * z + 2 * (b * b + c * c + e * e)) / 6)

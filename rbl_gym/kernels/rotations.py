@@ -1,6 +1,6 @@
 """Rotations of one trial: exponential, logarithm, left Jacobian and its inverse.
 
-`rbl_gym.geometry.rotations` has the textbook forms, and the tests hold both to each other.
+`rbl_gym.geometry.rotations` has the textbook forms, and tests compare both.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from typing import Any
 
 from rbl_gym.kernels.jit import helper, inlined
 
-# Below this squared angle series take the place of the closed forms.
+# Below this squared angle series replace the closed forms.
 _SMALL = 0.25
 
 
 @helper
 def coefficients(s: float) -> tuple[float, float, float]:
-    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 of s = x^2."""
+    """Return sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 of s = x^2."""
     if s < _SMALL:
         a = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72 * (1 - s / 110 * (1 - s / 156)))))
         b = 1 - s / 12 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90 * (1 - s / 132 * (1 - s / 182)))))
@@ -29,7 +29,7 @@ def coefficients(s: float) -> tuple[float, float, float]:
 
 @inlined
 def series(x: float, y: float, z: float, a: float, b: float, diagonal: float, out: Any) -> None:
-    """``diagonal I + a [w]x + b w w^T`` of w = (x, y, z): the form of exp and its Jacobians."""
+    """Compute ``diagonal I + a [w]x + b w w^T``, w = (x, y, z): form of exp and its Jacobians."""
     xy, xz, yz = b * x * y, b * x * z, b * y * z
     out[0, 0] = diagonal + b * x * x
     out[1, 1] = diagonal + b * y * y
@@ -41,7 +41,7 @@ def series(x: float, y: float, z: float, a: float, b: float, diagonal: float, ou
 
 @inlined
 def compose(A: Any, B: Any, out: Any) -> None:
-    """``out = A B`` of 3 x 3 matrices; `out` is neither of them."""
+    """Compute ``out = A B`` of 3 x 3 matrices; `out` is neither of them."""
     for i in range(3):
         for j in range(3):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
@@ -49,7 +49,7 @@ def compose(A: Any, B: Any, out: Any) -> None:
 
 @inlined
 def exp(x: float, y: float, z: float, out: Any) -> None:
-    """The rotation matrix of the rotation vector (x, y, z)."""
+    """Compute the rotation matrix of the rotation vector (x, y, z)."""
     s = x * x + y * y + z * z
     a, b, _ = coefficients(s)
     series(x, y, z, a, b, 1 - b * s, out)
@@ -57,7 +57,7 @@ def exp(x: float, y: float, z: float, out: Any) -> None:
 
 @inlined
 def left_jacobian(x: float, y: float, z: float, out: Any) -> None:
-    """Left Jacobian of exp at (x, y, z)."""
+    """Compute the left Jacobian of exp at (x, y, z)."""
     s = x * x + y * y + z * z
     _, b, c = coefficients(s)
     series(x, y, z, b, c, 1 - c * s, out)
@@ -65,7 +65,7 @@ def left_jacobian(x: float, y: float, z: float, out: Any) -> None:
 
 @inlined
 def left_jacobian_inverse(x: float, y: float, z: float, out: Any) -> None:
-    """Inverse of the left Jacobian at (x, y, z), of length below 2 pi."""
+    """Compute the inverse of the left Jacobian at (x, y, z), of length below 2 pi."""
     s = x * x + y * y + z * z
     if s < _SMALL:
         c = 1 + s * (691 / 27300) * (1 + s * (35 / 1382) * (1 + s * (3617 / 142800)))
@@ -78,7 +78,7 @@ def left_jacobian_inverse(x: float, y: float, z: float, out: Any) -> None:
 
 @inlined
 def log(Q: Any) -> tuple[float, float, float]:
-    """The rotation vector of a rotation matrix, of length at most pi."""
+    """Compute the rotation vector of a rotation matrix, of length at most pi."""
     x, y, z = 0.5 * (Q[2, 1] - Q[1, 2]), 0.5 * (Q[0, 2] - Q[2, 0]), 0.5 * (Q[1, 0] - Q[0, 1])
     sine, cosine = math.sqrt(x * x + y * y + z * z), 0.5 * (Q[0, 0] + Q[1, 1] + Q[2, 2] - 1)
     if cosine > -0.9:
@@ -89,9 +89,9 @@ def log(Q: Any) -> tuple[float, float, float]:
 
 @helper
 def _log_of_half_turn(Q: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """`log` near pi, where the symmetric part carries the axis: by the unit quaternion.
+    """Compute `log` near pi, where the symmetric part determines the axis, by the quaternion.
 
-    (x, y, z) is the axis times the sine. A row of ``4 q q^T`` that is not small is q.
+    (x, y, z) is the axis times the sine. Any row of ``4 q q^T`` that is not small gives q.
     """
     if Q[0, 0] >= Q[1, 1] and Q[0, 0] >= Q[2, 2]:
         w = 2 * x

@@ -1,4 +1,4 @@
-"""What boxes and prisms leave of links; the textbook forms are `rbl_gym.geometry.obstacles`."""
+"""Information of links behind boxes and prisms; textbook forms in `rbl_gym.geometry.obstacles`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TOUCH_M, _LEAST_WAY_M, _VERTICAL_M = 1e-9, 1e-6, 1e-12
 
 @gufunc("(m,d),(p,d),(k,b)->(p,m)", "fffb")
 def in_sight(anchors: Any, points: Any, boxes: Any, free: Any) -> None:
-    """Whether no box of centres and half sizes stands between each point and each anchor."""
+    """Compute whether no box of centres and half sizes is between each point and each anchor."""
     for p in range(points.shape[0]):
         for m in range(anchors.shape[0]):
             free[p, m] = True
@@ -32,7 +32,7 @@ def in_sight(anchors: Any, points: Any, boxes: Any, free: Any) -> None:
 
 @inlined
 def _is_beside(boxes: Any, k: int, west: float, east: float, south: float, north: float) -> bool:
-    """Whether a segment between these limits passes beside a box for certain, as most do."""
+    """Return whether a segment between these limits certainly misses a box, as most do."""
     reach = boxes[k, 3] + _TOUCH_M
     if west > boxes[k, 0] + reach or east < boxes[k, 0] - reach:
         return True
@@ -42,7 +42,7 @@ def _is_beside(boxes: Any, k: int, west: float, east: float, south: float, north
 
 @helper
 def _blocks(box: Any, start: Any, end: Any) -> bool:
-    """Whether a segment runs inside a box; touching it is not enough."""
+    """Return whether a segment passes through the inside of a box; touching does not count."""
     enter, leave = 0.0, 1.0
     for i in range(3):
         along, away = end[i] - start[i], box[i] - start[i]
@@ -56,7 +56,7 @@ def _blocks(box: Any, start: Any, end: Any) -> bool:
 
 @gufunc("(d),(k,b),(q,v,e),(q,l)->()", "ffffb")
 def held_by(point: Any, boxes: Any, corners: Any, limits: Any, held: Any) -> None:
-    """Whether a box or a prism holds a point."""
+    """Compute whether a box or a prism contains a point."""
     x, y, z = point[0], point[1], point[2]
     held[0] = False
     for k in range(boxes.shape[0]):
@@ -90,11 +90,11 @@ def share_behind(
     members: Any,
     share: Any,
 ) -> None:
-    """What boxes and prisms leave of the information of each link, by the cells on its way."""
+    """Compute the information fraction of each link behind boxes and prisms, cell by cell."""
     n_boxes, n_corners = boxes.shape[0], corners.shape[1]
     crossings = np.empty((2, n_corners))
     stops = np.empty(2 * n_corners + 2)
-    # The last link that has asked each obstacle.
+    # The last link that was tested against each obstacle.
     asked = np.full(n_boxes + corners.shape[0], -1)
     left, bottom, side = cells[0], cells[1], cells[2]
     n_columns, n_rows = int(cells[3]), int(cells[4])
@@ -108,7 +108,7 @@ def share_behind(
             for column in range(first, last + 1):
                 enter, leave = 0.0, 1.0
                 if first < last:
-                    # Where the link is in this column.
+                    # The part of the link in this column.
                     near, far = (
                         (left + column * side - ax) / dx,
                         (left + (column + 1) * side - ax) / dx,
@@ -146,15 +146,15 @@ def share_behind(
 
 @inlined
 def _cell_of(place: float, origin: float, side: float, count: int) -> int:
-    """Which row or column of cells a coordinate lies in."""
+    """Return the row or column of cells that contains a coordinate."""
     cell = int(min(max((place - origin) / side, 0.0), count - 0.5))
-    # What is no number is somewhere.
+    # NaN gets some cell.
     return min(max(cell, 0), count - 1)
 
 
 @inlined
 def _is_past(limits: Any, q: int, start: Any, end: Any, dx: float, dy: float) -> bool:
-    """Whether a segment passes beside the bounding box of a prism for certain."""
+    """Return whether a segment certainly misses the bounding box of a prism."""
     ax, bx, ay, by = start[0], end[0], start[1], end[1]
     if min(ax, bx) >= limits[q, 1] or max(ax, bx) <= limits[q, 0]:
         return True
@@ -162,7 +162,7 @@ def _is_past(limits: Any, q: int, start: Any, end: Any, dx: float, dy: float) ->
         return True
     if min(start[2], end[2]) >= limits[q, 5] or max(start[2], end[2]) <= limits[q, 4]:
         return True
-    # Or has all of it on one side of its line in the plan.
+    # Or all of it is on one side of the segment's line in plan.
     off = dx * (limits[q, 2] + limits[q, 3] - 2.0 * ay)
     off -= dy * (limits[q, 0] + limits[q, 1] - 2.0 * ax)
     half = abs(dx) * (limits[q, 3] - limits[q, 2]) + abs(dy) * (limits[q, 1] - limits[q, 0])
@@ -173,7 +173,7 @@ def _is_past(limits: Any, q: int, start: Any, end: Any, dx: float, dy: float) ->
 def _meets(
     start: Any, end: Any, corners: Any, limits: Any, q: int, crossings: Any, stops: Any
 ) -> bool:
-    """Whether a segment runs inside a prism; the last two are overwritten."""
+    """Return whether a segment passes through a prism; the last two arguments are overwritten."""
     dx, dy, dz = end[0] - start[0], end[1] - start[1], end[2] - start[2]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     enter, leave = 0.0, 1.0
@@ -192,7 +192,7 @@ def _meets(
         for side in range(2):
             at = crossings[side, i]
             if enter < at < leave:
-                # Into its place among those before.
+                # Insert it in order.
                 k = n_stops
                 while k > 0 and stops[k - 1] > at:
                     stops[k] = stops[k - 1]
@@ -211,9 +211,9 @@ def _meets(
 def _crossings(
     start: Any, dx: float, dy: float, corners: Any, q: int, left: Any, right: Any
 ) -> int:
-    """Where a line in the plan crosses the edges, moved by nothing to its left and to its right.
+    """Find where a line in plan crosses the edges, moved slightly to its left and to its right.
 
-    Infinity where one of the two does not; how many there are to look at.
+    Infinity if only one of the two crosses. Returns how many crossings there are.
     """
     ax, ay, reach = start[0], start[1], math.sqrt(dx * dx + dy * dy)
     last = corners.shape[1] - 1
@@ -243,7 +243,7 @@ def _crossings(
 
 @inlined
 def _is_odd(crossings: Any, place: float, count: int) -> bool:
-    """Whether an odd number of the crossings lies before a place."""
+    """Return whether an odd number of the crossings lies before a position."""
     odd = False
     for i in range(count):
         if crossings[i] < place:
@@ -253,7 +253,7 @@ def _is_odd(crossings: Any, place: float, count: int) -> bool:
 
 @helper
 def _holds(polygon: Any, px: float, py: float, margin: float) -> bool:
-    """Whether a point in the plan lies inside of a polygon, and not within a margin of its edge."""
+    """Return whether a point in plan lies inside a polygon, and not within a margin of its edge."""
     odd = False
     last = polygon.shape[0] - 1
     ax, ay = polygon[last, 0] - px, polygon[last, 1] - py

@@ -1,4 +1,4 @@
-"""What the policies of the learning tasks see. Textbook forms: `wrappers/views.py`."""
+"""Observations of the learning tasks. The textbook forms are in `wrappers/views.py`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rbl_gym.kernels.jit import gufunc, helper
 
 @helper
 def belief_view(rotation: Any, covariance: Any, prior_variance: Any, out: Any) -> None:
-    """Log standard deviations over the prior's, and two columns of the rotation, into (12,)."""
+    """Write log standard deviations minus the prior's, and two columns of Q, to (12,)."""
     for i in range(6):
         out[i] = 0.5 * math.log(max(covariance[i, i], 1e-24) / prior_variance[i]) + 1.0
     for i in range(3):
@@ -19,7 +19,7 @@ def belief_view(rotation: Any, covariance: Any, prior_variance: Any, out: Any) -
 
 @helper
 def cut(out: Any, limit: float) -> None:
-    """Entries within +-limit."""
+    """Cut entries to +-limit."""
     for i in range(out.shape[0]):
         out[i] = min(max(out[i], -limit), limit)
 
@@ -29,11 +29,11 @@ def mobile_anchors(
     translation: Any, rotation: Any, covariance: Any, twist: Any, anchors: Any,
     prior_variance: Any, speed: float, sort: bool, limits: Any, order: Any, out: Any,
 ) -> None:  # fmt: skip
-    """The order of the craft by bearing, and the view in that order."""
+    """Compute the order of the craft by bearing, and the view in that order."""
     m = anchors.shape[0]
     for i in range(m):
         order[i] = i
-        # An insertion sort, by the bearings that stand in `out` for the time.
+        # An insertion sort by the bearings, which are temporarily stored in `out`.
         out[i] = math.atan2(anchors[i, 1] - translation[1], anchors[i, 0] - translation[0])
         j = i
         while sort and j > 0 and out[order[j - 1]] > out[i]:
@@ -57,7 +57,7 @@ def anchor_selection(
     translation: Any, rotation: Any, covariance: Any, twist: Any, prior_variance: Any,
     speed: float, centre: Any, half: Any, limits: Any, out: Any,
 ) -> None:  # fmt: skip
-    """The view: place, velocity, belief."""
+    """Compute the view: position, velocity, belief."""
     for i in range(3):
         out[i] = (translation[i] - centre[i]) / half[i]
         out[3 + i] = twist[3 + i] / speed

@@ -1,4 +1,4 @@
-"""The walls and the ceiling of a room; the textbook forms are `rbl_gym.geometry.regions`."""
+"""Walls and ceiling of a room; the textbook forms are in `rbl_gym.geometry.regions`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from typing import Any
 
 from rbl_gym.kernels.jit import gufunc, helper
 
-# A direction this short points nowhere.
+# A direction this short is undefined.
 _NOWHERE = 1e-3
 
 
 @helper
 def _cut(value: float, low: float, high: float) -> float:
-    """The value within limits; NaN stays."""
+    """Return the value within limits; NaN stays NaN."""
     if value < low:
         return low
     return high if value > high else value
@@ -20,7 +20,7 @@ def _cut(value: float, low: float, high: float) -> float:
 
 @helper
 def _project(point: Any, low: Any, high: Any, legal: Any) -> None:
-    """The nearest point of the four walls and the ceiling."""
+    """Compute the nearest point of the four walls and the ceiling."""
     away = 0.0
     for i in range(3):
         legal[i] = _cut(point[i], low[i], high[i])
@@ -39,13 +39,13 @@ def _project(point: Any, low: Any, high: Any, legal: Any) -> None:
 
 @gufunc("(d),(d),(d)->(d)")
 def project(point: Any, low: Any, high: Any, legal: Any) -> None:
-    """The nearest legal point."""
+    """Compute the nearest legal point."""
     _project(point, low, high, legal)
 
 
 @gufunc("(d),(d),(d)->(d)")
 def place(action: Any, low: Any, high: Any, legal: Any) -> None:
-    """Where the ray from the middle of the room along an action meets a wall or the ceiling."""
+    """Compute where the ray from the room's centre along an action meets a wall or the ceiling."""
     reach = _cut(action[2], -1.0, 1.0)
     for i in range(2):
         reach = max(reach, abs(_cut(action[i], -1.0, 1.0)))
