@@ -58,7 +58,7 @@ def test_selection_actions_are_legal_and_follow_the_generator(arguments, name):
         elif isinstance(env.single_action_space, gym.spaces.Discrete):
             scores = AnchorSelectionVectorEnv(4, k=2)
             scores.reset(seed=1)
-            if not env.seen["links"].any():
+            if env.seen is not None and not env.seen["links"].any():
                 chosen = scores._choice(controller(scores, np.random.default_rng(7)))
                 np.testing.assert_array_equal(env._choice(actions), chosen)
         else:
@@ -257,6 +257,7 @@ def test_craft_of_each_world_go_where_they_would_alone(name):
     for rows, situation in situations(env):
         m = situation.scene.n_anchors
         assert {env.world.scenes[row] for row in rows} == {situation.scene}
+        assert env.seen is not None
         for row in rows:
             found[row] = m
             alone = MobileAnchorsVectorEnv(1, scene=situation.scene)

@@ -82,7 +82,7 @@ def test_a_memory_in_torch_is_that_in_numpy():
     torch.manual_seed(0)
     layer, rng = torch.nn.LSTM(5, 4), np.random.default_rng(0)
     reads, recalls, *biases = (one.detach().numpy().astype(float) for one in layer.parameters())
-    lstm = Lstm(reads, recalls, sum(biases))
+    lstm = Lstm(reads, recalls, np.sum(biases, axis=0))
     seen = rng.standard_normal((6, 3, 5))
     wanted = layer(torch.as_tensor(seen, dtype=torch.float32))[0].detach().numpy()
     state = np.zeros((3, 4)), np.zeros((3, 4))

@@ -13,7 +13,7 @@ from rbl_gym import bounds
 from rbl_gym.checks import FloatArray
 from rbl_gym.motion.kinematics import propagate
 from rbl_gym.wrappers.selection import AnchorSelectionVectorEnv
-from rbl_gym.wrappers.situations import Controller, in_each_scene
+from rbl_gym.wrappers.situations import Controller, Situation, in_each_scene
 from rbl_gym.wrappers.tasks import MobileAnchorsVectorEnv
 
 __all__ = [
@@ -183,7 +183,7 @@ def greedy_with_map(env: AnchorSelectionVectorEnv, rng: np.random.Generator) -> 
     return greedy(env, env.scene.obstruction.share(env.anchors, translation[:, None])[:, 0])
 
 
-def greedy(env: AnchorSelectionVectorEnv, quality: FloatArray) -> np.ndarray:
+def greedy(env: AnchorSelectionVectorEnv | Situation, quality: FloatArray) -> np.ndarray:
     """Return actions that choose greedily, with links weighted by `quality` (B, M)."""
     scene, tags = env.scene, np.asarray(env.scene.tags)
     rows = np.arange(env.num_envs)

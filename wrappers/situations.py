@@ -25,8 +25,8 @@ class Situation(NamedTuple):
     anchors: FloatArray
     order: np.ndarray | None
     mode: str | None
-    k: int | None
-    price: float | None
+    k: Any
+    price: Any
 
 
 def situations(env: Any) -> Iterator[tuple[np.ndarray, Situation]]:
@@ -35,7 +35,7 @@ def situations(env: Any) -> Iterator[tuple[np.ndarray, Situation]]:
     A scalar environment is one row.
     """
     one = env.anchors.ndim == 2
-    fields = [*env.belief, env.twist, env.anchors, getattr(env, "order", None)]
+    fields: list[Any] = [*env.belief, env.twist, env.anchors, getattr(env, "order", None)]
     if one:
         fields = [None if field is None else field[None] for field in fields]
     *belief, twist, anchors, order = fields

@@ -69,9 +69,12 @@ def _mask(env: Any) -> np.ndarray:
 
 def craft_seen(env: Any) -> craft_tokens.CraftTokens:
     """What each craft of an environment sees now, arrays (B, M, ...); of a scalar one B is 1."""
-    told = _batched(env, *env.belief[:3], env.twist, env.anchors)
-    reach = np.broadcast_to(views.reach_of_craft(env.world), len(told[0]))
-    return craft_tokens.craft_tokens(*told, _mask(env), reach, env.world.dt)
+    rotation, translation, covariance = _batched(env, *env.belief[:3])
+    twist, craft = _batched(env, env.twist, env.anchors)
+    reach = np.broadcast_to(views.reach_of_craft(env.world), len(craft))
+    return craft_tokens.craft_tokens(
+        rotation, translation, covariance, twist, craft, _mask(env), reach, env.world.dt
+    )
 
 
 def craft_actions(env: Any, seen: craft_tokens.CraftTokens, own: np.ndarray) -> np.ndarray:

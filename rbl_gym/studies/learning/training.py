@@ -273,7 +273,7 @@ def _policy(model: Any, meta: dict[str, Any]) -> Policy:
     lstm, memory = getattr(model.policy, "lstm_actor", None), None
     if lstm is not None:
         reads, recalls, *both = (array(one) for one in lstm.parameters())
-        memory = Lstm(reads, recalls, sum(both))
+        memory = Lstm(reads, recalls, np.sum(both, axis=0))
     return Policy(
         tuple(weights),
         tuple(biases),
