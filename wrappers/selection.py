@@ -180,16 +180,20 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
     the range. The policy does not observe the racks and has to learn where they are.
 
     ## Action space
-    ``mode="top-k"``: ``Box(-1, 1, (12,))``, scores; the anchors with the `k` highest are chosen.
-    ``"priced"``: ``MultiBinary(12)``, any number of anchors, each for the `price`. ``"subset"``:
-    ``Discrete(220)``, one of the subsets of `k` anchors, in lexical order. In the last two modes
-    `action_masks()` returns which actions choose only existing anchors. Other anchors in an action
-    are ignored.
+    * ``mode="top-k"``: ``Box(-1, 1, (12,))``, scores; the anchors with the `k` highest are chosen.
+    * ``mode="priced"``: ``MultiBinary(12)``, any number of anchors, each for the `price`.
+    * ``mode="subset"``: ``Discrete(220)``, one of the subsets of `k` anchors, in lexical order.
+
+    In the last two modes `action_masks()` returns which actions choose only existing anchors. Other
+    anchors in an action are ignored.
 
     ## Observation space
-    ``Box(-10, 10, (18,), float32)``: estimated position (scaled to the hall's volume), commanded
-    velocity (divided by the speed), log of the pose error's standard deviations divided by those of
-    the prior (6), first two columns of the estimated rotation (6).
+    ``Box(-10, 10, (18,), float32)``, in this order:
+
+    * estimated position, scaled to the hall's volume (3);
+    * commanded velocity divided by the speed (3);
+    * log of the pose error's standard deviations divided by those of the prior (6);
+    * first two columns of the estimated rotation (6).
 
     ## Reward
     ``-log b`` of the belief after every step, or another `reward`. ``mode="priced"``: minus `price`
@@ -218,11 +222,13 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
 
     `scenes`, instead of `scene`: a family of scenes, see `RBL/Tracking-v0`. M is then the largest
     number of anchors. Anchors that a drawn scene does not have cannot be chosen. The observation
-    has 21 + 6 M entries: first those above, with the position scaled to the volume of the drawn
-    scene; then the half sizes of that volume (3) and the anchors relative to the estimate (3 M),
-    both divided by the extent of the largest scene; then for each anchor (M each) the result of its
-    last choice (1: in sight, -1: not in sight, 0: never chosen), ``exp(-steps since then / 10)``,
-    and 1 if the anchor exists.
+    has 21 + 6 M entries:
+
+    * those above, with the position scaled to the volume of the drawn scene (18);
+    * half sizes of that volume (3) and the anchors relative to the estimate (3 M), both divided by
+      the extent of the largest scene;
+    * for each anchor the result of its last choice (1: in sight, -1: not in sight, 0: never
+      chosen), ``exp(-steps since then / 10)``, and 1 if the anchor exists (M each).
 
     `filter`, `options`, `reward`: as `EstimatePose`. By default ``"iekf"`` has 2 iterations.
     `observation`: ``"flat"`` is the above. The others are those of `EstimatePose`, with the memory

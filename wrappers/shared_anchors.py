@@ -213,12 +213,13 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
     As `RBL/Tracking-v0`.
 
     ## Observation space
-    ``observation="dict"``: that of `EstimatePose`, with a leading axis of K bodies for `ranges`,
-    `links`, `twist`, `quality`, `belief_rotation`, `belief_translation` and `belief_covariance`.
-    Also `tags` (K, N, 3), metres, body frame, and `tag_mask` (K, N), 1 for the tags of a body.
-    `anchors` (M, 3) are shared. ``"flat"``: the concatenated flat observations of the bodies,
-    float32. ``"tokens"`` and custom functions: as `EstimatePose`, with a leading axis of K bodies;
-    vectors are concatenated.
+    * ``observation="dict"``: that of `EstimatePose`, with a leading axis of K bodies for `ranges`,
+      `links`, `twist`, `quality`, `belief_rotation`, `belief_translation` and `belief_covariance`.
+      Also `tags` (K, N, 3), metres, body frame, and `tag_mask` (K, N), 1 for the tags of a body.
+      `anchors` (M, 3) are shared.
+    * ``"flat"``: the concatenated flat observations of the bodies, float32.
+    * ``"tokens"`` and custom functions: as `EstimatePose`, with a leading axis of K bodies; vectors
+      are concatenated.
 
     ## Reward
     Each body has the `reward` of `EstimatePose`. ``combine="mean"``, ``"worst"`` or ``"sum"``
@@ -250,9 +251,11 @@ class SharedAnchorsEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[repo
         combine="worst",
     )
     ```
-    `scene`: a name or a dict of overrides. `bodies`: overrides of the scene for each body. They
-    must agree in everything that concerns anchors and time. `filter`, `options`, `reward`: as
-    `EstimatePose`.
+
+    * `scene`: a name or a dict of overrides.
+    * `bodies`: overrides of the scene for each body. They must agree in everything that concerns
+      anchors and time.
+    * `filter`, `options`, `reward`: as `EstimatePose`.
 
     ## Version history
     * v0: first version.

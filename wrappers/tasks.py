@@ -150,11 +150,17 @@ class MobileAnchorsEnv(_MobileAnchors, TaskEnv):
     are cut to length 1), in the order of the observation.
 
     ## Observation space
-    ``Box(-10, 10, (15 + 3 M,), float32)``: estimated depth (in 50 m), commanded horizontal velocity
-    (divided by the speed), log of the pose error's standard deviations divided by those of the
-    prior (6), first two columns of the estimated rotation (6), craft relative to the estimate (in
-    100 m), log of their distances (in 100 m). Craft are sorted by bearing from the estimate;
-    ``sort_craft=False`` keeps the order of their numbers.
+    ``Box(-10, 10, (15 + 3 M,), float32)``, in this order:
+
+    * estimated depth in 50 m (1);
+    * commanded horizontal velocity divided by the speed (2);
+    * log of the pose error's standard deviations divided by those of the prior (6);
+    * first two columns of the estimated rotation (6);
+    * horizontal positions of the craft relative to the estimate, in 100 m (2 M);
+    * log of their distances in 100 m (M).
+
+    Craft are sorted by bearing from the estimate; ``sort_craft=False`` keeps the order of their
+    numbers.
 
     ## Reward
     ``-log b`` of the belief after every step (`rbl_gym.bounds.score`), or another `reward`.

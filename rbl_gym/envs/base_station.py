@@ -285,14 +285,18 @@ class BaseStationEnv(ScalarEnv):
     env = gym.make("rbl_gym:RBL/BaseStation-v0", angle_std_rad=0.01)
     env = gym.make("rbl_gym:RBL/BaseStation-v0", scene={"steps": 50, "anchor_speed_m_s": 0})
     ```
-    The wrapper `EstimatePose` runs the iterated EKF on the angles. `scene`: overrides of the
-    default world (`WORLD`), see `rbl_gym.worlds.scenes.get`. Its range noise is not used.
-    `angle_std_rad`: standard deviation of an angle. `reward`: ``"bound"`` or ``"none"``. `scenes`,
-    instead of `scene`: such overrides with laws, or a list of them
-    (`rbl_gym.worlds.families.SceneFamily`). Every reset draws a world, for example
-    ``scenes={"speed_m_s": {"uniform": [1, 4]}}``. All bodies must have the same number of tags. The
-    observation then also has `tags` (N, 3), metres, body frame. `info["scene"]` of the reset has
-    the drawn overrides as JSON.
+
+    * `scene`: overrides of the default world (`WORLD`), see `rbl_gym.worlds.scenes.get`. Its range
+      noise is not used.
+    * `scenes`, instead of `scene`: such overrides with laws, or a list of them
+      (`rbl_gym.worlds.families.SceneFamily`). Every reset draws a world, for example
+      ``scenes={"speed_m_s": {"uniform": [1, 4]}}``. All bodies must have the same number of tags.
+      The observation then also has `tags` (N, 3), metres, body frame. `info["scene"]` of the reset
+      has the drawn overrides as JSON.
+    * `angle_std_rad`: standard deviation of an angle.
+    * `reward`: ``"bound"`` or ``"none"``.
+
+    The wrapper `EstimatePose` runs the iterated EKF on the angles.
 
     ## Version history
     * v0: first version.

@@ -216,9 +216,14 @@ class PlanarNetworkEnv(ScalarEnv):
     (forward, left) of node 0, then of node 1, and so on. Nodes stay in the square.
 
     ## Observation space
-    ``Dict``: `bearings` (n, n) float64 in [-pi, pi], entry (i, j) is the bearing of node j in the
-    frame of node i, 0 without a link. `links` (n, n) int8 is 1 where i and j see each other. With
-    the argument `lengths` also `lengths` (n, n) float64, symmetric, metres, 0 without a length.
+    A ``Dict``:
+
+    | key | shape | type | meaning |
+    |---|---|---|---|
+    | `bearings` | (n, n) | float64 | (i, j): bearing of node j in the frame of node i, in [-pi, pi], 0 without a link |
+    | `links` | (n, n) | int8 | (i, j): 1 if i and j see each other |
+    | `lengths` | (n, n) | float64 | metres, symmetric, 0 without a length. Only with the argument `lengths` |
+
     ``lengths="one"`` gives the exact length of one link, the longest of node 0. ``lengths="all"``
     gives those of all links, with their own noise. Bearings and a length determine the scale, and
     with it the positions.
@@ -254,15 +259,20 @@ class PlanarNetworkEnv(ScalarEnv):
 
     env = gym.make("rbl_gym:RBL/PlanarNetwork-v0", n_nodes=20, radius_m=3.0)
     ```
-    `n_nodes`: number of nodes. `side_m`: side of the square. `radius_m`, `blind_m`: sensing radius
-    and blind zone. `bearing_std_rad`: standard deviation of a bearing. `lengths`: ``"none"``,
-    ``"one"`` or ``"all"``; with ``"all"``, `length_std_m` is their standard deviation. `step_m`:
-    longest displacement along an axis. `reward`: ``"bound"`` or ``"none"``. `steps`: length of an
-    episode.
+
+    * `n_nodes`: number of nodes.
+    * `side_m`: side of the square.
+    * `radius_m`, `blind_m`: sensing radius and blind zone.
+    * `bearing_std_rad`: standard deviation of a bearing.
+    * `lengths`: ``"none"``, ``"one"`` or ``"all"``; `length_std_m`: standard deviation of a length
+      with ``"all"``.
+    * `step_m`: longest displacement along an axis.
+    * `reward`: ``"bound"`` or ``"none"``.
+    * `steps`: length of an episode.
 
     ## Version history
     * v0: first version.
-    """
+    """  # noqa: E501 (a table row cannot be broken)
 
     batch_class = PlanarNetworkVectorEnv
 

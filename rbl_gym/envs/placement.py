@@ -228,20 +228,26 @@ class AnchorPlacementEnv(ScalarEnv):
     poses in the region (`rbl_gym.placement.score`).
 
     ## Action space
-    ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal surfaces
-    (`Region.place`). ``mode="one-shot"``: ``Box(-1, 1, (3 M,))``, all anchors at once.
-    ``mode="mounts"`` (rooms only): ``Discrete(57)``, one of the mount points of
-    `rbl_gym.placement.mounts`. A mount that is already taken gets a second anchor.
+    * ``mode="sequential"``: ``Box(-1, 1, (3,))``, the next anchor, projected onto the legal
+      surfaces (`Region.place`).
+    * ``mode="one-shot"``: ``Box(-1, 1, (3 M,))``, all anchors at once.
+    * ``mode="mounts"`` (rooms only): ``Discrete(57)``, one of the mount points of
+      `rbl_gym.placement.mounts`. A mount that is already taken gets a second anchor.
 
     ## Observation space
-    ``Box(-1, 1, (n,), float32)``, in this order: centre and size of the region, scaled to the
-    volume (6); position and half size of each rack, scaled to the room (6 each); sequential: the
-    actions so far (3 M); with ``sight=True`` and in mounts: the fraction of the poses that each
-    mount of `rbl_gym.placement.mounts` sees (57); mounts: whether each mount is taken (57); except
-    in one-shot: the one-hot number of the next anchor (M). If the legal space and the volume have
-    the same centre, problems are observed mirrored in x and y, so that the region lies towards +x
-    and +y. Racks are then in the order of x, and actions are mirrored back. ``mirror=False`` turns
-    this off.
+    ``Box(-1, 1, (n,), float32)``, in this order:
+
+    * centre and size of the region, scaled to the volume (6);
+    * position and half size of each rack, scaled to the room (6 each);
+    * ``"sequential"``: the actions so far (3 M);
+    * ``"mounts"``, or ``sight=True``: the fraction of the poses that each mount of
+      `rbl_gym.placement.mounts` sees (57);
+    * ``"mounts"``: whether each mount is taken (57);
+    * except in ``"one-shot"``: the one-hot number of the next anchor (M).
+
+    If the legal space and the volume have the same centre, problems are observed mirrored in x and
+    y, so that the region lies towards +x and +y. Racks are then in the order of x, and actions are
+    mirrored back. ``mirror=False`` turns this off.
 
     ## Reward
     ``-log score`` with the last anchor, 0 before. ``mode="mounts"``: the decrease of the log score

@@ -226,12 +226,17 @@ class PlacementFamilyEnv(ScalarEnv):
     numbers of anchors and boxes in the family. `scenes` is as in `TaskFamily`.
 
     ## Observation space
-    ``Box(-1, 1, (n,), float32)``, in order: the region's centre and size, scaled to the volume of
-    the drawn scene (6); for each of the scene's own obstacles and the racks its position and half
-    size, scaled to the scene, and a 1; zeros for unused rows (7 K); a description of the world (18,
-    see `rbl_gym.placement.families.described`); 1 for every anchor of this world (M). The rest is
-    as in `AnchorPlacementEnv`: actions so far (3 M), sight and taken mounts (57 each), one-hot
-    number of the next anchor (M). ``mode="mounts"`` and `sight` need rooms in all scenes.
+    ``Box(-1, 1, (n,), float32)``, in this order:
+
+    * centre and size of the region, scaled to the volume of the drawn scene (6);
+    * for each of the scene's own obstacles and the racks its position and half size, scaled to the
+      scene, and a 1; zeros for unused rows (7 K);
+    * a description of the world (18), see `rbl_gym.placement.families.described`;
+    * 1 for every anchor of this world (M);
+    * the rest as in `AnchorPlacementEnv`: actions so far (3 M), sight and taken mounts (57 each),
+      one-hot number of the next anchor (M).
+
+    ``mode="mounts"`` and `sight` need rooms in all scenes.
 
     ## Episode end
     Terminates with the last anchor of the drawn world.

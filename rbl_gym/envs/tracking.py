@@ -48,16 +48,12 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
 
     | key | shape | type | meaning |
     |---|---|---|---|
-    | `ranges` | (M, N) | float64 | metres, 0 without a link; with `links.offset` in the scene of
-    either sign |
+    | `ranges` | (M, N) | float64 | metres, 0 without a link; with `links.offset` in the scene of either sign |
     | `links` | (M, N) | int8 | 1 where a range was measured |
     | `anchors` | (M, 3) | float64 | positions of the anchors at this epoch, metres |
     | `twist` | (6,) | float64 | known angular velocity (world frame, rad/s) and velocity (m/s) of the interval that ends at this epoch |
-    | `quality` | (M,) | float64 | fraction of the nominal information of an anchor's links: 1 in
-    line of sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
-    | `inertial` | (S, 6) | float64 | S samples of the inertial sensor in that interval, body frame:
-    angular velocity (rad/s) and specific force (m/s^2); zeros at epoch 0. Only in scenes with an
-    inertial sensor |
+    | `quality` | (M,) | float64 | fraction of the nominal information of an anchor's links: 1 in line of sight, `scene.blocked_information` behind an obstacle. Only in scenes with obstacles |
+    | `inertial` | (S, 6) | float64 | S samples of the inertial sensor in that interval, body frame: angular velocity (rad/s) and specific force (m/s^2); zeros at epoch 0. Only in scenes with an inertial sensor |
 
     ## Reward
     ``reward="bound"``: ``-log b``, where b is the posterior Cramer-Rao bound of the root mean
@@ -95,14 +91,20 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         reward="none",
     )
     ```
-    ``scene={"links": {"offset": "tag"}}``: all ranges of a tag share an unknown offset (time
-    differences), see `rbl_gym.measurements.offsets`. ``scene={"survey_std_m": 0.05}``: observed
-    anchor positions are surveyed, with errors of standard deviation 5 cm on every axis.
-    `info["anchors"]` has the true positions. The bound then accounts for the known accuracy of the
-    survey. `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
-    `rbl_gym.worlds.scenes.get`. `reward`: ``"bound"`` or ``"none"``.
 
-    `scenes`, instead of `scene`: a family of scenes. Every reset draws one of them, see
+    * `scene`: a name of `rbl_gym.worlds.scenes.SCENES` or a dict of overrides, see
+      `rbl_gym.worlds.scenes.get`.
+    * `reward`: ``"bound"`` or ``"none"``.
+    * `scenes`, instead of `scene`: a family of scenes, see below.
+
+    With ``scene={"links": {"offset": "tag"}}`` all ranges of a tag share an unknown offset (time
+    differences), see `rbl_gym.measurements.offsets`.
+
+    With ``scene={"survey_std_m": 0.05}`` the observed anchor positions are surveyed, with errors of
+    standard deviation 5 cm on every axis. `info["anchors"]` has the true positions. The bound then
+    accounts for the known accuracy of the survey.
+
+    With `scenes` every reset draws a scene from a family, see
     `rbl_gym.worlds.families.SceneFamily`:
     ```python
     env = gym.make(
@@ -117,14 +119,16 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
         ],
     )
     ```
+
     M and N are then the largest numbers of anchors and tags in the family. Rows beyond those of the
     drawn scene are zeros, and their links 0. The observation has three more keys: `anchor_mask`
     (M,) and `tag_mask` (N,), int8, 1 for existing anchors and tags; `tags` (N, 3), metres, body
-    frame. It has `quality` if any scene has obstacles. `info["scene"]` of the reset has the drawn
-    overrides as JSON. `env.unwrapped.scene` is the scene of the episode. Actions move only existing
-    anchors. If no scene of the family has movable anchors, the action space is ``Discrete(1)``.
-    Families support no inertial sensor and no `links.offset`. With `survey_std_m` they support only
-    ``reward="none"``.
+    frame. It has `quality` if any scene has obstacles.
+
+    `info["scene"]` of the reset has the drawn overrides as JSON. `env.unwrapped.scene` is the scene
+    of the episode. Actions move only existing anchors. If no scene of the family has movable
+    anchors, the action space is ``Discrete(1)``. Families support no inertial sensor and no
+    `links.offset`. With `survey_std_m` they support only ``reward="none"``.
 
     ## Version history
     * v0: first version.
