@@ -1,6 +1,6 @@
 """rbl-gym: localization of rigid bodies by radio, as Gymnasium environments and estimators.
 
-Importing it registers the environments' ids and nothing heavy.
+Importing it registers the ids of the environments and loads no large modules.
 """
 
 import sys
@@ -16,7 +16,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 
 
 class _Folders:
-    """Finds the two packages that in a checkout stand beside this one, and nothing else."""
+    """Find the two packages that are next to this one in a checkout."""
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
@@ -29,13 +29,13 @@ class _Folders:
         )
 
 
-# Never in site-packages, where both stand inside. First, before the finder of an editable install,
-# which may be of another checkout.
+# Not in site-packages, where both are inside this package. First in the list, before the finder of
+# an editable install, which may belong to another checkout.
 if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "estimators").is_dir():
     sys.meta_path.insert(0, _Folders)
 
 
-# Modules that stood at the top before they moved into packages: `from rbl_gym import scenes` works.
+# Modules that were moved from the top level into packages: `from rbl_gym import scenes` works.
 _MOVED = {
     "bearing": "measurements",
     "g2o": "networks",

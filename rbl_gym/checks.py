@@ -1,8 +1,8 @@
-"""Checks of arguments: in comes a finite float64 array of the right shape, or an error goes out.
+"""Check arguments: convert them to finite float64 arrays of the right shape, or raise.
 
 Every error names the argument, the shape it should have, the shape it has, and the first
-offending value with its index. Public functions check at the door: those that hot paths call get
-it from `checked`, and whoever has checked already takes the `kernel` behind it.
+offending value with its index. Public functions check their arguments. Those called on hot paths
+use the decorator `checked`; callers with checked arguments use the `kernel` without checks.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-# float64 throughout; numpy's own stubs promise no more than this of most functions.
+# float64 throughout; the stubs of NumPy guarantee no more than this for most functions.
 FloatArray = NDArray[np.floating[Any]]
 BoolArray = NDArray[np.bool_]
-# One number for all three of the world's axes, or one for each.
+# One number for all three world axes, or one for each.
 Axes = float | tuple[float, float, float]
-# No length, time or rate is as large; its powers still are finite numbers.
+# Upper limit of lengths, times and rates; its powers are still finite.
 HUGE = 1e50
-# Up to so many numbers BLAS sums in one thread.
+# Up to this size BLAS sums in one thread.
 _ONE_THREAD = 10_000
 _FLOAT64 = np.dtype(np.float64)
 
@@ -34,7 +34,7 @@ R = TypeVar("R")
 def checked(
     **shapes: tuple[int | str, ...],
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A decorator: `check_array` of these arguments, by their names, before the function runs.
+    """Return a decorator that applies `check_array` to the named arguments.
 
     An argument whose default is None may be None.
     """
@@ -65,7 +65,7 @@ def checked(
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
-    """The function behind the door of `checked`, for callers whose arguments are checked."""
+    """Return the function inside `checked`, for callers with checked arguments."""
     return function.kernel  # pyright: ignore[reportFunctionMemberAccess]
 
 
@@ -75,9 +75,9 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
     Parameters
     ----------
     name
-        The argument's name, for the message.
+        Name of the argument, for the message.
     value
-        What came.
+        The value to check.
     shape
         Trailing axes: an int is an exact size, a string a free one of at least 1
         (``("M", 3)`` accepts ``(..., M, 3)``). Leading axes are free, but not empty.
@@ -85,8 +85,8 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
     Raises
     ------
     ValueError
-        If `value` is not numeric, has other trailing axes, is empty, or holds NaN, inf, or
-        what is as large as `HUGE`.
+        If `value` is not numeric, has other trailing axes, is empty, or holds NaN, inf, or a
+        magnitude of `HUGE` or more.
     """
     if (
         type(value) is np.ndarray
@@ -99,7 +99,7 @@ def check_array(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
 
 
 def check_shape(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> FloatArray:
-    """`check_array` without the look at the values."""
+    """Check as `check_array` does, except for the values."""
     array = value if type(value) is np.ndarray else as_float(name, value)
     if array.dtype is not _FLOAT64:
         array = as_float(name, array)
@@ -115,7 +115,7 @@ def check_shape(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Fl
 
 
 def as_float(name: str, value: Any) -> FloatArray:
-    """`value` as a float64 array, or a ValueError that names it."""
+    """Return `value` as a float64 array, or raise ValueError with its name."""
     try:
         array = np.asarray(value)
         if array.dtype.kind not in "fiub":
@@ -126,7 +126,7 @@ def as_float(name: str, value: Any) -> FloatArray:
 
 
 def as_array(name: str, value: Any) -> NDArray[Any]:
-    """An array of anything, or a ValueError that names it: ragged lists are none."""
+    """Return an array of any type, or raise ValueError with its name for ragged lists."""
     try:
         return np.asarray(value)
     except ValueError as error:
@@ -134,9 +134,9 @@ def as_array(name: str, value: Any) -> NDArray[Any]:
 
 
 def check_finite(name: str, array: FloatArray) -> FloatArray:
-    """`array` unchanged, or a ValueError with the first entry that is NaN, inf or `HUGE`."""
-    # The sum of squares of most arrays says it all, in one look; false of NaN too. Of larger ones
-    # BLAS would share out the sum to threads, whose start takes longer.
+    """Return `array` unchanged, or raise ValueError with the first NaN, inf or `HUGE` entry."""
+    # The sum of squares suffices for most arrays, in one pass; False for NaN too. For larger ones
+    # BLAS would split the sum over threads, whose start takes longer.
     if array.size <= _ONE_THREAD and np.vdot(array, array) < HUGE:
         return array
     if not (array.min(initial=0.0) > -HUGE and array.max(initial=0.0) < HUGE):
@@ -151,26 +151,26 @@ def check_finite(name: str, array: FloatArray) -> FloatArray:
 
 
 def all_finite(figures: Any) -> bool:
-    """Whether figures (...), an array or a single number of NumPy's, are all finite; quick."""
+    """Return whether all values of an array or NumPy scalar are finite, quickly."""
     if figures.ndim == 0:
         return math.isfinite(figures)
-    # Mostly one product tells; it may overflow.
+    # One product usually suffices; it may overflow.
     if figures.size <= _ONE_THREAD and math.isfinite(np.vdot(figures, figures)):
         return True
     return bool(np.isfinite(figures).all())
 
 
 def are_finite(array: FloatArray, trailing: int) -> BoolArray:
-    """Whether all of the last `trailing` axes are finite, (...) of the axes before them."""
+    """Return whether all entries of the last `trailing` axes are finite, (...)."""
     return np.asarray(np.isfinite(array).all(axis=tuple(range(-trailing, 0))))
 
 
 def check_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """`value` as a finite float in ``[low, high]``, or a ValueError that names it."""
+    """Return `value` as a finite float in ``[low, high]``, or raise ValueError with its name."""
     if type(value) is float and low <= value <= high and -HUGE < value < HUGE:
         return value
     try:
-        # Whether an array of one number is a number, NumPy's versions do not agree.
+        # NumPy versions differ in whether an array of one number is a number.
         if isinstance(value, (str, bytes)) or getattr(value, "ndim", 0):
             raise TypeError(type(value))
         number = float(value)
@@ -183,26 +183,26 @@ def check_number(name: str, value: Any, *, low: float = -math.inf, high: float =
 
 
 def check_axes(name: str, value: ArrayLike, leading: bool = False) -> Any:
-    """A standard deviation, or one for each of the world's axes; or a ValueError.
+    """Return a standard deviation, or one for each world axis; or raise ValueError.
 
-    `leading`: whether it may be (..., 3), of each trial its own.
+    `leading`: whether it may be (..., 3), with individual values for trials.
     """
     array = check_array(name, value, ())
     if array.shape not in ((), (3,)) and not (leading and array.ndim > 1 and array.shape[-1] == 3):
         raise ValueError(f"{name} must be one number or three, got shape {array.shape}")
     if (array < 0).any():
         raise ValueError(f"{name} must not be negative, got {array.tolist()!s:.80}")
-    # Lists come out of JSON; tuples keep the configuration hashable.
+    # JSON gives lists; tuples keep the configuration hashable.
     return as_tuples(array)
 
 
 def as_tuples(value: FloatArray) -> Any:
-    """An array as nested tuples of floats: configuration that hashes and compares."""
+    """Return an array as nested tuples of floats, which can be hashed and compared."""
     return tuple(as_tuples(row) for row in value) if value.ndim else float(value)
 
 
 def check_duration(name: str, value: ArrayLike) -> Any:
-    """Seconds that are not negative, a float or an array (...) of trials; or a ValueError."""
+    """Return nonnegative seconds, a float or an array (...) of trials; or raise ValueError."""
     if type(value) is float or not (getattr(value, "ndim", 0) or isinstance(value, list | tuple)):
         return check_number(name, value, low=0.0)
     array = check_array(name, value, ())
@@ -212,7 +212,7 @@ def check_duration(name: str, value: ArrayLike) -> Any:
 
 
 def check_count(name: str, value: Any, *, least: int = 1, most: int | None = None) -> int:
-    """`value` as an int from `least` to `most`, or a ValueError that names it."""
+    """Return `value` as an int from `least` to `most`, or raise ValueError with its name."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not whole or value < least or (most is not None and value > most):
         wanted = "a positive int" if least == 1 else f"an int of at least {least}"
@@ -223,19 +223,19 @@ def check_count(name: str, value: Any, *, least: int = 1, most: int | None = Non
 
 
 def check_generator(name: str, rng: Any) -> np.random.Generator:
-    """`rng` if it is a source of random numbers, or a ValueError that names it."""
+    """Return `rng` if it is a random generator, or raise ValueError with its name."""
     if not isinstance(rng, np.random.Generator):
         raise ValueError(f"{name} must be a numpy.random.Generator, got {rng!r:.80}")
     return rng
 
 
 def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | None:
-    """`links` as a boolean mask that broadcasts against ranges of `shape`; None stays None.
+    """Return `links` as a boolean mask that broadcasts against ranges of `shape`; None for None.
 
     Raises
     ------
     ValueError
-        If the mask holds anything but 0 and 1, or does not end in the ranges' (M, N).
+        If the mask holds other values than 0 and 1, or does not end in the (M, N) of the ranges.
     """
     if links is None:
         return None
@@ -256,7 +256,7 @@ def check_links(links: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray | 
 
 
 def check_one_of(name: str, value: str, choices: tuple[str, ...] | list[str]) -> str:
-    """`value` if it is among `choices`, or a ValueError that lists them."""
+    """Return `value` if it is among `choices`, or raise ValueError that lists them."""
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(map(repr, choices))}, got {value!r}")
     return value

@@ -1,4 +1,7 @@
-"""How good a belief is: pose errors, consistency, the papers' error measures; batched."""
+"""Measure the quality of beliefs: pose errors, consistency, error measures of the papers.
+
+Batched.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ __all__ = [
     "pose_error", "tag_error",
 ]  # fmt: skip
 
-# Behind the doors: what comes to these was checked.
+# Internal functions without checks: their arguments were checked.
 _ERROR, _ANGLE_BETWEEN = kernel(rotations.error), kernel(rotations.angle_between)
 
 
@@ -28,7 +31,7 @@ def pose_error(
     rotation: FloatArray,
     translation: FloatArray,
 ) -> FloatArray:
-    """Error (..., 6) = (w, v): ``Q_hat = exp(w) Q`` in radians, ``t_hat = t + v`` in metres.
+    """Return the error (..., 6), (w, v): ``Q_hat = exp(w) Q``, radians, ``t_hat = t + v``, metres.
 
     Parameters
     ----------
@@ -50,7 +53,7 @@ def tag_error(
     translation: FloatArray,
     tags: FloatArray,
 ) -> FloatArray:
-    """Root mean square (...) over the tags of their displacement, metres.
+    """Return the root mean square (...) of the tag displacements, metres.
 
     Parameters
     ----------
@@ -68,13 +71,16 @@ def tag_error(
 
 @checked(vector=("n",))
 def length(vector: FloatArray) -> FloatArray:
-    """Euclidean length (...) of vectors (..., n)."""
+    """Return the Euclidean length (...) of vectors (..., n)."""
     return np.sqrt(np.einsum("...i,...i->...", vector, vector))
 
 
 @checked(error=("n",), covariance=("n", "n"))
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Normalised estimation error squared (...), ``e^T P^-1 e``; mean 6 for a consistent pose."""
+    """Return the normalised estimation error squared (...), ``e^T P^-1 e``.
+
+    Mean 6 if consistent.
+    """
     if covariance.shape[-2:] != (error.shape[-1],) * 2:
         raise ValueError(
             f"covariance must fit error of {error.shape[-1]} entries, got {covariance.shape}"
@@ -88,10 +94,10 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 @checked(matrix=(3, 3), rotation=(3, 3))
 def mean_angular_error(matrix: FloatArray, rotation: FloatArray) -> FloatArray:
-    """Mean angle (...) in radians between the columns of an estimate and of the rotation.
+    """Return the mean angle (...), radians, between the columns of an estimate and the rotation.
 
-    The static paper's measure; by atan2, so small angles are not lost, and the estimate need
-    not be orthogonal.
+    This is the measure of the static paper. It is computed by atan2, so that small angles are
+    accurate. The estimate need not be orthogonal.
     """
     columns = np.swapaxes(np.asarray(matrix), -1, -2), np.swapaxes(np.asarray(rotation), -1, -2)
     return _ANGLE_BETWEEN(*columns).mean(axis=-1)
@@ -99,10 +105,10 @@ def mean_angular_error(matrix: FloatArray, rotation: FloatArray) -> FloatArray:
 
 @checked(covariance=(6, 6), rotation=(3, 3))
 def expected_mean_angular_error(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
-    """The mean angular error (...) in radians of a Gaussian error of this pose covariance.
+    """Return the mean angular error (...), radians, of a Gaussian error of this pose covariance.
 
-    A column moves in the plane across it by a zero-mean Gaussian with eigenvalues l1 >= l2:
-    its mean length is ``sqrt(2 l1 / pi) E(1 - l2 / l1)``, E the complete elliptic integral of
+    A column moves in the plane perpendicular to it by a zero-mean Gaussian with eigenvalues l1 >=
+    l2. Its mean length is ``sqrt(2 l1 / pi) E(1 - l2 / l1)``, E the complete elliptic integral of
     the second kind (parameter m).
     """
     body = np.swapaxes(rotation, -1, -2) @ covariance[..., :3, :3] @ rotation
@@ -118,7 +124,7 @@ def expected_mean_angular_error(covariance: FloatArray, rotation: FloatArray) ->
 
 
 class Figures(NamedTuple):
-    """How good beliefs are, arrays (...).
+    """Quality figures of beliefs, arrays (...).
 
     Attributes
     ----------
@@ -129,7 +135,7 @@ class Figures(NamedTuple):
     nees
         `nees` of the pose error, 6 degrees of freedom.
     score_m
-        `bounds.score` of the belief's covariance.
+        `bounds.score` of the covariance of the belief.
     """
 
     rotation_error_rad: FloatArray
@@ -147,7 +153,7 @@ def judge(
     translation: FloatArray,
     tags: FloatArray,
 ) -> Figures:
-    """Errors of beliefs against true poses, their NEES and their score, all at once.
+    """Return the errors of beliefs relative to true poses, their NEES and their score.
 
     Parameters
     ----------
@@ -164,7 +170,7 @@ def judge(
     figures = Figures(
         *_judge(rotation_hat, translation_hat, covariance, rotation, translation, tags)
     )
-    # A NaN or inf of any of them is one here.
+    # A NaN or inf in any of them is one here.
     total = figures.nees + figures.score_m + figures.tag_error_m
     if not all_finite(total):
         wrong = covariance if np.isfinite(figures.tag_error_m).all() else translation_hat
@@ -184,7 +190,7 @@ def _judge(
     translation: FloatArray,
     tags: FloatArray,
 ) -> tuple[FloatArray, ...]:
-    """`judge`; NaN for the NEES of a covariance that is not positive definite."""
+    """Compute `judge`; the NEES is NaN if a covariance is not positive definite."""
     truth = rotation, translation
     error = kernel(pose_error)(rotation_hat, translation_hat, *truth)
     good = np.asarray(np.isfinite(covariance).all(axis=(-2, -1)))

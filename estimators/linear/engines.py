@@ -1,6 +1,6 @@
-"""The linear algebra of a Kalman filter with 12 states: batched, or by filterpy for one body.
+"""Linear algebra of a Kalman filter with 12 states: batched, or with filterpy for one body.
 
-A test holds both to each other on the same trials.
+A test compares both on the same trials.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rbl_gym.estimators.linear.squared_range import (
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 
-# Behind the door: what comes to it was checked.
+# Internal functions without checks: their arguments were checked.
 _EXP = kernel(rotations.exp)
 _EYE = np.eye(12)
 # The angular velocity of a twist.
@@ -31,14 +31,14 @@ _TURN = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 
 
 class Motion(NamedTuple):
-    """What a step of time does: ``Q <- exp(w dt) Q + noise``, ``t <- t + v dt + noise``.
+    """The motion over a time step: ``Q <- exp(w dt) Q + noise``, ``t <- t + v dt + noise``.
 
     Attributes
     ----------
     twist, dt
         Known twist (w, v) (..., 6), and seconds.
     rate
-        Variances (12,) that are added in 1 s, one for all entries of Q.
+        Variances (12,) added in 1 s, the same for all entries of Q.
     """
 
     twist: FloatArray
@@ -47,15 +47,15 @@ class Motion(NamedTuple):
 
 
 class LinearEpoch(NamedTuple):
-    """One epoch, checked: what the linear update reads.
+    """One checked epoch, the input of the linear update.
 
     Attributes
     ----------
     ranges, anchors, tags
-        (..., M, N), 0 where there is no link, (..., M, 3) and (N, 3); metres.
+        (..., M, N), 0 without a link, (..., M, 3) and (N, 3); metres.
     weights
-        Inverse variances of the squared ranges [1/m^4], 0 where there is no link: (..., M, 1)
-        where all tags share them, else (..., M, N).
+        Inverse variances of the squared ranges [1/m^4], 0 without a link: (..., M, 1) if all tags
+        share them, else (..., M, N).
     """
 
     ranges: FloatArray
@@ -64,16 +64,16 @@ class LinearEpoch(NamedTuple):
     weights: FloatArray
 
     def statistic(self) -> Statistic:
-        """G and b of `squared_range`."""
+        """Return the statistic G, b of `squared_range`."""
         return statistic(*self)
 
 
 class Batched:
-    """Any leading axes, by broadcasting: a covariance (12, 12) belongs to all trials."""
+    """Engine for any leading axes, by broadcasting: one covariance (12, 12) serves all trials."""
 
     @staticmethod
     def predict(mean: FloatArray, P: FloatArray, motion: Motion) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance after ``x <- F x + [0; v dt]``, ``P <- F P F^T + Q``."""
+        """Return mean and covariance after ``x <- F x + [0; v dt]``, ``P <- F P F^T + Q``."""
         twist, dt, rate = motion
         return predict_mean(mean, twist, dt), predict_covariance(P, twist, dt, rate)
 
@@ -81,14 +81,14 @@ class Batched:
     def update(
         mean: FloatArray, P: FloatArray, epoch: LinearEpoch
     ) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance after an epoch."""
+        """Return mean and covariance after an epoch."""
         P = update_covariance(P, *epoch[1:])
         return update_mean(mean, P, *epoch), P
 
 
 @compiled("linear_filter:predict_mean")
 def predict_mean(mean: FloatArray, twist: FloatArray, dt: float) -> FloatArray:
-    """``F x + [0; v dt]`` (..., 12), ``F = blkdiag(R, R, R, I)``, ``R = exp(w dt)``."""
+    """Return ``F x + [0; v dt]`` (..., 12), ``F = blkdiag(R, R, R, I)``, ``R = exp(w dt)``."""
     mean = (transition(_EXP(twist[..., :3] * dt)) @ mean[..., None])[..., 0]
     mean[..., 9:] += twist[..., 3:] * dt
     return mean
@@ -96,7 +96,7 @@ def predict_mean(mean: FloatArray, twist: FloatArray, dt: float) -> FloatArray:
 
 @compiled("linear_filter:predict_covariance")
 def predict_covariance(P: FloatArray, twist: FloatArray, dt: float, rate: FloatArray) -> FloatArray:
-    """``F P F^T + dt diag(rate)`` (..., 12, 12), F as of `predict_mean`."""
+    """Return ``F P F^T + dt diag(rate)`` (..., 12, 12), F as in `predict_mean`."""
     F = transition(_EXP(twist[..., :3] * dt))
     return symmetric(F @ P @ np.swapaxes(F, -1, -2)) + dt * rate[..., None] * _EYE
 
@@ -105,7 +105,7 @@ def predict_covariance(P: FloatArray, twist: FloatArray, dt: float, rate: FloatA
 def update_covariance(
     P: FloatArray, anchors: FloatArray, tags: FloatArray, weights: FloatArray
 ) -> FloatArray:
-    """Covariance (..., 12, 12) after an epoch, ``(I + P G)^-1 P``: exact for vague priors.
+    """Return the covariance (..., 12, 12) after an epoch, ``(I + P G)^-1 P``: exact if P is large.
 
     It depends on the weights, not on the ranges.
     """
@@ -123,14 +123,14 @@ def update_mean(
     tags: FloatArray,
     weights: FloatArray,
 ) -> FloatArray:
-    """Mean (..., 12) after an epoch, ``x + P (y - G x)``, with the covariance P after it."""
+    """Return the mean (..., 12) after an epoch, ``x + P (y - G x)``, P being the new covariance."""
     matrix, vector = information(statistic(ranges, anchors, tags, weights))
     innovation = vector[..., None] - matrix @ mean[..., None]
     return mean + (P @ innovation)[..., 0]
 
 
 def transition(step: FloatArray) -> FloatArray:
-    """F (..., 12, 12) of a rotation: ``blkdiag(step, step, step, I)``."""
+    """Return F (..., 12, 12) of a rotation: ``blkdiag(step, step, step, I)``."""
     F = np.empty((*step.shape[:-2], 12, 12))
     F[...] = _EYE
     for k in (0, 3, 6):
@@ -146,30 +146,30 @@ def compress(
     weights: FloatArray,
     like: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """`squared_range.compressed` of an epoch: z (..., 12) and H (..., 12, 12), by any factor.
+    """Return z (..., 12), H (..., 12, 12) as `squared_range.compressed`, with any factor H.
 
-    `like` (12,) only tells a kernel how large the results are.
+    `like` (12,) only gives a kernel the size of the results.
     """
     return compressed(statistic(ranges, anchors, tags, weights))
 
 
 @compiled("linear_filter:inverse")
 def inverse12(matrix: FloatArray) -> FloatArray:
-    """Inverse of symmetric positive definite matrices (..., 12, 12)."""
+    """Return the inverse of symmetric positive definite matrices (..., 12, 12)."""
     return inverse(matrix)
 
 
 class FilterPy:
-    """filterpy's KalmanFilter on the compressed measurement; one body."""
+    """Engine with filterpy's KalmanFilter on the compressed measurement, for one body."""
 
     @classmethod
     def predict(
         cls, mean: FloatArray, P: FloatArray, motion: Motion
     ) -> tuple[FloatArray, FloatArray]:
-        """As `Batched.predict`."""
+        """See `Batched.predict`."""
         kf = cls._filter(mean, P)
         twist, dt, rate = motion
-        # F is what a turn alone does to the unit vectors.
+        # F is the effect of the rotation alone on the unit vectors.
         turn = twist * _TURN
         kf.F, kf.Q = predict_mean(_EYE, turn, dt).T, np.diag(dt * rate)
         kf.predict(u=twist[3:, None] * dt)
@@ -179,7 +179,7 @@ class FilterPy:
     def update(
         cls, mean: FloatArray, P: FloatArray, epoch: LinearEpoch
     ) -> tuple[FloatArray, FloatArray]:
-        """As `Batched.update`, by filterpy's own gain and Joseph form."""
+        """See `Batched.update`; filterpy computes the gain and the Joseph form."""
         kf = cls._filter(mean, P)
         z, H = compress(*epoch, mean)
         # A one-dimensional z would silently broadcast the state to a matrix.
@@ -190,7 +190,7 @@ class FilterPy:
     def _filter(mean: FloatArray, P: FloatArray) -> Any:
         ready = _kalman_filter()
         kf = object.__new__(type(ready))
-        # It never writes into its arrays: a shallow copy shares those that stay the same.
+        # It never writes into its arrays, so a shallow copy can share the unchanged ones.
         kf.__dict__.update(ready.__dict__)
         kf.x, kf.P = mean[:, None].copy(), P.copy()
         return kf
@@ -209,14 +209,14 @@ ENGINES = ("auto", "batched", "filterpy")
 
 
 def engine_for(name: str, **arrays: tuple[int, ...]) -> type[Batched] | type[FilterPy]:
-    """The engine of a step, from its name and the leading axes of all that comes in.
+    """Return the engine of a step, from its name and the leading axes of all arguments.
 
-    ``"auto"``: filterpy where nothing has leading axes, batched otherwise.
+    ``"auto"``: filterpy if no argument has leading axes, batched otherwise.
 
     Raises
     ------
     ValueError
-        For filterpy, where an argument has leading axes.
+        For filterpy, if an argument has leading axes.
     """
     if name == "batched":
         return Batched
@@ -234,11 +234,11 @@ def engine_for(name: str, **arrays: tuple[int, ...]) -> type[Batched] | type[Fil
 
 @functools.cache
 def _kalman_filter() -> Any:
-    """A KalmanFilter to copy: making one takes as long as two steps of it."""
-    from filterpy.kalman import KalmanFilter  # slow to import, and not always needed
+    """Return a KalmanFilter to copy, since creating one takes as long as two steps."""
+    from filterpy.kalman import KalmanFilter  # slow to import, and often not needed
 
     kf = KalmanFilter(dim_x=12, dim_z=12, dim_u=3)
     kf.inv = inverse12  # pyright: ignore[reportAttributeAccessIssue]
-    # Without B filterpy ignores u in silence.
+    # Without B, filterpy silently ignores u.
     kf.B = np.vstack([np.zeros((9, 3)), np.eye(3)])  # pyright: ignore[reportAttributeAccessIssue]
     return kf

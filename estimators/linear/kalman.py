@@ -60,7 +60,7 @@ from rbl_gym.measurements.noise_laws import law_of, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
-# How large the parts of a belief are, to kernels.
+# Sizes of the parts of a belief, for kernels.
 _SIZES = np.zeros(3), np.zeros(6)
 
 
@@ -72,10 +72,10 @@ class KalmanState(NamedTuple):
     mean
         (..., 12), ``[vec Q; t]``, columns of Q first.
     covariance
-        (..., 12, 12). It has fewer leading axes than the mean where it is the same for all
-        trials: a prior given once, as long as anchors, weights, links and twists are common.
+        (..., 12, 12). It has fewer leading axes than the mean if it is the same for all
+        trials: for one common prior, as long as anchors, weights, links and twists are common.
     constrained
-        (...), whether the last update put the rotation back onto SO(3).
+        (...), whether the last update projected the rotation onto SO(3).
     """
 
     mean: FloatArray
@@ -92,28 +92,28 @@ class KalmanFamily:
     tags
         (N, 3), metres, body frame, as given (centred tags decouple rotation and translation).
     noise
-        Law of the ranges; weights come from the measured ranges.
+        Noise law of the ranges; weights are computed from the measured ranges.
     process
-        Noise of the motion.
+        Process noise.
     constraint
         ``"none"`` KF, (17)-(22); ``"newton"`` UC-KF, (23)-(27): the rotation of the weighted
-        problem (26), then the translation (27); ``"threshold"`` ET-KF: projection (28) where
+        problem (26), then the translation (27); ``"threshold"`` ET-KF: projection (28) if
         ``|Q^T Q - I|_F > threshold``; ``"always"`` KF-ortho, Section V: projection after every
         update. The projection is fed back.
     sigma_q_scale
-        Process noise of an entry of Q over that of the rotation; 1 as printed, sqrt(2/3) is
-        consistent.
+        Ratio of the process noise of an entry of Q to that of the rotation; 1 as printed,
+        sqrt(2/3) is consistent.
     threshold
-        Of the event-triggered filter.
+        Threshold of the event-triggered filter.
     coupled
-        UC-KF only: solve the coupled problem (23) in place of (26)-(27). It is what is solved
-        anyway where the tags' weights differ (lost links, per-link noise).
+        UC-KF only: solve the coupled problem (23) instead of (26)-(27). This is always done if
+        the weights of the tags differ (lost links, per-link noise).
     weights
         Fixed inverse variances of the squared ranges [1/m^4], (M,) or (M, N); None: from the
         measured ranges.
     engine
-        ``"auto"``: filterpy for one body, where no array has leading axes, batched otherwise.
-        ``"batched"`` or ``"filterpy"``: that one always.
+        ``"auto"``: filterpy for one body, if no array has leading axes, batched otherwise.
+        ``"batched"`` or ``"filterpy"``: always this one.
     """
 
     tags: FloatArray
@@ -141,14 +141,14 @@ class KalmanFamily:
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
     ) -> KalmanState:
-        """State of a prior; covariance (..., 6, 6) of the pose or (..., 12, 12) of the state.
+        """Return the state of a prior; covariance (..., 6, 6) of pose or (..., 12, 12) of state.
 
         A pose covariance becomes ``blkdiag(2/3 tr(P_w) I9, P_v)``: isotropic and of full rank.
 
         Raises
         ------
         ValueError
-            On wrong shapes, a matrix that is no rotation, a covariance that is not positive.
+            If a shape is wrong, a matrix is not a rotation, or a covariance is not positive.
         """
         rotation, translation, covariance = check_prior(rotation, translation, covariance, (6, 12))
         if covariance.shape[-1] == 6:
@@ -161,7 +161,7 @@ class KalmanFamily:
         return KalmanState(mean, covariance.copy(), np.zeros(batch, bool))
 
     def predict(self, state: KalmanState, twist: ArrayLike, dt: float) -> KalmanState:
-        """State after `dt` seconds of the twist (..., 6): eqs (10)-(15), Omega carrying dt."""
+        """Return the state after `dt` seconds of the twist (..., 6): (10)-(15), Omega with dt."""
         state = plain(state)
         twist = check_array("twist", twist, (6,))
         dt = check_number("dt", dt, low=0.0)
@@ -178,16 +178,16 @@ class KalmanFamily:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> KalmanState:
-        """State after one epoch of ranges (..., M, N); `noise` is its law, None: the filter's.
+        """Return the state after an epoch of ranges (..., M, N); `noise` None: that of the filter.
 
-        Weights that the filter was given count more than any law.
+        Fixed weights of the filter take precedence over any law.
 
         Raises
         ------
         ValueError
-            On wrong shapes, NaN, ranges that are not positive, and where anchors and tags
-            cannot determine the 12 states and the state is too vague to stand in (the
-            message names the rank).
+            If a shape is wrong, a value is NaN, a range is not positive, or anchors and tags do
+            not determine the 12 states and the covariance of the state is too large to
+            compensate (the message gives the rank).
         """
         found = self._update_plain(state, ranges, anchors, links, noise)
         if found is not None:
@@ -224,9 +224,9 @@ class KalmanFamily:
     def _update_plain(
         self, state: KalmanState, ranges: ArrayLike, anchors: ArrayLike, links: Any, noise: Any
     ) -> KalmanState | None:
-        """The KF's update by an epoch with nothing special about it, in one call.
+        """Return the KF update with a plain epoch in one call; None for other epochs.
 
-        None where there is: then the long way says what, or does it.
+        Other epochs need the general code, which also raises the errors.
         """
         batch = state.mean.shape[:-1]
         if (
@@ -250,10 +250,10 @@ class KalmanFamily:
         return KalmanState(mean, covariance, np.zeros(batch, bool))
 
     def belief(self, state: KalmanState) -> PoseBelief:
-        """Pose, its covariance, and the raw matrix (copies).
+        """Return the pose, its covariance, and the raw matrix (copies).
 
-        The covariance is that of the projected output, ``J^+ P J^+T``; of UC-KF, whose mean
-        is constrained already, ``(J^T P^-1 J)^-1``.
+        The covariance is that of the projected output, ``J^+ P J^+T``. For UC-KF, whose mean is
+        already constrained, it is ``(J^T P^-1 J)^-1``.
         """
         state = plain(state)
         form = constrained_belief if self.constraint == "newton" else projected_belief
@@ -264,7 +264,7 @@ class KalmanFamily:
 
     @cached_property
     def _variance_rate(self) -> FloatArray:
-        """Process noise (12,) of the state after 1 s."""
+        """Return the process noise (12,) of the state after 1 s."""
         std = self.process.std()
         sigma_q = self.sigma_q_scale * np.sqrt(np.mean(std[:3] ** 2))
         return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
@@ -285,7 +285,7 @@ class KalmanFamily:
 
 @compiled("linear_filter:is_vague")
 def _is_vague(P: FloatArray, anchors: FloatArray, vague_entry: float) -> BoolArray:
-    """Whether a covariance says nothing (...): of an entry of Q, or beyond the anchors' extent."""
+    """Return whether a covariance is uninformative (...) on an entry of Q, or on the position."""
     variance = np.diagonal(P, axis1=-2, axis2=-1)
     extent = np.ptp(anchors, axis=-2).max(axis=-1)
     vague = variance[..., :9].max(axis=-1) > vague_entry
@@ -302,9 +302,9 @@ def _update(
     tags: FloatArray,
     vague_entry: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance after an epoch without lost links, by the numbers of its law.
+    """Return mean and covariance after an epoch without lost links, from the law's numbers.
 
-    NaN where a range is not positive or the prior says nothing (`_is_vague`).
+    NaN if a range is not positive or the prior is uninformative (`_is_vague`).
     """
     weights = 1 / law_of(law).squared_range_variance(ranges)
     new_P = update_covariance.textbook(P, anchors, tags, weights)
@@ -315,7 +315,7 @@ def _update(
     return np.where(sound[..., None], new_mean, np.nan), new_P
 
 
-# --- constraints: what happens to the rotation after the linear update --------------------
+# --- constraints on the rotation after the linear update --------------------
 
 
 def _no_constraint(
@@ -349,9 +349,9 @@ def _above_threshold(
 def _newton(
     family: KalmanFamily, prior: KalmanState, posterior: KalmanState, epoch: LinearEpoch
 ) -> KalmanState:
-    """UC-KF: (26)-(27) where all tags share their weights, the coupled problem (23) elsewhere.
+    """Solve UC-KF: (26)-(27) if all tags share their weights, else the coupled problem (23).
 
-    The covariance stays that of the linear update, (22) as printed: an overestimate.
+    The covariance remains that of the linear update, (22) as printed: an overestimate.
     """
     if epoch.weights.shape[-1] == 1 and not family.coupled:
         mean = decoupled_fit(prior.mean, prior.covariance, *epoch)
@@ -372,7 +372,7 @@ _CONSTRAINTS: dict[str, Callable[..., KalmanState]] = {
 
 
 def expand_covariance(covariance: FloatArray) -> FloatArray:
-    """Pose covariance (..., 6, 6) to that of the 12 states, ``blkdiag(2/3 tr(P_w) I9, P_v)``."""
+    """Return the covariance of 12 states, ``blkdiag(2/3 tr(P_w) I9, P_v)``, of one (..., 6, 6)."""
     expanded = np.zeros((*covariance.shape[:-2], 12, 12))
     trace = np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1)
     index = np.arange(9)

@@ -1,9 +1,9 @@
 """Estimators on squared ranges: LS, LS-projected, CLS (CTLS), weighted Procrustes (UC-LS).
 
-LS and CLS are of the static paper (ICASSP 2013), LS with projection and UC-LS of the slides.
+LS and CLS are from the static paper (ICASSP 2013), LS with projection and UC-LS from the slides.
 
-All read the statistic of an epoch (`squared_range`) and broadcast over leading axes. Where the
-links of a trial do not determine a solution, its entries are NaN; the caller must look.
+All use the statistic of an epoch (`squared_range`) and broadcast over leading axes. If the links
+of a trial do not determine a solution, its entries are NaN, which the caller must check.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from rbl_gym.estimators.linear.squared_range import Statistic, information
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 
-# Behind the doors: entries of what is not determined are NaN here.
+# Internal functions without checks: undetermined entries are NaN.
 _NEAREST = kernel(rotations.nearest)
 # From a step on the tangent space to a rotation, equal to second order.
 RETRACTIONS = {"exponential": kernel(rotations.exp), "cayley": kernel(rotations.cayley)}
@@ -29,13 +29,13 @@ _EE = 0.5 * (np.einsum("iab,jbc->ijac", _E, _E) + np.einsum("jab,ibc->ijac", _E,
 
 
 def vec(matrix: FloatArray) -> FloatArray:
-    """Columns of (..., 3, k) stacked, (..., 3 k)."""
+    """Return the columns of (..., 3, k), stacked to (..., 3 k)."""
     columns = np.swapaxes(matrix, -1, -2)
     return columns.reshape(*columns.shape[:-2], -1)
 
 
 def unvec(vector: FloatArray) -> FloatArray:
-    """Inverse of `vec` for 3 x 3 matrices."""
+    """Return the 3 x 3 matrix of a vector; inverse of `vec`."""
     return np.swapaxes(vector.reshape(*vector.shape[:-1], 3, 3), -1, -2)
 
 
@@ -45,11 +45,11 @@ def procrustes(
     start: FloatArray,
     retraction: str = "exponential",
 ) -> tuple[FloatArray, FloatArray]:
-    """Rotation that minimises ``(vec Q - q)^T W (vec Q - q) / 2`` by Newton's method on SO(3).
+    """Minimise ``(vec Q - q)^T W (vec Q - q) / 2`` over rotations by Newton's method on SO(3).
 
-    Exact Hessian, damped where it is not positive or the cost would rise; the update is
-    ``Q <- R(w) Q`` with the retraction R. Local: the caller chooses the starts (put them on a
-    batch axis).
+    The Hessian is exact, and damped if it is not positive or the cost would increase. The update is
+    ``Q <- R(w) Q`` with the retraction R. The search is local: the caller chooses the starts, on a
+    batch axis.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def procrustes(
 def _newton(
     weight: FloatArray, target: FloatArray, start: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """`procrustes` with the exponential."""
+    """Compute `procrustes` with the exponential as retraction."""
     return _newton_by(weight, target, start, "exponential")
 
 
@@ -95,11 +95,11 @@ def _newton_by(
         smallest = np.linalg.eigvalsh(hessian)[..., 0]
         scale = np.trace(gauss, axis1=-2, axis2=-1)
         shift = np.maximum(0.0, 1e-9 * scale - smallest) * 1.5 + damping * scale + 1e-300
-        # Of a weight that is rounding only, as of tags in one point, nothing else is certain.
+        # If a weight is only rounding noise, as for tags at one point, nothing else is certain.
         shift += 1e-15 * np.abs(hessian).max(axis=(-2, -1))
         step = -np.linalg.solve(hessian + shift[..., None, None] * np.eye(3), gradient[..., None])
         step = step[..., 0]
-        # A step past a quarter turn leaves the region the quadratic model speaks of.
+        # A step of more than 90 degrees leaves the region where the quadratic model is valid.
         length = np.linalg.norm(step, axis=-1, keepdims=True)
         step = step * np.minimum(1.0, 1.5 / np.maximum(length, 1e-300))
         candidate = RETRACTIONS[retraction](step) @ Q
@@ -117,25 +117,25 @@ def _newton_by(
 
 
 def linear_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """LS: the unconstrained 3 x 3 matrix and translation, eq. (14) of the static paper."""
+    """Return LS: the unconstrained 3 x 3 matrix and translation, eq. (14) of the static paper."""
     matrix, vector = information(stat)
     x = _solve(matrix, vector)
     return unvec(x[..., :9]), x[..., 9:]
 
 
 def translation_fit(stat: Statistic, rotation: FloatArray) -> FloatArray:
-    """The translation of least squares for a given rotation."""
+    """Return the least-squares translation for a given rotation."""
     per_tag = stat.b - (stat.G @ (stat.tags @ np.swapaxes(rotation, -1, -2))[..., None])[..., 0]
     return _solve(_total(stat), per_tag.sum(axis=-2))
 
 
 def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """CLS, which is CTLS too: every tag located by itself, then an orthogonal Procrustes fit.
+    """Return CLS, also CTLS: locate every tag separately, then fit by orthogonal Procrustes.
 
     Static paper: (17)-(19) and Lemma 1, (20)-(21) and Lemma 2, Algorithm 1.
 
-    Tags whose links do not determine their place are left out; three that are not collinear
-    have to remain.
+    Tags whose links do not determine their position are left out; three non-collinear tags must
+    remain.
     """
     places = _solve(stat.G, stat.b)
     known = np.broadcast_to(np.isfinite(places).all(axis=-1), places.shape[:-1])
@@ -156,15 +156,15 @@ def points_fit(stat: Statistic) -> tuple[FloatArray, FloatArray]:
 def procrustes_fit(
     stat: Statistic, starts: FloatArray, retraction: str = "exponential"
 ) -> tuple[FloatArray, FloatArray]:
-    """Weighted orthogonal Procrustes, searched for globally.
+    """Return the global solution of the weighted orthogonal Procrustes problem.
 
     Remark 2 of the static paper; UC-LS in the appendix of the slides.
 
     Parameters
     ----------
     starts
-        Rotations (..., S, 3, 3); Newton's method runs from the first of every trial and from
-        the two of least cost among the others.
+        Rotations (..., S, 3, 3); Newton's method starts from the first of every trial and from the
+        two with the least cost among the others.
     retraction
         One of `RETRACTIONS`.
 
@@ -176,7 +176,7 @@ def procrustes_fit(
     lower = np.linalg.solve(loaded(matrix[..., 9:, 9:]), matrix[..., 9:, :9])
     weight = matrix[..., :9, :9] - np.swapaxes(matrix[..., 9:, :9], -1, -2) @ lower
     pull = vector[..., :9] - (np.swapaxes(lower, -1, -2) @ vector[..., 9:, None])[..., 0]
-    # Coplanar tags leave the weight singular: the loading acts where it carries nothing.
+    # For coplanar tags the weight is singular; the loading acts in its null space.
     target = np.linalg.solve(loaded(weight), pull[..., None])[..., 0]
     weight, target = weight[..., None, :, :], target[..., None, :]
     residual = vec(starts) - target
@@ -198,14 +198,14 @@ def _total(stat: Statistic) -> FloatArray:
 
 
 def loaded(matrix: FloatArray) -> FloatArray:
-    """Symmetric matrices (..., n, n) with 1e-13 of its trace on the diagonal: invertible."""
+    """Return symmetric matrices (..., n, n) with 1e-13 of the trace added to the diagonal."""
     size = matrix.shape[-1]
     trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
     return matrix + (1e-13 * trace + 1e-300) * np.eye(size)
 
 
 def _solve(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Solution of symmetric positive systems, NaN where one is singular."""
+    """Return the solution of symmetric positive systems, NaN if one is singular."""
     singular = information_rank(matrix) < matrix.shape[-1]
     safe = np.where(singular[..., None, None], np.eye(matrix.shape[-1]), matrix)
     solved = np.linalg.solve(safe, vector[..., None])[..., 0]

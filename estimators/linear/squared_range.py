@@ -1,15 +1,15 @@
-"""The papers' linear model of squared ranges, and the small statistic that is all of it.
+"""The linear model of squared ranges of the papers, and its sufficient statistic.
 
 Sources: static paper (ICASSP 2013), (3)-(13); tracking paper (CAMSAP 2013), (1)-(9).
 
-With ``d_mn = r_mn^2 - |a_m|^2`` the tag places obey ``d_mn = |s_n|^2 - 2 a_m^T s_n + noise``.
+With ``d_mn = r_mn^2 - |a_m|^2`` the tag positions satisfy ``d_mn = |s_n|^2 - 2 a_m^T s_n + noise``.
 Projecting ``|s_n|^2`` out with ``Pi = W - W 1 1^T W / (1^T W 1)`` (W the inverse variances of
-the squared ranges) leaves a linear model in ``x = [vec Q; t]``, ``s_n = Q c_n + t``, whose
+the squared ranges) gives a linear model in ``x = [vec Q; t]``, ``s_n = Q c_n + t``, whose
 information is ``sum_n (c_e c_e^T) kron G_n`` with ``c_e = [c_n; 1]`` and
 
     ``G_n = 4 A Pi_n A^T``,    ``b_n = -2 A Pi_n d_n``    (A = 3 x M, as in the papers).
 
-No matrix larger than 12 x 12 is ever made, whatever the number of anchors and tags.
+No matrix larger than 12 x 12 is formed, for any number of anchors and tags.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Statistic(NamedTuple):
     Attributes
     ----------
     G
-        (..., 1, 3, 3) where all tags share their weights, else (..., N, 3, 3).
+        (..., 1, 3, 3) if all tags share their weights, else (..., N, 3, 3).
     b
         (..., N, 3).
     tags
@@ -42,7 +42,7 @@ class Statistic(NamedTuple):
 
     @property
     def is_common(self) -> bool:
-        """Whether all tags share their weights: the papers' case."""
+        """Return whether all tags share their weights, as in the papers."""
         return self.G.shape[-3] == 1
 
 
@@ -54,7 +54,7 @@ def statistic(
     links: BoolArray | None = None,
     pseudo: bool = False,
 ) -> Statistic:
-    """G and b of one epoch.
+    """Return the statistic G, b of one epoch.
 
     Parameters
     ----------
@@ -63,13 +63,13 @@ def statistic(
     anchors, tags
         (..., M, 3) and (..., N, 3), metres.
     weights
-        Inverse variances of the squared ranges [1/m^4], (..., M, 1) where common to the tags.
+        Inverse variances of the squared ranges [1/m^4], (..., M, 1) if common to the tags.
     links
         Mask (..., M, N); a missing link has weight zero.
     pseudo
-        Whether the ranges of a tag have an unknown offset c in common, ``r = d + c + noise``. Then
-        ``d_mn = |s_n|^2 - c^2 - 2 a_m^T s_n + 2 c r_mn``: what goes with r is projected out too,
-        and the weights are those of ``(r - c)^2``. It takes five anchors.
+        Whether the ranges of a tag share an unknown offset c, ``r = d + c + noise``. Then
+        ``d_mn = |s_n|^2 - c^2 - 2 a_m^T s_n + 2 c r_mn``: the part proportional to r is projected
+        out too, and the weights are those of ``(r - c)^2``. This needs five anchors.
     """
     if links is not None and not links.all():
         weights = np.where(links, weights, 0.0)
@@ -78,7 +78,7 @@ def statistic(
     share = weights / np.where(total > 0, total, 1.0)
     spread, weighted = weighted_spread(anchors, weights)
     if pseudo:
-        # Only the spread must be free of r: what of d goes with it then falls out by itself.
+        # Only the spread must be orthogonal to r: the part of d along r then cancels.
         r = np.swapaxes(ranges - (share * ranges).sum(axis=-2, keepdims=True), -1, -2)[..., None]
         square = (np.swapaxes(weights, -1, -2)[..., None] * r**2).sum(axis=-2, keepdims=True)
         along = np.swapaxes(weighted, -1, -2) @ r / np.where(square > 0, square, 1.0)
@@ -95,17 +95,17 @@ def statistic(
 
 
 def extended(tags: FloatArray) -> FloatArray:
-    """Tags with a fourth coordinate 1, ``c_e`` (..., N, 4)."""
+    """Return tags with a fourth coordinate 1, ``c_e`` (..., N, 4)."""
     return np.concatenate([tags, np.ones((*tags.shape[:-1], 1))], axis=-1)
 
 
 def paper_matrices(stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """G (..., 3, 3) and ``B = sum_n b_n c_e^T`` (..., 3, 4) of the common-weight case."""
+    """Return G (..., 3, 3) and ``B = sum_n b_n c_e^T`` (..., 3, 4) for common weights."""
     return stat.G[..., 0, :, :], np.swapaxes(stat.b, -1, -2) @ extended(stat.tags)
 
 
 def information(stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """Information matrix (..., 12, 12) and vector (..., 12) about ``x = [vec Q; t]``."""
+    """Return the information matrix (..., 12, 12) and vector (..., 12) about ``x = [vec Q; t]``."""
     ce = extended(stat.tags)
     if stat.is_common:
         gram = np.swapaxes(ce, -1, -2) @ ce
@@ -118,10 +118,10 @@ def information(stat: Statistic) -> tuple[FloatArray, FloatArray]:
 
 
 def compressed(stat: Statistic) -> tuple[FloatArray, FloatArray]:
-    """Measurement z (..., 12) and matrix H (..., 12, 12) with unit noise and the same information.
+    """Return z (..., 12) and H (..., 12, 12) with unit noise and the same information.
 
-    ``H^T H`` and ``H^T z`` are those of `information`: twelve rows in place of M x N, for any
-    Kalman filter that wants a measurement. Directions without information are rows of zeros.
+    ``H^T H`` and ``H^T z`` are those of `information`: twelve rows instead of M x N, for any
+    Kalman filter with a measurement update. Directions without information are rows of zeros.
     """
     matrix, vector = information(stat)
     values, vectors = np.linalg.eigh(matrix)
@@ -134,7 +134,7 @@ def compressed(stat: Statistic) -> tuple[FloatArray, FloatArray]:
 
 
 def geometric_rank(anchors: FloatArray, tags: FloatArray) -> np.ndarray:
-    """How many of the 12 states full links would determine: anchors' rank (<= 3) x tags' (<= 4)."""
+    """Return how many of 12 states all links determine: rank of anchors (<= 3) x tags (<= 4)."""
     size = np.linalg.norm(tags, axis=-1).max(axis=-1)[..., None, None]
     unit_tags = extended(tags / np.where(size > 0, size, 1.0))
     return spanned_dimensions(anchors) * matrix_rank(unit_tags)

@@ -1,4 +1,4 @@
-"""From the 12 states to poses: UC-KF's problems (23), (26) and (27), and beliefs on SO(3)."""
+"""Convert the 12 states to poses: problems (23), (26), (27) of UC-KF, and beliefs on SO(3)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rbl_gym.estimators.linear.squared_range import statistic
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
 
-# Behind the doors: what is not determined is NaN.
+# Internal functions without checks: undetermined entries are NaN.
 _HAT, _NEAREST = kernel(rotations.hat), kernel(rotations.nearest)
 
 
@@ -25,14 +25,14 @@ def decoupled_fit(
     tags: FloatArray,
     weights: FloatArray,
 ) -> FloatArray:
-    """Rotation from the centred tags and its prior block (26), then the translation (27).
+    """Return the rotation from centred tags and its prior block (26), then the translation (27).
 
     Parameters
     ----------
     mean, covariance
         Prior (..., 12) and (..., 12, 12).
     ranges, anchors, tags, weights
-        Of an epoch (`engines.LinearEpoch`), weights (..., M, 1) common to all tags.
+        As in `engines.LinearEpoch`, weights (..., M, 1) common to all tags.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def decoupled_fit(
 
 @compiled("linear_beliefs:coupled_fit")
 def coupled_fit(mean: FloatArray, covariance: FloatArray) -> FloatArray:
-    """The pose (..., 12) nearest to a linear posterior in its own covariance, (23)."""
+    """Return the pose (..., 12) nearest to a linear posterior in its covariance norm, (23)."""
     q, t = mean[..., :9], mean[..., 9:]
     weight = inverse(covariance[..., :9, :9])
     rotation = _fit_rotation(weight, q)
@@ -75,10 +75,10 @@ def _fit_rotation(weight: FloatArray, q: FloatArray) -> FloatArray:
 def projected_belief(
     mean: FloatArray, covariance: FloatArray, like: FloatArray, size: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The nearest pose, its covariance ``J^+ P J^+T``, and the matrix (..., 3, 3) of the state.
+    """Return the nearest pose, its covariance ``J^+ P J^+T``, and the state matrix (..., 3, 3).
 
     The pose is a rotation (..., 3, 3) and a translation (..., 3). `like` (3,) and `size` (6,) only
-    tell a kernel how large the results are.
+    give a kernel the size of the results.
     """
     matrix, translation = unvec(mean[..., :9]).copy(), mean[..., 9:].copy()
     rotation = _NEAREST(matrix)
@@ -93,9 +93,9 @@ def projected_belief(
 def constrained_belief(
     mean: FloatArray, covariance: FloatArray, like: FloatArray, size: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The pose of the state, its covariance ``(J^T P^-1 J)^-1`` on SO(3), and the matrix.
+    """Return the pose of the state, its covariance ``(J^T P^-1 J)^-1`` on SO(3), and the matrix.
 
-    As `projected_belief`.
+    See `projected_belief`.
     """
     matrix, translation = unvec(mean[..., :9]).copy(), mean[..., 9:].copy()
     rotation = _NEAREST(matrix)
@@ -105,7 +105,7 @@ def constrained_belief(
 
 
 def state_jacobian(rotation: FloatArray) -> FloatArray:
-    """Derivative (..., 12, 6) of ``[vec Q; t]`` by the pose error (w, v)."""
+    """Return the derivative (..., 12, 6) of ``[vec Q; t]`` by the pose error (w, v)."""
     J = np.zeros((*rotation.shape[:-2], 12, 6))
     for k in range(3):
         J[..., 3 * k : 3 * k + 3, :3] = -_HAT(rotation[..., :, k])

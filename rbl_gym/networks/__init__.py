@@ -1,1 +1,1 @@
-"""Planar sensing networks: graphs, cycles, rigidity, bounds, files."""
+"""Model planar sensing networks: graphs, cycles, rigidity, bounds, files."""

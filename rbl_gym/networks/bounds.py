@@ -1,7 +1,7 @@
-"""Cramer-Rao bounds of planar networks: orientations from edge angles, frames from bearings.
+"""Compute Cramer-Rao bounds of networks: orientations from edge angles, frames from bearings.
 
-Everything is relative to node 0, whose frame is the reference: its orientation is 0 and it
-stands at the origin.
+All quantities are relative to node 0, whose frame is the reference: its orientation is 0 and its
+position is the origin.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ __all__ = [
 
 
 def orientation_covariance(edges: ArrayLike, n_nodes: int, bearing_std_rad: float) -> FloatArray:
-    """Bound (n - 1, n - 1) of orientations 1 to n - 1 from edge angles of variance 2 sigma^2."""
+    """Return the bound (n - 1, n - 1) of orientations from edge angles of variance 2 sigma^2."""
     sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
     B = incidence(check_connected(edges, n_nodes), n_nodes)[:, 1:]
     return 2 * sigma**2 * np.linalg.inv((B.T @ B).toarray())
 
 
 def edge_variance(n_edges: int, n_nodes: int, bearing_std_rad: float) -> float:
-    """Mean bound of a consistent edge angle: ``2 sigma^2 (n - 1) / m``."""
+    """Return the mean bound of a consistent edge angle: ``2 sigma^2 (n - 1) / m``."""
     return 2 * bearing_std_rad**2 * (n_nodes - 1) / n_edges
 
 
 def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: float) -> FloatArray:
-    """Orientation bound (..., n - 1, n - 1) of many small networks, disconnected ones too.
+    """Return the orientation bound (..., n - 1, n - 1) of networks that may be disconnected.
 
-    Nodes without a path to node 0 keep their prior: links among them say nothing about node 0.
+    Nodes without a path to node 0 keep their prior: their links give no information on node 0.
 
     Parameters
     ----------
     links
-        (..., n, n) symmetric: who sees whom.
+        (..., n, n) symmetric: the pairs that see each other.
     bearing_std_rad
         sigma of a bearing.
     prior_std_rad
-        Of an orientation that nothing is measured of; it keeps the bound finite.
+        Prior standard deviation of an orientation without measurements; it keeps the bound finite.
     """
     weight = linked_to_0(links) / (2 * bearing_std_rad**2)
     information = np.eye(links.shape[-1]) * (weight.sum(axis=-1) + prior_std_rad**-2)[..., None]
@@ -60,7 +60,7 @@ def linked_covariance(links: BoolArray, bearing_std_rad: float, prior_std_rad: f
 
 
 def linked_to_0(links: BoolArray) -> BoolArray:
-    """Links (..., n, n) without those of nodes that have no path to node 0."""
+    """Return links (..., n, n) without those of nodes that have no path to node 0."""
     near = np.zeros(links.shape[:-1], dtype=np.bool_)
     near[..., 0] = True
     while ((more := near | (links & near[..., None, :]).any(axis=-1)) != near).any():
@@ -69,13 +69,13 @@ def linked_to_0(links: BoolArray) -> BoolArray:
 
 
 class Sensing(NamedTuple):
-    """What is known of a network beside what is measured: of its sensors, and beforehand."""
+    """Sensor noise and prior knowledge of a network."""
 
     bearing_std_rad: float
     length_std_m: float  # of a measured length
     # Mean and standard deviation of the length of a link before it is measured.
     typical_length_m: tuple[float, float]
-    # Of an orientation and a coordinate, relative to node 0, that nothing is measured of.
+    # Prior standard deviations of an orientation and a coordinate, relative to node 0.
     prior_std_rad: float
     prior_std_m: float
 
@@ -83,7 +83,7 @@ class Sensing(NamedTuple):
 def linked_pose_covariance(
     positions: FloatArray, links: BoolArray, ranged: BoolArray, sensing: Sensing
 ) -> FloatArray:
-    """Pose bound (..., 3 n - 3, 3 n - 3) of many small networks, disconnected ones too.
+    """Return the pose bound (..., 3 n - 3, 3 n - 3) of networks that may be disconnected.
 
     Rows: n - 1 orientations, then x and y of nodes 1 to n - 1, in the frame of node 0, as
     `frame_covariance`. Nodes without a path to node 0 keep their prior.
@@ -91,12 +91,12 @@ def linked_pose_covariance(
     Parameters
     ----------
     positions
-        (..., n, 2) metres, in any frame turned like node 0.
+        (..., n, 2) metres, in any frame with the orientation of node 0.
     links, ranged
-        (..., n, n) symmetric: who sees whom, and whose distance is measured. Any link has the
-        typical length, without which networks that are not rigid have no bound.
+        (..., n, n) symmetric: the pairs that see each other, and those with a measured distance.
+        Any link has the typical length as a prior, without which non-rigid networks have no bound.
     sensing
-        The deviations.
+        The standard deviations.
     """
     links = linked_to_0(links)
     weight = length_information(links, ranged & links, sensing)
@@ -108,12 +108,12 @@ def linked_pose_covariance(
 
 
 def length_information(links: BoolArray, ranged: BoolArray, sensing: Sensing) -> FloatArray:
-    """Information (..., n, n) of the lengths of links: typical, and measured where they are."""
+    """Return the information (..., n, n) on the lengths of links, prior plus measured."""
     return links / sensing.typical_length_m[1] ** 2 + ranged / sensing.length_std_m**2
 
 
 def prior_information(n_nodes: int, sensing: Sensing) -> FloatArray:
-    """Information (3 n,) of what no sensor says, in the order of `bearing_jacobian`."""
+    """Return the prior information (3 n,), in the order of `bearing_jacobian`."""
     each = [sensing.prior_std_rad**-2, sensing.prior_std_m**-2]
     return np.repeat(each, [n_nodes, 2 * n_nodes])
 
@@ -125,19 +125,19 @@ def pose_information(
     of_lengths: FloatArray,
     nearest_m: float = 1e-9,
 ) -> FloatArray:
-    """Fisher information (..., 3 n, 3 n) of frames, columns as `bearing_jacobian`.
+    """Return the Fisher information (..., 3 n, 3 n) of frames, columns as in `bearing_jacobian`.
 
-    Of both bearings of each link, and of lengths with the information (..., n, n). Bearings
-    count as if no node were nearer than `nearest_m`.
+    It contains both bearings of each link, and lengths with the information (..., n, n). For
+    bearings, distances below `nearest_m` are replaced by it.
     """
     along, distance = lines_of_sight(positions)
     across = across_of(along, distance, nearest_m)
     weight = links / bearing_std_rad**2
     n_nodes = links.shape[-1]
-    # Both bearings of a link and its length tie two places together ...
+    # Both bearings of a link and its length connect two positions ...
     tie = _outer(across) * (2 * weight)[..., None, None]
     tie += _outer(along) * of_lengths[..., None, None]
-    # ... and a bearing its observer's turn to both places.
+    # ... and a bearing connects the orientation of its observer to both positions.
     turn = -weight[..., None] * across
     diagonal = np.arange(n_nodes)
     places = -tie
@@ -155,14 +155,14 @@ def pose_information(
 
 
 def lines_of_sight(positions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors (..., n, n, 2) from i to j and distances (..., n, n); no distance is 0."""
+    """Return unit vectors (..., n, n, 2) from i to j and distances (..., n, n), none of them 0."""
     apart = positions[..., None, :, :] - positions[..., :, None, :]
     distance = np.maximum(np.linalg.norm(apart, axis=-1), 1e-9)
     return apart / distance[..., None], distance
 
 
 def across_of(along: FloatArray, distance: FloatArray, nearest_m: float) -> FloatArray:
-    """Derivative (..., n, n, 2) of the direction from i to j by the place of j."""
+    """Return the derivative (..., n, n, 2) of the direction from i to j by the position of j."""
     across = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     return across / np.maximum(distance, nearest_m)[..., None]
 
@@ -172,7 +172,7 @@ def _outer(vectors: FloatArray) -> FloatArray:
 
 
 def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
-    """Derivative (2 m, 3 n) of the bearings; columns: n orientations, then x and y of each node.
+    """Return the derivative (2 m, 3 n) of bearings by n orientations, then x and y of each node.
 
     Rows are in the order of ``bearings.ravel()``: of j seen by i, of i seen by j, edge by edge.
     """
@@ -197,7 +197,7 @@ def bearing_jacobian(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
 
 
 def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
-    """Derivative (k, 3 n) of the distances of pairs of nodes, columns as `bearing_jacobian`."""
+    """Return derivative (k, 3 n) of distances of node pairs, columns as in `bearing_jacobian`."""
     positions = check_positions(positions)
     n_nodes = len(positions)
     pairs = check_edges(pairs, n_nodes)
@@ -208,7 +208,7 @@ def range_jacobian(positions: ArrayLike, pairs: ArrayLike) -> sp.csr_matrix:
 
 
 def sparse_rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_matrix:
-    """The matrix (m, width) of rows with equally many entries (m, k), at columns (m, k)."""
+    """Return the sparse matrix (m, width) of entries (m, k) at columns (m, k)."""
     rows, each = values.shape
     return sp.csr_matrix(
         (values.ravel(), columns.ravel(), each * np.arange(rows + 1)), shape=(rows, width)
@@ -216,7 +216,7 @@ def sparse_rows(values: FloatArray, columns: IntArray, width: int) -> sp.csr_mat
 
 
 def free_columns(n_nodes: int) -> IntArray:
-    """Columns (3 n - 3,) of the Jacobians that are unknown: all but those of node 0."""
+    """Return the columns (3 n - 3,) of the Jacobians for unknowns: all but those of node 0."""
     known = [0, n_nodes, n_nodes + 1]
     return np.setdiff1d(np.arange(3 * n_nodes), known)
 
@@ -229,14 +229,14 @@ def frame_covariance(
     ranges_of: ArrayLike | None = None,
     range_std_m: float | None = None,
 ) -> FloatArray:
-    """Bound (3 n - 3, 3 n - 3) of frames: n - 1 orientations, then x and y of nodes 1 to n - 1.
+    """Return the bound (3 n - 3, 3 n - 3) of n - 1 orientations, then x and y of nodes 1 to n - 1.
 
     Parameters
     ----------
     positions
-        (n, 2) metres, in any frame: the bound is of the frame of node 0 turned like it.
+        (n, 2) metres, in any frame; the bound is in the frame of node 0 with that orientation.
     edges
-        (m, 2), both bearings of each measured.
+        (m, 2), both bearings of each edge are measured.
     bearing_std_rad
         sigma of a bearing.
     known_pair
@@ -265,7 +265,7 @@ def frame_covariance(
     free = free_columns(len(positions))
     J = sp.csr_matrix(sp.vstack(rows))[:, free].toarray()
     if known_pair is not None:
-        # Moves that keep the known distance: the null space of its one row.
+        # Motions that keep the known distance: the null space of its one row.
         pair = check_pair("known_pair", known_pair, len(positions))
         row = range_jacobian(positions, [pair])[:, free].toarray()[0]
         basis = np.linalg.svd(row[None])[2][1:].T
@@ -285,9 +285,9 @@ def frame_covariance(
 
 
 def space_jacobian(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
-    """Derivative (6 m, 6 n) of bearings in space, all frames parallel to the world's.
+    """Return the derivative (6 m, 6 n) of bearings in space, frames parallel to the world.
 
-    Columns: shifts of node 0, of node 1, ..., then turns w, ``R = exp(w) R``, of node 0, and so
+    Columns: shifts of node 0, of node 1, ..., then rotations w, ``R = exp(w) R``, of node 0, and so
     on. Rows: the direction of j seen by i, of i seen by j, edge by edge.
 
     Parameters
@@ -311,7 +311,7 @@ def space_jacobian(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
                 f"positions must differ along edges, those of nodes {i} and {j} are the same"
             )
         u = apart / length
-        # d u = (I - u u^T) (dp_j - dp_i) / length; a turn w of the observer adds -w x u.
+        # d u = (I - u u^T) (dp_j - dp_i) / length; a rotation w of the observer adds -w x u.
         shift = (np.eye(3) - np.outer(u, u)) / length
         turn = rotations.hat(u)
         for side, (node, sense) in enumerate(((i, 1), (j, -1))):
@@ -323,14 +323,15 @@ def space_jacobian(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
 def space_orientation_covariance(
     positions: ArrayLike, edges: ArrayLike, bearing_std_rad: float
 ) -> FloatArray:
-    """Bound (3 (n - 1), 3 (n - 1)) of the turns of nodes 1 to n - 1 against node 0, in space.
+    """Return the bound (3 (n - 1), 3 (n - 1)) of rotations relative to node 0, in space.
 
-    Of mutual bearings with noise of `bearing_std_rad` about each axis across them.
+    It is for nodes 1 to n - 1, from mutual bearings with noise of `bearing_std_rad` about each axis
+    perpendicular to them.
 
     Raises
     ------
     ValueError
-        If the bearings leave more free than a shift, a turn and the scale of the whole.
+        If the bearings leave more freedom than a shift, a rotation and the scale of the whole.
     """
     sigma = check_number("bearing_std_rad", bearing_std_rad, low=0.0)
     J = space_jacobian(positions, edges)
@@ -338,7 +339,8 @@ def space_orientation_covariance(
     scale = np.zeros(6 * n_nodes)
     scale[: 3 * n_nodes] = (np.asarray(positions) - np.asarray(positions)[0]).ravel()
     kept = np.delete(np.arange(6 * n_nodes), [0, 1, 2, *range(3 * n_nodes, 3 * n_nodes + 3)])
-    # No bearing sees the scale: knowing it makes the rest regular and changes no orientation.
+    # Bearings do not determine the scale. Fixing it makes the rest regular and changes no
+    # orientation.
     known = np.vstack([J, scale / np.linalg.norm(scale)])[:, kept]
     values = np.linalg.svd(known, compute_uv=False)
     if values[-1] < 1e-9 * values[0]:

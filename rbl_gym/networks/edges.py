@@ -1,4 +1,4 @@
-"""Edges of a network: pairs of node indices, checked."""
+"""Check the edges of a network: pairs of node indices."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ MOST_NODES = 10**9
 
 
 def check_edges(edges: ArrayLike, n_nodes: int, name: str = "edges") -> IntArray:
-    """`edges` as (m, 2) indices of two different nodes each, under this or another `name`.
+    """Return `edges` as (m, 2) indices of two different nodes each; `name` is for the message.
 
-    An edge may come twice, in either direction: then it was measured twice. No edges at all
-    are an empty sequence.
+    An edge may occur twice, in either direction, if it was measured twice. An empty sequence means
+    no edges.
 
     Raises
     ------
     ValueError
-        If they are not pairs of whole numbers in [0, n_nodes), or an edge joins a node to itself.
+        If they are not pairs of integers in [0, n_nodes), or an edge joins a node to itself.
     """
     n_nodes = check_count("n_nodes", n_nodes, most=MOST_NODES)
     try:

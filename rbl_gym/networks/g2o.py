@@ -1,8 +1,8 @@
-"""Planar pose graphs and networks from files: g2o, or CSV of edges.
+"""Read planar pose graphs and networks from files: g2o, or CSV of edges.
 
-A pose graph's edge measures the pose of j in the frame of i; its turn is the edge angle of a
-sensing network. Whatever is wrong in a file is a ValueError that names the file, the line, the
-column and the value that came.
+An edge of a pose graph measures the pose of j in the frame of i; its rotation is the edge angle of
+a sensing network. Errors in a file raise a ValueError that names the file, the line, the column and
+the value.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ __all__ = ["PoseGraph", "read_graph"]
 _POSE = ("dx", "dy", "dtheta")
 _INFORMATION = ("I11", "I12", "I13", "I22", "I23", "I33")
 _LONE = "VERTEX_SE2 without an edge"
-# Lines of a g2o file that are no planar pose: landmarks, SE(3), parameters, priors.
+# Lines of a g2o file that are not planar poses: landmarks, SE(3), parameters, priors.
 _OTHER = ("EDGE", "VERTEX", "PARAMS")
 _LARGEST_ID = 2**64 - 1
 
 
 class PoseGraph(NamedTuple):
-    """Edges between n planar poses, which are numbered 0 to n - 1 here."""
+    """Edges between n planar poses, numbered 0 to n - 1."""
 
-    ids: NDArray[np.integer[Any]]  # (n,) what the file calls them, ascending
+    ids: NDArray[np.integer[Any]]  # (n,) ids in the file, ascending
     edges: IntArray  # (m, 2)
-    y: FloatArray  # (m,) angle of j's frame in that of i, radians in [-pi, pi)
-    displacement: FloatArray | None  # (m, 2) place of j in the frame of i, metres
-    information: FloatArray | None  # (m, 3, 3) of (dx, dy, dtheta); NaN of edges without any
-    skipped: dict[str, int]  # lines that were not read: how many of each kind
+    y: FloatArray  # (m,) angle of frame j in frame i, radians in [-pi, pi)
+    displacement: FloatArray | None  # (m, 2) position of j in the frame of i, metres
+    information: FloatArray | None  # (m, 3, 3) of (dx, dy, dtheta); NaN for edges without it
+    skipped: dict[str, int]  # number of lines of each kind that were not read
 
 
 class _Rows(NamedTuple):
@@ -54,15 +54,15 @@ def read_graph(path: str | os.PathLike[str]) -> PoseGraph:
     """Read a planar graph: ``.g2o``, else CSV.
 
     g2o: lines ``EDGE_SE2 i j dx dy dtheta I11 I12 I13 I22 I23 I33``, or without the information.
-    Values of vertices, FIX, and lines that start with ``#`` are passed over. Lines of other
-    kinds (``EDGE_SE3:QUAT``, ``EDGE_SE2_XY``, ...) are not read; `skipped` counts them, and the
-    planar vertices that no edge joins.
+    Values of vertices, FIX, and lines that start with ``#`` are ignored. Lines of other kinds
+    (``EDGE_SE3:QUAT``, ``EDGE_SE2_XY``, ...) are not read; `skipped` counts them, and the planar
+    vertices without an edge.
 
     CSV: a header; columns ``i,j`` and one of ``dtheta`` (or ``y``), radians, or ``a,b``, the two
-    bearings of an edge, radians; beside ``dtheta`` may stand ``dx,dy`` (metres) and ``I11`` to
-    ``I33``, which are empty in edges without information.
+    bearings of an edge, radians; with ``dtheta``, optional columns are ``dx,dy`` (metres) and
+    ``I11`` to ``I33``, which are empty for edges without information.
 
-    Nodes have whole numbers up to 2^64 - 1, as GTSAM's keys.
+    Nodes are integers up to 2^64 - 1, as the keys of GTSAM.
 
     Raises
     ------
@@ -169,7 +169,7 @@ def _csv_rows(path: str) -> _Rows:
 
 
 def _lines(path: str) -> Iterator[tuple[int, str]]:
-    """Lines with something on them, and their numbers."""
+    """Return the lines that are not blank, and their numbers."""
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -192,7 +192,7 @@ def _ends(path: str, line: int, cells: list[str]) -> tuple[int, int]:
 
 
 def _node(path: str, line: int, column: str, cell: str) -> int:
-    """A node's number, exact above 2^53 too."""
+    """Return the number of a node, also exact above 2^53."""
     value: Any = None
     if len(cell) <= 40 and "_" not in cell:  # int() reads 1_000
         try:
@@ -210,7 +210,7 @@ def _node(path: str, line: int, column: str, cell: str) -> int:
 
 
 def _number(cell: str) -> float:
-    """A finite number, or inf."""
+    """Return a finite number, or inf."""
     try:
         value = math.inf if "_" in cell else float(cell)  # float() reads 1_000
     except ValueError:

@@ -1,9 +1,9 @@
-"""Graphs of sensing networks: components, trees, incidence and cycle matrices, all sparse.
+"""Analyse graphs of sensing networks: components, trees, incidence and cycle matrices, sparse.
 
-Graphs are multigraphs: rows of `edges` (m, 2), each an edge of its own.
+Graphs are multigraphs: every row of `edges` (m, 2) is a separate edge.
 """
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportOptionalSubscript=false
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ __all__ = ["BASES", "SpanningTree", "cycle_matrix", "incidence", "spanning_tree"
 
 BASES = ("bfs", "paton", "minimum")
 CYCLES = (*BASES, "all")
-_MOST_CYCLES = 100_000  # that "all" lists; a complete graph of 9 nodes has 62,814
-_NAMED = 8  # nodes of a component that a message lists
+_MOST_CYCLES = 100_000  # limit of "all"; a complete graph of 9 nodes has 62,814
+_NAMED = 8  # nodes of a component listed in a message
 
 
 class SpanningTree(NamedTuple):
@@ -31,12 +31,12 @@ class SpanningTree(NamedTuple):
 
     parent: IntArray  # (n,)
     edge: IntArray  # (n,) row of `edges` that joins a node to its parent
-    sign: IntArray  # (n,) +1 where that row runs from the parent to the node, else -1
+    sign: IntArray  # (n,) +1 if that row runs from the parent to the node, else -1
     depth: IntArray  # (n,) edges up to node 0
 
 
 def components(edges: ArrayLike, n_nodes: int) -> IntArray:
-    """Label (n,) of the connected component of every node."""
+    """Return the label (n,) of the connected component of every node."""
     return csgraph.connected_components(
         _adjacency(check_edges(edges, n_nodes), n_nodes), directed=False
     )[1].astype(np.intp)
@@ -45,9 +45,9 @@ def components(edges: ArrayLike, n_nodes: int) -> IntArray:
 def check_connected(
     edges: ArrayLike, n_nodes: int, ids: Sequence[int] | np.ndarray | None = None
 ) -> IntArray:
-    """`edges`, checked, of a connected graph.
+    """Return checked `edges` of a connected graph.
 
-    `ids` (n,) are the nodes' names in the message; None: 0 to n - 1.
+    `ids` (n,) are the names of the nodes in the message; None: 0 to n - 1.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def _adjacency(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
 
 
 def incidence(edges: ArrayLike, n_nodes: int) -> sp.csr_matrix:
-    """Incidence matrix B (m, n): ``B theta`` are the differences ``theta_j - theta_i``."""
+    """Return the incidence matrix B (m, n): ``B theta`` are ``theta_j - theta_i``."""
     edges = check_edges(edges, n_nodes)
     m = len(edges)
     values = np.tile([-1.0, 1.0], m)
@@ -88,7 +88,7 @@ def incidence(edges: ArrayLike, n_nodes: int) -> sp.csr_matrix:
 
 
 def spanning_tree(edges: ArrayLike, n_nodes: int) -> SpanningTree:
-    """Breadth-first tree from node 0, neighbours in ascending order.
+    """Return the breadth-first tree from node 0, neighbours in ascending order.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def _tree(edges: IntArray, parent: IntArray) -> SpanningTree:
 
 
 def sum_to_root(parent: IntArray, values: np.ndarray) -> np.ndarray:
-    """Sum (n,) of `values` along every node's path to node 0, by doubling the paths."""
+    """Return the sum (n,) of `values` along the path of every node to node 0, by path doubling."""
     total, up = values.astype(np.result_type(values, np.intp)), parent
     total[0] = 0
     while up.any():
@@ -127,10 +127,10 @@ def sum_to_root(parent: IntArray, values: np.ndarray) -> np.ndarray:
 
 
 def _tree_edges(edges: IntArray, parent: IntArray) -> tuple[IntArray, IntArray]:
-    """Row and sign of the edge to the parent; of parallel edges the first."""
+    """Return row and sign of the edge to the parent; for parallel edges the first."""
     i, j = edges.T
     edge, sign = np.full(len(parent), -1, dtype=np.intp), np.zeros(len(parent), dtype=np.intp)
-    # Written from the last row to the first, the first stays.
+    # Written from the last row to the first, so that the first remains.
     down, up = (np.flatnonzero(parent[child] == above)[::-1] for child, above in ((j, i), (i, j)))
     down, up = down[j[down] != 0], up[i[up] != 0]
     edge[j[down]] = down
@@ -143,24 +143,24 @@ def _tree_edges(edges: IntArray, parent: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> sp.csr_matrix:
-    """Cycle matrix C (q, m), entries -1, 0, 1: ``C B = 0`` (Definition 4).
+    """Return the cycle matrix C (q, m), entries -1, 0, 1: ``C B = 0`` (Definition 4).
 
     Parameters
     ----------
     edges, n_nodes
         A connected graph.
     basis
-        ``"bfs"``: one cycle for each edge outside of the breadth-first tree, run in the sense
-        of that edge from i to j. ``"paton"``: a tree grown from the node that was reached
-        last, each cycle cut short where it meets a neighbour. ``"minimum"``: shortest
-        cycles in all (Horton), for graphs of up to some hundred nodes. These are bases, q is
-        m - n + 1 (Theorem 5). ``"all"``: every cycle of a small graph once, in either sense.
+        ``"bfs"``: one cycle for each edge outside the breadth-first tree, in the direction of
+        this edge from i to j. ``"paton"``: cycles from a tree that grows from the last node
+        reached, each shortened where it meets a neighbour. ``"minimum"``: the cycles of least total
+        length (Horton), for graphs of up to some hundred nodes. These are bases with q = m - n + 1
+        (Theorem 5). ``"all"``: every cycle of a small graph once, in either direction.
 
     Raises
     ------
     ValueError
         If the graph is not connected (the message names the components), or has more than
-        100,000 cycles where all are asked for.
+        100,000 cycles if all are requested.
     """
     check_one_of("basis", basis, CYCLES)
     edges = check_connected(edges, n_nodes)
@@ -170,13 +170,13 @@ def cycle_matrix(edges: ArrayLike, n_nodes: int, basis: str = "bfs") -> sp.csr_m
 
 
 def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: int) -> sp.csr_matrix:
-    """A cycle matrix (q, m) of one's own; its rows may depend on each other.
+    """Return a checked user-defined cycle matrix (q, m); its rows may be linearly dependent.
 
     Raises
     ------
     ValueError
-        If it has another number of columns, or a row is no closed walk over edges that are run
-        once each.
+        If it has another number of columns, or a row is not a closed walk that uses each edge
+        once.
     """
     C = sp.csr_matrix(cycles, dtype=np.float64, copy=True)
     if C.shape[1] != len(edges):
@@ -193,7 +193,7 @@ def check_cycles(cycles: ArrayLike | sp.csr_matrix, edges: IntArray, n_nodes: in
 
 
 def fundamental_cycles(edges: IntArray, tree: SpanningTree) -> sp.csr_matrix:
-    """One cycle for each edge outside of a tree: i to j, and back over the tree."""
+    """Return one cycle for each edge outside a tree: i to j, and back along the tree."""
     outside = np.ones(len(edges), dtype=np.bool_)
     outside[tree.edge[1:]] = False
     closing = np.flatnonzero(outside)
@@ -218,13 +218,13 @@ def fundamental_cycles(edges: IntArray, tree: SpanningTree) -> sp.csr_matrix:
 
 
 def _paton_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
-    """Paton's (1969) cycles: every edge that meets a node already reached closes one."""
+    """Return cycles of Paton (1969): every edge that meets a node already reached closes one."""
     near: list[list[tuple[int, int]]] = [[] for _ in range(n_nodes)]
     for row, (i, j) in enumerate(edges.tolist()):
         near[i].append((j, row))
         near[j].append((i, row))
     parent, upward = {0: 0}, {0: -1}
-    # Of every reached node: its neighbours whose edge is used, and by which edge.
+    # For every reached node: the neighbours with a used edge, and this edge.
     used: list[dict[int, int]] = [{} for _ in range(n_nodes)]
     done, walks, stack = set(), [], [0]
     while stack:
@@ -238,7 +238,7 @@ def _paton_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
                 used[other][node] = row
                 stack.append(other)
                 continue
-            # From `other` over the new edge to `node`, up the tree, and back to `other`.
+            # From `other` along the new edge to `node`, up the tree, and back to `other`.
             walk, at = [(other, row)], node
             while at not in used[other]:
                 walk.append((at, upward[at]))
@@ -249,7 +249,7 @@ def _paton_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
 
 
 def _walked(walks: list[list[tuple[int, int]]], edges: IntArray) -> sp.csr_matrix:
-    """Cycle matrix of closed walks, each a list of (node, row of the edge that leaves it)."""
+    """Return the cycle matrix of closed walks, lists of (node, row of the edge that leaves it)."""
     rows = [row for row, walk in enumerate(walks) for _ in walk]
     starts, columns = (
         np.array([step[k] for walk in walks for step in walk], dtype=np.intp) for k in (0, 1)
@@ -259,9 +259,9 @@ def _walked(walks: list[list[tuple[int, int]]], edges: IntArray) -> sp.csr_matri
 
 
 def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
-    """Every cycle, from its smallest node on, in the sense that leaves it by the smaller row.
+    """Return every cycle from its smallest node, in the direction that leaves by the smaller row.
 
-    A path is grown only where it can still come back to its start: no branch is without a cycle.
+    A path is extended only if it can still return to its start, so that every branch has a cycle.
     """
     near: list[list[tuple[int, int]]] = [[] for _ in range(n_nodes)]
     beside = [0] * n_nodes  # neighbours, as bits
@@ -312,12 +312,12 @@ def _all_cycles(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
 
 
 def _minimum_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
-    """Horton's: of all cycles of two shortest paths and an edge, the shortest independent ones."""
+    """Return Horton's basis: the shortest independent cycles of two shortest paths and an edge."""
     wanted = len(edges) - n_nodes + 1
     graph = _neighbours(edges, n_nodes)
     candidates = []
     for root in range(n_nodes):
-        # Named anew with the root as 0, which is where trees begin.
+        # Renumbered with the root as 0, where trees begin.
         swap = np.arange(n_nodes)
         swap[[0, root]] = root, 0
         named = swap[edges]
@@ -329,7 +329,7 @@ def _minimum_basis(edges: IntArray, n_nodes: int) -> sp.csr_matrix:
         candidates += [(int(lengths[row]), root, row, C[row]) for row in np.flatnonzero(through)]
     candidates.sort(key=lambda candidate: candidate[:3])
     chosen: list[sp.csr_matrix] = []
-    # Independent modulo 2, cycles as bits of an int, is independent.
+    # Cycles as bits of an int; independent modulo 2 implies independent.
     pivots: dict[int, int] = {}
     for *_, cycle in candidates:
         if len(chosen) == wanted:

@@ -1,11 +1,11 @@
-"""What a network's measurements determine: orientations, frames, and what stays free.
+"""Test what the measurements of a network determine: orientations, frames, remaining freedom.
 
-Plane: orientations need a connected graph of bearings; frames up to scale need a parallel
-rigid one, whose rigidity matrix has rank 2 n - 3. Space: bearings leave a turn about the line
-of sight free, unless triangles take it away.
+In the plane, orientations need a connected graph of bearings. Frames up to scale need a parallel
+rigid one, whose rigidity matrix has rank 2 n - 3. In space, bearings do not determine the rotation
+about the line of sight, unless triangles do.
 """
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportOptionalSubscript=false, reportOperatorIssue=false
 from __future__ import annotations
 
@@ -33,44 +33,44 @@ __all__ = [
     "parallel_rigidity_matrix", "parallel_rigidity_rank", "triangle_rotation",
 ]  # fmt: skip
 
-# Eigenvalues of a Gram matrix of unit rows below this are zero.
+# Smaller eigenvalues of a Gram matrix of unit rows count as zero.
 _ZERO = 1e-10
 _DENSE = 400
 
 
 class Localizability(NamedTuple):
-    """What the bearings of a planar network determine."""
+    """The quantities that the bearings of a planar network determine."""
 
-    components: int  # 1: the orientations, relative to one node's
+    components: int  # 1: the orientations are determined, relative to one node
     rank: int  # of the rigidity matrix
-    full_rank: int  # 2 n - 3: all frames, but for a shift, a turn and a scale
+    full_rank: int  # 2 n - 3: all frames, up to a shift, a rotation and a scale
 
     @property
     def orientations(self) -> bool:
-        """Whether all orientations are determined."""
+        """Return whether all orientations are determined."""
         return self.components == 1
 
     @property
     def frames(self) -> bool:
-        """Whether all frames are determined once a length is known."""
+        """Return whether all frames are determined if one length is known."""
         return self.orientations and self.rank == self.full_rank
 
 
 def check_orientations(edges: ArrayLike, n_nodes: int, measured: str = "bearings") -> None:
-    """Raise unless all orientations can be found from what is measured.
+    """Raise ValueError unless the measurements determine all orientations.
 
     Parameters
     ----------
     edges, n_nodes
-        (m, 2), who measures whom.
+        (m, 2), the measuring pairs, and the number of nodes.
     measured
-        ``"bearings"``, ``"both"`` or ``"ranges"``. Ranges alone say nothing about orientations:
-        turning a node changes none (Proposition 15).
+        ``"bearings"``, ``"both"`` or ``"ranges"``. Ranges alone do not determine orientations:
+        rotating a node changes none (Proposition 15).
 
     Raises
     ------
     ValueError
-        If they cannot; the message names the components.
+        If they do not; the message names the components.
     """
     check_one_of("measured", measured, ("bearings", "ranges", "both"))
     check_connected(edges, n_nodes)
@@ -82,10 +82,10 @@ def check_orientations(edges: ArrayLike, n_nodes: int, measured: str = "bearings
 
 
 def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> sp.csr_matrix:
-    """Rows (m, 2 n): shifts of the nodes that keep the direction of an edge, to first order.
+    """Return the rows (m, 2 n) whose null space are node shifts that keep all edge directions.
 
-    The row of edge (i, j) is ``u' (dp_j - dp_i)``, u' the unit vector across it; columns are
-    x and y of node 0, then of node 1, and so on.
+    This holds to first order. The row of edge (i, j) is ``u' (dp_j - dp_i)``, with u' the unit
+    vector perpendicular to it. Columns are x and y of node 0, then of node 1, and so on.
     """
     positions = check_positions(positions)
     edges = check_edges(edges, len(positions))
@@ -96,21 +96,21 @@ def parallel_rigidity_matrix(positions: ArrayLike, edges: ArrayLike) -> sp.csr_m
 
 
 def parallel_rigidity_rank(positions: ArrayLike, edges: ArrayLike) -> tuple[int, int]:
-    """Rank of `parallel_rigidity_matrix`, and the rank 2 n - 3 that localizes all frames."""
+    """Return the rank of `parallel_rigidity_matrix`, and the full rank 2 n - 3."""
     R = parallel_rigidity_matrix(positions, edges)
     n_nodes = R.shape[1] // 2
     return 2 * n_nodes - _null_dimension(R), max(2 * n_nodes - 3, 0)
 
 
 def localizability(positions: ArrayLike, edges: ArrayLike) -> Localizability:
-    """What the bearings of a planar network determine at these positions."""
+    """Return what the bearings of a planar network determine at these positions."""
     positions = check_positions(positions)
     parts = int(components(edges, len(positions)).max()) + 1
     return Localizability(parts, *parallel_rigidity_rank(positions, edges))
 
 
 def check_frames(positions: ArrayLike, edges: ArrayLike) -> None:
-    """Raise unless all frames can be found from bearings and one length (Proposition 16).
+    """Raise ValueError unless bearings and one length determine all frames (Proposition 16).
 
     Raises
     ------
@@ -128,12 +128,12 @@ def check_frames(positions: ArrayLike, edges: ArrayLike) -> None:
 
 
 def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> None:
-    """Raise unless all frames can be found from bearings of `edges` and ranges of `ranged`.
+    """Raise ValueError unless bearings of `edges` and ranges of `ranged` determine all frames.
 
     Raises
     ------
     ValueError
-        If they cannot at these positions; the message names the missing rank.
+        If they do not at these positions; the message names the missing rank.
     """
     J = sp.vstack([bearing_jacobian(positions, edges), range_jacobian(positions, ranged)])
     full = J.shape[1] - 3
@@ -146,7 +146,7 @@ def check_joint(positions: ArrayLike, edges: ArrayLike, ranged: ArrayLike) -> No
 
 
 def _null_dimension(R: sp.csr_matrix) -> int:
-    """Dimension of the null space, by the zero eigenvalues of ``R^T R``."""
+    """Return the dimension of the null space, from the zero eigenvalues of ``R^T R``."""
     gram = sp.csc_matrix(R.T @ R)
     size = gram.shape[0]
     if size <= _DENSE:
@@ -168,32 +168,32 @@ def _null_dimension(R: sp.csr_matrix) -> int:
 
 
 class Freedom(NamedTuple):
-    """What bearings in space leave free, beside a shift, a turn and a scale of the whole."""
+    """The freedom left by bearings in space, besides shift, rotation and scale of the whole."""
 
     rank: int  # of the rigidity matrix (2 rows a bearing, 6 columns a node)
-    free: int  # 6 n - 7 - rank: motions of frames that no bearing sees
-    free_orientations: int  # of the orientations among them
+    free: int  # 6 n - 7 - rank: motions of frames that change no bearing
+    free_orientations: int  # of the orientations
 
 
 def feasible_rotations(u_ij: ArrayLike, u_ji: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Rotations from frame j to frame i that two opposite bearings allow (Lemma 13).
+    """Return rotations from frame j to frame i consistent with two opposite bearings (Lemma 13).
 
-    All of them are ``exp(phi [u_ij]x) R_0``: the bearings leave the turn phi about the line of
-    sight free.
+    They are ``exp(phi [u_ij]x) R_0`` with any phi: the bearings do not determine the rotation about
+    the line of sight.
 
     Parameters
     ----------
     u_ij, u_ji
-        (3,) bearing of j in the frame of i, and of i in the frame of j; made unit here.
+        (3,) bearing of j in the frame of i, and of i in the frame of j; normalised here.
 
     Returns
     -------
     R_0
-        (3, 3) with ``R_0 u_ji = -u_ij``: the smallest such turn. In the degenerate cases:
-        the identity for ``u_ji = -u_ij``; for ``u_ji = u_ij`` a half turn about an axis
-        across it, of which all are equally small.
+        (3, 3), the smallest rotation with ``R_0 u_ji = -u_ij``. Degenerate cases: the identity
+        for ``u_ji = -u_ij``; for ``u_ji = u_ij`` a rotation by 180 degrees about any axis
+        perpendicular to it, as all are equally small.
     axis
-        (3,) of the free turn, ``u_ij``.
+        (3,) axis of the free rotation, ``u_ij``.
     """
     axis, other = _unit("u_ij", u_ij), _unit("u_ji", u_ji)
     across = np.cross(other, -axis)
@@ -210,27 +210,26 @@ def feasible_rotations(u_ij: ArrayLike, u_ji: ArrayLike) -> tuple[FloatArray, Fl
 def triangle_rotation(
     u_ij: ArrayLike, u_ji: ArrayLike, u_ik: ArrayLike, u_jk: ArrayLike
 ) -> FloatArray:
-    """Rotation (3, 3) from frame j to frame i when both also see k.
+    """Return the rotation (3, 3) from frame j to frame i if both also see k.
 
-    Beside the line of sight the frames share the normal of the triangle's plane, so that no
-    turn stays free. With noise, the line of sight is kept and the normals agree as nearly as
-    they can.
+    The frames share the line of sight and the normal of the plane of the triangle, which determine
+    the rotation. With noise, the line of sight is kept and the normals are fitted.
 
     Parameters
     ----------
     u_ij, u_ik
         Directions (3,) in which i sees j and k, in the frame of i.
     u_ji, u_jk
-        The same of j.
+        The same for j.
 
     Raises
     ------
     ValueError
-        If the three nodes stand on one line: there is no plane.
+        If the three nodes lie on one line: there is no plane.
     """
     axis, other = _unit("u_ij", u_ij), _unit("u_ji", u_ji)
     normal_i = np.cross(axis, _unit("u_ik", u_ik))
-    # Seen from j the triangle is run the other way around.
+    # Seen from j, the triangle has the opposite orientation.
     normal_j = np.cross(_unit("u_jk", u_jk), other)
     for name, normal in (("u_ik", normal_i), ("u_jk", normal_j)):
         if np.linalg.norm(normal) < 1e-9:
@@ -254,7 +253,7 @@ def _unit(name: str, vector: ArrayLike) -> FloatArray:
 
 
 def freedom(positions: ArrayLike, edges: ArrayLike) -> Freedom:
-    """What mutual bearings in space leave free at these positions.
+    """Return the freedom left by mutual bearings in space at these positions.
 
     Parameters
     ----------
@@ -269,5 +268,5 @@ def freedom(positions: ArrayLike, edges: ArrayLike) -> Freedom:
     null = vectors[:, values < _ZERO * max(1.0, values[-1])]
     turns = np.linalg.matrix_rank(null[3 * n_nodes :], tol=1e-6)
     rank = 6 * n_nodes - null.shape[1]
-    # One node alone has no size, and so no scale.
+    # A single node has no size, and so no scale.
     return Freedom(rank, max(6 * n_nodes - 7 - rank, 0), int(turns) - 3)

@@ -1,14 +1,14 @@
-"""Planar relative sensing networks: nodes that see each other's bearing, each in its own frame.
+"""Model planar relative sensing networks: nodes measure bearings of others in their own frames.
 
-Node i stands at ``p_i`` and is turned by ``theta_i``; neither is known. Nodes within sensing
-radius measure each other's bearing in their own frames, and the two bearings of an edge give
-the difference of its orientations, (8).
+Node i has the unknown position ``p_i`` and orientation ``theta_i``. Nodes within the sensing
+radius measure each other's bearing in their own frames. The two bearings of an edge give the
+difference of the orientations of its nodes, (8).
 
 Source: G. Piovan, I. Shames, B. Fidan, F. Bullo, B. D. O. Anderson, "On frame and orientation
-localization for relative sensing networks". Numbers of equations are the paper's.
+localization for relative sensing networks". Equation numbers are those of the paper.
 """
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportAttributeAccessIssue=false
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _TURN = 2 * np.pi
 
 
 class SensingNetwork(NamedTuple):
-    """Nodes, who sees whom, and what they measured."""
+    """Nodes, edges, and the measured bearings."""
 
     positions: FloatArray  # (n, 2) metres
     orientations: FloatArray  # (n,) radians, that of node 0 is 0
@@ -50,22 +50,22 @@ class SensingNetwork(NamedTuple):
 
     @property
     def y(self) -> FloatArray:
-        """Edge angles (m,), `edge_angles`."""
+        """Return the edge angles (m,), see `edge_angles`."""
         return edge_angles(self.bearings)
 
 
 def proj(angle: ArrayLike) -> FloatArray:
-    """Angles brought into the half-open [-pi, pi); those inside stay to the last bit."""
+    """Wrap angles to the half-open [-pi, pi); angles inside are unchanged to the last bit."""
     angle = check_finite("angle", as_float("angle", angle))
     wrapped = angle - _TURN * np.floor((angle + np.pi) / _TURN)
-    # Rounding can leave a value on the open end, or just below the closed one.
+    # Rounding can give a value at the open end, or just below the closed one.
     wrapped = np.where(wrapped >= np.pi, wrapped - _TURN, wrapped)
     wrapped = np.maximum(wrapped, -np.pi)
     return np.where((angle >= -np.pi) & (angle < np.pi), angle, wrapped)
 
 
 def check_pair(name: str, pair: ArrayLike, n_nodes: int) -> tuple[int, int]:
-    """A pair of nodes, or a ValueError."""
+    """Return a pair of nodes, or raise ValueError."""
     pairs = check_edges([pair], n_nodes, name)  # pyright: ignore[reportArgumentType]
     if not len(pairs):
         raise ValueError(f"{name} must be two nodes, got {pair!r:.80}")
@@ -75,7 +75,7 @@ def check_pair(name: str, pair: ArrayLike, n_nodes: int) -> tuple[int, int]:
 def check_edge_values(
     name: str, values: ArrayLike, edges: IntArray, trailing: int = 0
 ) -> FloatArray:
-    """`values` as finite floats, one (or a row of `trailing`) for each edge."""
+    """Return `values` as finite floats, one (or a row of `trailing`) for each edge."""
     shape = (len(edges), trailing) if trailing else (len(edges),)
     array = as_float(name, values)
     if array.size == 0 == len(edges):
@@ -86,9 +86,9 @@ def check_edge_values(
 
 
 def unit_disk_edges(positions: ArrayLike, radius_m: float, blind_m: float = 0.0) -> IntArray:
-    """Edges (m, 2), i < j and sorted, of nodes at most `radius_m` apart.
+    """Return the edges (m, 2), i < j and sorted, of nodes at most `radius_m` apart.
 
-    Nodes nearer than `blind_m` do not see each other.
+    Nodes closer than `blind_m` do not see each other.
     """
     positions = check_positions(positions)
     radius_m = check_number("radius_m", radius_m, low=0.0)
@@ -102,19 +102,19 @@ def unit_disk_edges(positions: ArrayLike, radius_m: float, blind_m: float = 0.0)
 
 
 def directions(positions: ArrayLike, edges: ArrayLike) -> FloatArray:
-    """Direction (m,) in the world frame from i to j of every edge.
+    """Return the direction (m,) in the world frame from i to j of every edge.
 
     Raises
     ------
     ValueError
-        If the nodes of an edge stand on the same point: there is no bearing.
+        If the nodes of an edge have the same position: there is no bearing.
     """
     positions = check_positions(positions)
     return directions_of(positions, check_edges(edges, len(positions)))
 
 
 def directions_of(positions: FloatArray, edges: IntArray) -> FloatArray:
-    """`directions` of checked positions and edges."""
+    """Compute `directions` of checked positions and edges."""
     apart = positions[edges[:, 1]] - positions[edges[:, 0]]
     same = (apart == 0).all(axis=1)
     if same.any():
@@ -124,7 +124,7 @@ def directions_of(positions: FloatArray, edges: IntArray) -> FloatArray:
 
 
 def check_edge_angles(y: ArrayLike, edges: IntArray) -> FloatArray:
-    """Edge angles y (m,), or a ValueError: of much larger ones rounding leaves no angle."""
+    """Return edge angles y (m,), or raise ValueError; very large angles are invalid."""
     array = check_edge_values("y", y, edges)
     if (np.abs(array) > _LARGEST_ANGLE).any():
         raise ValueError(f"y must be angles in radians, got {np.abs(array).max():g}")
@@ -132,7 +132,7 @@ def check_edge_angles(y: ArrayLike, edges: IntArray) -> FloatArray:
 
 
 def true_bearings(positions: ArrayLike, orientations: ArrayLike, edges: ArrayLike) -> FloatArray:
-    """Bearings (m, 2) without noise: of j in the frame of i, and of i in the frame of j."""
+    """Return noise-free bearings (m, 2): of j in the frame of i, and of i in the frame of j."""
     positions = check_positions(positions)
     edges = check_edges(edges, len(positions))
     toward = directions_of(positions, edges)
@@ -150,7 +150,7 @@ def measure_bearings(
     bearing_std_rad: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Noisy bearings (m, 2): the true ones plus N(0, sigma^2), independent, wrapped.
+    """Simulate bearings (m, 2): true bearings plus independent N(0, sigma^2), wrapped.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def measure_bearings(
 
 
 def edge_angles(bearings: ArrayLike) -> FloatArray:
-    """Edge angles y (m,), (8): ``proj(a - b + pi)`` estimates ``theta_j - theta_i``.
+    """Return edge angles y (m,), (8): ``proj(a - b + pi)`` estimates ``theta_j - theta_i``.
 
     Parameters
     ----------
@@ -190,10 +190,10 @@ def measure_in_space(
     bearing_std_rad: float,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Noisy directions (..., m, 2, 3) along the edges of nodes in space, unit vectors.
+    """Simulate noisy directions (..., m, 2, 3) along the edges of nodes in space, unit vectors.
 
-    Of j in the frame of i, and of i in the frame of j; each is turned by ``exp(n)``, n of
-    N(0, sigma^2) about every axis.
+    They are those of j in the frame of i, and of i in the frame of j. Each is rotated by ``exp(n)``
+    with n from N(0, sigma^2) about every axis.
 
     Parameters
     ----------
@@ -223,17 +223,17 @@ def measure_in_space(
 def random_network(
     n_nodes: int, mean_degree: float, bearing_std_rad: float, rng: np.random.Generator
 ) -> SensingNetwork:
-    """Nodes uniform in a square of unit density, its unit-disk graph, random orientations.
+    """Return a random network: nodes uniform in a square of unit density, and a unit-disk graph.
 
-    The nodes outside of the largest connected component are left out, so that a few of
-    `n_nodes` can be missing.
+    Orientations are random. Nodes outside the largest connected component are left out, so that the
+    network may have fewer nodes than `n_nodes`.
 
     Parameters
     ----------
     n_nodes, mean_degree
-        How many, and how many neighbours each has on average.
+        Number of nodes, and mean number of neighbours of a node.
     bearing_std_rad, rng
-        Noise of the measured bearings, and where all that is drawn comes from.
+        Noise of the measured bearings, and the source of all randomness.
     """
     n_nodes = check_count("n_nodes", n_nodes, most=MOST_NODES)
     mean_degree = check_number("mean_degree", mean_degree, low=0.0)
@@ -251,7 +251,7 @@ def random_network(
 
 
 def check_positions(positions: ArrayLike) -> FloatArray:
-    """Places (n, 2) of nodes as an array, or a ValueError."""
+    """Return node positions (n, 2) as an array, or raise ValueError."""
     array = check_array("positions", positions, ("n", 2))
     if array.ndim != 2:
         raise ValueError(f"positions must have shape (n, 2), got {array.shape}")
