@@ -27,7 +27,8 @@ STAGES, _KEPT = (256, 1024, 2048), (2, 1, 1)
 _FRESH, _STEPS = 3, 12
 # Gradient steps without obstacles: the gradient alone then finds the layout.
 _STEPS_FREE = 40
-# Numbers of greedy candidates, and of greedy starts: limited by the total number of anchors.
+# Number of greedy candidates, largest number of anchors in all greedy starts together, and
+# largest number of greedy starts.
 _CANDIDATES, _ANCHORS, _STARTS = 400, 32, 4
 
 

@@ -121,7 +121,8 @@ def refresh(
         Draws the candidates.
     each
         Number of candidates at each of some distances around the anchor, and of candidates from
-        anywhere. They are projected onto the region, so that they also pass its edges.
+        anywhere. They are projected onto the region, so that those near an edge may lie on the
+        adjacent face.
 
     Returns
     -------
