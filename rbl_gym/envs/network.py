@@ -244,9 +244,9 @@ class PlanarNetworkEnv(ScalarEnv):
     Never terminates; truncates after `steps` steps.
 
     ## Info
-    `positions` (n, 2) and `orientations` (n,): the truth, in a frame with the orientation of node
-    0. `score_rad`: the bound of the orientations. With `lengths` also `score_m`: the bound of the
-    poses.
+    * `positions` (n, 2), `orientations` (n,): the truth, in a frame with the orientation of node 0.
+    * `score_rad`: the bound of the orientations.
+    * `score_m`: the bound of the poses, with `lengths`.
 
     ## Rendering
     ``render_mode="rgb_array"``: nodes, links and headings, with the orientations estimated by

@@ -259,9 +259,11 @@ class AnchorPlacementEnv(ScalarEnv):
     environment made from that spec Gymnasium's `TimeLimit` also truncates at that step.)
 
     ## Info
-    `anchors` (M, 3): positions, zeros for anchors not yet placed. `region`: centre and half size,
-    metres. `racks` (K, 6): the scene's own obstacles first. `score_m`: score of the complete
-    layout, 0 before. mounts: `action_mask` (57); `action_masks()` gives it as booleans.
+    * `anchors` (M, 3): positions, zeros for anchors not yet placed.
+    * `region`: centre and half size, metres.
+    * `racks` (K, 6): centre and half size, metres; the scene's own obstacles first.
+    * `score_m`: score of the complete layout, 0 before.
+    * `action_mask` (57), with ``mode="mounts"``; `action_masks()` gives it as booleans.
 
     ## Rendering
     ``render_mode="rgb_array"``: the problem and its anchors in 3-D and in plan, the expected tag

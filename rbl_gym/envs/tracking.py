@@ -67,9 +67,11 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
     `prior_covariance`). It refers to epoch 0 before the measurements of that epoch.
 
     ## Info
-    `rotation`, `translation`: the true pose. `nlos`: which ranges came over a reflected path (only
-    if ranges are observed). `epoch`: the epoch. `score_m`: b, with ``reward="bound"``. With an
-    inertial sensor also `velocity` (3,), m/s, and `inertial_bias` (6,).
+    * `rotation`, `translation`: the true pose.
+    * `nlos` (M, N): which ranges came over a reflected path.
+    * `epoch`: number of the epoch.
+    * `score_m`: b, with ``reward="bound"``.
+    * `velocity` (3,), m/s, and `inertial_bias` (6,): with an inertial sensor.
 
     ## Episode end
     Never terminates; truncates after `scene.steps` steps (`env.spec.max_episode_steps`). The

@@ -34,8 +34,7 @@ def posterior_step(
     Parameters
     ----------
     scene, at, anchors, links
-        The world at an epoch, the anchor positions (..., M, 3), the links that measured (..., M,
-        N).
+        The world at an epoch, anchor positions (..., M, 3), links that measured (..., M, N).
     previous, prior_covariance
         Information (..., n, n) after the previous epoch, and the prior covariance at epoch 0.
 
@@ -49,7 +48,7 @@ def posterior_step(
         If the information is singular or not finite.
     """
     law = ranging.numbers_of(scene.noise, scene.body.shape[-2])
-    assert law is not None  # all laws of scenes have variances
+    assert law is not None  # all laws of scenes have `numbers`
     if scene.inertial is not None or scene.links.offset is not None or scene.survey_std_m > 0:
         return _joint_step(scene, at, anchors, links, previous, prior_covariance)
     information, score = posterior.step_of_ranges(
