@@ -1,9 +1,9 @@
-"""The iterated EKF with more states than the pose: an unknown twist, biases of the links.
+"""The iterated EKF with states besides the pose: an unknown twist, link biases.
 
-One core serves all of them. Given the pose, what an epoch tells of the other states is linear;
-they are eliminated, the pose is found by the damped Gauss-Newton of `levenberg_marquardt`, and
-they follow from it. An unknown twist is not seen by the ranges at all: the pose's update is then
-that of the plain `IteratedEkf`, at its speed.
+Given the pose, an epoch is linear in the other states. They are eliminated, the pose is found by
+the damped Gauss-Newton method of `levenberg_marquardt`, and the other states follow from it.
+Ranges do not depend on an unknown twist. The pose update is then that of the plain `IteratedEkf`,
+at its speed.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import propagate
 from rbl_gym.motion.unknown_twist import TwistSensor, WanderingTwist
 
-# Losses of whitened innovations, by `robust`. What is left of real ranges has heavier tails than
-# noise: Huber's threshold of 1.0 was measured better than 1.5.
+# Losses of whitened innovations, by `robust`. Residuals of real ranges have heavier tails than
+# Gaussian noise: Huber's threshold of 1.0 was measured to be better than 1.5.
 LOSSES = {False: SQUARES, True: huber(1.0), "late": LATE}
 _AT_REST = np.zeros(6)
-# How often a law of directions is made linear in an update: at the start, and where that leads.
+# Linearisations of a law of directions in an update: at the start, and at the result.
 _PASSES = 2
 
 
@@ -56,16 +56,15 @@ class AugmentedEkf:
     Parameters
     ----------
     pose
-        The filter of the pose alone: tags, noise, process, iterations, robustness.
+        The filter of the pose: tags, noise, process, iterations, robustness.
     twist
-        Law of a twist that is not known; None: `predict` is told the twist.
+        Law of an unknown twist; None: the twist is known and passed to `predict`.
     sensor
-        Reads the twist with noise; None: what `predict` is told of an unknown twist is ignored.
+        Noisy sensor of the twist; None: the twist passed to `predict` is ignored if unknown.
     biases
-        Laws of the links' biases, which add up; empty: there are none.
+        Laws of the link biases, which are added; empty: no biases.
     directions
-        What ranges have too much by the direction of the ray, at the pose that is sought; None:
-        nothing.
+        Range bias by ray direction, at the estimated pose; None: no such bias.
     """
 
     pose: IteratedEkf
@@ -79,7 +78,7 @@ class AugmentedEkf:
 
     @property
     def offset(self) -> str | None:
-        """Whose ranges have an unknown offset in common: as the filter of the pose has it."""
+        """Return which ranges share an unknown offset, as in the pose filter."""
         return self.pose.offset
 
     @property
@@ -88,21 +87,21 @@ class AugmentedEkf:
 
     @property
     def _prior_std(self) -> FloatArray:
-        """Standard deviations of the states between the pose and the biases of links."""
+        """Return prior standard deviations of the states between pose and link biases."""
         return np.zeros(0) if self.twist is None else self.twist.prior_std()
 
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
     ) -> AugmentedState:
-        """State of a prior of the pose, covariance (..., 6, 6).
+        """Return the state of a prior of the pose, covariance (..., 6, 6).
 
-        The further states are zero, as wide as their laws say; biases of links come with the
-        first ranges.
+        The other states are zero, with the covariance of their laws. Link biases are added with
+        the first ranges.
 
         Raises
         ------
         ValueError
-            As `IteratedEkf.initial`.
+            As in `IteratedEkf.initial`.
         """
         pose = self.pose.initial(rotation, translation, covariance)
         batch, std = pose.translation.shape[:-1], self._prior_std
@@ -113,13 +112,13 @@ class AugmentedEkf:
         return AugmentedState(pose.rotation, pose.translation, np.zeros((*batch, n - 6)), P)
 
     def predict(self, state: AugmentedState, twist: ArrayLike | None, dt: float) -> AugmentedState:
-        """State after `dt` seconds.
+        """Return the state after `dt` seconds.
 
         Parameters
         ----------
         twist
-            (..., 6) of the interval. Known, where this filter estimates none. Otherwise it is
-            what the `sensor` read, or nothing to it (None), and without a sensor it is ignored.
+            (..., 6) of the interval. It is the known twist if this filter does not estimate one.
+            Otherwise it is the reading of the `sensor`, or None; without a sensor it is ignored.
         """
         dt, state = check_number("dt", dt, low=0.0), plain(state)
         state, told = told_twist(self, state, twist)
@@ -131,17 +130,17 @@ class AugmentedEkf:
 
     @functools.cached_property
     def _process(self) -> FloatArray:
-        """Variances (6,) of the pose's own motion after 1 s."""
+        """Return the variances (6,) of the process noise of the pose after 1 s."""
         return self.pose.process.std() ** 2
 
     @functools.cached_property
     def _wander(self) -> FloatArray:
-        """Variances (6,) of the change of an unknown twist after 1 s."""
+        """Return the variances (6,) of the change of an unknown twist after 1 s."""
         return np.zeros(6) if self.twist is None else self.twist.std() ** 2
 
     @functools.cached_property
     def _laws(self) -> FloatArray:
-        """Standard deviation, time and common standard deviation (n, 3) of the biases' laws."""
+        """Return standard deviation, time and common standard deviation (n, 3) of the bias laws."""
         laws = [
             (law.std_m, math.inf if law.time_s is None else law.time_s, law.common_std_m)
             for law in self.biases
@@ -156,17 +155,17 @@ class AugmentedEkf:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> AugmentedState:
-        """State after one epoch of ranges (..., M, N); links True = measured.
+        """Return the state after one epoch of ranges (..., M, N); links True = measured.
 
-        `noise` is the law of this epoch, None: that of the filter of the pose.
+        `noise` is the law of this epoch; None: that of the pose filter.
 
-        With biases every update must name the same anchors in the same order. A vague prior is
-        started as by `IteratedEkf`, the biases taken for noise.
+        With biases, every update must have the same anchors in the same order. A vague prior is
+        started as in `IteratedEkf`, with biases treated as noise.
 
         Raises
         ------
         ValueError
-            As `IteratedEkf.update`, and where the number of anchors changes under biases.
+            As in `IteratedEkf.update`, and if the number of anchors changes with biases.
         """
         state = plain(state)
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
@@ -210,7 +209,7 @@ class AugmentedEkf:
         start: tuple[FloatArray, FloatArray],
         covariance: FloatArray,
     ) -> AugmentedState:
-        """The most likely state of an epoch near a start and the covariance of its pose."""
+        """Return the most likely state of an epoch near a start, and its pose covariance."""
         epoch: tuple[Any, ...] = (
             *state, ranges, weights, anchors, self.pose.tags, *start, covariance,
             self.pose.iterations, LOSSES[self.pose.robust], self._n_twist,
@@ -220,7 +219,7 @@ class AugmentedEkf:
         return AugmentedState(*update_any(*epoch, self.offset))  # pyright: ignore[reportCallIssue]
 
     def _with_biases(self, state: AugmentedState, shape: tuple[int, ...]) -> AugmentedState:
-        """The state with room for the biases of (M, N) links."""
+        """Return the state extended by the biases of (M, N) links."""
         links = shape[0] * shape[1]
         have = state.extra.shape[-1] - self._n_twist
         if have == links * len(self.biases):
@@ -249,7 +248,7 @@ class AugmentedEkf:
         anchors: FloatArray,
         mask: BoolArray | None,
     ) -> PoseState:
-        """The pose by the plain filter, the biases taken for noise of the ranges."""
+        """Return the pose of the plain filter, with biases treated as range noise."""
         prior = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
         links = math.prod(ranges.shape[-2:])
         sums = bias_cost.sums_of(self._n_twist, len(self.biases), links)
@@ -264,7 +263,7 @@ class AugmentedEkf:
     def biases_of(
         self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Extra states (..., K), covariance, and what they add to the ranges (M N, K) of anchors
+        """Extra states (..., K), covariance, and derivative (M N, K) of the ranges to anchors
         (..., M, 3).
         """
         shape, count = (anchors.shape[-2], self.pose.tags.shape[-2]), len(self.biases)
@@ -277,7 +276,7 @@ class AugmentedEkf:
         return state.extra, state.covariance, sums
 
     def belief(self, state: AugmentedState) -> PoseBelief:
-        """What the state says about the pose (copies)."""
+        """Return the belief about the pose (copies)."""
         rotation = state.rotation.copy()
         covariance = state.covariance[..., :6, :6].copy()
         return PoseBelief(rotation, state.translation.copy(), covariance, rotation)
@@ -296,19 +295,19 @@ def predict_augmented(
     laws: FloatArray,
     n_twist: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The fields of a state after `dt` seconds.
+    """Return the fields of a state after `dt` seconds.
 
     Parameters
     ----------
     rotation, translation, extra, covariance
-        As of `AugmentedState`.
+        As in `AugmentedState`.
     twist
-        (..., 6), where it is known: where the state holds none (`n_twist` 0).
+        (..., 6), if it is known and not in the state (`n_twist` 0).
     process, wander
-        Variances (6,) after 1 s: of the pose beyond its twist, and of the twist.
+        Variances (6,) after 1 s: of the pose besides its twist, and of the twist.
     laws
-        (n, 3) of the biases: standard deviation, time (infinite: constant), common deviation.
-        They are forgotten, and wander.
+        (n, 3) of the biases: standard deviation, time (infinite: constant), common standard
+        deviation. Biases are Gauss-Markov processes.
     """
     moving = extra[..., :6] if n_twist else twist
     moved = propagate(rotation, translation, moving, dt)
@@ -331,7 +330,7 @@ def predict_augmented(
 def told_twist(
     filter: AugmentedEkf, state: AugmentedState, twist: ArrayLike | None
 ) -> tuple[AugmentedState, FloatArray]:
-    """The state with what a sensor of the filter read, and the twist (..., 6) if it is known."""
+    """Return the state after a sensor reading, and the twist (..., 6) if it is known."""
     known = filter.twist is None
     if twist is None and known:
         raise ValueError("twist must be given to a filter that does not estimate it, got None")
@@ -342,7 +341,7 @@ def told_twist(
 
 
 def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> AugmentedState:
-    """The state after a reading (..., 6) of the twist."""
+    """Return the state after a reading (..., 6) of the twist."""
     rows = np.isfinite(sensor.std())
     H = sensor.jacobian(state.extra[..., :6])[..., rows, :]
     n = H.shape[-1]
@@ -361,7 +360,7 @@ def _sensed(state: AugmentedState, reading: FloatArray, sensor: TwistSensor) -> 
 
 
 def _carried(state: AugmentedState, pose: PoseState) -> AugmentedState:
-    """The state once its pose is known better: the others follow by their correlation with it."""
+    """Return the state after an update of its pose; other states change by their correlation."""
     return AugmentedState(pose.rotation, pose.translation, *carry_states(*state, *pose))
 
 
@@ -375,15 +374,15 @@ def carry_states(
     new_translation: FloatArray,
     new_covariance: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Extra states (..., K) and the covariance (..., 6 + K, 6 + K) of all, of a new pose.
+    """Return extra states (..., K) and covariance (..., 6 + K, 6 + K) for a new pose.
 
-    The first four are of the state before, the others of the pose that an update has found.
+    The first four arguments are the previous state, the others the pose found by an update.
     """
     P, new = covariance, new_covariance
     turn = rotations.error(new_rotation, rotation)
     error, D = pose_error(turn, new_translation - translation)
     gain = P[..., 6:, :6] @ positive_inverse(P[..., :6, :6])
-    # An error of the new pose is one of the old times blkdiag(Jl^-1, I).
+    # The error about the new pose is that about the old one times blkdiag(Jl^-1, I).
     slope = gain @ D
     across = slope @ new
     kept = P[..., 6:, 6:] - gain @ P[..., :6, 6:] + across @ np.swapaxes(slope, -1, -2)

@@ -1,8 +1,8 @@
-"""The iterated EKF of a pose and of clocks that drift: offsets of the ranges that last.
+"""The iterated EKF of a pose and of drifting clocks, which cause lasting range offsets.
 
-A white offset is eliminated in its epoch (`IteratedEkf.offset`). Where clocks are good, what one
-epoch tells of an offset holds for the next: offset and drift are then states beside the pose, two
-for every tag, every anchor or one pair for all, and biases of the ranges as those of links are.
+A white offset is eliminated in its epoch (`IteratedEkf.offset`). If clocks are stable, the offset
+of one epoch is informative for the next. Offset and drift are then states besides the pose: two
+for every tag, for every anchor, or for all. They act on the ranges as link biases do.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from rbl_gym.measurements.offsets import Clock
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import propagate
 
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
 
 @dataclass(frozen=True, eq=False)
 class ClockEkf(AugmentedEkf):
-    """Iterated extended Kalman filter of the pose, of clocks' offsets and of their drifts.
+    """Iterated extended Kalman filter of the pose, and of the offsets and drifts of clocks.
 
-    The extra states are those of `AugmentedEkf`, then offsets and drifts of the G clocks; these
-    and the biases come with the first ranges.
+    The extra states are those of `AugmentedEkf`, then offsets and drifts of the G clocks. These and
+    the biases are added with the first ranges.
 
     Parameters
     ----------
     pose
-        The filter of the pose alone, without an offset.
+        The filter of the pose, without an offset.
     twist, sensor, biases
-        As `AugmentedEkf`.
+        As in `AugmentedEkf`.
     clock
         Law of the offsets.
     """
@@ -57,7 +57,10 @@ class ClockEkf(AugmentedEkf):
             raise ValueError(f"offset must be None beside a clock, got {self.pose.offset!r}")
 
     def predict(self, state: AugmentedState, twist: ArrayLike | None, dt: float) -> AugmentedState:
-        """State after `dt` seconds, the clocks running on; arguments as `AugmentedEkf.predict`."""
+        """Return the state, with clocks, after `dt` seconds.
+
+        Arguments as in `AugmentedEkf.predict`.
+        """
         dt, state = check_number("dt", dt, low=0.0), plain(state)
         state, told = told_twist(self, state, twist)
         known = self.twist is None
@@ -72,7 +75,7 @@ class ClockEkf(AugmentedEkf):
         return AugmentedState(*moved, extra, T @ P @ T.T + noise)
 
     def _transition(self, extra: int, dt: float) -> tuple[FloatArray, FloatArray]:
-        """F and Q of the extra states beside what the twist does: of biases, and of clocks."""
+        """Return F and Q of biases and clocks."""
         F, Q = np.eye(extra), np.zeros((extra, extra))
         clocks = self._n_clocks(extra)
         if not clocks:
@@ -90,11 +93,11 @@ class ClockEkf(AugmentedEkf):
         return F, Q
 
     def _n_clocks(self, extra: int) -> int:
-        """How many clocks a state of so many extra states has: none before the first ranges."""
+        """Return the number of clocks in the extra states: zero before the first ranges."""
         return 0 if extra == self._n_twist else self._clocks_of(extra - self._n_twist)
 
     def _clocks_of(self, more: int) -> int:
-        """Clocks of so many states of biases and clocks: of M N links and N tags."""
+        """Return the number of clocks from that of states, for M N links and N tags."""
         n, laws = self.pose.tags.shape[-2], len(self.biases)
         if self.clock.offset == "anchor":
             return more // (laws * n + 2)
@@ -109,12 +112,12 @@ class ClockEkf(AugmentedEkf):
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> AugmentedState:
-        """State after one epoch of ranges (..., M, N) of any sign; arguments as `AugmentedEkf`.
+        """Return the state after ranges (..., M, N) of any sign; arguments as in `AugmentedEkf`.
 
         Raises
         ------
         ValueError
-            As `IteratedEkf.update`, and where the number of anchors changes under their clocks.
+            As in `IteratedEkf.update`, and if the number of anchors with clocks changes.
         """
         state = plain(state)
         pose = PoseState(state.rotation, state.translation, state.covariance[..., :6, :6])
@@ -124,7 +127,7 @@ class ClockEkf(AugmentedEkf):
         ranges, distance = np.broadcast_arrays(ranges, distance)
         there = np.broadcast_to(True if mask is None else mask, ranges.shape)
         variance = epoch_variance(noise, self.pose.noise, distance, mask)
-        # A start is sought as if biases were noise.
+        # The search for a start treats biases as noise.
         spread = sum(law.std_m**2 + law.common_std_m**2 for law in self.biases)
         seen = np.where(there, 1 / (variance + spread), 0.0)
         white = dataclasses.replace(self.pose, offset=self.clock.offset)
@@ -143,13 +146,16 @@ class ClockEkf(AugmentedEkf):
 
     @property
     def offset(self) -> str | None:
-        """Whose ranges have a clock in common: innovations are those of what offsets leave."""
+        """Return which ranges share a clock.
+
+        Innovations are those after the offsets are removed.
+        """
         return self.clock.offset
 
     def biases_of(
         self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As `AugmentedEkf.biases_of`, without the clocks."""
+        """See `AugmentedEkf.biases_of`; clocks are not included."""
         state = plain(state)
         n = state.extra.shape[-1]
         n -= 2 * self._n_clocks(n)
@@ -157,7 +163,7 @@ class ClockEkf(AugmentedEkf):
         return super().biases_of(AugmentedState(state.rotation, state.translation, *less), anchors)
 
     def _sums(self, shape: tuple[int, ...]) -> FloatArray:
-        """Which biases, which offset, and no drift, each of (M, N) ranges has: (M N, K)."""
+        """Return the derivative (M N, K) of ranges by biases, offsets and drifts (zero)."""
         links = shape[0] * shape[1]
         own = bias_cost.sums_of(self._n_twist, len(self.biases), links)
         columns = offsets.columns(self.clock.offset, shape[0], shape[1])
@@ -166,7 +172,7 @@ class ClockEkf(AugmentedEkf):
     def _with_clocks(
         self, state: AugmentedState, gaps: FloatArray, there: np.ndarray
     ) -> AugmentedState:
-        """The state with biases and clocks, at first set by ranges less distances (..., M, N)."""
+        """Return the state with biases and clocks, from ranges minus distances (..., M, N)."""
         guess = offsets.median(gaps, there, self.clock.offset)
         shape = gaps.shape[-2:]
         biases = len(self.biases) * shape[0] * shape[1]

@@ -1,8 +1,8 @@
-"""Biases by the direction of the ray as states of an epoch, which hang on the pose alone.
+"""Treat biases by ray direction as states of an epoch, which are functions of the pose.
 
-About a pose x the bias of a link is ``beta(x) + B e``, e the pose's error: a state without
-uncertainty of its own, wholly correlated with the pose. So it goes through the update of biases
-as it is, and is dropped after it.
+About a pose x the bias of a link is ``beta(x) + B e`` with the pose error e. It is a state without
+own uncertainty, fully correlated with the pose. The bias update applies to it unchanged, and it is
+dropped afterwards.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ def directed(
     anchors: FloatArray,
     tags: FloatArray,
 ) -> AugmentedState:
-    """The state with the biases (M N) of the directions behind the others.
+    """Return the state with the biases (M N) by direction appended.
 
     Parameters
     ----------
     state
-        Of the filter, before or after an update.
+        State of the filter, before or after an update.
     law
-        Of M anchors and N tags.
+        Law of M anchors and N tags.
     about
-        Rotation (..., 3, 3) and translation (..., 3) where the law is made linear.
+        Rotation (..., 3, 3) and translation (..., 3) of the linearisation.
     anchors, tags
         (..., M, 3) and (N, 3).
     """
@@ -55,6 +55,6 @@ def directed(
 
 
 def undirected(state: AugmentedState, links: int) -> AugmentedState:
-    """The state without the biases of so many links that `directed` has put behind."""
+    """Return the state without the link biases that `directed` has appended."""
     n = state.covariance.shape[-1] - links
     return state._replace(extra=state.extra[..., : n - 6], covariance=state.covariance[..., :n, :n])

@@ -1,4 +1,4 @@
-"""The iterated extended Kalman filter with directions of arrival, alone or beside ranges."""
+"""The iterated extended Kalman filter with directions of arrival, alone or with ranges."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ class DoaEkf(IteratedEkf):
     Parameters
     ----------
     tags, process, iterations, robust
-        As `IteratedEkf`; of angles the loss is Huber's.
+        As in `IteratedEkf`; the loss of angles is Huber's.
     noise
-        Law of the angles.
+        Noise law of the angles.
     range_noise
-        Law of the ranges, where an update is given some besides.
+        Noise law of ranges, if an update also has ranges.
     offset
         None: angles have no unknown offset.
     """
 
-    noise: Any  # bearing.AngleNoise, where the base class has a law of ranges
+    noise: Any  # bearing.AngleNoise, the base class has a law of ranges
     range_noise: NoiseLaw | None = None
 
     def __post_init__(self) -> None:
@@ -79,23 +79,23 @@ class DoaEkf(IteratedEkf):
         range_links: ArrayLike | None = None,
         range_noise: NoiseLaw | None = None,
     ) -> PoseState:
-        """State after one epoch of directions of arrival, and of ranges where there are any.
+        """Return the state after one epoch of directions of arrival, and of ranges if given.
 
-        Where the prior rotation is vague in a direction that the epoch determines, the update
-        starts from the global solution of the angles and its alternatives besides (with fewer
-        than three tags, or tags in a line, from rotations all over the prior); of mirror images
-        the prior decides. What the epoch does not see stays as wide as it was.
+        If the prior rotation is vague in a direction that the epoch determines, the update also
+        starts from the global solution of the angles and its alternatives. With fewer than three
+        tags, or collinear tags, it starts from rotations spread over the prior. The prior decides
+        between mirror images. Directions that the epoch does not determine keep their uncertainty.
 
         Parameters
         ----------
         angles
             (..., 2, N), radians (`rbl_gym.measurements.bearing`).
         station
-            Place of the base station, (..., 3) or, as the one anchor, (..., 1, 3).
+            Position of the base station, (..., 3) or, as a single anchor, (..., 1, 3).
         links
-            Mask (..., N) or (..., 1, N): which tags were heard; None: all.
+            Mask (..., N) or (..., 1, N): which tags were received; None: all.
         noise, range_noise
-            Laws of the angles and of the ranges of this epoch; None: the filter's.
+            Laws of the angles and of the ranges of this epoch; None: those of the filter.
         ranges, anchors, range_links
             (..., M, N), (..., M, 3) and their mask, of the same epoch; anchors None: one range
             to every tag, from the station.
@@ -103,14 +103,14 @@ class DoaEkf(IteratedEkf):
         Raises
         ------
         ValueError
-            On wrong shapes, NaN, angles outside [0, pi], ranges without their law.
+            If a shape is wrong, a value is NaN, an angle is outside [0, pi], or ranges have no law.
         """
         n_tags = self.tags.shape[-2]
         station = _check_station(station)
         heard = _check_heard(links, n_tags)
         if heard is not None:
             shape = np.broadcast_shapes(np.shape(angles), (*heard.shape[:-1], 1, n_tags))
-            # What was not heard may hold anything.
+            # Entries that were not received may have any value.
             angles = np.where(heard[..., None, :], np.broadcast_to(angles, shape), 0.0)
         angles = bearing.check_angles(angles, n_tags)
         law = self.noise if noise is None else noise
@@ -146,7 +146,7 @@ class DoaEkf(IteratedEkf):
         return self.tags.shape[-2] > 2 and bool((spanned_dimensions(self.tags) > 1).all())
 
     def _start(self, problem: MapProblem, data: DoaCost | SumCost) -> tuple[FloatArray, FloatArray]:
-        """The prior, or what a search finds where that is vague in what the epoch determines."""
+        """Return the prior, or a search result if it is vague in a determined direction."""
         vague = is_vague(problem.prior.covariance)
         if not vague.any():
             return problem.prior.rotation, problem.prior.translation
@@ -160,7 +160,7 @@ class DoaEkf(IteratedEkf):
 
 
 def _starts_of_angles(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
-    """Poses (K, S, ...): the prior, the global solution of the angles, and its alternatives.
+    """Return poses (K, S, ...): the prior, the global solution of the angles, its alternatives.
 
     `problem`: trials (K, 1).
     """
@@ -179,19 +179,19 @@ def _starts_of_angles(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
 
 
 def _spread_of_prior(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
-    """Poses (K, S, ...) at the prior's place, turned as far as the prior is wide."""
+    """Return poses (K, S, ...) at the prior position, with rotations spread over the prior."""
     rotation = spread(problem.prior)
     return rotation, np.broadcast_to(problem.prior.translation, rotation.shape[:-1])
 
 
 def _check_station(station: ArrayLike) -> FloatArray:
-    """A place (..., 3) from that or from one anchor (..., 1, 3)."""
+    """Return a position (..., 3), from this shape or from one anchor (..., 1, 3)."""
     place = check_array("station", station, (3,))
     return place[..., 0, :] if place.ndim > 1 and place.shape[-2] == 1 else place
 
 
 def _check_heard(links: ArrayLike | None, n_tags: int) -> BoolArray | None:
-    """The mask (..., N), or None where every tag was heard."""
+    """Return the mask (..., N), or None if every tag was received."""
     if links is None:
         return None
     mask = np.asarray(links)
@@ -215,20 +215,20 @@ def iterated_ekf(
     clock: Clock | None = None,
     anchor_std_m: ArrayLike | None = None,
 ) -> IteratedEkf | AugmentedEkf | ClockEkf:
-    """The filter ``"iekf"``: `IteratedEkf` on ranges, `DoaEkf` on directions of arrival.
+    """Return the filter ``"iekf"``: `IteratedEkf` on ranges, `DoaEkf` on directions of arrival.
 
     Parameters
     ----------
     measurement
-        ``"ranges"`` or ``"doa"``; `noise` is the law of what is measured.
+        ``"ranges"`` or ``"doa"``; `noise` is their law.
     range_noise
-        Of ``"doa"``: the law of ranges that an update may bring besides.
+        For ``"doa"``: the law of additional ranges of an update.
     tags, process, iterations, robust, offset
-        As `IteratedEkf`.
+        As in `IteratedEkf`.
     clock
-        Law of offsets that last, in place of `offset`: their clocks are states then (`ClockEkf`).
+        Law of lasting offsets, instead of `offset`: their clocks become states (`ClockEkf`).
     anchor_std_m
-        How well the anchors' places are known: they are states then (`SurveyedEkf`).
+        Standard deviation of the anchor positions: they become states (`SurveyedEkf`).
     """
     check_one_of("measurement", measurement, MEASUREMENTS)
     if measurement == "doa":

@@ -1,9 +1,9 @@
-"""The iterated EKF that an inertial sensor carries from one epoch of ranges to the next.
+"""The iterated EKF with prediction by an inertial sensor between epochs of ranges.
 
-Error states: rotation (global), place, velocity, biases of gyroscope and accelerometer (15); if
-asked for the tilt of gravity (2), where the world's z axis is not quite vertical; then biases of
-the links. Readings between two epochs are integrated by `motion.navigation`; ranges update the
-pose as in `AugmentedEkf`, and the other states follow from it.
+Error states: rotation (global), position, velocity, biases of gyroscope and accelerometer (15);
+optionally the tilt of gravity (2), if the z axis of the world is not exactly vertical; then link
+biases. Readings between two epochs are integrated by `motion.navigation`; ranges update the
+pose as in `AugmentedEkf`, and the other states by correlation.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ _NAVIGATION = 9
 
 @dataclass(frozen=True, eq=False)
 class InertialEkf(AugmentedEkf):
-    """Iterated extended Kalman filter of pose, velocity and biases, moved by an inertial sensor.
+    """Iterated extended Kalman filter of pose, velocity and biases with an inertial sensor.
 
     Parameters
     ----------
     pose, biases
-        As `AugmentedEkf`; the `process` of the filter of the pose is not used: what moves the body
-        is measured, and its noise is the sensor's.
+        As in `AugmentedEkf`. The `process` of the pose filter is not used, because the motion is
+        measured with the noise of the sensor.
     twist, sensor
         None.
     inertial
         The sensor.
     speed_m_s
-        Standard deviation of the first velocity about zero, per axis.
+        Standard deviation of the initial velocity about zero, per axis.
     gravity_tilt_rad
-        Standard deviation per axis of the angle between the world's z axis and the vertical;
-        0: there is none, and no states for it.
+        Standard deviation per axis of the angle between the world z axis and the vertical; 0: no
+        tilt, and no states for it.
     """
 
     inertial: InertialSensor = field(default_factory=lambda: SENSORS["consumer"])
@@ -63,7 +63,7 @@ class InertialEkf(AugmentedEkf):
 
     @functools.cached_property
     def _law(self) -> FloatArray:
-        """As `navigation.propagate` takes it."""
+        """Return the law for `navigation.propagate`."""
         return np.append(self.inertial.numbers, self.gravity_tilt_rad > 0)
 
     @functools.cached_property
@@ -74,19 +74,20 @@ class InertialEkf(AugmentedEkf):
     def predict(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, state: AugmentedState, readings: ArrayLike, dt: ArrayLike
     ) -> AugmentedState:
-        """State after the samples of an interval.
+        """Return the state after the samples of an interval.
 
         Parameters
         ----------
         readings
             (..., S, 6): angular velocity (rad/s) and specific force (m/s^2) in the body frame.
         dt
-            Seconds of the interval, which its samples share alike; or of each sample, (..., S).
+            Duration of the interval, shared equally by its samples, or of each sample, (..., S),
+            seconds.
 
         Raises
         ------
         ValueError
-            On wrong shapes, NaN, negative times.
+            If a shape is wrong, a value is NaN, or a time is negative.
         """
         readings = check_array("readings", readings, ("S", 6))
         if isinstance(dt, list | tuple) or getattr(dt, "ndim", 0):
@@ -107,16 +108,17 @@ class InertialEkf(AugmentedEkf):
 def fade(
     extra: FloatArray, covariance: FloatArray, laws: FloatArray, dt: FloatArray, n_twist: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Extra states and covariance after `dt` seconds (...): biases of the links are forgotten.
+    """Return extra states and covariance after `dt` seconds (...), over which biases decorrelate.
 
     Parameters
     ----------
     extra, covariance
-        As of `AugmentedState`.
+        As in `AugmentedState`.
     laws
-        (n, 3) of the biases: standard deviation, time (infinite: constant), common deviation.
+        (n, 3) of the biases: standard deviation, time (infinite: constant), common standard
+        deviation.
     dt, n_twist
-        Seconds (...), and how many of the extra states are no biases.
+        Seconds (...), and the number of extra states that are not biases.
     """
     start = 6 + n_twist
     links = (covariance.shape[-1] - start) // len(laws)

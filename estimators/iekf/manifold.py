@@ -1,8 +1,8 @@
 """The iterated extended Kalman filter on SO(3) x R^3 with raw ranges.
 
 Every update is the maximum a posteriori pose of the epoch by Gauss-Newton, with the prior
-residual ``log(Q Q_pred^T)``; it reaches the posterior Cramer-Rao bound where the linear
-filters of the tracking paper, which project ``|s|^2`` out, cannot.
+residual ``log(Q Q_pred^T)``; it reaches the posterior Cramer-Rao bound, which the linear
+filters of the tracking paper cannot, because they project ``|s|^2`` out.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise, numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
-# Fewer ranges in an epoch are no reason for a search.
+# With fewer ranges in an epoch, no search is made.
 _FEWEST_SOUGHT = 3
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
 
@@ -68,21 +68,21 @@ class IteratedEkf:
     Parameters
     ----------
     tags
-        (N, 3), metres, body frame, as given; with leading axes each trial has its own.
+        (N, 3), metres, body frame; with leading axes for individual trials.
     noise
-        Law of the ranges; variances are taken at the measured ranges.
+        Noise law of the ranges; variances are taken at the measured ranges.
     process
-        Noise of the motion; with leading axes each trial has its own.
+        Process noise; with leading axes for individual trials.
     iterations
-        Gauss-Newton iterations of an update; one alone is overconfident at high turn noise.
+        Gauss-Newton iterations of an update; a single one is overconfident at high rotation noise.
     robust
-        For real radios. True: Huber's loss on the whitened residuals (threshold 1.5), and nothing
-        of ranges that contradict the rest. ``"late"``: for ranges that err late rather than
-        early, weights that fall with the square of the residual, half as large where it is late.
+        For real radios. True: Huber's loss on the whitened residuals (threshold 1.5), and exclusion
+        of ranges that contradict the others. ``"late"``: for ranges with mostly late errors,
+        weights that fall with the square of the residual, half as large for late ones.
     offset
-        Whose ranges have an unknown offset in common, new at every epoch: ``"tag"`` (uplink time
-        differences), ``"anchor"``, ``"epoch"``; None: no ranges. They may then have any sign, and
-        the law's variances are taken at the distances from the prior.
+        Ranges of one ``"tag"`` (uplink time differences), ``"anchor"`` or ``"epoch"`` share an
+        unknown offset, independent at every epoch; None: no offset. With an offset, ranges may have
+        any sign, and variances are taken at the distances of the prior.
     """
 
     tags: FloatArray
@@ -100,23 +100,23 @@ class IteratedEkf:
 
     @functools.cached_property
     def _loss(self) -> int:
-        """`robust` as the kernel takes it."""
+        """Return the kernel code of `robust`."""
         return check_robust(self.robust)
 
     @functools.cached_property
     def _variance(self) -> FloatArray:
-        """Variances (..., 6) of the motion's noise after 1 s."""
+        """Return the variances (..., 6) of the process noise after 1 s."""
         return self.process.std() ** 2
 
     def initial(
         self, rotation: ArrayLike, translation: ArrayLike, covariance: ArrayLike
     ) -> PoseState:
-        """State of a prior, covariance (..., 6, 6).
+        """Return the state of a prior, covariance (..., 6, 6).
 
         Raises
         ------
         ValueError
-            On wrong shapes, a matrix that is no rotation, a covariance that is not positive.
+            If a shape is wrong, a matrix is not a rotation, or a covariance is not positive.
         """
         rotation, translation, covariance = check_prior(rotation, translation, covariance, (6,))
         batch = np.broadcast_shapes(
@@ -129,7 +129,7 @@ class IteratedEkf:
         )
 
     def predict(self, state: PoseState, twist: ArrayLike, dt: ArrayLike) -> PoseState:
-        """State after `dt` seconds (...) of the twist (..., 6), ``P <- F P F^T + Q``."""
+        """Return the state after `dt` seconds (...) of the twist (..., 6), ``P <- F P F^T + Q``."""
         twist = check_array("twist", twist, (6,))
         dt = check_duration("dt", dt)
         if twist.ndim > 1 or type(dt) is not float or self._variance.ndim > 1:
@@ -146,18 +146,18 @@ class IteratedEkf:
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> PoseState:
-        """State after one epoch of ranges (..., M, N); `noise` is its law, None: the filter's.
+        """Return the state after an epoch of ranges (..., M, N); `noise` None: that of the filter.
 
-        Where the prior rotation is vague in a direction that the epoch determines (a first epoch,
-        a lost track), the update starts from many poses and keeps the best. What the epoch does
-        not see stays as wide as it was. Among coplanar anchors the mirror pose may explain the
-        ranges as well: then only a prior that knows the side tells them apart (`locate` lists both,
+        If the prior rotation is vague in a direction that the epoch determines (first epoch, lost
+        track), the update starts from many poses and keeps the best. Directions that the epoch does
+        not determine keep their uncertainty. With coplanar anchors the mirror pose may explain the
+        ranges equally well. Then only the prior can distinguish the two (`locate` lists both,
         ``"iekf-bank"`` follows both).
 
         Raises
         ------
         ValueError
-            On wrong shapes, NaN, ranges that are not positive.
+            If a shape is wrong, a value is NaN, or a range is not positive.
         """
         found = self._update_plain(state, ranges, anchors, links, noise)
         if found is not None:
@@ -189,17 +189,17 @@ class IteratedEkf:
     def _update_plain(
         self, state: PoseState, ranges: ArrayLike, anchors: ArrayLike, links: Any, noise: Any
     ) -> PoseState | None:
-        """The update by an epoch with nothing special about it, in few calls.
+        """Return the update with a plain epoch, in few calls; None for other epochs.
 
-        None where there is: then the long way says what, or does it. The values are looked at
-        by `update_pose`.
+        Other epochs need the general code, which also raises the errors. `update_pose` checks the
+        values.
         """
         P = state.covariance
         if self.offset is not None or not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
             return None
         shares, numbers = self._plain_law(ranges, links, noise)  # pyright: ignore[reportArgumentType]
         if P.ndim == 2:
-            # The trace of the rotation's block; single numbers are quickest as floats.
+            # The trace of the rotation block; single numbers are fastest as floats.
             wide = P.item(0) + P.item(7) + P.item(14) > VAGUE_ROTATION_RAD**2
         else:
             wide = is_vague(P).any()
@@ -209,7 +209,7 @@ class IteratedEkf:
             *state, ranges, shares, numbers, anchors, self.tags,
             state.rotation, state.translation, 0, self.iterations, self._loss,
         )  # fmt: skip
-        # One number tells of all: it is finite where the covariance is.
+        # One number suffices: it is finite if the covariance is.
         if not all_finite(cost):
             return None
         return PoseState(rotation, translation, P)
@@ -217,14 +217,14 @@ class IteratedEkf:
     def _plain_law(
         self, ranges: FloatArray, links: Any, noise: Any
     ) -> tuple[FloatArray | None, FloatArray | None]:
-        """Shares and law as `update_pose` takes them; None where the long way finds them."""
+        """Return shares and law for `update_pose`; None if the general code must compute them."""
         if links is None and noise is None:
             return all_links(*ranges.shape[-2:]), numbers_of(self.noise, len(self.tags))
         if (
             type(links) is not np.ndarray
             or links.dtype != np.bool_
             or links.shape != ranges.shape
-            # A lost range may be anything: the long way puts zeros in its place.
+            # A lost range may have any value: the general code replaces it by zero.
             or not math.isfinite(np.vdot(ranges, ranges))
         ):
             return None, None
@@ -250,9 +250,9 @@ class IteratedEkf:
         noise: NoiseLaw | None,
         state: Any,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A checked epoch as (ranges, weights, anchors): inverse variances, 0 of lost links.
+        """Return a checked epoch: ranges, weights (inverse variances, 0 if lost), and anchors.
 
-        Of ranges with offsets the `state` tells the distances, for their variances.
+        For ranges with offsets, the `state` gives the distances for the variances.
         """
         ranges, variance, anchors, mask = self.measured(state, ranges, anchors, links, noise)
         if variance.shape[-2:] != ranges.shape[-2:]:
@@ -262,7 +262,7 @@ class IteratedEkf:
     def measured(
         self, state: Any, ranges: Any, anchors: Any, links: Any, noise: NoiseLaw | None
     ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray | None]:
-        """A checked epoch: ranges, variances, anchors, and links, None where all were measured."""
+        """Return a checked epoch: ranges, variances, anchors, and links (None: all measured)."""
         if self.offset is None:
             ranges, anchors, mask = check_epoch(ranges, anchors, links, self.tags)
             return ranges, epoch_variance(noise, self.noise, ranges, mask), anchors, mask
@@ -275,11 +275,11 @@ class IteratedEkf:
     def start(
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Where an update of a checked epoch starts from: the prior, or what a search finds."""
+        """Return the start of an update with a checked epoch: the prior, or a search result."""
         sought = self.is_sought(state, ranges, weights, anchors)
         if not sought.any():
             return state.rotation, state.translation
-        # Late ranges would lead squares to the wrong one of many minima.
+        # With late ranges, least squares would reach a wrong local minimum.
         late = self.robust == "late" or (self.robust and self.offset is not None)
         loss = huber(HUBER) if late else SQUARES
         problem = map_problem(state, self._cost(ranges, weights, anchors, loss=loss))
@@ -288,11 +288,11 @@ class IteratedEkf:
     def is_sought(
         self, state: PoseState, ranges: FloatArray, weights: FloatArray, anchors: FloatArray
     ) -> BoolArray:
-        """Where (...) an update by a checked epoch starts from many poses (`vague_start`)."""
+        """Return whether (...) an update starts from many poses (`vague_start`)."""
         vague = is_vague(state.covariance)
         if not vague.any():
             return vague
-        # So few ranges leave a curve of poses: to search them is to guess.
+        # So few ranges leave a curve of poses, and a search would pick an arbitrary one.
         vague = vague & ((weights > 0).sum(axis=(-2, -1)) >= _FEWEST_SOUGHT)
         if not vague.any():
             return vague
@@ -310,6 +310,6 @@ class IteratedEkf:
         return RangeCost(ranges, weights, anchors, self.tags, loss, offset=self.offset)
 
     def belief(self, state: PoseState) -> PoseBelief:
-        """The state as a belief (copies)."""
+        """Return the state as a belief (copies)."""
         rotation = state.rotation.copy()
         return PoseBelief(rotation, state.translation.copy(), state.covariance.copy(), rotation)

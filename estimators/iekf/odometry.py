@@ -1,9 +1,9 @@
-"""The iterated EKF of a body with odometry: its twist in its own axes, and the sensor's faults.
+"""The iterated EKF of a body with odometry: states are the body twist and the sensor errors.
 
-Error states: rotation (global), place, turn rate and speed in the body's axes (12); scales of turn
-rate and speed and biases of the turn rates, which are constant (5); then biases of the links. The
-twist wanders by white acceleration, and every reading of the odometry measures it: where readings
-are missing, the body goes on as it did.
+Error states: rotation (global), position, turn rate and velocity in body axes (12); constant scale
+errors of turn rate and speed and biases of the turn rates (5); then link biases. The twist is a
+random walk driven by white acceleration, and every odometry reading measures it. Without readings,
+the predicted twist stays constant.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class OdometryEkf(AugmentedEkf):
     Parameters
     ----------
     pose, biases
-        As `AugmentedEkf`.
+        As in `AugmentedEkf`.
     twist
         Law of the twist, per axis of the body.
     sensor
         None.
     odometry
-        Law of the readings.
+        Error model of the readings.
     """
 
     twist: WanderingTwist | None = field(default_factory=WanderingTwist)
@@ -69,20 +69,21 @@ class OdometryEkf(AugmentedEkf):
     def predict(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, state: AugmentedState, readings: ArrayLike, dt: ArrayLike
     ) -> AugmentedState:
-        """State after the readings of an interval.
+        """Return the state after the readings of an interval.
 
         Parameters
         ----------
         readings
-            (..., S, 6): turn rate (rad/s) and speed (m/s) in the body frame, NaN where there is
-            none.
+            (..., S, 6): turn rate (rad/s) and velocity (m/s) in the body frame, NaN if not
+            measured.
         dt
-            Seconds of the interval, which its readings share alike; or of each reading, (..., S).
+            Duration of the interval, shared equally by its readings, or of each reading, (..., S),
+            seconds.
 
         Raises
         ------
         ValueError
-            On wrong shapes, infinite readings, negative times.
+            If a shape is wrong, a reading is infinite, or a time is negative.
         """
         readings = np.asarray(readings, dtype=np.float64)
         if readings.ndim < 2 or readings.shape[-1] != 6 or np.isinf(readings).any():
@@ -99,7 +100,7 @@ class OdometryEkf(AugmentedEkf):
         for k in range(readings.shape[-2]):
             step = steps[..., k]
             state = self._jumped(state, step)
-            # A reading of no time tells nothing.
+            # A reading of zero duration has no information.
             told = np.where(step[..., None] > 0, readings[..., k, :], np.nan)
             if not np.isnan(told).all():
                 state = _sensed(state, told, step, self.odometry)
@@ -110,7 +111,7 @@ class OdometryEkf(AugmentedEkf):
         return state
 
     def _jumped(self, state: AugmentedState, dt: FloatArray) -> AugmentedState:
-        """State whose twist has changed by what it does in `dt` seconds (...)."""
+        """Return the state after the random walk of the twist over `dt` seconds (...)."""
         P = state.covariance
         P = np.broadcast_to(P, (*np.broadcast_shapes(P.shape[:-2], np.shape(dt)), *P.shape[-2:]))
         P = P.copy()
@@ -118,7 +119,7 @@ class OdometryEkf(AugmentedEkf):
         return state._replace(covariance=P)
 
     def _moved(self, state: AugmentedState, dt: FloatArray) -> AugmentedState:
-        """State after `dt` seconds (...) of its twist, which stays."""
+        """Return the state after `dt` seconds (...) with a constant twist."""
         Q, extra = state.rotation, state.extra
         dt = np.asarray(dt)[..., None]
         turn, speed = extra[..., :3] * dt, extra[..., 3:6]
@@ -144,14 +145,13 @@ class OdometryEkf(AugmentedEkf):
 def _sensed(
     state: AugmentedState, reading: FloatArray, dt: FloatArray, sensor: OdometrySensor
 ) -> AugmentedState:
-    """The state after a reading (..., 6) that counts for `dt` seconds (...)."""
+    """Return the state after a reading (..., 6) with the duration `dt` seconds (...)."""
     known, P = np.isfinite(reading), state.covariance
     twist, calibration = state.extra[..., :6], state.extra[..., 6:11]
     scale = 1 + np.repeat(calibration[..., :2], 3, axis=-1)
     error = np.where(known, reading, 0.0) - np.where(known, expected(twist, calibration), 0.0)
     variance = sensor.noise() ** 2 / np.where(dt > 0, dt, 1.0)[..., None]
-    # The scales are seen at the twist that the reading makes likely: the body may have been
-    # believed at rest.
+    # The scales are linearised at the twist of the reading, because the prior may be at rest.
     own = np.diagonal(P, axis1=-2, axis2=-1)[..., _TWIST]
     likely = twist + own * scale / (own * scale**2 + variance) * error
     H = np.zeros((*np.broadcast_shapes(error.shape, scale.shape), _STATES))

@@ -1,4 +1,4 @@
-"""Prediction and update of a pose as arrays: textbook forms of the kernels of `pose_filter`."""
+"""Predict and update a pose as arrays: textbook forms of the kernels of `pose_filter`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from rbl_gym.kernels import compiled
 from rbl_gym.measurements import offsets
 from rbl_gym.measurements.noise_laws import law_of
 
-# The law of `update_pose` whose shares are weights.
+# The law of `update_pose` if its shares are weights.
 WEIGHTS = np.array([2.0, 0.0, 0.0, -1.0])
-# Behind the doors: what comes to these was checked, or made here.
+# Internal functions without checks: their arguments were checked, or made here.
 _EXP, _LEFT_JACOBIAN = kernel(rotations.exp), kernel(rotations.left_jacobian)
 
 
@@ -35,10 +35,10 @@ def predict_pose(
     dt: float,
     variance: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pose and covariance after `dt` seconds of a twist, ``P <- F P F^T + dt G S G^T``.
+    """Return pose and covariance after `dt` seconds of a twist, ``P <- F P F^T + dt G S G^T``.
 
     ``F = blkdiag(exp(w dt), I)`` and ``G = blkdiag(Jl(w dt), I)``: the error is global, and the
-    noise, of `variance` (6,) after 1 s, is on the angular velocity.
+    noise, with `variance` (6,) after 1 s, acts on the angular velocity.
     """
     rotation, translation, covariance = plain(PoseState(rotation, translation, covariance))
     seconds = np.asarray(dt)[..., None]
@@ -69,31 +69,31 @@ def update_pose(
     iterations: int,
     robust: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The most likely pose of an epoch near a start, its covariance, and the cost there.
+    """Return the most likely pose of an epoch near a start, its covariance, and its cost.
 
     Parameters
     ----------
     rotation, translation, covariance
         The prior.
     ranges, anchors, tags
-        As of `RangeCost`.
+        As in `RangeCost`.
     shares, law
         The weights (..., M, N) and `WEIGHTS`; or ones and the numbers (4,) of a noise law
-        (`noise_laws.numbers_of`), where all links were measured.
+        (`noise_laws.numbers_of`), if all links were measured.
     start_rotation, start_translation
-        Where Gauss-Newton starts.
+        Start of Gauss-Newton.
     offset
-        Kind of the ranges' offsets, as kernels have it (`offsets.code_of`).
+        Code of the kind of range offsets (`offsets.code_of`).
     iterations
-        Of Gauss-Newton, at the most.
+        Maximum number of Gauss-Newton iterations.
     robust
-        Of `robust_update.ROBUST`. 1: the cost is that of Huber's loss, constant beyond `GATE`, of
-        all links. 2: it is that of the redescending loss.
+        A value of `robust_update.ROBUST`. 1: the cost is Huber's loss of all links, constant beyond
+        `GATE`. 2: it is the redescending loss.
 
     Returns
     -------
-    Rotation, translation, covariance, cost (...). The last two are NaN where a matrix is not
-    positive definite, a range that counts not positive, or anything not finite.
+    Rotation, translation, covariance, cost (...). The last two are NaN if a matrix is not
+    positive definite, a used range is not positive, or a value is not finite.
     """
     weights = shares if law[0] == WEIGHTS[0] else shares / law_of(law).variance(ranges)
     prior = plain(PoseState(rotation, translation, covariance))
@@ -122,7 +122,7 @@ def update_pose(
 
 
 def as_state(rotation: FloatArray, translation: FloatArray, covariance: FloatArray) -> PoseState:
-    """A state of what an update found, or a LinAlgError where its covariance is none."""
+    """Return the state of an update, or raise LinAlgError if its covariance is invalid."""
     if not math.isfinite(np.vdot(covariance, covariance)):
         raise np.linalg.LinAlgError(
             "the information about the pose must be positive definite before and after an update"

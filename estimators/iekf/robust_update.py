@@ -1,9 +1,9 @@
-"""The robust updates: Huber's loss, and no pull at all of links that contradict the rest.
+"""Robust updates: Huber's loss, and exclusion of links that contradict the others.
 
-Huber's loss alone survives wrong ranges, but each of them still pulls with the force of 1.5
-standard deviations: with one range in ten over a reflected path that doubles the error.
+Huber's loss alone tolerates wrong ranges, but each of them still has the influence of 1.5 standard
+deviations. With one range in ten over a reflected path, this doubles the error.
 
-Where ranges err late, the redescending loss for late ranges takes the place of both.
+For late ranges, the redescending loss replaces both.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from rbl_gym.estimators.costs.losses import LATE, cut_huber, huber
 from rbl_gym.estimators.costs.map_problem import MapProblem, PoseState
 from rbl_gym.estimators.costs.range_cost import RangeCost, squared_residuals
 
-# Whitened residual at which Huber's loss turns from squares to absolute values.
+# Whitened residual at which Huber's loss changes from squares to absolute values.
 HUBER = 1.5
-# Standard deviations beyond which a link contradicts a pose.
+# Number of standard deviations beyond which a link contradicts a pose.
 GATE = 4.0
-# Where the gate at the prior was wrong: first with care, as Huber's pose is biased.
+# Used if the gate at the prior was wrong. The first one is wide, because Huber's pose is biased.
 _CUTOFFS = (6.0, GATE)
-# What `robust` may be, to the kernel.
+# Codes of `robust` for the kernel.
 ROBUST = {False: 0, True: 1, "late": 2}
-# A pose that more than this share of the links contradict is itself in doubt: all links count.
+# If more than this share of the links contradict a pose, the pose is in doubt and all links count.
 _LARGEST_SHARE_OUT = 0.5
 
 
 def robust_solution(
     problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
 ) -> Solution:
-    """The pose of most links, `minimize_pose` of a problem on ranges (`RangeCost`).
+    """Return the pose of the consistent links, by `minimize_pose` of a `RangeCost`.
 
-    Links whose innovation no honest prior explains are left out from the start. Where the pose
-    that follows tells otherwise, of links in or out, they are chosen anew from a solution by
-    Huber's loss, at `_CUTOFFS` one after the other.
+    Links whose innovation no consistent prior explains are excluded at the start. If the resulting
+    pose disagrees, for links in or out, they are selected again from a solution with Huber's loss,
+    successively at `_CUTOFFS`.
 
     Parameters
     ----------
     problem
-        Its loss is not looked at.
+        Its loss is ignored.
     rotation, translation
         The starts, (..., 3, 3) and (..., 3).
     iterations
@@ -80,7 +80,7 @@ def robust_solution(
 def late_solution(
     problem: MapProblem, rotation: FloatArray, translation: FloatArray, iterations: int
 ) -> Solution:
-    """The pose by the redescending loss, from that of Huber's; arguments as `robust_solution`."""
+    """Return the pose of the redescending loss, started at Huber's; see `robust_solution`."""
     data: RangeCost = problem.data  # pyright: ignore[reportAssignmentType]
     easy = _with(problem, dataclasses.replace(data, loss=huber(HUBER)))
     found = minimize_pose(easy, rotation, translation, iterations, 1e-2)
@@ -89,7 +89,7 @@ def late_solution(
 
 
 def check_robust(robust: Any) -> int:
-    """`robust` as the kernel takes it, or a ValueError."""
+    """Return the kernel code of `robust`, or raise ValueError."""
     if not isinstance(robust, bool | str) or robust not in ROBUST:
         raise ValueError(f"robust must be True, False or 'late', got {robust!r:.80}")
     return ROBUST[robust]
@@ -100,10 +100,10 @@ def _with(problem: MapProblem, data: RangeCost) -> MapProblem:
 
 
 def _beyond_gate(prior: PoseState, data: RangeCost) -> BoolArray:
-    """Links (..., M, N) that contradict the prior; none where too many do.
+    """Return the links (..., M, N) that contradict the prior; none if too many do.
 
-    The variance of an innovation is at most that of the range and the square of
-    ``sqrt(tr P_v) + |c| sqrt(tr P_w)``: cheap, and never too narrow.
+    The variance of an innovation is at most that of the range and the square of ``sqrt(tr P_v) +
+    |c| sqrt(tr P_w)``: it is cheap and conservative.
     """
     of_rotation, of_place = (
         np.sqrt(np.einsum("...ii->...", prior.covariance[..., block, block]))[..., None]
@@ -111,7 +111,7 @@ def _beyond_gate(prior: PoseState, data: RangeCost) -> BoolArray:
     )
     reach = of_place + np.linalg.norm(data.tags, axis=-1) * of_rotation
     if data.offset is not None:
-        # An offset is told by the other ranges, which are as uncertain.
+        # An offset is determined by the other ranges, which are equally uncertain.
         reach = 2 * reach
     allowed = GATE**2 * (1 + data.weights * np.square(reach)[..., None, :])
     out = squared_residuals(data, prior.rotation, prior.translation) > allowed
@@ -119,6 +119,6 @@ def _beyond_gate(prior: PoseState, data: RangeCost) -> BoolArray:
 
 
 def _contradicted(out: BoolArray, weights: FloatArray) -> BoolArray:
-    """Whether (...) more than `_LARGEST_SHARE_OUT` of the links are out."""
+    """Return whether (...) more than `_LARGEST_SHARE_OUT` of the links are out."""
     links = (weights > 0).sum(axis=(-2, -1))
     return np.asarray(out.sum(axis=(-2, -1)) > _LARGEST_SHARE_OUT * links)

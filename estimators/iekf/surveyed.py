@@ -1,8 +1,8 @@
-"""The iterated EKF of a pose and of the places of anchors that are known to centimetres.
+"""The iterated EKF of a pose and of anchor positions with survey errors.
 
-What a survey is off is the same at every epoch: taken for noise of the ranges, it makes a filter
-overconfident, as the errors of one epoch do not average out over the next. Here the anchors'
-places are states beside the pose, whose prior is the survey.
+Survey errors are the same at every epoch. If they are treated as range noise, the filter becomes
+overconfident, because they do not average out over epochs. Here the anchor positions are states
+besides the pose, and the survey is their prior.
 """
 
 from __future__ import annotations
@@ -26,25 +26,25 @@ from rbl_gym.estimators.inputs import check_batches, check_epoch, epoch_variance
 from rbl_gym.measurements import ranging
 from rbl_gym.measurements.ranging import NoiseLaw
 
-# How often the derivative by the places is taken: at the prior, and at what follows from it.
+# Number of linearisations by the positions: at the prior, and at the resulting pose.
 _PASSES = 2
 
 
 @dataclass(frozen=True, eq=False)
 class SurveyedEkf(AugmentedEkf):
-    """Iterated extended Kalman filter of the pose and of its anchors' places.
+    """Iterated extended Kalman filter of the pose and of the anchor positions.
 
-    The extra states (3 M) are the true place of each anchor less the one that an update tells.
+    The extra states (3 M) are the true position of each anchor minus the one given in an update.
 
     Parameters
     ----------
     pose, twist, sensor
-        As `AugmentedEkf`.
+        As in `AugmentedEkf`.
     biases
         Empty.
     anchor_std_m
-        Standard deviation of the told places: one, one for each anchor (M,), or for each of their
-        axes (M, 3).
+        Standard deviation of the given positions: one, one per anchor (M,), or one per axis
+        (M, 3).
     """
 
     anchor_std_m: ArrayLike = 0.05
@@ -57,7 +57,7 @@ class SurveyedEkf(AugmentedEkf):
 
     @functools.cached_property
     def _laws(self) -> FloatArray:
-        """To a prediction the places are biases that stay."""
+        """Return the laws for a prediction: positions are constant biases."""
         return np.array([[0.0, math.inf, 0.0]])
 
     def update(
@@ -68,15 +68,15 @@ class SurveyedEkf(AugmentedEkf):
         links: ArrayLike | None = None,
         noise: NoiseLaw | None = None,
     ) -> AugmentedState:
-        """State after one epoch of ranges (..., M, N) to anchors at told places (..., M, 3).
+        """Return the state after ranges (..., M, N) to anchors at given positions (..., M, 3).
 
-        Other arguments as `IteratedEkf`. Every update must name the same anchors in the same
-        order; they may move, each with the same error all the time.
+        Other arguments as in `IteratedEkf`. Every update must have the same anchors in the same
+        order. They may move, but the error of each must be constant.
 
         Raises
         ------
         ValueError
-            As `IteratedEkf.update`, and where the number of anchors changes.
+            As in `IteratedEkf.update`, and if the number of anchors changes.
         """
         state, tags = plain(state), self.pose.tags
         signed = self.offset is not None
@@ -89,7 +89,7 @@ class SurveyedEkf(AugmentedEkf):
         ranges, distance = np.broadcast_arrays(ranges, distance)
         there = np.broadcast_to(True if mask is None else mask, ranges.shape)
         variance = epoch_variance(noise, self.pose.noise, distance if signed else ranges, mask)
-        # A start is sought as if the survey's errors were noise of the ranges.
+        # The search for a start treats survey errors as range noise.
         own = np.diagonal(state.covariance, axis1=-2, axis2=-1)[..., 6 + self._n_twist :]
         spread = own.reshape((*own.shape[:-1], -1, 3)).mean(axis=-1)[..., None]
         seen = np.where(there, 1 / (variance + spread), 0.0)
@@ -97,7 +97,7 @@ class SurveyedEkf(AugmentedEkf):
         weights = np.where(there, 1 / variance, 0.0)
         found = state
         for _ in range(_PASSES):
-            # The extra states are told from where their derivative is taken.
+            # The extra states are relative to the point of linearisation.
             point = np.zeros_like(found.extra)
             point[..., self._n_twist :] = found.extra[..., self._n_twist :]
             prior = state._replace(extra=state.extra - point)
@@ -117,20 +117,20 @@ class SurveyedEkf(AugmentedEkf):
     def biases_of(
         self, state: AugmentedState, anchors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As `AugmentedEkf.biases_of`: innovations are judged as if the told places were right."""
+        """See `AugmentedEkf.biases_of`; innovations treat the given positions as true."""
         state, n = plain(state), self._n_twist
         less = state.extra[..., :n], state.covariance[..., : 6 + n, : 6 + n]
         return super().biases_of(AugmentedState(state.rotation, state.translation, *less), anchors)
 
     def _off(self, extra: FloatArray) -> FloatArray:
-        """True places less told ones (..., M, 3), of extra states."""
+        """Return true minus given positions (..., M, 3) from the extra states."""
         off = extra[..., self._n_twist :]
         return off.reshape((*off.shape[:-1], -1, 3))
 
     def _sums(
         self, anchors: FloatArray, rotation: FloatArray, translation: FloatArray
     ) -> FloatArray:
-        """By how much the extra states lengthen every range at a pose, (..., M N, K)."""
+        """Return the derivative (..., M N, K) of ranges at a pose by the extra states."""
         distance, J = bounds.range_jacobian(anchors, self.pose.tags, rotation, translation)
         M, N = distance.shape[-2:]
         unit = J[..., 3:, :].reshape((*J.shape[:-2], 3, M, N))
@@ -140,7 +140,7 @@ class SurveyedEkf(AugmentedEkf):
         return np.concatenate([nothing, columns], axis=-1)
 
     def _with_places(self, state: AugmentedState, anchors: int) -> AugmentedState:
-        """The state with room for the places of so many anchors."""
+        """Return the state extended by the positions of the anchors."""
         have = state.extra.shape[-1] - self._n_twist
         if have == 3 * anchors:
             return state

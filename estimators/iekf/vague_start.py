@@ -1,8 +1,8 @@
-"""Where an update starts from when its prior says little about the rotation.
+"""Find start poses of an update whose prior is vague about the rotation.
 
-An update starts globally where the prior is vague in a direction that its epoch determines: at a
-first epoch, and after a track was lost. A direction that the epoch does not see stays wide, and
-needs no search.
+An update starts globally if the prior is vague in a direction that its epoch determines: at the
+first epoch, and after a lost track. A direction that the epoch does not determine remains
+uncertain, and needs no search.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from rbl_gym.estimators.locating.differences import places_of_differences
 from rbl_gym.estimators.locating.rotation_net import ROTATION_NET
 from rbl_gym.geometry import rotations
 
-# Beyond this standard deviation (rad) of the prior rotation, no single linearisation is right.
+# Above this standard deviation (rad) of the prior rotation, one linearisation is not sufficient.
 VAGUE_ROTATION_RAD = 0.5
 
 _NET = rotations.log(ROTATION_NET)
 
-# What takes a problem of trials (K, 1) to poses (K, S, 3, 3), (K, S, 3) to start from.
+# Function from a problem of trials (K, 1) to start poses (K, S, 3, 3), (K, S, 3).
 Starts = Callable[[MapProblem], tuple[FloatArray, FloatArray]]
 
 
 def is_vague(covariance: FloatArray) -> BoolArray:
-    """Where (...) the rotation's largest variance is above that of `VAGUE_ROTATION_RAD`."""
+    """Return whether (...) the largest variance of the rotation exceeds `VAGUE_ROTATION_RAD`^2."""
     limit = VAGUE_ROTATION_RAD**2
-    # The trace bounds the largest eigenvalue: most priors need no more.
+    # The trace bounds the largest eigenvalue, which suffices for most priors.
     if covariance.ndim == 2 and not sum(covariance.item(i, i) for i in range(3)) > limit:
         return np.asarray(False)
     vague = np.asarray(
@@ -43,22 +43,23 @@ def is_vague(covariance: FloatArray) -> BoolArray:
 
 
 def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> BoolArray:
-    """Where (...) an epoch determines a direction in which its prior rotation is vague.
+    """Return whether (...) an epoch determines a direction in which its prior rotation is vague.
 
-    That is where the linear update leaves fewer vague directions than there were. It is tried at
-    the prior's place and one standard deviation from it to all sides: what anchors in a plane tell
-    vanishes in that plane.
+    This is so if the linear update leaves fewer vague directions than the prior has. It is computed
+    at the prior position and one standard deviation from it on all sides, because the information
+    of coplanar anchors vanishes in their plane.
 
     Parameters
     ----------
     problem
-        The problem of the update, of least squares: by a loss, what misfits there tells little.
+        The least-squares problem of the update. With a robust loss, poor fits would give little
+        information.
     vague
-        Trials (...) to be looked at, by `is_vague`; the others are False.
+        Trials (...) to check, from `is_vague`; the others are False.
     batch
         Leading axes of the problem.
     """
-    # A trial alone has no axis to index: it gets one.
+    # A single trial has no axis to index, so one is added.
     axes = batch or (1,)
     where = np.broadcast_to(vague, axes)
     part = problem.take(axes, where)
@@ -67,7 +68,7 @@ def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> Bo
     offsets = np.concatenate([np.zeros_like(steps[:, :1]), steps, -steps], axis=1)
     places = part.prior.translation + offsets
     if isinstance(part.data, RangeCost) and part.data.offset is not None:
-        # Differences tell little outside of the anchors, where a vague prior may well be.
+        # Differences give little information outside the anchors, where a vague prior may be.
         middle = part.data.anchors.mean(axis=-2)
         places = np.concatenate([places, np.broadcast_to(middle, places[:, :1].shape)], axis=1)
     told = part.data(part.prior.rotation, places).hessian
@@ -78,7 +79,7 @@ def settles(problem: MapProblem, vague: BoolArray, batch: tuple[int, ...]) -> Bo
 
 
 def _vague_directions(covariance: FloatArray) -> np.ndarray:
-    """How many (...) principal axes of the rotation are vague."""
+    """Return the number (...) of vague principal axes of the rotation."""
     values = np.linalg.eigvalsh(covariance[..., :3, :3])
     return (values > VAGUE_ROTATION_RAD**2).sum(axis=-1)
 
@@ -86,8 +87,8 @@ def _vague_directions(covariance: FloatArray) -> np.ndarray:
 def global_start(
     problem: MapProblem, vague: BoolArray, batch: tuple[int, ...], starts: Starts
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses to start from: for vague priors the best local solve from `starts`, else the prior."""
-    # A trial alone has no axis to index: it gets one for the search.
+    """Return start poses: for vague priors the best solution from `starts`, else the prior."""
+    # A single trial has no axis to index, so one is added for the search.
     axes = batch or (1,)
     rotation = np.broadcast_to(problem.prior.rotation, (*axes, 3, 3)).copy()
     translation = np.broadcast_to(problem.prior.translation, (*axes, 3)).copy()
@@ -100,16 +101,16 @@ def global_start(
 
 
 def net_of_starts(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
-    """24 rotations spread as far as the prior is wide on each axis; with each the translation.
+    """Return 24 start poses, whose rotations are spread over the prior on each axis.
 
-    That is what the squared ranges and the prior imply, a linear problem. `problem` is one of
-    ranges, of trials (K, 1).
+    Their translations follow from the squared ranges and the prior, a linear problem. `problem` is
+    one of ranges, with trials (K, 1).
     """
     rotation, data = spread(problem.prior), problem.data
     assert isinstance(data, RangeCost)
     if data.offset is None:
         return rotation, _translation_given(rotation, problem.prior, data)
-    # Of differences the linear problem tells little, or nothing: other places as well.
+    # For differences the linear problem gives little or no information: try other positions too.
     places = places_of_differences(data, ROTATION_NET)[:, :, None]
     places = places - (rotation @ data.tags.mean(axis=-2)[..., None])[..., 0][:, None]
     near: list[FloatArray] = [problem.prior.translation + np.zeros(rotation.shape[:-1])]
@@ -120,17 +121,17 @@ def net_of_starts(problem: MapProblem) -> tuple[FloatArray, FloatArray]:
 
 
 def spread(prior: PoseState) -> FloatArray:
-    """Rotations (K, 24, 3, 3) around priors (K, 1), on each axis as far as it is uncertain."""
+    """Return rotations (K, 24, 3, 3) around priors (K, 1), spread by the variance of each axis."""
     values, vectors = np.linalg.eigh(prior.covariance[..., :3, :3])
-    # An axis that is held has a variance that rounds to less than zero.
+    # The variance of a fixed axis may round to less than zero.
     reach = np.minimum(np.sqrt(np.maximum(values, 0.0)) / VAGUE_ROTATION_RAD, 1.0)
     shape = (vectors * reach[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return rotations.exp((_NET @ shape)[:, 0]) @ prior.rotation
 
 
 def _translation_given(rotation: FloatArray, prior: PoseState, data: RangeCost) -> FloatArray:
-    """Translations (K, S, 3) of the linear squared-range model and the prior, given rotations."""
-    # To first order var(r^2) = 4 r^2 var(r); of differences r is not known.
+    """Return translations (K, S, 3) from the linear squared-range model and the prior."""
+    # To first order var(r^2) = 4 r^2 var(r); for differences r is unknown.
     pseudo = data.offset is not None
     scale = 1.0 if pseudo else 4 * np.where(data.weights > 0, data.ranges, 1.0) ** 2
     stat = statistic(data.ranges, data.anchors, data.tags, data.weights / scale, pseudo=pseudo)
