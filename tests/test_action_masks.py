@@ -33,7 +33,7 @@ def made(kind: str, num_envs: int = 0, **more: Any) -> Any:
 
 
 def size_of(space: Any) -> int:
-    return 2 * space.n if isinstance(space, gym.spaces.MultiBinary) else int(space.n)
+    return 2 * space.shape[0] if isinstance(space, gym.spaces.MultiBinary) else int(space.n)
 
 
 @every_env

@@ -17,6 +17,7 @@ from rbl_gym.envs.placement import AnchorPlacementEnv
 from rbl_gym.measurements import ranging
 from rbl_gym.placement import Context, layouts, search
 from rbl_gym.studies.learning import evaluation, policies, rollouts, training, transfer
+from rbl_gym.studies.learning.policies import AnyPolicy
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, TASKS, RlTask, rl_task
 from rbl_gym.studies.progress import silent
 from rbl_gym.wrappers.selection import AnchorSelectionEnv
@@ -260,7 +261,7 @@ def test_tasks_and_their_references(name):
 
 def test_progress_is_told_as_often_as_announced():
     told, (small, _, sizes, kind) = Told(), SHORT["selection"]
-    played = {"mine": random_policy(kind, sizes)}
+    played: dict[str, AnyPolicy] = {"mine": random_policy(kind, sizes)}
     evaluation.evaluate(small, played, ["nearest"], 2, 0, told)
     assert told.done == told.announced > 0
 
@@ -430,13 +431,13 @@ def test_drawn_problems_are_each_placed_in_by_itself():
     for i, (problem, contexts, found) in enumerate(groups):
         alone = gym.make("rbl_gym:RBL/AnchorPlacement-v0", **task.arguments)
         seen, _ = alone.reset(seed=HELD_OUT_SEED + i)
-        terminated = False
+        terminated, reward = False, np.nan
         while not terminated:
             seen, reward, terminated, _, info = alone.step(played(None, seen).astype(np.float32))
         placed = info["anchors"][: problem.n_anchors]
         np.testing.assert_allclose(found["mine"][0], placed, atol=1e-5)
         score = placement.score(problem, contexts, found["mine"])
-        np.testing.assert_allclose(-np.log(score[0]), reward, atol=1e-4)
+        assert float(reward) == pytest.approx(-np.log(score[0]), abs=1e-4)
         assert found["ring"].shape == (1, problem.n_anchors, 3)
         assert found["random"].shape == (1, 8, problem.n_anchors, 3)
 

@@ -151,6 +151,7 @@ def test_a_stretched_scene_has_its_places_multiplied():
     for name in ("volume", "anchor_region"):
         got, want = getattr(long, name).bounds(), getattr(plain, name).bounds()
         np.testing.assert_allclose(got, np.array(want) * factors)
+    assert long.anchors is not None
     np.testing.assert_allclose(long.anchors, np.array(plain.anchors) * factors)
     np.testing.assert_allclose(long.obstacles, np.array(plain.obstacles) * np.tile(factors, 2))
     assert long.tags == plain.tags

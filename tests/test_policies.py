@@ -53,6 +53,7 @@ def test_files_give_the_same_policy_back(tmp_path, kind, sizes):
     path = tmp_path / "new" / "policy.npz"
     policies.save(policy, path)
     again = policies.load(path)
+    assert isinstance(again, policies.Policy)
     assert (again.kind, again.meta) == (kind, policy.meta)
     for got, want in zip(
         (*again.weights, *again.biases), (*policy.weights, *policy.biases), strict=True

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -63,12 +65,15 @@ def calm() -> list[Frame]:
     return played()
 
 
-def arrays(frame: Frame) -> list[np.ndarray]:
+def truth_of(frame: Frame) -> Pose:
+    assert frame.truth is not None
+    return frame.truth
+
+
+def arrays(frame: Frame) -> list[Any]:
     tracks: tuple[Tracked, ...] = frame.tracks
-    truth: Pose | None = frame.truth
     beliefs = [field for track in tracks for field in track.belief]
-    assert truth is not None
-    return [*truth, frame.told, *frame.links, *beliefs, *(t.refused for t in tracks)]
+    return [*truth_of(frame), frame.told, *frame.links, *beliefs, *(t.refused for t in tracks)]
 
 
 def test_the_same_seed_gives_the_same_frames_and_another_one_others(calm):
@@ -78,8 +83,8 @@ def test_the_same_seed_gives_the_same_frames_and_another_one_others(calm):
             np.testing.assert_array_equal(a, b)
     assert len(calm) == len(again) == 81
     # Disturbances change no truth.
-    np.testing.assert_array_equal(calm[-1].truth.translation, again[-1].truth.translation)
-    assert not np.allclose(calm[0].truth.translation, other[0].truth.translation)
+    np.testing.assert_array_equal(truth_of(calm[-1]).translation, truth_of(again[-1]).translation)
+    assert not np.allclose(truth_of(calm[0]).translation, truth_of(other[0]).translation)
 
 
 def test_an_undisturbed_run_is_the_episode_of_the_environment_and_its_filter(calm):
@@ -89,7 +94,7 @@ def test_an_undisturbed_run_is_the_episode_of_the_environment_and_its_filter(cal
     observation, info = env.reset(seed=3)
     for frame in calm[:20]:
         np.testing.assert_array_equal(observation["anchors"], frame.told)
-        np.testing.assert_array_equal(info["translation"], frame.truth.translation)
+        np.testing.assert_array_equal(info["translation"], truth_of(frame).translation)
         np.testing.assert_allclose(
             observation["belief_translation"], frame.tracks[0].belief.translation, atol=1e-12
         )
@@ -169,7 +174,7 @@ def test_a_building_is_watched_with_its_walls():
     run = [*frames(stage, [filter_named("iekf")], 0)]
     low, high = problem.zones[0].bounds()
     for frame in run:
-        place = frame.truth.translation
+        place = truth_of(frame).translation
         assert (place > low - 1).all()
         assert (place < high + 1).all()
         np.testing.assert_array_equal(frame.anchors, mounts)
@@ -195,7 +200,8 @@ def test_what_cannot_be_played_is_refused_before_the_first_frame():
 @pytest.fixture(scope="module")
 def log() -> recordings.Recording:
     folder = ROOT / "examples" / "log"
-    files = {name: str(folder / f"{name}.csv") for name in ("ranges", "anchors", "tags", "truth")}
+    names = ("ranges", "anchors", "tags", "truth")
+    files: dict[str, Any] = {name: folder / f"{name}.csv" for name in names}
     whole = recordings.read_recording(**files)
     some = ("times", "ranges", "links")
     return whole._replace(**{name: getattr(whole, name)[:40] for name in some}, range_std=None)
@@ -209,12 +215,14 @@ def test_a_recording_is_shown_as_replay_judges_it(log):
     replayed = replay.replay_recording(log, settings)
     assert len(run) == len(log.times)
     assert run[-1].time_s == pytest.approx(log.times[-1] - log.times[0])
+    assert replayed.errors is not None
     known = np.array([frame.truth is not None for frame in run])
     np.testing.assert_array_equal(known, replayed.errors.known)
     shown = np.array([frame.tracks[0].position_m for frame in run])
     np.testing.assert_allclose(shown[known], replayed.errors.position[known])
     assert np.isnan(shown[~known]).all()
     told = replayed.track.innovations
+    assert told is not None
     np.testing.assert_allclose([f.tracks[0].nis for f in run], told.nis)
     np.testing.assert_array_equal([f.tracks[0].refused for f in run], log.links & ~told.used)
     np.testing.assert_array_equal([f.links.measured for f in run], log.links)
@@ -243,14 +251,14 @@ def test_an_environment_is_shown_with_its_own_filter_and_others():
         *_, info = env.step(0)
         assert frame.tracks[0].position_m == pytest.approx(info["position_error_m"], rel=1e-9)
         assert frame.score_m == info["score_m"]
-        np.testing.assert_array_equal(frame.truth.rotation, info["rotation"])
+        np.testing.assert_array_equal(truth_of(frame).rotation, info["rotation"])
 
 
 def test_only_the_anchors_that_were_chosen_have_links():
     env = gym.make("rbl_gym:RBL/AnchorSelection-v0")
     run = [*env_frames(env, seed=1)]
     assert {int(frame.links.measured.any(axis=1).sum()) for frame in run[1:]} == {3}
-    last, belief = run[-1].tracks[0].belief, env.unwrapped.belief
+    last, belief = run[-1].tracks[0].belief, env.get_wrapper_attr("belief")
     np.testing.assert_allclose(last.translation, belief.translation, atol=1e-9)
     np.testing.assert_allclose(last.covariance, belief.covariance, atol=1e-9)
 
@@ -262,7 +270,7 @@ def test_other_environments_are_shown_as_they_are_rendered():
     frame = next(env_frames(env))
     np.testing.assert_array_equal(frame.picture, env.render())
     with pytest.raises(ValueError, match="env must be"):
-        env_frames("RBL/Tracking-v0")
+        env_frames("RBL/Tracking-v0")  # pyright: ignore[reportArgumentType]
 
 
 def random_policy(task: str, folder) -> str:
@@ -292,7 +300,8 @@ def test_a_policy_steers_beside_a_reference_as_it_is_evaluated(tmp_path):
     run = [*learned_frames(short, policy, "orbit", seed=0)]
     returns, steps = rollouts.returns(short, policy.player(), 1, 0)
     assert run[-1].score_m == pytest.approx(float(np.exp(-returns / steps)[0]), rel=1e-6)
-    returns, steps = rollouts.returns(short, lambda env, _: controllers.orbit(env, None), 1, 0)
+    rng = np.random.default_rng(0)
+    returns, steps = rollouts.returns(short, lambda env, _: controllers.orbit(env, rng), 1, 0)
     assert run[-1].scores["orbit"] == pytest.approx(float(np.exp(-returns / steps)[0]), rel=1e-6)
     assert run[-1].ghosts["orbit"].shape == run[-1].anchors.shape == (3, 3)
 

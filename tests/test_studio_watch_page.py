@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -27,7 +28,7 @@ from rbl_gym.studio.watch.view import ellipsoid, letterbox, link_lines
 from rbl_gym.worlds import scenes
 from tests.helpers import ROOT
 from tests.test_studio_page import ARGUMENTS, CHROMIUM, until
-from tests.test_studio_watch import random_policy
+from tests.test_studio_watch import random_policy, truth_of
 
 pytest.importorskip("viser", reason="needs the extra studio")
 
@@ -109,7 +110,9 @@ def test_the_ellipsoid_holds_95_percent():
     rng = np.random.default_rng(0)
     root = rng.standard_normal((6, 6))
     covariance = root @ root.T
-    half, axes = ellipsoid(covariance)
+    found = ellipsoid(covariance)
+    assert found is not None
+    half, axes = found
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1)
     drawn = rng.multivariate_normal(np.zeros(6), covariance, 20_000)[:, 3:] @ axes
@@ -126,7 +129,9 @@ def test_links_go_from_anchors_to_tags_by_their_kinds():
     assert sum(map(len, drawn.values())) == 36
     assert len(drawn["lost"]) == 36 - frame.links.measured.sum()
     assert len(drawn["refused"]) == frame.tracks[0].refused.sum()
-    tags = program.tags @ frame.truth.rotation.T + frame.truth.translation
+    rotation, translation = truth_of(frame)
+    assert rotation is not None
+    tags = program.tags @ rotation.T + translation
     for anchor, tag in np.concatenate(list(drawn.values())):
         assert (anchor == frame.anchors).all(axis=1).any()
         assert np.abs(tag - tags).max(axis=1).min() < 1e-12
@@ -231,7 +236,7 @@ def test_environments_that_are_no_rooms_are_shown_as_pictures():
 
 def test_a_recording_is_shown_with_its_track():
     folder = ROOT / "examples" / "log"
-    files = {name: str(folder / f"{name}.csv") for name in ("ranges", "anchors", "tags")}
+    files: dict[str, Any] = {name: folder / f"{name}.csv" for name in ("ranges", "anchors", "tags")}
     log = recordings.read_recording(**files)
     log = log._replace(**{name: getattr(log, name)[:10] for name in ("times", "ranges", "links")})
     track = replay.track_recording(log, replay.Settings.of(filter="iekf"))

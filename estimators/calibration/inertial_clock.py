@@ -9,7 +9,7 @@ found at the offset then give the positions of the tags.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -115,7 +115,7 @@ def inertial_clock(
     if np.ptp(told.times) < _WINDOW_S or not windows:
         raise ValueError(f"imu and ranges must last {_WINDOW_S:g} s without gaps: give the offset")
     arms = np.zeros_like(told.tags)
-    path: ArrayLike | scipy.interpolate.BSpline = start
+    path: Any = start
     first_s, slow = float(told.times[0]), _SLOW_S
     found: InertialClock | None = None
     for _ in range(_ROUNDS):

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
+from numba.core import config
 from numba.core.types import Array, BaseFunction, BaseTuple, Boolean, Number, unliteral
 
 try:  # private names of numba: without them compilation takes longer
@@ -22,11 +23,15 @@ try:  # private names of numba: without them compilation takes longer
     from numba.core.compiler import Compiler
     from numba.core.compiler_lock import global_compiler_lock
     from numba.core.registry import cpu_target
+
+    _lock: Any = global_compiler_lock
+    _target: Any = cpu_target
 except ImportError:
-    Compiler = JITCodeLibrary = None
+    Compiler = JITCodeLibrary = _lock = _target = None
 
 # The type annotations of numba omit some of its options.
 _njit: Any = numba.njit
+_config: Any = config
 
 
 def _as_any(kind: Any) -> Any:
@@ -90,19 +95,19 @@ def types_remembered() -> Iterator[None]:
 
 def _is_plain(kind: Any) -> bool:
     if isinstance(kind, BaseTuple):
-        return all(map(_is_plain, kind))
+        return all(map(_is_plain, kind))  # pyright: ignore[reportArgumentType]
     return isinstance(kind, (Number, Boolean, Array))
 
 
 @contextlib.contextmanager
 def optimizing(level: int) -> Iterator[None]:
     """Context in which the optimizer works at a level from 0 to 3."""
-    before: Any = numba.config.OPT
-    numba.config.OPT = type(before)(level)
+    before = _config.OPT
+    _config.OPT = type(before)(level)
     try:
         yield
     finally:
-        numba.config.OPT = before
+        _config.OPT = before
 
 
 @contextlib.contextmanager
@@ -111,8 +116,8 @@ def as_code() -> Iterator[None]:
     if Compiler is None:
         yield
         return
-    codegen: Any = cpu_target.target_context.codegen()
-    with global_compiler_lock:
+    codegen = _target.target_context.codegen()
+    with _lock:
         codegen._library_class = _Code
         try:
             yield

@@ -136,7 +136,7 @@ def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
     own = own_std(recording, settings)
     elapsed = np.diff(recording.times, prepend=recording.times[0])
     anchors = recording.anchors_by_epoch
-    complete = recording.links.all(axis=(1, 2)).tolist()
+    complete = np.all(recording.links, axis=(1, 2)).tolist()
     for k, dt in enumerate(elapsed.tolist()):
         yield Reading(
             recording.ranges[k],
