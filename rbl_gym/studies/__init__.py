@@ -1,1 +1,1 @@
-"""Studies: what the commands compute, as functions that return data."""
+"""Studies: the computations of the commands, as functions that return data."""

@@ -1,4 +1,4 @@
-"""The same function on many tasks: here, on several processes, or on a cluster, through joblib."""
+"""Run a function on many tasks: in this process, in several ones, or on a cluster, by joblib."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from rbl_gym.studies.extras import require
 __all__ = ["HERE", "Workers", "each"]
 
 BACKENDS = ("loky", "dask", "ray")
-# Workers may die so often in a row without one more task done, before that is an error.
+# Maximum number of successive worker deaths without a completed task.
 _PATIENCE = 3
 
 
 class Workers(NamedTuple):
-    """Where tasks are run.
+    """Where to run tasks.
 
     Attributes
     ----------
     jobs
         Processes of this machine.
     backend
-        None: this process where `jobs` is 1, else ``"loky"``. ``"dask"`` or ``"ray"``: the
+        None: this process if `jobs` is 1, else ``"loky"``. ``"dask"`` or ``"ray"``: the
         cluster at `address`, or one of `jobs` local workers.
     address
-        Of the cluster's scheduler.
+        Address of the scheduler of the cluster.
     """
 
     jobs: int = 1
@@ -35,29 +35,29 @@ class Workers(NamedTuple):
     address: str | None = None
 
 
-# One task after the other, in this process.
+# Tasks run sequentially, in this process.
 HERE = Workers()
 
 
 def each(
     function: Callable[[Any], Any], tasks: Sequence[Any], workers: Workers = HERE
 ) -> Iterator[tuple[int, Any]]:
-    """``function(task)`` of every task, as (index, result), in the order they finish.
+    """Yield ``function(task)`` of every task, as (index, result), in the order of completion.
 
     Parameters
     ----------
     function, tasks
         Picklable; the function must be importable where the workers run.
     workers
-        Where they are run.
+        Where to run them.
 
     Raises
     ------
     MissingExtraError
-        Where joblib or the backend is not installed.
+        If joblib or the backend is not installed.
     ChildProcessError
-        When workers die again and again on the same tasks; a worker that dies otherwise loses
-        nothing but time: its tasks are run again.
+        If workers die repeatedly on the same tasks. Otherwise the tasks of a dead worker are run
+        again.
     """
     check(workers)
     jobs, backend, address = workers
@@ -72,7 +72,7 @@ def each(
 
 
 def check(workers: Workers) -> None:
-    """A MissingExtraError where `each` lacks what it needs."""
+    """Raise MissingExtraError if a library for `each` is not installed."""
     jobs, backend, _ = workers
     if backend is None and jobs == 1:
         return
@@ -86,7 +86,7 @@ def check(workers: Workers) -> None:
 def _surviving(
     function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int
 ) -> Iterator[tuple[int, Any]]:
-    """Processes of this machine: after a death, a new set of them takes what is left."""
+    """Run on processes of this machine; after a death, new processes run the remaining tasks."""
     from joblib.externals.loky import BrokenProcessPool
 
     open_ = set(range(len(tasks)))
@@ -111,7 +111,7 @@ def _finished(
     function: Callable[[Any], Any], tasks: Sequence[Any], indices: list[int], **options: Any
 ) -> Iterator[tuple[int, Any]]:
     joblib: Any = import_module("joblib")
-    # One task at a time: what is done is handed over, and safe, at once.
+    # One task at a time, so that finished results are returned at once.
     parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1, **options)
     found = parallel(joblib.delayed(_indexed)(function, index, tasks[index]) for index in indices)
     with contextlib.closing(found):
@@ -125,7 +125,7 @@ def _indexed(function: Callable[[Any], Any], index: int, task: Any) -> tuple[int
 def _dask(
     function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, address: str | None
 ) -> Iterator[tuple[int, Any]]:
-    """A dask cluster, which itself hands the tasks of a worker that dies to another."""
+    """Run on a dask cluster, which itself reassigns the tasks of a dead worker."""
     joblib: Any = import_module("joblib")
     distributed: Any = import_module("distributed")
     with contextlib.ExitStack() as stack:
@@ -146,7 +146,7 @@ def _dask(
 def _ray(
     function: Callable[[Any], Any], tasks: Sequence[Any], jobs: int, address: str | None
 ) -> Iterator[tuple[int, Any]]:
-    """A ray cluster; its joblib backend returns lists, so the tasks go in portions."""
+    """Run on a ray cluster; its joblib backend returns lists, so tasks are sent in batches."""
     joblib: Any = import_module("joblib")
     ray: Any = import_module("ray")
     ray_joblib: Any = import_module("ray.util.joblib")

@@ -1,7 +1,7 @@
-"""The loop over epochs: a filter predicts, updates and says what it believes, epoch by epoch.
+"""Run a filter over epochs: predict, update and return the belief, epoch by epoch.
 
-Everything that runs a filter over more than one epoch runs this loop: Monte Carlo, the benchmark,
-replayed recordings, tracking among designed layouts.
+All code that runs a filter over several epochs uses this loop: Monte Carlo, the benchmark,
+replayed recordings, tracking with designed layouts.
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ Prior = tuple[ArrayLike, ArrayLike, ArrayLike]
 
 
 class Reading(NamedTuple):
-    """What a filter is told of one epoch; arrays may have leading axes.
+    """The input of a filter at one epoch; arrays may have leading axes.
 
     Attributes
     ----------
     ranges, anchors
-        Ranges (..., M, N) in metres and places of the anchors (..., M, 3).
+        Ranges (..., M, N) in metres and anchor positions (..., M, 3).
     links
         (..., M, N), True where a range was measured; None: all.
     noise
-        Law of this epoch; None: the law that the filter was made with.
+        Noise law of this epoch; None: that of the filter.
     twist
-        (..., 6), rad/s and m/s, of the interval that ends at this epoch; None: no time has
-        passed, as at the first epoch.
+        (..., 6), rad/s and m/s, of the interval that ends at this epoch; None: no interval, as at
+        the first epoch.
     dt
         Length of that interval, seconds.
     inertial
-        Readings (..., S, 6) of an inertial sensor in that interval, for a filter that takes them
-        in place of the twist.
+        Readings (..., S, 6) of an inertial sensor in that interval, for a filter that uses them
+        instead of the twist.
     odometry
-        Readings (..., S, 6) of odometry in that interval, for a filter that takes them; NaN where
-        there is none.
+        Readings (..., S, 6) of odometry in that interval, for a filter that uses them; NaN if
+        not measured.
     steps
-        Seconds (S,) for which each of these readings counts; None: they share `dt` alike.
+        Duration (S,) of each of these readings, seconds; None: equal parts of `dt`.
     """
 
     ranges: FloatArray
@@ -78,7 +78,7 @@ class Reading(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A filter after an epoch: its state before and after the ranges, its belief, the epoch."""
+    """The state of a filter before and after the ranges of an epoch, its belief, and the epoch."""
 
     predicted: Any
     state: Any
@@ -93,28 +93,28 @@ def track_epochs(
     restart: Callable[[PoseBelief, FloatArray], Prior | None] | None = None,
     hold: Callable[[Any, Any], Any] | None = None,
 ) -> Iterator[Step]:
-    """Run a filter over epochs, one step after the other.
+    """Run a filter over epochs, and yield each step.
 
     Parameters
     ----------
     filter
-        Made by `estimators.make`, or anything with its interface.
+        A filter from `estimators.make`, or an object with the same interface.
     prior
         Rotation (..., 3, 3), translation (..., 3) and covariance (..., 6, 6) at the first epoch,
         before its ranges.
     readings
-        What the filter is told, an epoch each.
+        The inputs of the filter, one per epoch.
     restart
-        Called with every belief and the anchors of its epoch. Where it returns a prior, the
-        filter starts again from that one and takes the ranges of the same epoch.
+        Called with every belief and the anchors of its epoch. If it returns a prior, the filter
+        restarts from it and uses the ranges of the same epoch again.
     hold
-        Called with the states before and after every prediction, for what is known besides:
-        `rbl_gym.estimators.hold_level` of a level body. What it returns is updated.
+        Called with the states before and after every prediction, to apply constraints such as
+        `rbl_gym.estimators.hold_level`. The state that it returns is updated.
 
     Yields
     ------
     Step
-        One per epoch, as soon as it is there.
+        One per epoch, as soon as it is available.
     """
     state = filter.initial(*prior)
     for reading in readings:
@@ -138,13 +138,13 @@ def track_epochs(
 
 
 def _updated(filter: Filter, state: Any, reading: Reading) -> Any:
-    # A filter that knows no law of an epoch has no such argument.
+    # A filter without support for a law per epoch has no such argument.
     law = {} if reading.noise is None else {"noise": reading.noise}
     return filter.update(state, reading.ranges, reading.anchors, reading.links, **law)
 
 
 def timed(steps: Iterable[Step]) -> Iterator[tuple[Step, float]]:
-    """Steps, each with the processor time that it took, in seconds."""
+    """Yield steps, each with its processor time in seconds."""
     iterator = iter(steps)
     while True:
         start = time.process_time()
@@ -156,32 +156,32 @@ def timed(steps: Iterable[Step]) -> Iterator[tuple[Step, float]]:
 
 
 def stack_beliefs(beliefs: Iterable[PoseBelief]) -> PoseBelief:
-    """Beliefs of K epochs as one, with arrays (K, ...)."""
+    """Stack the beliefs of K epochs to one, with arrays (K, ...)."""
     columns = zip(*beliefs, strict=True)
     return PoseBelief(*(np.array(column, dtype=np.float64) for column in columns))
 
 
-# So many epochs of one body at once: their matrices fit into the processor's caches.
+# Epochs of one body per group: their matrices fit into the processor caches.
 _CHUNK = 256
 
 
 def innovations_of(
     filter: Filter, steps: Iterable[Step], tags: FloatArray, noise: NoiseLaw
 ) -> Iterator[tuple[list[Step], Innovations]]:
-    """Steps in groups of K, each group with its innovations, arrays (K, ...).
+    """Yield steps in groups of K, each group with its innovations, arrays (K, ...).
 
-    What `estimators.innovations` finds, of many epochs at once.
+    The innovations are those of `estimators.innovations`, for many epochs at once.
 
     Parameters
     ----------
     filter
-        That made the steps.
+        The filter of the steps.
     steps
-        Of `track_epochs`.
+        Steps from `track_epochs`.
     tags
-        Places on the body (N, 3).
+        Tag positions on the body (N, 3).
     noise
-        Law of the ranges where an epoch has none of its own.
+        Noise law of epochs without their own.
     """
     kept: list[Step] = []
     shapes: list[tuple[int, ...]] = []
@@ -241,8 +241,8 @@ class PoseErrors(NamedTuple):
     tags_m
         Root mean square displacement (...) of the tags.
     nees
-        ``e^T P^-1 e`` (...), of mean 6 for an honest belief; inf where the covariance is not
-        positive.
+        ``e^T P^-1 e`` (...), with mean 6 for a consistent belief; inf if the covariance is
+        not positive definite.
     """
 
     pose: FloatArray
@@ -253,18 +253,18 @@ class PoseErrors(NamedTuple):
 def pose_errors(
     belief: PoseBelief, rotation: FloatArray, translation: FloatArray, tags: FloatArray
 ) -> PoseErrors:
-    """Errors of beliefs against true poses.
+    """Return the errors of beliefs relative to true poses.
 
-    What a filter that diverges overflows is inf or NaN here, and raises no warning.
+    Overflow of a diverging filter gives inf or NaN, without a warning.
 
     Parameters
     ----------
     belief
-        Of the filter, arrays (...).
+        Belief of the filter, arrays (...).
     rotation, translation
         The truth, (..., 3, 3) and (..., 3).
     tags
-        True places on the body (N, 3).
+        True tag positions on the body (N, 3).
     """
     truth = rotation, translation
     with np.errstate(all="ignore"):
@@ -277,16 +277,16 @@ def pose_errors(
 
 
 class AxisErrors(NamedTuple):
-    """Errors of K beliefs in position and rotation, (K,) each; NaN where truth is not known.
+    """Errors of K beliefs in position and rotation, (K,) each; NaN if the truth is unknown.
 
     Attributes
     ----------
     position_m, rotation_deg
-        Lengths of the errors.
+        Norms of the errors.
     position_std_m, rotation_std_deg
-        Standard deviations that the beliefs claim, of all axes together.
+        Standard deviations of the beliefs, of all axes together.
     nees
-        Of the same axes.
+        NEES of the same axes.
     """
 
     position_m: FloatArray
@@ -303,18 +303,18 @@ def axis_errors(
     known: BoolArray | None = None,
     planar: bool = False,
 ) -> AxisErrors:
-    """Errors and claimed standard deviations of beliefs along a track, for curves over time.
+    """Return errors and standard deviations of beliefs along a track, for curves over time.
 
     Parameters
     ----------
     belief
         Arrays (K, ...).
     rotation, translation
-        The truth (K, 3, 3), (K, 3); rotation None: positions alone are judged.
+        The truth (K, 3, 3), (K, 3); rotation None: only positions are compared.
     known
-        Epochs (K,) that have truth; None: all.
+        Epochs (K,) with truth; None: all.
     planar
-        Judge yaw and the position in x and y only.
+        Compare only yaw and the position in x and y.
     """
     turn, move = ([2], [3, 4]) if planar else ([0, 1, 2], [3, 4, 5])
     axes = move if rotation is None else turn + move
@@ -336,16 +336,16 @@ def axis_errors(
 
 
 def nees_interval(count: int = 1, dof: int = 6, level: float = 0.95) -> tuple[float, float]:
-    """Ends of the interval that holds the mean NEES of honest beliefs with this probability.
+    """Return the interval that contains the mean NEES of consistent beliefs with a probability.
 
     Parameters
     ----------
     count
-        Independent beliefs that the mean is over.
+        Number of independent beliefs in the mean.
     dof
         Degrees of freedom of each.
     level
-        Probability; half of the rest lies below, half above.
+        Probability; half of the remainder lies below, half above.
     """
     tail = 0.5 * (1 - level)
     low, high = (special.chdtri(dof * count, p) / count for p in (1 - tail, tail))

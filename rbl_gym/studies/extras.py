@@ -1,4 +1,4 @@
-"""Libraries that only an extra installs: say which one is missing."""
+"""Report missing libraries that are installed by an extra."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import importlib.util
 
 
 class MissingExtraError(Exception):
-    """A library is missing that one of the extras installs."""
+    """Raised if a library from one of the extras is missing."""
 
 
 def require(module: str, extra: str, also: str = "") -> None:
-    """Say which extra is missing before the work begins, and what is needed `also`, of no extra."""
+    """Raise MissingExtraError before the work begins; `also`: needed libraries of no extra."""
     if importlib.util.find_spec(module) is None:
         raise MissingExtraError(
             f"this command needs the extra {extra}: pip install 'rbl-gym[{extra}]' {also}".rstrip()

@@ -1,4 +1,4 @@
-"""Hard conditions: lost and reflected links, wrong starts, outages; filters against bounds."""
+"""Compare filters with bounds under hard conditions: bad links, wrong starts, outages."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
 START_SCENES = ("uwb_room", "drone_yard", "satellite", "auv_buoys")
 STARTS = ("wrong", "nothing", "outage", "wrong, 10 % NLOS")
 START_FILTERS = ("iekf", "bank")
-# Where anchors in a plane leave a mirror pose, a bank that knows the side besides.
+# If coplanar anchors leave a mirror pose, also a bank that knows the side.
 _COPLANAR = ("auv_buoys",)
-# An error whose square in the bound's covariance is above this is no chance (mean 6).
+# An error whose square, normalised by the bound, exceeds this is not random (mean 6).
 LOST = 100.0
 # Epochs of the wrong starts; the outage's links and odometry are gone for `_GONE` of them.
 _START_STEPS, _GONE = 20, range(5, 50)
 _WRONG_RAD, _WRONG_M = np.pi, 10.0
-# Epochs after a wrong start, or after an outage, at which it is asked who is back.
+# Epochs after a wrong start, or after an outage, at which recovery is evaluated.
 AFTER = (0, 1, 2, 5, 10)
 
 
 class _Case(NamedTuple):
-    """Trials, information by which errors are judged, and the epoch at which links are back."""
+    """Trials, information of the bound, and the epoch at which links return."""
 
     trials: SimulatedTrials
     information: FloatArray
@@ -58,16 +58,17 @@ def _start_filters(scene: str) -> tuple[str, ...]:
 
 
 def compare_hard_conditions(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
-    """All filters under all conditions, and all starts.
+    """Run all filters under all conditions, and from all starts.
 
     Returns
     -------
     A dict of plain numbers. ``links[scene][condition]``: `share_good`, of links that measured on
-    a straight path; `filters`, each with its RMSE over two posterior Cramer-Rao bounds, averaged
-    over the epochs (``clean``: all links on straight paths; ``good``: the straight ones that
-    were there), NEES, the largest errors, `lost` (share of trials with an error of more than
-    `LOST` in the bound's covariance at the end, or ever), microseconds a step.
-    ``starts[scene][start][filter]``: share of the trials that are back `AFTER` so many epochs.
+    a direct path; `filters`, each with its RMSE over two posterior Cramer-Rao bounds, averaged
+    over the epochs (``clean``: all links on direct paths; ``good``: the available direct
+    ones), NEES, the largest errors, `lost` (share of trials with an error of more than
+    `LOST` in the covariance of the bound at the end, or ever), microseconds per step.
+    ``starts[scene][start][filter]``: share of the trials that have recovered `AFTER` these numbers
+    of epochs.
     """
     result: dict[str, Any] = {"experiment": "hard", "trials": trials, "seed": seed}
     links = len(LINK_SCENES) * len(CONDITIONS) * len(FILTERS)
@@ -96,7 +97,7 @@ def compare_hard_conditions(trials: int, seed: int, advance: Advance = silent) -
 
 
 def _links(scene: Scene, count: int, rng: np.random.Generator, advance: Advance) -> dict[str, Any]:
-    """All filters on the same episodes of one scene and condition."""
+    """Run all filters on the same episodes of one scene and condition."""
     trials = monte_carlo.simulate_trials(scene, count, rng)
     good = np.array([m.links & ~m.nlos for m in trials.measurements])
     clean = monte_carlo.bound_of(scene, trials.episode, np.ones_like(good))
@@ -122,7 +123,7 @@ def _links(scene: Scene, count: int, rng: np.random.Generator, advance: Advance)
 
 
 def _ratios(error: FloatArray, bound: FloatArray) -> dict[str, float]:
-    """RMSE over the bound's, per epoch, averaged over the epochs: rotation and translation."""
+    """Return RMSE over that of the bound, averaged over epochs: rotation and translation."""
     variance = np.diagonal(bound, axis1=-2, axis2=-1).mean(axis=1)
     square = np.square(error).mean(axis=1)
     return {
@@ -139,7 +140,7 @@ def _squared_distance(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Case:
-    """Episodes whose filters are told something wrong, nothing, or lose sight on the way."""
+    """Run episodes with wrong or no start information, or with an outage."""
     links = {"nlos_probability": 0.1} if "NLOS" in start else {}
     back = _GONE.stop if start == "outage" else 0
     scene = scenes.get({"name": name, "links": links, "steps": back + _START_STEPS})
@@ -177,7 +178,7 @@ def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Cas
 
 
 def _back(case: _Case, label: str, robust: bool, advance: Advance) -> dict[str, Any]:
-    """Who is back when, and what a step took."""
+    """Return the recovery of filters over epochs, and the time of a step."""
     options: dict[str, Any] = {"robust": robust}
     if label == "bank, volume":
         options["volume"] = case.trials.scene.volume.bounds()

@@ -1,4 +1,4 @@
-"""Runs of a filter over a batch of episodes, with everything that judges it."""
+"""Run a filter over a batch of episodes, and evaluate it."""
 
 from __future__ import annotations
 
@@ -44,25 +44,25 @@ class SimulatedTrials(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """What a filter did, per epoch and trial: arrays (K, B) unless said.
+    """Results of a filter per epoch and trial: arrays (K, B) unless noted.
 
     Attributes
     ----------
     frobenius
-        Frobenius norm of the raw rotation estimate's error.
+        Frobenius norm of the error of the raw rotation estimate.
     angular
         Mean angle between columns (rad), of the raw estimate.
     error
         Pose error of the belief (K, B, 6).
     nees, score
-        Of the belief: ``e^T P^-1 e``; b in metres.
+        NEES ``e^T P^-1 e`` and score b in metres of the belief.
     own_rotation, own_translation
-        Variances that the filter claims in its own state: of the rotation's Frobenius error
-        (the tracking paper's tr P_q), and of the translation (tr P_t).
+        Variances from the own covariance of the filter: of the Frobenius error of the rotation
+        (tr P_q of the tracking paper), and of the translation (tr P_t).
     constrained
-        Whether the update put the rotation back onto SO(3).
+        Whether the update projected the rotation onto SO(3).
     seconds
-        Processor time of one step of one trial.
+        Processor time of one step of one trial, seconds.
     """
 
     frobenius: FloatArray
@@ -77,7 +77,7 @@ class Trace(NamedTuple):
 
 
 def simulate_trials(scene: Scene, trials: int, rng: np.random.Generator) -> SimulatedTrials:
-    """Episodes of a scene, with anchors that stay where they start."""
+    """Simulate episodes of a scene with fixed anchors."""
     episode = simulation.draw_episode(scene, rng, (trials,))
     measurements = measure_episode(scene, episode)
     links = [measured.links for measured in measurements]
@@ -85,7 +85,7 @@ def simulate_trials(scene: Scene, trials: int, rng: np.random.Generator) -> Simu
 
 
 def measure_episode(scene: Scene, episode: simulation.Episode) -> list[ranging.Measurement]:
-    """Ranges and links (B, M, N) of every epoch of episodes whose anchors stand still."""
+    """Return ranges and links (B, M, N) of every epoch of episodes with fixed anchors."""
     anchors = episode.anchors[:, None]
     measured = simulation.measure_epoch(scene, simulation.whole(episode), anchors)
     columns = (np.moveaxis(column, 1, 0) for column in measured)
@@ -93,7 +93,7 @@ def measure_episode(scene: Scene, episode: simulation.Episode) -> list[ranging.M
 
 
 def bound_of(scene: Scene, episode: simulation.Episode, links: Iterable[BoolArray]) -> FloatArray:
-    """Posterior Cramer-Rao covariances (K, B, 6, 6) of true poses, by the links (K, B, M, N)."""
+    """Return posterior Cramer-Rao bounds (K, B, 6, 6) at true poses, for links (K, B, M, N)."""
     covariances, information = [], None
     for epoch, measured in enumerate(links):
         at = simulation.epoch_of(episode, epoch)
@@ -111,18 +111,18 @@ def told_readings(
     told: Scene | None = None,
     anchors: FloatArray | None = None,
 ) -> list[Reading]:
-    """What filters are told of episodes whose anchors stand still, an entry per epoch.
+    """Return the inputs of filters for episodes with fixed anchors, one per epoch.
 
-    In scenes with obstacles each epoch has a law of its own: receivers learn how good a link is.
+    In scenes with obstacles each epoch has its own law: receivers know the quality of a link.
 
     Parameters
     ----------
     scene, episode, measurements
-        The truth, and what was measured.
+        The truth, and the measurements.
     told
-        The scene as filters know it; None: as it is.
+        The scene as known to filters; None: the true scene.
     anchors
-        Places (B, M, 3) that filters are told; None: the true ones, or the surveyed ones where
+        Anchor positions (B, M, 3) known to filters; None: the true ones, or the surveyed ones if
         the scene has a survey.
     """
     told = scene if told is None else told
@@ -145,20 +145,20 @@ def told_reading(
     quality: FloatArray | None,
     first: bool,
 ) -> Reading:
-    """What filters are told of one epoch.
+    """Return the input of filters for one epoch.
 
     Parameters
     ----------
     told
-        The scene as filters know it.
+        The scene as known to filters.
     at, measured
-        The epoch, and what was measured.
+        The epoch, and the measurements.
     anchors
-        Places (..., M, 3) that filters are told.
+        Anchor positions (..., M, 3) known to filters.
     quality
         Share (..., M) of their information that links keep; None: all of it.
     first
-        Whether the epoch is the first, to which no twist leads.
+        Whether the epoch is the first, without a twist.
     """
     law = None if quality is None else WeakenedNoise(told.noise, quality)
     twist, inertial = (None, None) if first else (at.twist, at.readings)
@@ -166,13 +166,13 @@ def told_reading(
 
 
 def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators.Filter:
-    """A named filter that knows the scene's tags and laws.
+    """Return a named filter with the tags and laws of the scene.
 
     Raises
     ------
     ValueError
-        As `estimators.make`; and for a filter that takes no law of an epoch, in a scene whose
-        obstacles give one to every epoch.
+        As in `estimators.make`, and if the filter does not support a law per epoch, which scenes
+        with obstacles need.
     """
     options = {**scene.links.options, **inertial_options(name, scene), **options}
     filter = estimators.make(
@@ -184,7 +184,7 @@ def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators
 
 
 def trial_steps(trials: SimulatedTrials, filter: estimators.Filter) -> Iterator[Step]:
-    """A filter over all trials at once, epoch by epoch, started from their priors."""
+    """Run a filter over all trials at once, epoch by epoch, from their priors."""
     episode = trials.episode
     prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
     readings = told_readings(trials.scene, episode, trials.measurements)
@@ -197,14 +197,14 @@ def track_trials(
     options: dict[str, Any],
     advance: Callable[[], None] = lambda: None,
 ) -> Trace:
-    """A named filter over all trials, and everything that judges it.
+    """Run a named filter over all trials, and evaluate it.
 
     Parameters
     ----------
     trials
-        Of `simulate_trials`.
+        Trials from `simulate_trials`.
     name, options
-        Of the filter (`estimators.make`).
+        Name and options of the filter (`estimators.make`).
     advance
         Called after every epoch.
     """
@@ -237,7 +237,7 @@ def track_trials(
 
 
 def _own_variances(state: Any) -> tuple[FloatArray, FloatArray]:
-    """Of the rotation's Frobenius error and of the translation."""
+    """Return the variances of the Frobenius error of the rotation, and of the translation."""
     variance = np.diagonal(state.covariance, axis1=-2, axis2=-1)
     if isinstance(state, KalmanState):
         return variance[..., :9].sum(-1), variance[..., 9:].sum(-1)
@@ -246,6 +246,6 @@ def _own_variances(state: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def rms(values: FloatArray, axis: int | None = None) -> Any:
-    """Root mean square; inf where any is."""
+    """Return the root mean square; inf if a value is inf."""
     with np.errstate(over="ignore"):
         return np.sqrt(np.mean(np.square(values), axis=axis))

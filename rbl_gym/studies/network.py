@@ -1,6 +1,6 @@
-"""rbl-gym network: orientations of a planar network or pose graph from a file."""
+"""rbl-gym network: solve the orientations of a planar network or pose graph from a file."""
 
-# scipy.sparse comes without stubs, and pyright's guesses of it are wrong.
+# scipy.sparse has no stubs, and pyright infers wrong types for it.
 # pyright: reportArgumentType=false, reportCallIssue=false
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 WEIGHTS = ("information", "unit")
-_WORST = 5  # edges that are listed
+_WORST = 5  # number of listed edges
 
 
 class Solved(NamedTuple):
@@ -34,25 +34,25 @@ class Solved(NamedTuple):
     graph: PoseGraph
     theta: FloatArray  # (n,)
     residual: FloatArray  # (m,) radians
-    positions: FloatArray | None  # (n, 2), where the file has displacements
+    positions: FloatArray | None  # (n, 2), if the file has displacements
 
 
 def solve_network(path: str, weights: str = "information") -> Solved:
-    """Read a file, solve, certify.
+    """Read a file, solve for the orientations, and certify the solution.
 
     Parameters
     ----------
     path
         The file.
     weights
-        ``"information"``: the information of theta, I33, of each edge; a file that has none at
-        all leaves all edges alike. ``"unit"``: all edges alike, whatever the file says.
+        ``"information"``: the information of theta, I33, of each edge; if the file has none,
+        all edges have equal weights. ``"unit"``: equal weights in all cases.
 
     Raises
     ------
     ValueError
-        If the file is not as described, the graph is not connected, or the information of
-        theta is missing where it matters. The message names the file and its nodes.
+        If the file is not as described, the graph is not connected, or required information of
+        theta is missing. The message names the file and its nodes.
     """
     graph = g2o.read_graph(path)
     try:
@@ -116,14 +116,14 @@ def _solved(path: str, graph: PoseGraph, weights: str) -> Solved:
 
 
 def edge_weights(graph: PoseGraph) -> FloatArray:
-    """Information of theta (m,), I33 of each edge; 1 where the file has none at all.
+    """Return the information of theta (m,), I33 of each edge; 1 if the file has none.
 
-    An edge on no cycle needs none: its angle is taken as it is.
+    An edge that is not on a cycle needs none: its angle is used unchanged.
 
     Raises
     ------
     ValueError
-        If some edges on cycles have information and others not; the first of those is named.
+        If some edges on cycles have information and others do not; the message names the first.
     """
     if graph.information is None:
         return np.ones(len(graph.edges))
@@ -142,7 +142,7 @@ def edge_weights(graph: PoseGraph) -> FloatArray:
 
 
 def _on_cycles(edges: IntArray, n_nodes: int) -> np.ndarray:
-    """Whether an edge (m,) is part of a cycle."""
+    """Return whether each edge (m,) is part of a cycle."""
     cycles = graphs.cycle_matrix(edges, n_nodes)
     return np.bincount(cycles.indices, minlength=len(edges)) > 0
 
@@ -156,9 +156,9 @@ def _said(graph: PoseGraph, weights: str) -> str:
 
 
 def _positions(graph: PoseGraph, theta: FloatArray, weights: str) -> FloatArray | None:
-    """Least squares of the displacements, once turned by the orientations.
+    """Return the least-squares positions of the displacements, rotated by the orientations.
 
-    Weighted by their information, where all edges have it; None where it is not definite.
+    They are weighted by their information if all edges have it; None if it is not definite.
     """
     if graph.displacement is None:
         return None

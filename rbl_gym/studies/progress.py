@@ -1,4 +1,4 @@
-"""How studies tell how far they are."""
+"""Report the progress of studies."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ __all__ = ["Advance"]
 
 
 class Advance(Protocol):
-    """What a study calls: ``advance(0, more=n)`` before n steps, ``advance()`` after each."""
+    """Progress callback: ``advance(0, more=n)`` before n steps, ``advance()`` after each."""
 
     def __call__(self, steps: int = 1, *, more: int = 0) -> None:
-        """`steps` are done, `more` are still to come besides those announced before."""
+        """Report that `steps` are done, and `more` are added to those announced before."""
 
 
 def silent(steps: int = 1, *, more: int = 0) -> None:
-    """Tells nobody."""
+    """Ignore progress."""

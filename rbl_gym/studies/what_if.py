@@ -1,7 +1,7 @@
-"""What would an inertial sensor, a better survey or calibrated links buy? Bounds along a track.
+"""Compute bounds along a track with an inertial sensor, a better survey or calibrated links.
 
-On one set of episodes the posterior Cramer-Rao bound is run once for each way in which the motion
-is known, and each thing that is not. No filter is run: a bound is what the best one reaches.
+The posterior Cramer-Rao bound is computed on one set of episodes for each model of the motion and
+each set of unknowns. No filter is run: the bound is the limit of the best one.
 """
 
 from __future__ import annotations
@@ -31,37 +31,37 @@ __all__ = ["SURVEYS_M", "UNCALIBRATED", "what_if"]
 
 # Standard deviations of surveys (m), per axis.
 SURVEYS_M = (0.01, 0.03, 0.1)
-# Biases of links that nobody calibrated: of each, and of what all have in common.
+# Biases of uncalibrated links: of each link, and common to all.
 UNCALIBRATED = LinkBias(0.05, None, 0.1)
 
 
 def what_if(
     scene: str | Mapping[str, Any] | Scene, trials: int, seed: int, advance: Advance = silent
 ) -> dict[str, Any]:
-    """Bounds of pose along episodes of a scene, by what tells the motion and what is not known.
+    """Return pose bounds along episodes of a scene, by the motion model and the unknowns.
 
     The body flies smoothly, as in a scene with an inertial sensor (`worlds.inertial_motion`).
 
     Parameters
     ----------
     scene
-        As `scenes.get`. Its own offset and survey are there in every row; without an inertial
-        sensor of its own it gets a ``"consumer"``.
+        As in `scenes.get`. Its own offset and survey are part of every row. A scene without an
+        inertial sensor gets a ``"consumer"`` one.
     trials, seed
-        Episodes, and the seed of their randomness.
+        Number of episodes, and the seed of their randomness.
     advance
         Called after each row.
 
     Returns
     -------
     Plain numbers: ``rows``, each with `motion`, `unknown`, and root mean squares over trials and
-    epochs of `position_m`, `rotation_deg` and `tags_m` (b), all of the second half of the episode
-    beside them (``late_position_m``, ...), when what is constant has been learned.
+    epochs of `position_m`, `rotation_deg` and `tags_m` (b), and the same for the second half of
+    the episode (``late_position_m``, ...), when constants have been estimated.
 
     Raises
     ------
     ValueError
-        Where the scene takes no inertial sensor, or its ranges do not determine the pose.
+        If the scene supports no inertial sensor, or its ranges do not determine the pose.
     """
     base, trials = scenes.get(scene), check_count("trials", trials)
     flown = base
@@ -88,7 +88,7 @@ def what_if(
 
 
 def _unknowns(scene: Scene) -> dict[str, bounds.Nuisances]:
-    """What is not known, by name; the scene's own offset and survey are in all of it."""
+    """Return the sets of unknowns, by name; all include the offset and survey of the scene."""
     offset, survey = scene.links.offset, scene.survey_std_m
     found = {"nothing more": bounds.Nuisances(offset, survey)}
     for std in SURVEYS_M:
@@ -101,7 +101,7 @@ def _unknowns(scene: Scene) -> dict[str, bounds.Nuisances]:
 
 
 class _Law(NamedTuple):
-    """What tells the motion: information of the prior, its states, the motion of each epoch."""
+    """A motion model: information of the prior, its states, the motion of each epoch."""
 
     prior: FloatArray
     states: int
@@ -109,7 +109,7 @@ class _Law(NamedTuple):
 
 
 def _motions(drawn: monte_carlo.SimulatedTrials) -> dict[str, _Law]:
-    """What may tell the motion, by name."""
+    """Return the motion models, by name."""
     scene, episode = drawn.scene, drawn.episode
     pose = np.linalg.inv(episode.prior_covariance)
     law, true = _wandering(drawn)
@@ -141,12 +141,12 @@ def _sensed(dt: float, sensor: InertialSensor, at: simulation.Epoch, _: int) -> 
 
 
 def _wandering(drawn: monte_carlo.SimulatedTrials) -> tuple[WanderingTwist, FloatArray]:
-    """A law for the twists of the episodes, and they (B, T, 6): its figures are those of them."""
+    """Return a law fitted to the twists of the episodes, and the twists (B, T, 6)."""
     episode, dt = drawn.episode, drawn.scene.dt
     true = twists_between(episode.rotation, episode.translation, dt)
     rate, change = true.reshape(-1, 2, 3), np.diff(true, axis=-2).reshape(-1, 2, 3) / np.sqrt(dt)
     std = [np.sqrt((x**2).mean(axis=(0, 2))) if len(x) else np.zeros(2) for x in (rate, change)]
-    # What never turns, or never speeds up, has no law.
+    # A body that never turns, or never accelerates, has no law.
     (turn, speed), (turning, speeding) = np.maximum(std, 1e-4).tolist()
     return WanderingTwist(turn, speed, turning, speeding), true
 
@@ -154,7 +154,7 @@ def _wandering(drawn: monte_carlo.SimulatedTrials) -> tuple[WanderingTwist, Floa
 def _track_bound(
     drawn: monte_carlo.SimulatedTrials, law: _Law, nuisances: bounds.Nuisances
 ) -> dict[str, float]:
-    """Root mean squares over trials and epochs, of all of them and of the second half."""
+    """Return root mean squares over trials and epochs, for all epochs and for the second half."""
     scene, episode = drawn.scene, drawn.episode
     J = bounds.with_nuisances(law.prior, nuisances.count(scene.n_anchors, len(scene.tags)))
     variance, b = [], []

@@ -1,4 +1,4 @@
-"""A recording through a filter: the track, its mirror image, errors against the truth, hints."""
+"""Replay a recording through a filter: track, mirror pose, errors relative to the truth, hints."""
 
 from rbl_gym.studies.replay.causes import Cause, likely_causes
 from rbl_gym.studies.replay.clocks import CLOCK_TRIALS, SensorClock, sensor_clock

@@ -1,9 +1,9 @@
-"""Why a filter contradicts its data: faults are supposed one by one, and the likelihood judges.
+"""Find causes of a contradiction between filter and data: test faults one by one by likelihood.
 
-Every supposition is a changed log or changed settings (`suppositions`). All of them run over the
-part of the log that is contradicted most, and the likeliest is taken. The excess of a run is by how
-much its log-likelihood lies below what its filter claims; a fault is named if mending it takes away
-most of that.
+Every hypothesis is a changed log or changed settings (`suppositions`). All of them run over the
+part of the log with the largest contradiction, and the most likely one is selected. The excess of a
+run is its log-likelihood below the expectation of its filter. A fault is reported if its correction
+removes most of the excess.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from rbl_gym.studies.replay.tracking import origin_of
 
 __all__ = ["Cause", "likely_causes"]
 
-# So many ranges are looked at, and so many epochs at the least and at the most.
+# Number of ranges to use, and minimum and maximum number of epochs.
 _RANGES, _FEWEST, _MOST = 6_000, 100, 1_500
-# Causes together take away this share of the excess to be named, each of them this one.
+# To be reported, causes together must remove the first share of the excess, each the second.
 _ENOUGH, _WORTH = 0.5, 0.1
 
 
 class Cause(NamedTuple):
-    """A fault that would explain why a filter contradicts its data.
+    """A fault that would explain why the data contradict a filter.
 
     Attributes
     ----------
@@ -41,11 +41,11 @@ class Cause(NamedTuple):
         ``"tags-swapped"``, ``"anchor-moved"``, ``"anchor-bias"``, ``"tag-bias"``, ``"link-bias"``,
         ``"common-bias"``, ``"units"``, ``"height"`` or ``"outliers"``.
     text
-        In words.
+        Description.
     nis_per_dof
-        The NIS per degree of freedom that would be left, over the part of the log looked at.
+        The remaining NIS per degree of freedom, over the tested part of the log.
     mended
-        The share of the excess that it takes away.
+        The share of the excess that its correction removes.
     """
 
     kind: str
@@ -60,17 +60,17 @@ def likely_causes(
     found: Innovations,
     poses: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Cause]:
-    """Faults that explain most of what a filter did not foretell, at most two; empty: none does.
+    """Return at most two faults that explain most of the contradiction; empty: none does.
 
     Parameters
     ----------
     recording, settings
-        What was filtered, and how; the truth is not looked at.
+        The log and its settings; the truth is not used.
     found
-        Innovations of that run.
+        Innovations of the run.
     poses
-        Rotations (K, 3, 3) and places (K, 3) of that run. With an inertial sensor, where headings
-        take long to find, the part that is looked at starts there.
+        Rotations (K, 3, 3) and positions (K, 3) of the run. With an inertial sensor, where headings
+        take long to converge, the tested part starts at these poses.
     """
     part = _strained_part(recording, found)
     if poses is not None and settings.filter == "iekf-imu":
@@ -90,7 +90,7 @@ def likely_causes(
         more = list(second_suppositions(trial, suppositions, here, there))
         suppositions += more
         tried = here.part(slice(1, None)).with_more(evidence([s.trial for s in more]))
-        # Schwarz's criterion: numbers that were fitted have their price.
+        # Schwarz's criterion: fitted parameters are penalised.
         price = 0.5 * np.log(trial.recording.links.sum())
         fitted = np.array([supposition.parameters for supposition in suppositions])
         density = np.log([supposition.scale for supposition in suppositions])
@@ -113,7 +113,7 @@ def likely_causes(
 
 
 def _excess(trial: Trial, seen: Evidence) -> float:
-    """By how much the log-likelihood of a trial misses what its filter claims."""
+    """Return how far the log-likelihood of a trial lies below the expectation of its filter."""
     links = trial.recording.links
     usual = LOG_USED - 0.5 - np.log(std_of(*trial)[links]).mean()
     nis, dof = seen.nis.sum(), seen.dof.sum()
@@ -121,7 +121,7 @@ def _excess(trial: Trial, seen: Evidence) -> float:
 
 
 def _strained_part(recording: Recording, found: Innovations) -> slice:
-    """The epochs of the part of a log that is contradicted most."""
+    """Return the epochs of the part of a log with the largest contradiction."""
     links = recording.links.sum(axis=(1, 2))
     size = int(np.clip(_RANGES / max(links.mean(), 1), _FEWEST, _MOST))
     if size >= len(links):
@@ -133,7 +133,7 @@ def _strained_part(recording: Recording, found: Innovations) -> slice:
 
 
 def cut(recording: Recording, epochs: slice) -> Recording:
-    """Some epochs of a recording, without the truth."""
+    """Return some epochs of a recording, without the truth."""
     std, anchors = recording.range_std, recording.anchors
     return recording._replace(
         times=recording.times[epochs],
@@ -146,7 +146,7 @@ def cut(recording: Recording, epochs: slice) -> Recording:
 
 
 def local_trial(recording: Recording, settings: Settings) -> Trial:
-    """A recording relative to its anchors, where its coordinates are those of a map."""
+    """Return a recording relative to its anchors, if it has map coordinates."""
     origin = origin_of(recording)
     known = settings.knowledge
     changed: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""What a log says of itself without truth: NIS, residuals of anchors, tags and links."""
+"""Check the consistency of a log without truth: NIS, residuals of anchors, tags and links."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ _MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
 
 
 def consistency_figures(found: Innovations, recording: Recording) -> dict[str, Any]:
-    """How well a filter foretold a log, in plain numbers.
+    """Return how well a filter predicted a log, in plain numbers.
 
     Parameters
     ----------
     found
-        Of the filter, arrays (K, ...).
+        Innovations of the filter, arrays (K, ...).
     recording
-        What it was told.
+        The filtered recording.
 
     Returns
     -------
-    ``nis_per_dof`` (1 where the filter is honest), ``log_likelihood`` (per range),
+    ``nis_per_dof`` (1 if the filter is consistent), ``log_likelihood`` (per range),
     ``refused_share``, ``contradicts``, and the tables of `residual_tables`.
     """
     ranges, used = int(recording.links.sum()), int(found.dof.sum())
@@ -52,7 +52,7 @@ def consistency_figures(found: Innovations, recording: Recording) -> dict[str, A
 
 
 def contradicts(found: Innovations, recording: Recording) -> bool:
-    """Whether the ranges of a log are not what the filter expects of them."""
+    """Return whether the ranges of a log contradict the filter."""
     whole, parts = (_is_strained(*_sums(found, recording, n)) for n in (1, _BLOCKS))
     if whole[0] or parts.sum() >= max(2, _PART * len(parts)):
         return True
@@ -69,7 +69,7 @@ def contradicts(found: Innovations, recording: Recording) -> bool:
 
 
 def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatArray, ...]:
-    """NIS, ranges used and refused of so many parts of a log."""
+    """Return NIS, used and rejected ranges of this number of parts of a log."""
     links = recording.links.sum(axis=(1, 2))
     starts = np.unique(np.linspace(0, len(links), blocks, endpoint=False).astype(int))
     nis, dof, links = (np.add.reduceat(a, starts) for a in (found.nis, found.dof, links))
@@ -79,16 +79,16 @@ def _sums(found: Innovations, recording: Recording, blocks: int) -> tuple[FloatA
 def _is_strained(nis: FloatArray, dof: FloatArray, refused: FloatArray) -> BoolArray:
     by_chance = special.chdtri(np.maximum(dof, 1), _CHANCE)
     lost = refused > MOST_REFUSED * (dof + refused)
-    # A single range in five may be wrong without a word.
+    # A single wrong range in five is not reported.
     return (nis > np.maximum(MOST_NIS * dof, by_chance)) | (lost & (refused > _BLOCKS))
 
 
 def residual_tables(found: Innovations, recording: Recording) -> dict[str, list[dict[str, Any]]]:
-    """Residuals after the update, by anchor, by tag and by link.
+    """Return tables of residuals after the update, by anchor, by tag and by link.
 
     A row has the ids, ``ranges`` (how many), ``mean_m`` of those used, ``spread_m`` of all (1.4826
     times the median distance from the median: the standard deviation of a Gaussian), and
-    ``refused_share``. What was never measured has no row.
+    ``refused_share``. Points and links without ranges have no row.
     """
     links = recording.links
     M, N = links.shape[1:]
@@ -124,12 +124,12 @@ def _row(found: Innovations, links: Any, index: tuple[Any, ...]) -> dict[str, An
 def nis_curve(
     times: FloatArray, found: Innovations, points: int = 400
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """NIS per degree of freedom over time, in at most so many points.
+    """Return the NIS per degree of freedom over time, in a limited number of points.
 
     Returns
     -------
-    Times, NIS over degrees of freedom of the epochs about each, and the ends of the interval that
-    holds 95 % of them where the filter is honest.
+    Times, NIS over degrees of freedom of the epochs around each, and the interval that contains
+    95 % of them if the filter is consistent.
     """
     starts = np.unique(np.linspace(0, len(times), points, endpoint=False).astype(int))
     starts = starts[starts < len(times)]

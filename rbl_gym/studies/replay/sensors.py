@@ -14,20 +14,20 @@ __all__ = ["Inertial", "Odometry"]
 
 @dataclasses.dataclass(frozen=True)
 class Odometry:
-    """What the recording's odometry is worth, and its clock.
+    """Error model and clock of the odometry of a recording.
 
     Parameters
     ----------
     odometry_m, slip_m, odometry_deg
-        By how much the way it tells is off after 1 s: forwards; sideways and vertically; turned.
+        Standard deviation of dead reckoning after 1 s: forwards; sideways and vertical; rotation.
     odometry_scale
-        Standard deviation of its scale errors, of speeds and of turn rates, which are estimated.
+        Standard deviation of the scale errors of speeds and turn rates, which are estimated.
     odometry_bias_deg_s
         Standard deviation of the biases of its turn rates, which are estimated (deg/s).
     odometry_offset_s
-        How far its clock is ahead of that of the ranges.
+        How far its clock is ahead of that of the ranges, seconds.
     headings
-        How many headings the filter starts from, where none is told.
+        Number of start headings of the filter, if none is given.
     """
 
     odometry_m: float = 0.05
@@ -44,7 +44,7 @@ class Odometry:
         self.sensor()
 
     def sensor(self) -> OdometrySensor:
-        """The law of its readings."""
+        """Return the error model of its readings."""
         for name in ("odometry_m", "slip_m", "odometry_deg"):
             check_number(name, getattr(self, name), low=1e-6)
         for name in ("odometry_scale", "odometry_bias_deg_s"):
@@ -61,21 +61,21 @@ class Odometry:
 
 @dataclasses.dataclass(frozen=True)
 class Inertial:
-    """What the recording's inertial sensor is worth, and its clock.
+    """Error model and clock of the inertial sensor of a recording.
 
     Parameters
     ----------
     gyro_noise, accel_noise
-        Densities of its white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz). The defaults are ten times
-        and more those of a data sheet: they stand for vibration, and for what the sensor's place
-        off the body's origin adds.
+        Densities of its white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz). The defaults are at
+        least ten times those of a data sheet. They include vibration, and the lever arm of the
+        sensor to the body origin.
     gravity_tilt_deg
-        Standard deviation of the angle between the world's z axis and the vertical.
+        Standard deviation of the angle between the world z axis and the vertical.
     recorded_share
-        How much of the standard deviations that a recording states for its ranges is noise from
-        one to the next. The rest is biases that last, which the filter estimates.
+        The share of the range standard deviations of a recording that is white noise. The rest is
+        lasting biases, which the filter estimates.
     imu_offset_s
-        How far its clock is ahead of that of the ranges.
+        How far its clock is ahead of that of the ranges, seconds.
     """
 
     gyro_noise: float = 3e-3
@@ -91,7 +91,7 @@ class Inertial:
         self.sensor()
 
     def sensor(self) -> InertialSensor:
-        """The law of its readings."""
+        """Return the error model of its readings."""
         return InertialSensor(
             gyro_noise=self.gyro_noise,
             accel_noise=self.accel_noise,

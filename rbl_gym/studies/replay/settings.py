@@ -1,4 +1,4 @@
-"""How a recording is filtered, by subject."""
+"""Settings for filtering a recording, by subject."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ __all__ = [
 ]
 
 DEFAULT_RANGE_STD_M = 0.12
-# Of the filter iekf-imu: what a link keeps for long is not told from what all keep.
+# For the filter iekf-imu: lasting biases of single links cannot be separated from the common one.
 _INERTIAL_BIASES = {"constant_std_m": 0.0, "constant_common_m": 0.073, "drift_time_s": 20.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class Motion:
-    """How the body moves: no twist is told.
+    """Motion of the body with unknown twist.
 
     Parameters
     ----------
     walk_m, walk_deg
         The pose is a random walk of this standard deviation after 1 s.
     accel_m, accel_deg
-        Of the filters ``"iekf-log"`` and ``"iekf-cv"``: how much speed (m/s) and turn rate (deg/s)
-        change in 1 s; None: 30 deg/s, and 1 m/s, of ``"iekf-cv"`` 0.5; with odometry, which
-        tells of every change, 1000 deg/s and 3 m/s.
+        For the filters ``"iekf-log"`` and ``"iekf-cv"``: standard deviation of the change of
+        velocity (m/s) and turn rate (deg/s) in 1 s; None: 30 deg/s, and 1 m/s (``"iekf-cv"``:
+        0.5 m/s). With odometry, which measures all changes, 1000 deg/s and 3 m/s.
     """
 
     walk_m: float = 0.1
@@ -54,16 +54,16 @@ class Motion:
 
 @dataclasses.dataclass(frozen=True)
 class Biases:
-    """Laws of the links' biases.
+    """Laws of the link biases.
 
     Parameters
     ----------
     bias_std_m, bias_time_s, bias_common_m
-        Of the filter ``"iekf-bias"``: as of `rbl_gym.measurements.link_bias.LinkBias`.
+        For the filter ``"iekf-bias"``: as in `rbl_gym.measurements.link_bias.LinkBias`.
     constant_std_m, constant_common_m
-        Of ``"iekf-log"`` and ``"iekf-imu"``: biases that stay, of each link and in common to all.
+        For ``"iekf-log"`` and ``"iekf-imu"``: constant biases, of each link and common to all.
     drift_std_m, drift_time_s
-        Of the same: biases that move as the body does.
+        For the same filters: biases that change with the motion.
     """
 
     bias_std_m: float = 0.02
@@ -83,13 +83,13 @@ class Biases:
 
 @dataclasses.dataclass(frozen=True)
 class Loss:
-    """How much a range counts that does not fit.
+    """Treatment of ranges that do not fit.
 
     Parameters
     ----------
     robust
-        Of the iterated EKFs: False, squares; True, Huber's loss; ``"late"``, the redescending loss
-        for ranges that err late. None: ``"late"`` of ``"iekf-log"``, else True.
+        For the iterated EKFs: False, squares; True, Huber's loss; ``"late"``, the redescending loss
+        for late ranges. None: ``"late"`` for ``"iekf-log"``, else True.
     """
 
     robust: bool | str | None = None
@@ -97,29 +97,29 @@ class Loss:
 
 @dataclasses.dataclass(frozen=True)
 class Knowledge:
-    """What is known of the body's place before any range.
+    """Prior knowledge of the pose of the body.
 
     Parameters
     ----------
     planar
         Hold height, roll and pitch by a tight prior.
     height_offset_m
-        How far the tags' mean height lies below the anchors' (planar only). None: the same height,
-        which anchors in one plane alone can mean.
+        Mean height of the anchors minus that of the tags (planar only). None: the same height,
+        which is only possible for anchors in one plane.
     volume
-        Where the body's origin may be: xmin, xmax, ymin, ymax, zmin, zmax in metres, None where
-        there is no limit. It tells a pose from its mirror image.
+        Possible positions of the body origin: xmin, xmax, ymin, ymax, zmin, zmax in metres, None
+        for no limit. It can distinguish a pose from its mirror image.
     below_anchors
-        The body stays below the anchors' mean height.
+        The body is below the mean height of the anchors.
     start
-        Where the body's origin is at the first epoch: x, y, z in metres, and its yaw in degrees or
-        nothing. None: anywhere among the anchors, turned anyhow.
+        Position of the body origin at the first epoch: x, y, z in metres, and optionally its yaw in
+        degrees. None: anywhere among the anchors, with any rotation.
     prior_position_m, prior_rotation_deg
-        Standard deviations of that, on each axis; None: 0.5 m, and 30 degrees where a yaw is told.
+        Standard deviations of `start` on each axis; None: 0.5 m, and 30 degrees if a yaw is given.
     height_m, height_std_m
-        The body's origin stays at about this height; with `planar` at this height.
+        Approximate height of the body origin and its standard deviation; exact with `planar`.
     tilt_std_deg
-        The body stays level but for this, about each of two axes.
+        Standard deviation of roll and pitch of a body that stays level.
     """
 
     planar: bool = False
@@ -162,23 +162,23 @@ class Knowledge:
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """How a track is compared with the truth.
+    """Comparison of a track with the truth.
 
     Parameters
     ----------
     yaw_offset_deg
-        Constant turn of the tag table against the truth's body frame: the yaw error is
+        Constant rotation of the tag table relative to the body frame of the truth: the yaw error is
         estimate - (truth + offset).
     truth_gap_s
-        Longest gap, of the truth or of the ranges, that is bridged to compare the two.
+        Longest gap, in the truth or the ranges, that is interpolated for the comparison.
     truth_exclude
-        Windows of time, in seconds of the ranges' clock, in which the truth is known to be wrong:
-        pairs of start and end. Their epochs are not judged.
+        Time windows in which the truth is wrong: pairs of start and end, in seconds on the clock of
+        the ranges. Their epochs are not compared.
     time_offset
-        How far the truth's clock is ahead of that of the ranges, seconds; ``"auto"``: found by
-        the motion (`rbl_gym.recordings.motion_offset`).
+        How far the clock of the truth is ahead of that of the ranges, seconds; ``"auto"``:
+        estimated from the motion (`rbl_gym.recordings.motion_offset`).
     align
-        What of the truth's world frame is estimated from the matched positions
+        The part of the world frame of the truth that is estimated from matched positions
         (`rbl_gym.recordings.align_positions`): ``"none"``, ``"position"``, ``"yaw"``, ``"se3"``.
     """
 
@@ -200,19 +200,19 @@ class Comparison:
 
 @dataclasses.dataclass(frozen=True)
 class Smoothing:
-    """The smoothed track, beside the causal one, and its laws.
+    """The smoothed track, in addition to the causal one, and its laws.
 
     Parameters
     ----------
     smooth
-        Whether to find it.
+        Whether to compute it.
     smooth_accel_m, smooth_accel_deg
-        The twist is unknown, and wanders: by how much speed (m/s) and turn rate (deg/s) change in
-        1 s.
+        The twist is an unknown random walk: standard deviation of the change of velocity (m/s) and
+        turn rate (deg/s) in 1 s.
     smooth_bias_std_m, smooth_bias_time_s
-        Of every link's bias that drifts, as of `rbl_gym.measurements.link_bias.LinkBias`.
+        Drifting bias of every link, as in `rbl_gym.measurements.link_bias.LinkBias`.
     smooth_constant_m, smooth_common_m
-        Standard deviations of every link's bias that stays, and of what they have in common.
+        Standard deviations of the constant bias of every link, and of the common bias.
     """
 
     smooth: bool = False
@@ -232,7 +232,7 @@ class Smoothing:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How a recording is filtered.
+    """Settings for filtering a recording.
 
     No two groups have a field of the same name: `of`, `changed` and `flat` read and write fields
     without their groups, as the command line, files and JSON name them.
@@ -242,10 +242,10 @@ class Settings:
     filter
         Name of the filter.
     range_std_m
-        Standard deviation of a range; None: the recording's own where it has one, else
-        `DEFAULT_RANGE_STD_M`, which covers link biases that change with the pose.
+        Standard deviation of a range; None: that of the recording if given, else
+        `DEFAULT_RANGE_STD_M`, which includes link biases that change with the pose.
     motion, biases, odometry, inertial, loss, knowledge, comparison, smoothing
-        The rest, by subject.
+        The other settings, by subject.
 
     Examples
     --------
@@ -270,22 +270,22 @@ class Settings:
 
     @classmethod
     def of(cls, **fields: Any) -> Settings:
-        """The settings with these fields, of whatever group.
+        """Return settings with these fields, of any group.
 
-        Biases of the links default to those of the filter: of ``"iekf-imu"``, which knows the
-        motion well, one that all have in common and stays (0.073 m), and of each one that drifts
-        in 20 s.
+        Link biases default to those of the filter. For ``"iekf-imu"``, with an accurate motion,
+        these are a constant bias common to all links (0.073 m), and a bias of each link that
+        drifts in 20 s.
 
         Raises
         ------
         ValueError
-            On a field that no group has, and as the groups.
+            If a field is unknown, or a value is invalid for its group.
         """
         usual = _INERTIAL_BIASES if fields.get("filter") == "iekf-imu" else {}
         return cls().changed(**{**usual, **fields})
 
     def changed(self, **fields: Any) -> Settings:
-        """These settings with new values of fields, of whatever group; errors as of `of`."""
+        """Return settings with new values of fields, of any group; errors as in `of`."""
         known = self.flat()
         unknown = [name for name in fields if name not in known]
         if unknown:
@@ -301,7 +301,7 @@ class Settings:
         return Settings(**groups)
 
     def flat(self) -> dict[str, Any]:
-        """All fields by their names, without the groups."""
+        """Return all fields by their names, without the groups."""
         result: dict[str, Any] = {}
         for name, value in vars(self).items():
             result |= vars(value) if dataclasses.is_dataclass(value) else {name: value}

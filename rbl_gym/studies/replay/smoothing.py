@@ -1,4 +1,4 @@
-"""A recording through the smoother: every pose from all ranges, those after it too."""
+"""Smooth a recording: estimate every pose from all ranges, including later ones."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from rbl_gym.studies.replay.tracking import (
 
 __all__ = ["SmoothedRecording", "smooth_recording"]
 
-# Squared residuals beyond this multiple of what is to be expected: the start had lost its way.
+# If squared residuals exceed this multiple of their expectation, the start had diverged.
 _LOST = 2.0
-# Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
+# Standard deviations of an unknown turn rate (rad/s) and velocity (m/s).
 _ANY_TURN, _ANY_SPEED = 1.0, 3.0
-# Memory (bytes) that blocks of all epochs may take.
+# Maximum memory (bytes) of the blocks of all epochs.
 _MOST_MEMORY = 8e9
 
 
@@ -50,9 +50,9 @@ class SmoothedRecording(NamedTuple):
     track
         Beliefs of every epoch.
     found
-        Of `estimators.smooth`, in coordinates of `origin_of`.
+        Result of `estimators.smooth`, in coordinates relative to `origin_of`.
     seconds
-        Processor time that it took.
+        Processor time, seconds.
     """
 
     track: Track
@@ -61,17 +61,17 @@ class SmoothedRecording(NamedTuple):
 
 
 def smooth_recording(recording: Recording, settings: Settings, track: Track) -> SmoothedRecording:
-    """The most likely track of a recording, from its causal track on.
+    """Return the most likely track of a recording, starting from its causal track.
 
-    Where the fit says that the causal track had lost its way, a track filtered backwards in time
-    and a body at rest are tried as starts too; the most likely result counts.
+    If the fit shows that the causal track had diverged, a track filtered backwards in time and a
+    body at rest are tried as starts too. The most likely result is returned.
 
     Parameters
     ----------
     recording, settings
-        What is smoothed, and how.
+        The recording to smooth, and the settings.
     track
-        Of `track_recording`.
+        Result of `track_recording`.
 
     Raises
     ------
@@ -103,13 +103,13 @@ def smooth_recording(recording: Recording, settings: Settings, track: Track) -> 
 
 
 def _along(axes: tuple[int, int, int], size: float) -> tuple[float, float, float]:
-    """`size` on the axes that are 1, zero on the others."""
+    """Return `size` on the axes that are 1, zero on the others."""
     x, y, z = axes
     return size * x, size * y, size * z
 
 
 def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
-    """What the settings take for true of a recording."""
+    """Return the model of a recording according to the settings."""
     laws, planar = settings.smoothing, settings.knowledge.planar
     biases = (
         LinkBias(laws.smooth_constant_m, None, laws.smooth_common_m),
@@ -151,10 +151,10 @@ def model_of(recording: Recording, settings: Settings) -> smoothing.LogModel:
 def _starts(
     recording: Recording, settings: Settings, track: Track
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Tracks to start from, the likeliest to be near first."""
+    """Yield start tracks, the most promising first."""
     yield track.rotation, track.translation
     if settings.filter == "iekf-imu":
-        # No body at rest, and none that falls upwards backwards in time, reads what this one did.
+        # Neither a body at rest nor reversed time is compatible with inertial readings.
         return
     times = recording.times
     moving = recording.anchors.ndim == 3
@@ -178,7 +178,7 @@ def _starts(
 
 
 def _backwards(recording: Recording, settings: Settings) -> OdometryLog | None:
-    """Odometry of a body that goes the same way backwards, on the clock of its ranges."""
+    """Return the odometry of the time-reversed motion, on the clock of the ranges."""
     log, times = recording.odometry, recording.times
     if log is None:
         return None

@@ -1,4 +1,4 @@
-"""`rbl-gym replay` as a function: a recording, its track, its errors, its figures."""
+"""`rbl-gym replay` as a function: compute the track of a recording, its errors, its figures."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ __all__ = ["Replayed", "check_replay", "replay_recording"]
 
 
 class Replayed(NamedTuple):
-    """A recording as a filter saw it.
+    """The result of a replayed recording.
 
     Attributes
     ----------
     settings
-        As they were used.
+        The settings used.
     track
         Beliefs after every epoch.
     errors
-        Against the recording's truth; None without one.
+        Errors relative to the truth of the recording; None without truth.
     figures
-        Plain numbers: what `rbl-gym replay --json` writes.
+        Plain numbers, as written by `rbl-gym replay --json`.
     smoothed, smoothed_errors
-        The smoothed track and its errors, where `Smoothing.smooth` asks for it.
+        The smoothed track and its errors, if `Smoothing.smooth` is True.
     """
 
     settings: Settings
@@ -54,13 +54,13 @@ class Replayed(NamedTuple):
 
 
 def check_replay(recording: Recording, settings: Settings) -> Settings:
-    """The settings with what the recording says of them, checked before any work is done.
+    """Return settings completed from the recording, and check them before any work is done.
 
     Raises
     ------
     ValueError
-        On a filter or option that is not known, a height that must be told, or truth that does
-        not overlap the ranges.
+        If a filter or option is unknown, a required height is not given, or the truth does not
+        overlap the ranges.
     """
     offset = height_offset(recording, settings)
     settings = settings.changed(height_offset_m=offset, robust=robust_of(settings))
@@ -75,21 +75,21 @@ def check_replay(recording: Recording, settings: Settings) -> Settings:
 def replay_recording(
     recording: Recording, settings: Settings, advance: Callable[[], None] = lambda: None
 ) -> Replayed:
-    """Track a recorded body, causally, and judge the track by the truth where there is one.
+    """Track a recorded body causally, and compare the track with the truth if there is one.
 
     Parameters
     ----------
     recording
-        Of `rbl_gym.recordings.read_recording`, or made of arrays.
+        From `rbl_gym.recordings.read_recording`, or constructed from arrays.
     settings
-        How it is filtered.
+        Settings of the filter.
     advance
         Called after every epoch.
 
     Raises
     ------
     ValueError
-        As `check_replay`.
+        As in `check_replay`.
     """
     settings = check_replay(recording, settings)
     clock = _Stopwatch(advance)
@@ -99,7 +99,7 @@ def replay_recording(
         smoothed = smooth_recording(recording, settings, track)
     offset: TimeOffset | None = None
     if settings.comparison.time_offset == "auto":
-        # A smoothed track does not lag.
+        # A smoothed track has no lag.
         best = track if smoothed is None else smoothed.track
         offset = find_offset(recording, best, settings)
         settings = with_offset(settings, offset)
@@ -119,7 +119,7 @@ def replay_recording(
 
 
 class _Stopwatch:
-    """Processor time from one epoch to the next, without what `advance` takes."""
+    """Measure the processor time from one epoch to the next, without `advance`."""
 
     def __init__(self, advance: Callable[[], None]) -> None:
         self._advance = advance
@@ -127,11 +127,11 @@ class _Stopwatch:
         self._start = time.process_time()
 
     def tick(self) -> None:
-        """An epoch is done."""
+        """Note the end of an epoch."""
         self._spent.append(time.process_time() - self._start)
         self._advance()
         self._start = time.process_time()
 
     def microseconds(self) -> float:
-        """The median: the first epochs may have compiled what they run."""
+        """Return the median time of an epoch; the first ones may include compilation."""
         return 1e6 * float(np.median(self._spent))

@@ -1,4 +1,4 @@
-"""A replayed track with all that a file of it holds."""
+"""Prepare a replayed track for writing to a file."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from rbl_gym.studies.replay.tracking import Track
 
 __all__ = ["epoch_ranks", "track_file"]
 
-# Epochs whose Jacobians are held at a time.
+# Number of epochs whose Jacobians are in memory at a time.
 _CHUNK = 2048
 
 
 def track_file(recording: Recording, track: Track) -> TrackFile:
-    """The track of a recording with covariance, NIS and rank, as `write_track` takes it."""
+    """Return the track of a recording with covariance, NIS and rank, for `write_track`."""
     found = track.innovations
     nis, dof = (None, None) if found is None else (found.nis, found.dof.astype(np.int64))
     rank = epoch_ranks(recording, track)
@@ -25,10 +25,10 @@ def track_file(recording: Recording, track: Track) -> TrackFile:
 
 
 def epoch_ranks(recording: Recording, track: Track) -> np.ndarray:
-    """How many of the six directions of the pose the ranges of each epoch determine, (K,).
+    """Return how many of the six pose directions the ranges of each epoch determine, (K,).
 
-    The rank of their Fisher information at the estimated pose: what an epoch of less than six does
-    not tell, the belief has from other epochs, the motion or the prior.
+    It is the rank of their Fisher information at the estimated pose. For a rank below six, the
+    belief in the other directions comes from other epochs, the motion or the prior.
     """
     anchors = recording.anchors_by_epoch
     noise = ranging.RangeNoise(1.0)

@@ -1,4 +1,4 @@
-"""A recording through a filter: the same estimators on real radios."""
+"""Filter a recording, with the same estimators as in simulation."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ __all__ = [
 
 # Filters with biases by the direction of the ray in their measurement model.
 _DIRECTED = ("iekf-log", "iekf-bias", "iekf-imu")
-# How much wider than the belief its mirror image starts.
+# Factor on the covariance of the belief at the start of its mirror image.
 _IMAGE_RAD, _IMAGE_M = 0.1, 0.2
 
 
 class Track(NamedTuple):
     """Beliefs after every epoch: times (K,), rotation, translation, covariance (K, 6, 6).
 
-    `other`: the mirror pose where one explains the ranges too; the covariance covers it then.
-    `innovations`: how well the filter foretold the ranges, arrays (K, ...); its `nis` over its
-    `dof` is 1 on average where the filter is honest.
+    `other`: the mirror pose if it explains the ranges too; the covariance then includes it.
+    `innovations`: innovations of the ranges, arrays (K, ...). `nis` over `dof` is 1 on average if
+    the filter is consistent.
     """
 
     times: FloatArray
@@ -70,7 +70,7 @@ def track_recording(
 ) -> Track:
     """Filter a recording causally, epoch by epoch; `advance` is called after each.
 
-    Where a mirror pose explains the ranges as well, the belief covers both (`replay.mirror`).
+    If a mirror pose explains the ranges equally well, the belief includes both (`replay.mirror`).
     """
     filter = recording_filter(recording, settings)
     beliefs, found = [], []
@@ -84,7 +84,7 @@ def track_recording(
     track = Track(recording.times, *stack_beliefs(beliefs)[:3], innovations=foretold)
     known = settings.knowledge
     if known.planar or known.height_std_m is not None or known.tilt_std_deg is not None:
-        # Height, roll and pitch are known: they tell the sides apart.
+        # Height, roll and pitch are known: they distinguish the sides.
         return track
     std = None
     if not has_own_std(recording, settings):
@@ -106,11 +106,11 @@ def _counted(steps: Iterator[Step], advance: Callable[[], None]) -> Iterator[Ste
 def recording_steps(
     recording: Recording, settings: Settings, filter: estimators.Filter
 ) -> Iterator[Step]:
-    """A filter over the epochs of a recording, started from nothing.
+    """Run a filter over the epochs of a recording, without a known start.
 
-    Standard deviations that the recording reports itself are the law of their epoch. A belief
-    outside the settings' volume starts again from its mirror image, where that is inside.
-    Coordinates of a map are taken relative to the anchors; beliefs are of the world.
+    Standard deviations of the recording are the law of their epoch. A belief outside the volume of
+    the settings restarts from its mirror image, if that is inside. Map coordinates are taken
+    relative to the anchors; beliefs are in world coordinates.
     """
     origin = origin_of(recording)
     local = recording._replace(anchors=recording.anchors - origin)
@@ -132,7 +132,7 @@ def recording_steps(
 
 
 def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
-    """The epochs of a recording."""
+    """Yield the epochs of a recording."""
     own = own_std(recording, settings)
     elapsed = np.diff(recording.times, prepend=recording.times[0])
     anchors = recording.anchors_by_epoch
@@ -150,13 +150,13 @@ def _readings(recording: Recording, settings: Settings) -> Iterator[Reading]:
 
 
 def prior_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rotation, translation and covariance of the body before the first ranges."""
+    """Return rotation, translation and covariance of the body before the first ranges."""
     prior = start_of(recording, settings)
     return standing(recording, settings, prior) if settings.filter == "iekf-imu" else prior
 
 
 def readings_of(recording: Recording, settings: Settings) -> list[tuple[FloatArray, FloatArray]]:
-    """Readings of the body's sensor and the seconds that they count for, between all epochs."""
+    """Return the readings of the body sensor and their durations, between all epochs."""
     what = "inertial" if settings.filter == "iekf-imu" else "odometry"
     found = (sensed(recording, settings, *ends) for ends in pairwise(recording.times.tolist()))
     return [(one[what], one["steps"]) for one in found]
@@ -165,7 +165,7 @@ def readings_of(recording: Recording, settings: Settings) -> list[tuple[FloatArr
 def sensed(
     recording: Recording, settings: Settings, start_s: float, end_s: float
 ) -> dict[str, FloatArray]:
-    """Fields of a `Reading`: what the recording's sensors read between two times."""
+    """Return fields of a `Reading`: the sensor readings between two times."""
     if settings.filter == "iekf-imu" and recording.inertial is not None:
         log = clocked(recording, settings)
         readings, steps = samples_between(log, start_s, end_s)  # pyright: ignore[reportArgumentType]
@@ -180,32 +180,32 @@ def sensed(
 def _image_inside(
     tags: FloatArray, volume: FloatArray, belief: estimators.PoseBelief, anchors: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """The mirror image of a belief that is outside the volume, if that is inside; widened."""
+    """Return the widened mirror image of a belief outside the volume, if the image is inside."""
     if not is_outside(volume, belief.translation, belief.covariance):
         return None
     image = mirror_pose(*belief[:3], anchors, tags)
     if is_outside(volume, *image[1:]):
         return None
-    # Of anchors nearly in a plane the image is near the best pose, not at it.
+    # For nearly coplanar anchors the image is near the best pose, not at it.
     widened = image[2] + np.diag([_IMAGE_RAD**2] * 3 + [_IMAGE_M**2] * 3)
     return image[0], image[1], widened
 
 
 def range_std_of(recording: Recording, settings: Settings) -> float | str:
-    """The standard deviation of a range [m], or ``"recorded"`` where each has its own."""
+    """Return the standard deviation of a range [m], or ``"recorded"`` if each has its own."""
     if settings.range_std_m is not None:
         return settings.range_std_m
     return "recorded" if has_own_std(recording, settings) else DEFAULT_RANGE_STD_M
 
 
 def recording_filter(recording: Recording, settings: Settings) -> estimators.Filter:
-    """The named filter with the recording's tags, its motion and the range noise.
+    """Return the filter of the settings, with the tags and motion of a recording.
 
     Raises
     ------
     ValueError
-        As `named_filter`, and where the recording has a sensor, or biases by direction, that the
-        filter does not read.
+        As in `named_filter`, and if the recording has a sensor, or biases by direction, that the
+        filter does not support.
     """
     if (recording.inertial is None) == (settings.filter == "iekf-imu"):
         what = "iekf-imu needs imu" if recording.inertial is None else "imu is read by iekf-imu"
@@ -225,20 +225,20 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
 def named_filter(
     recording: Recording, settings: Settings, name: str, options: dict[str, Any]
 ) -> estimators.Filter:
-    """A filter with a recording's tags, a random walk and the range noise.
+    """Return a named filter with the tags of a recording, a random walk and the range noise.
 
     Parameters
     ----------
     recording, settings
-        What is filtered, and how.
+        The recording to filter, and the settings.
     name, options
-        Of the filter, in place of the settings' own.
+        Name and options of the filter, instead of those of the settings.
 
     Raises
     ------
     ValueError
-        As `estimators.make`; and for a filter that does not take the law of an epoch, where the
-        recording has one.
+        As in `estimators.make`, and if the recording has a law per epoch that the filter does not
+        support.
     """
     walk, turn = settings.motion.walk_m, math.radians(settings.motion.walk_deg)
     if settings.knowledge.planar:
@@ -246,11 +246,11 @@ def named_filter(
     else:
         process = motion.ProcessNoise(turn, walk)
     if options.get("odometry") is not None:
-        # How far the way that it tells is off is said by its own law.
+        # The error of dead reckoning is given by its own law.
         process = motion.ProcessNoise(0.0, 0.0)
     volume = volume_of(recording, settings)
     if name == "iekf-bank" and volume is not None:
-        # The bank looks for a lost body in its volume, which is finite.
+        # The bank searches a lost body in its volume, which is finite.
         box = np.clip(volume, *reach_of(recording))
         options = {"volume": box - origin_of(recording), **options}
     if recording.offset is not None:
@@ -264,7 +264,7 @@ def named_filter(
 
 
 def accel_of(settings: Settings, told: bool = False) -> tuple[float, float]:
-    """How much speed (m/s) and turn rate (deg/s) change in 1 s; `told`: odometry tells of it."""
+    """Return the change of velocity (m/s) and turn rate (deg/s) in 1 s; `told`: with odometry."""
     given = settings.motion.accel_m, settings.motion.accel_deg
     usual = _TOLD if told else _ACCEL.get(settings.filter, _ACCEL["iekf-log"])
     accel_m, accel_deg = (a if b is None else b for a, b in zip(usual, given, strict=True))
@@ -272,26 +272,26 @@ def accel_of(settings: Settings, told: bool = False) -> tuple[float, float]:
 
 
 def _noise(settings: Settings) -> ranging.RangeNoise:
-    """Law of the ranges that have none of their own."""
+    """Return the noise law of ranges without their own."""
     return ranging.RangeNoise(settings.range_std_m or DEFAULT_RANGE_STD_M)
 
 
-# Standard deviations of a turn rate (rad/s) and a speed (m/s) of which nothing is known.
+# Standard deviations of an unknown turn rate (rad/s) and velocity (m/s).
 _ANY_TURN, _ANY_SPEED = 1.0, 3.0
-# How much they change in 1 s (m/s, deg/s), where it is not told.
+# Their default change in 1 s (m/s, deg/s).
 _TOLD = (3.0, 1000.0)
 _ACCEL = {"iekf-log": (1.0, 30.0), "iekf-cv": (0.5, 30.0)}
 
 
 def robust_of(settings: Settings) -> bool | str:
-    """The loss of the filter."""
+    """Return the loss of the filter."""
     if settings.loss.robust is not None:
         return settings.loss.robust
     return "late" if settings.filter in ("iekf-log", "iekf-imu") else True
 
 
 def _options(recording: Recording, settings: Settings) -> dict[str, Any]:
-    """What the settings say to the named filter."""
+    """Return the options of the named filter from the settings."""
     robust, biases = {"robust": robust_of(settings)}, settings.biases
     if settings.filter in ("iekf", "iekf-bank"):
         return robust
@@ -327,14 +327,14 @@ def _options(recording: Recording, settings: Settings) -> dict[str, Any]:
 
 
 def _headings(settings: Settings) -> int:
-    """How many headings the filter starts from."""
+    """Return the number of start headings of the filter."""
     known = settings.knowledge
     told = known.start is not None and len(known.start) == 4
     return 1 if told or known.prior_rotation_deg is not None else settings.odometry.headings
 
 
 def _twist(settings: Settings, accel: tuple[float, float]) -> dict[str, Any]:
-    """Law of an unknown twist."""
+    """Return the law of an unknown twist."""
     accel_m, accel_deg = accel
     turn, shift = ((0, 0, 1), (1, 1, 0)) if settings.knowledge.planar else ((1, 1, 1), (1, 1, 1))
     return {

@@ -1,4 +1,4 @@
-"""Deviation of the ranges and motion of the body, by the likelihood of a log's first part."""
+"""Tune range noise and motion of the body by the likelihood of the first part of a log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rbl_gym.studies.replay.tracking import accel_of, recording_filter
 
 __all__ = ["TUNING_ROUNDS", "Tuned", "tune"]
 
-# What each setting stays between.
+# Limits of each setting.
 _LIMITS = {
     "range_std_m": (2e-3, 10.0),
     "walk_m": (5e-3, 100.0),
@@ -29,28 +29,28 @@ _LIMITS = {
     "constant_std_m": (1e-2, 1.0),
     "drift_std_m": (1e-3, 1.0),
 }
-# Factors between the values that are tried of each setting, round by round.
+# Factors between the tested values of each setting, by round.
 _FACTORS = (4.0, 3.0, 2.0, 1.5, 1.25, 1.15)
 TUNING_ROUNDS = len(_FACTORS)
-# Longest part that is looked at, in epochs.
+# Longest part that is used, in epochs.
 _MOST = 3_000
 
 
 class Tuned(NamedTuple):
-    """Settings that make a log likely.
+    """Settings that maximise the likelihood of a log.
 
     Attributes
     ----------
     settings
-        The settings with what was found.
+        The settings with the tuned values.
     found
-        What was found, by the names of the settings; `filter` where it was chosen too.
+        The tuned values, by the names of the settings; `filter` if it was chosen too.
     options
         The same as options of ``rbl-gym replay``.
     log_likelihood, log_likelihood_before
-        Per range, of the part looked at, with the settings found and with those given.
+        Per range, over the part used, with the tuned and with the given settings.
     epochs, seconds
-        How much of the log was looked at.
+        Length of the part of the log that was used.
     """
 
     settings: Settings
@@ -62,7 +62,7 @@ class Tuned(NamedTuple):
     seconds: float
 
     def figures(self) -> dict[str, Any]:
-        """All but the settings as plain numbers and text."""
+        """Return all fields except the settings as plain numbers and text."""
         return {name: value for name, value in self._asdict().items() if name != "settings"}
 
 
@@ -73,32 +73,32 @@ def tune(
     filters: Sequence[str] = (),
     advance: Callable[[], None] = lambda: None,
 ) -> Tuned:
-    """Choose the deviation of the ranges and the motion by the likelihood of the innovations.
+    """Choose the range standard deviation and the motion by the likelihood of the innovations.
 
-    The likelihood is that of `estimators.Innovations`: a Gaussian for the ranges used, a constant
-    for those refused, so that refusing has its price. Tuned are ``range_std_m``, ``walk_m`` and
-    ``walk_deg``, and of filters that estimate a twist ``accel_m`` and ``accel_deg``; a walk of zero
-    stays zero. The laws of the biases stay as they are: left free they take over what the body
-    does. With odometry, which tells what the body does, they are tuned in place of the motion:
-    ``odometry_m``, ``odometry_deg``, ``constant_std_m`` and ``drift_std_m``. The truth is not
-    looked at.
+    The likelihood is that of `estimators.Innovations`: a Gaussian for used ranges, and a constant
+    for rejected ranges, so that rejection has a cost. The tuned settings are ``range_std_m``,
+    ``walk_m`` and ``walk_deg``, and for filters that estimate a twist ``accel_m`` and
+    ``accel_deg``. A walk of zero remains zero. The laws of the biases are not tuned, because they
+    would absorb the motion. With odometry, which measures the motion, they are tuned instead of
+    it: ``odometry_m``, ``odometry_deg``, ``constant_std_m`` and ``drift_std_m``. The truth is not
+    used.
 
     Parameters
     ----------
     recording, settings
-        What is filtered, and how; the search starts from the settings.
+        The recording and the settings, from which the search starts.
     seconds
-        How much of the log, from its start, is looked at.
+        Length of the part of the log, from its start, that is used.
     filters
-        Names of filters, of which the one that makes the log likeliest is taken; none: that of the
-        settings stays.
+        Names of filters, of which the one with the highest likelihood is chosen; empty: that of
+        the settings.
     advance
         Called after each of the `TUNING_ROUNDS` of each filter.
 
     Raises
     ------
     ValueError
-        If `seconds` is not positive, or fewer than ten epochs are in them.
+        If `seconds` is not positive, or the part has fewer than ten epochs.
     """
     seconds = check_number("seconds", seconds, low=1e-6)
     count = min(int(np.searchsorted(recording.times, recording.times[0] + seconds, "right")), _MOST)
@@ -117,10 +117,10 @@ def tune(
     if best != settings.filter or len(names) > 1:
         found = {"filter": best, **found}
     if recording.odometry is not None:
-        # The smoother has the same laws.
+        # The smoother uses the same laws.
         same = {"constant_std_m": "smooth_constant_m", "drift_std_m": "smooth_bias_std_m"}
         found |= {there: found[here] for here, there in same.items() if here in found}
-    # Without the filter's name other options may mean another filter.
+    # Without the name of the filter, other options may select another filter.
     options = " ".join(
         f"--{name.replace('_', '-')} {value if isinstance(value, str) else f'{value:g}'}"
         for name, value in {"filter": best, **found}.items()
@@ -131,7 +131,7 @@ def tune(
 
 
 def _climbed(trial: Trial, advance: Callable[[], None]) -> tuple[float, dict[str, Any]]:
-    """The log-likelihood that a search from the settings comes to, and what it found."""
+    """Return the log-likelihood reached by a search from the settings, and the values found."""
     start = _start(trial)
     names = list(start)
     low, high = np.array([_LIMITS[name] for name in names]).T
@@ -157,7 +157,8 @@ def _climbed(trial: Trial, advance: Callable[[], None]) -> tuple[float, dict[str
                 point[k] *= step
                 star.append(np.clip(point, low, high))
         values = values_of(star)
-        # Along each axis the top of a parabola in the logarithm; together, if that is better.
+        # The maximum of a parabola in the logarithm along each axis; all together if that is
+        # better.
         steps = [_top(*values[[2 * k + 1, 0, 2 * k + 2]]) for k in range(len(names))]
         together = np.clip(centre * factor ** np.array(steps), low, high)
         star.append(together)
@@ -168,7 +169,7 @@ def _climbed(trial: Trial, advance: Callable[[], None]) -> tuple[float, dict[str
 
 
 def _start(trial: Trial) -> dict[str, float]:
-    """What is tuned, as it is now."""
+    """Return the current values of the tuned settings."""
     recording, settings = trial
     std = settings.range_std_m
     own = own_std(recording, settings)
@@ -187,7 +188,7 @@ def _start(trial: Trial) -> dict[str, float]:
 
 
 def _top(below: float, here: float, above: float) -> float:
-    """Where a parabola through values at -1, 0 and 1 is highest, at most two away."""
+    """Return the maximum of a parabola through values at -1, 0 and 1, at most two away."""
     bend = below - 2 * here + above
     if not bend < 0:
         return 1.0 if above > below else -1.0
