@@ -1,4 +1,4 @@
-"""What the Cramer-Rao bound promises at places of a zone: points, grids, maps."""
+"""Predict the accuracy in a zone by the Cramer-Rao bound: points, grids, maps."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _DRAWS, _DRAWN = 200, 4096
 
 
 def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zone) -> Errors:
-    """What the Cramer-Rao bound of one epoch of ranges promises (L) at places (L, 3) of a zone.
+    """Return the errors (L) of the Cramer-Rao bound of one epoch at positions (L, 3) of a zone.
 
     Parameters
     ----------
     problem, anchors
-        What is placed, and where (M, 3).
+        The problem, and the anchors (M, 3).
     places, zone
-        Where, and how the body may be turned there.
+        The positions, and the zone with the possible rotations.
     """
     rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
     found = []
@@ -57,7 +57,7 @@ def accuracy(problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zo
 def accuracy_without_each(
     problem: Problem, anchors: FloatArray, places: FloatArray, zone: Zone
 ) -> Errors:
-    """`accuracy` (M, L) with each one of the anchors missing. Arguments as `accuracy`."""
+    """Return `accuracy` (M, L) without each one of the anchors. Arguments as in `accuracy`."""
     rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
     found = []
     for part in _blocks(problem, anchors, places):
@@ -72,9 +72,9 @@ def _blocks(problem: Problem, anchors: FloatArray, places: FloatArray) -> list[F
 
 
 def prior_of(problem: Problem, zone: Zone) -> FloatArray:
-    """Information (6, 6) before any range: 60 degrees, and half of the extent of all zones.
+    """Return the prior information (6, 6): 60 degrees, and half of the extent of all zones.
 
-    Where only the heading is estimated, the tilt is known.
+    If only the heading is estimated, the tilt is known.
     """
     extent = float(np.ptp(problem.corners(), axis=0).max())
     diagonal = np.array([_PRIOR_ROTATION_RAD**-2] * 3 + [(0.5 * extent) ** -2] * 3)
@@ -84,19 +84,19 @@ def prior_of(problem: Problem, zone: Zone) -> FloatArray:
 
 
 def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: int) -> FloatArray:
-    """Places (count, 3) of the body's origin, uniform over what is free of a zone.
+    """Draw positions (count, 3) of the body origin, uniform over the free part of a zone.
 
     Parameters
     ----------
     problem, zone
-        Which obstacles, and which zone.
+        The problem with its obstacles, and the zone.
     rng, count
-        Random numbers, and how many.
+        Source of randomness, and number of positions.
 
     Raises
     ------
     ValueError
-        If hardly any place is free.
+        If almost no position is free.
     """
     low, high = zone.bounds()
     free = np.empty((0, 3))
@@ -109,12 +109,12 @@ def draw_places(problem: Problem, zone: Zone, rng: np.random.Generator, count: i
 
 
 def is_free(problem: Problem, zone: Zone, places: FloatArray) -> BoolArray:
-    """Which places (...) lie in a zone, edges included, and in no obstacle."""
+    """Return which positions (...) lie in a zone, including edges, and in no obstacle."""
     return zone.contains(places) & ~problem.obstacles.contain(places)
 
 
 def free_grid(problem: Problem, zone: Zone) -> FloatArray:
-    """A grid of places (L, 3) over a zone, its edges and corners included, obstacles left out."""
+    """Return a grid of positions (L, 3) over a zone with edges and corners, without obstacles."""
     low, high = zone.bounds()
     axes = [np.linspace(a, b, n if b > a else 1) for a, b, n in zip(low, high, _GRID, strict=True)]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -150,16 +150,16 @@ def accuracy_map(
     share: float = 0.5,
     zone: Zone | None = None,
 ) -> Map:
-    """Accuracy on a plane of a zone.
+    """Return the accuracy on a plane of a zone.
 
     Parameters
     ----------
     problem, anchors
-        What is placed, and where (M, 3).
+        The problem, and the anchors (M, 3).
     up
         1: over x and y; 2: over x and z.
     share
-        Where the plane cuts the third axis: 0 is the zone's lower side, 1 its upper one.
+        Position of the plane on the third axis: 0 is the lower side of the zone, 1 the upper one.
     zone
         None: the first.
     """
@@ -196,7 +196,7 @@ def accuracy_map(
 
 
 def level_maps(problem: Problem, anchors: FloatArray, zone: Zone | None = None) -> list[Map]:
-    """Maps over x and y at heights from the bottom of a zone to its top. Arguments as there."""
+    """Return maps over x and y at heights from the bottom to the top of a zone."""
     zone = problem.zones[0] if zone is None else zone
     shares = np.linspace(0, 1, _LEVELS) if zone.high_m > zone.low_m else [0.5]
     return [accuracy_map(problem, anchors, share=float(share), zone=zone) for share in shares]

@@ -1,4 +1,4 @@
-"""Where do my anchors go, and will that do? A design or a given layout, verdicts, the check."""
+"""Design or evaluate a layout of anchors: verdicts, comparison, and check by filters."""
 
 from __future__ import annotations
 
@@ -41,28 +41,28 @@ _SEEN = 0.5
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked about a problem.
+    """Options for designing or evaluating a layout.
 
     Parameters
     ----------
     numbers
-        Numbers of anchors; all but the last appear only in the table over the number. With
-        `fewest`, those among which the least is sought.
+        Numbers of anchors; all but the last are only used for the table over the number. With
+        `fewest`, the candidates for the smallest number.
     fewest
-        The least number that meets the requirements of all zones.
+        Find the smallest number that meets the requirements of all zones.
     layout, names
-        Anchors (M, 3) that are judged, and what they are called; None: they are designed.
+        Anchors (M, 3) to evaluate, and their names; None: they are designed.
     optimise
-        Start from the layout, which is not judged itself.
+        Use the layout as the start of a design, instead of evaluating it.
     keep
-        Indices of the layout's anchors that stay where they are.
+        Indices of the anchors of the layout that are fixed.
     survive
-        1: any one anchor may fail, in judging and in the search.
+        1: any one anchor may fail, in the evaluation and in the search.
     seed, trials
-        Of all randomness, and bodies of the Monte-Carlo check.
+        Seed of all randomness, and number of bodies of the Monte-Carlo check.
     start
-        Of `design.STARTS`: ``"search"``, or ``"amortised"``, the network's layout and a few steps
-        along the gradient in place of the search.
+        One of `design.STARTS`: ``"search"``, or ``"amortised"``: the layout of the network and a
+        few gradient steps instead of the search.
     """
 
     numbers: range
@@ -78,7 +78,7 @@ class Question:
 
 
 class Placed(NamedTuple):
-    """What a run found: the problem with its last number of anchors, its design, the figures."""
+    """The result of a run: the problem with its last number of anchors, the design, the figures."""
 
     problem: Problem
     design: Design
@@ -86,22 +86,22 @@ class Placed(NamedTuple):
 
 
 def place_anchors(problem: Problem, question: Question, advance: Advance = silent) -> Placed:
-    """Design or take a layout, judge, compare and check it; figures as plain numbers.
+    """Design or take a layout, evaluate, compare and check it; figures are plain numbers.
 
     Parameters
     ----------
     problem
-        What is placed.
+        The placement problem.
     question
-        What is asked.
+        The options.
     advance
         Called after every step of the work.
 
     Raises
     ------
     ValueError
-        If the layout does not fit the problem or the numbers, `fewest` has nothing to meet, or
-        `start` is unknown or means nothing.
+        If the layout does not match the problem or the numbers, `fewest` is set without
+        requirements, or `start` is unknown or has no effect.
     """
     check_one_of("start", question.start, design.STARTS)
     if question.start != "search" and (question.fewest or question.layout is not None):

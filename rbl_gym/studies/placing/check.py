@@ -1,4 +1,4 @@
-"""Does the prediction hold? Real filters on simulated ranges, at random poses in the zones."""
+"""Check the prediction: run filters on simulated ranges, at random poses in the zones."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ _DRAWS = 40
 
 
 class DrawnBodies(NamedTuple):
-    """Bodies (B, ...) at random poses, their ranges (B, M, N) and what is known of them.
+    """Bodies (B, ...) at random poses, with their ranges (B, M, N) and priors.
 
     Attributes
     ----------
     zone
-        Index (B,) of the zone in which each is.
+        Index (B,) of the zone of each body.
     rotation, translation
         The truth.
     ranges, links, told
-        Ranges, which of them are readings, and the law of every link.
+        Ranges, the mask of measured ones, and the noise law of every link.
     prior_rotation, prior_translation, prior
         Drawn around the truth, with the covariance (B, 6, 6).
     information
@@ -68,7 +68,7 @@ class DrawnBodies(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Poses (B, ...) that a filter found, NaN: none, and its covariance (B, 6, 6)."""
+    """Poses (B, ...) found by a filter, NaN if none, and the covariance (B, 6, 6)."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -76,23 +76,23 @@ class Found(NamedTuple):
 
 
 def check_layout(problem: Problem, anchors: FloatArray, trials: int, seed: int) -> dict[str, Any]:
-    """Errors of real filters beside what the bound predicts for the same poses.
+    """Compare the errors of filters with the prediction of the bound for the same poses.
 
-    - ``iterated EKF``: one update from a prior drawn around the truth; told which links are
-      blocked, as radios report it.
-    - ``iterated EKF, not told``: takes all links for clear, with Huber's loss; only where there
-      are obstacles or a limited gain.
-    - ``locate, from nothing``: maximum likelihood without a prior; told as well. Only where the
-      ranges tell the pose of nine bodies in ten, and no zone takes the tilt for known.
+    - ``iterated EKF``: one update from a prior drawn around the truth; it knows which links
+    are blocked, as reported by radios.
+    - ``iterated EKF, not told``: treats all links as clear, with Huber's loss; only with
+    obstacles or a limited gain.
+    - ``locate, from nothing``: maximum likelihood without a prior; it also knows blocked links.
+    Only if the ranges determine the pose of nine bodies in ten, and no zone has a known tilt.
 
-    The figures are of all bodies that have a pose, found or lost; see `_figures`.
+    The figures include all bodies with a pose, found or lost; see `_figures`.
 
     Parameters
     ----------
     problem, anchors
-        What is placed, and where (M, 3).
+        The problem, and the anchors (M, 3).
     trials, seed
-        Bodies at random poses, as many in each zone, and of which random numbers.
+        Number of bodies at random poses, equally many in each zone, and the random seed.
     """
     drawn = draw_bodies(problem, anchors, trials, np.random.default_rng([seed, 1]))
     with_prior = np.linalg.inv(drawn.information + np.linalg.inv(drawn.prior))
@@ -144,14 +144,14 @@ def _located(
 def draw_bodies(
     problem: Problem, anchors: FloatArray, trials: int, rng: np.random.Generator
 ) -> DrawnBodies:
-    """Bodies uniform over the free part of each zone, turned as they may be, and one epoch.
+    """Draw bodies uniformly over the free part of each zone, with random rotation, and one epoch.
 
     Parameters
     ----------
     problem, anchors
-        What is placed, and where (M, 3).
+        The problem, and the anchors (M, 3).
     trials, rng
-        How many bodies, and their random numbers.
+        Number of bodies, and the source of randomness.
     """
     zone = np.sort(np.arange(trials) % len(problem.zones))
     translation = np.concatenate(

@@ -1,4 +1,4 @@
-"""What each anchor is for: the accuracy without it."""
+"""Compute the contribution of each anchor: the accuracy without it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ __all__ = ["without_each"]
 
 
 def without_each(judged: list[Judged], lost: list[Errors]) -> list[dict[str, Any]]:
-    """For each anchor what is left without it: b over all zones, and every zone's figures.
+    """Return for each anchor the figures without it: b over all zones, and those of every zone.
 
     Parameters
     ----------
     judged, lost
-        Of every zone: with all anchors, and `accuracy_without_each`.
+        For every zone: the result with all anchors, and `accuracy_without_each`.
     """
     zones = [one.zone for one in judged]
     with_all = overall_score(zones, [one.errors.score for one in judged])

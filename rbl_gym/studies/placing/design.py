@@ -1,4 +1,4 @@
-"""The search for a layout that makes b small, and the usual layouts."""
+"""Search for a layout that minimises b, and compute the usual layouts."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ _RANDOM_DRAWS = 25
 
 
 class FreeTask(PlacementTask):
-    """A task scored over poses in the zones of a problem, outside of its obstacles."""
+    """A task scored over poses in the zones of a problem, outside its obstacles."""
 
     problem: Problem
 
     def obstacles(self, context: Context) -> Obstacles:
-        """Those of the problem."""
+        """Return the obstacles of the problem."""
         return self.problem.obstacles
 
     @functools.cached_property
     def poses(self) -> tuple[FloatArray, FloatArray]:
-        """Rotations (P, 3, 3) and offsets (P, 3), spread evenly over what is free."""
+        """Return rotations (P, 3, 3) and offsets (P, 3), spread evenly over the free space."""
         low, high = self.scene.volume.bounds()
         # Few places may be free: they are then taken in turns.
         places = np.resize(self.problem.free_places(self.n_poses), (self.n_poses, 3))
@@ -55,14 +55,14 @@ class FreeTask(PlacementTask):
 
 
 def free_task(problem: Problem, n_poses: int) -> FreeTask:
-    """The problem's task over so many free poses."""
+    """Return the task of the problem over a number of free poses."""
     task = FreeTask(problem.scene, problem.n_anchors, n_poses=n_poses)
     object.__setattr__(task, "problem", problem)
     return task
 
 
 class Design(NamedTuple):
-    """A layout (M, 3), how it was found, and what the searches reached: name -> layout."""
+    """A layout (M, 3), the search that found it, and all results: name -> layout."""
 
     anchors: FloatArray
     method: str
@@ -79,19 +79,19 @@ def design_layout(
     start: FloatArray | None = None,
     begin: str = "search",
 ) -> Design:
-    """The best layout of a problem that `placement.design` finds, or a usual one.
+    """Return the best layout of a problem, from `placement.design` or a usual one.
 
     Parameters
     ----------
     problem, seed
-        What is placed, and the seed of all randomness.
+        The problem, and the seed of all randomness.
     advance
         Called after each of the `SEARCH_STEPS` steps.
     start
-        A layout (K, 3), its first rows the fixed anchors: one more start. With fewer anchors than
-        are placed, the others are added.
+        An additional start: a layout (K, 3), its first rows the fixed anchors. If it has fewer
+        anchors than needed, the others are added.
     begin
-        Of `STARTS`: what looks for the layout.
+        One of `STARTS`: the method of the search.
     """
     check_one_of("start", begin, STARTS)
     context, fixed = problem.context, problem.fixed
@@ -129,13 +129,13 @@ SEARCH_STEPS = len(design.STAGES)
 
 
 def _rounded(problem: Problem, anchors: FloatArray) -> FloatArray:
-    """Anchors to the millimetre where that leaves them legal: nobody mounts to less."""
+    """Return anchors rounded to the millimetre, if they remain legal."""
     rounded = problem.mounts.project(np.round(anchors, 3))
     return np.where(problem.obstacles.contain(rounded)[:, None], anchors, rounded)
 
 
 def _in_order(anchors: FloatArray, centre: FloatArray) -> FloatArray:
-    """Anchors counted around the region, counter-clockwise from the x axis."""
+    """Return anchors in counter-clockwise order around the region, from the x axis."""
     away = anchors - centre
     return anchors[np.argsort(np.arctan2(away[:, 1], away[:, 0]) % (2 * np.pi), kind="stable")]
 
@@ -148,7 +148,7 @@ def _repeated(context: Context, count: int) -> Context:
 
 
 def usual_layouts(problem: Problem, seed: int) -> dict[str, FloatArray]:
-    """The usual layouts (M, 3) of a problem by their names."""
+    """Return the usual layouts (M, 3) of a problem by their names."""
     rng = np.random.default_rng([seed, 2])
     return usual(free_task(problem, _N_POSES), problem.context, rng)
 

@@ -1,9 +1,9 @@
-"""What a zone asks for, and when a place meets it: functions on the information at its poses.
+"""Evaluate the requirements of a zone from the information at its poses.
 
-The figures at a place are one standard deviation of one epoch of ranges by the Cramer-Rao bound,
-root mean squares over the turns that the body may have there. A place is within the requirement
-where every figure that has a limit is at most that limit. A zone passes where the share of such
-places is at least the share that it asks for.
+The figures at a position are standard deviations for one epoch of ranges by the Cramer-Rao bound,
+as root mean squares over the possible rotations of the body. A position is within the requirement
+if every figure with a limit is at most that limit. A zone passes if the share of such positions is
+at least the required share.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _TURN_SEED = 20130821
 
 
 class Errors(NamedTuple):
-    """Predicted errors at places, (...): one sigma, root mean squares over the turns.
+    """Predicted errors at positions, (...): one sigma, root mean squares over the rotations.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Errors(NamedTuple):
     score
         b, the root mean square error of the tags, metres.
     horizontal, height
-        Position across the vertical, ``sqrt(P_xx + P_yy)``, and along it, metres.
+        Horizontal position, ``sqrt(P_xx + P_yy)``, and height, metres.
     heading
         Rotation about the vertical, radians.
     """
@@ -58,12 +58,12 @@ class Errors(NamedTuple):
     heading: FloatArray
 
     def of_places(self, which: slice) -> Errors:
-        """Of some of the places."""
+        """Return the errors of some of the positions."""
         return Errors(*(values[..., which] for values in self))
 
 
 class Asked(NamedTuple):
-    """Those of the `Errors` (...) that a zone may ask for."""
+    """The `Errors` (...) that a zone may limit."""
 
     horizontal: FloatArray
     height: FloatArray
@@ -71,27 +71,27 @@ class Asked(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Most that a place may have: metres, metres, radians; infinite: anything."""
+    """Limits of the errors at a position: metres, metres, radians; infinite: no limit."""
 
     horizontal: float = math.inf
     height: float = math.inf
     heading: float = math.inf
 
     def any(self) -> bool:
-        """Whether one of them is a limit."""
+        """Return whether one of them is finite."""
         return any(math.isfinite(limit) for limit in self)
 
 
 def turns(attitude: str, count: int) -> FloatArray:
-    """Turns (count, 3, 3) of a body over which the figures at a place are averaged.
+    """Return rotations (count, 3, 3) over which the figures at a position are averaged.
 
     Parameters
     ----------
     attitude
-        ``"free"``: drawn once for all from all rotations. ``"level"`` or ``"heading"``: about
-        the vertical, evenly spaced, the first none.
+        ``"free"``: random rotations, drawn once. ``"level"`` or ``"heading"``: about the vertical,
+        evenly spaced, the first is the identity.
     count
-        How many.
+        Number of rotations.
     """
     if attitude == "free":
         return rotations.random(np.random.default_rng(_TURN_SEED), (count,))
@@ -102,21 +102,21 @@ def turns(attitude: str, count: int) -> FloatArray:
 def errors_of(
     information: FloatArray, rotation: FloatArray, tags: FloatArray, part: FloatArray | None = None
 ) -> Errors:
-    """Errors (...) at places of an information (..., T, 6, 6) at T turns, its prior included.
+    """Return errors (...) at positions from information (..., T, 6, 6) at T rotations, with prior.
 
     Parameters
     ----------
     information
-        At every place and turn, of all that is known.
+        Total information at every position and rotation.
     rotation, tags
-        Turns (..., T, 3, 3), and tags (N, 3) on the body.
+        Rotations (..., T, 3, 3), and tags (N, 3) on the body.
     part
-        (..., T, 6, 6), information that is added: of one more anchor, or less of one.
+        (..., T, 6, 6), information to add: that of one more anchor, or minus that of one.
 
     Raises
     ------
     ValueError
-        Where an information is singular: without a prior, of fewer ranges than a pose needs.
+        If the information is singular: without a prior, with fewer ranges than a pose needs.
     """
     args = information, _part(part, information), rotation, tags
     return Errors(*_roots(_mean_squares, *args))
@@ -172,30 +172,30 @@ def _asked_squares(base: FloatArray, part: FloatArray) -> tuple[FloatArray, ...]
 
 
 def relative_errors(errors: Errors | Asked, limits: Limits) -> FloatArray:
-    """The largest ratio (...) of an error to its limit at each place: within where at most 1.
+    """Return the largest ratio (...) of an error to its limit at each position; within if <= 1.
 
     Parameters
     ----------
     errors
-        At places.
+        Errors at positions.
     limits
-        Of the zone; one of them at least is finite.
+        Limits of the zone; at least one is finite.
     """
     ratios = [getattr(errors, name) / limit for name, limit in limits._asdict().items()]
     return np.max(ratios, axis=0)
 
 
 def value_at_share(values: FloatArray, share: float) -> FloatArray:
-    """The least value (...) that this share of the places (..., L) does not exceed.
+    """Return the smallest value (...) that this share of the positions (..., L) does not exceed.
 
-    Of relative errors it is at most 1 just where the share within is at least `share`.
+    For relative errors it is at most 1 if and only if the share within is at least `share`.
 
     Parameters
     ----------
     values
-        At places; infinite where a place has none.
+        Values at positions; infinite if undefined.
     share
-        Of the places, above 0, at most 1.
+        Share of the positions, above 0, at most 1.
     """
     check_number("share", share, low=0.0, high=1.0)
     rank = _rank(share, values.shape[-1])
@@ -209,14 +209,14 @@ def _rank(share: float, count: int) -> int:
 
 
 def wilson_interval(within: int, places: int, level: float = 0.95) -> tuple[float, float]:
-    """Ends of the interval for the share of a zone, of places drawn uniformly (Wilson, 1927).
+    """Return the confidence interval of the share of a zone, from uniform positions (Wilson, 1927).
 
     Parameters
     ----------
     within, places
-        How many of how many places are within.
+        Number of positions within, and of all positions.
     level
-        Probability that the interval holds the share.
+        Probability that the interval contains the share.
     """
     z = math.sqrt(2) * float(special.erfinv(level))
     share = within / places
@@ -227,5 +227,5 @@ def wilson_interval(within: int, places: int, level: float = 0.95) -> tuple[floa
 
 
 def share_within(relative: FloatArray) -> BoolArray:
-    """Share (...) of places (..., L) that are within."""
+    """Return the share (...) of positions (..., L) that are within."""
     return (relative <= 1).mean(axis=-1)

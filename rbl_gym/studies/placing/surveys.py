@@ -1,4 +1,4 @@
-"""How good a pose is where anchors were surveyed to centimetres, or links were never calibrated."""
+"""Predict the accuracy with survey errors of anchors, or uncalibrated links."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ _PLACES = 200
 def survey_rows(
     problem: Problem, anchors: FloatArray, judged: list[Judged]
 ) -> list[dict[str, Any]]:
-    """Figures of one epoch by what is known of anchors and links, over the places of all zones.
+    """Return figures of one epoch for several survey and calibration errors, over all zones.
 
     Parameters
     ----------
     problem, anchors
-        What is placed, and where (M, 3).
+        The problem, and the anchors (M, 3).
     judged
-        Its zones, with the places that were judged.
+        Its zones, with the evaluated positions.
 
     Returns
     -------
     Rows of plain numbers: `known` (a name), `anchor_std_m`, `bias_std_m` and `bias_common_m`, root
-    mean squares `position_m`, `rotation_deg` and `score_m`, and of every zone that asks for
-    something the share of its places `within`, by name.
+    mean squares `position_m`, `rotation_deg` and `score_m`, and for every zone with
+    requirements the share of its positions `within`, by name.
     """
     cases: list[tuple[str, float, LinkBias | None]] = [("anchors and links", 0.0, None)]
     cases += [(f"anchors to {100 * std:g} cm", std, None) for std in SURVEYS_M]
@@ -84,16 +84,16 @@ def surveyed_accuracy(
     anchor_std_m: float = 0.0,
     bias: LinkBias | None = None,
 ) -> Errors:
-    """`accuracy` (L) at places (L, 3) of a zone with anchors and links that are not quite known.
+    """Return `accuracy` (L) at positions (L, 3) of a zone, with survey errors and link biases.
 
     Parameters
     ----------
     problem, anchors, places, zone
-        As `accuracy`.
+        As in `accuracy`.
     anchor_std_m
-        Standard deviation of the anchors' places, per axis.
+        Standard deviation of the anchor positions, per axis.
     bias
-        Law of the links' biases; None: they have none.
+        Law of the link biases; None: no biases.
     """
     rotation, prior = turns(zone.attitude, TURNS), prior_of(problem, zone)
     share = link_shares(problem, anchors, places, rotation)
