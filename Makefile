@@ -6,6 +6,7 @@ BIN := .venv/bin
 
 demo: .venv/demo.stamp
 	$(BIN)/rbl-gym demo --plot out/demo.png --html out/demo.html
+	@echo '`. $(BIN)/activate` puts rbl-gym on the path of this shell.'
 
 test: .venv/dev.stamp
 	$(BIN)/python -m pytest -n 2 --dist worksteal
