@@ -37,7 +37,7 @@ class BenchErrors(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """What errors are held against.
+    """References for errors.
 
     Attributes
     ----------
@@ -46,8 +46,8 @@ class Reference(NamedTuple):
     prior_tags_m
         Expected tag error (B,) of the prior.
     mirror_m
-        Distance (B,) of the last position to the truth's image behind the anchors' plane; None
-        where they have no plane.
+        Distance (B,) of the last position to the image of the truth in the plane of the anchors;
+        None if they have no plane.
     """
 
     bound: dict[str, FloatArray]
@@ -56,7 +56,7 @@ class Reference(NamedTuple):
 
 
 def error_figures(errors: BenchErrors, reference: Reference | None) -> dict[str, Any]:
-    """All figures of a filter under a condition, as plain numbers; None for what is not finite.
+    """Return all figures of a filter under a condition, as plain numbers; None if not finite.
 
     Without a reference (a recording, whose trials are stretches of it) what is relative to the
     bound is absent, and what is of single epochs.
@@ -88,9 +88,9 @@ def error_figures(errors: BenchErrors, reference: Reference | None) -> dict[str,
 
 
 def consistency(nees: FloatArray, dof: int) -> dict[str, Any]:
-    """The average NEES per degree of freedom (K, B), and what it says of the filter.
+    """Return the average NEES per degree of freedom (K, B), and the consistency of the filter.
 
-    Honest beliefs have 1. At one epoch the sum over B trials is chi-square of ``dof B``
+    Consistent beliefs have 1. At one epoch the sum over B trials is chi-square of ``dof B``
     degrees of freedom; an average over epochs that depend on each other strays no farther, so
     the interval of one epoch is a safe one: above it the filter is ``"optimistic"`` (its errors
     are larger than it says), below it ``"pessimistic"``. `within` is the share of epochs whose

@@ -1,4 +1,4 @@
-"""One filter after the other through a world of the benchmark, each with its figures."""
+"""Run the filters of the benchmark on a world, and compute their figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rbl_gym.worlds import scenes
 
 
 class Tracked(NamedTuple):
-    """What a filter did: beliefs (K, B, ...), how often it triggered, its seconds."""
+    """The run of a filter: beliefs (K, B, ...), how often it triggered, its time in seconds."""
 
     belief: estimators.PoseBelief
     trigger_rate: float | None
@@ -26,7 +26,7 @@ class Tracked(NamedTuple):
 
 
 class StoppedError(Exception):
-    """A filter raised: at which epoch, and what."""
+    """A filter raised an error: the epoch and the error."""
 
     def __init__(self, epoch: int, error: Exception) -> None:
         super().__init__(epoch, error)
@@ -34,7 +34,7 @@ class StoppedError(Exception):
 
 
 class BenchStage(NamedTuple):
-    """A world as filters meet it.
+    """A world of the benchmark for filters.
 
     Attributes
     ----------
@@ -45,8 +45,8 @@ class BenchStage(NamedTuple):
     figures
         All figures of what it did.
     anchors, tags
-        True geometry; `pose_rank` the directions of the pose that it determines, None where
-        that depends on the way.
+        True geometry. `pose_rank` is the number of pose directions that it determines, None if
+        that depends on the path.
     batch
         Leading axes of a belief.
     """
@@ -108,11 +108,11 @@ def recording_stage(spec: Mapping[str, Any], condition: str, seed: int) -> Bench
 def run_filter(
     stage: BenchStage, name: str, options: dict[str, Any]
 ) -> tuple[dict[str, Any], float | None]:
-    """A filter on a stage: what a record says of it, and its microseconds per step and trial.
+    """Run a filter on a stage; return its record, and its microseconds per step and trial.
 
-    `status` is ``"ok"``; ``"unobservable"`` where the geometry does not determine its states
-    (it leans on its prior); ``"refused"`` where it raised a ValueError; ``"failed"`` where it
-    raised anything else. `message` says at which epoch and what; no time is given of those two.
+    `status` is ``"ok"``; ``"unobservable"`` if the geometry does not determine its states
+    (it relies on its prior); ``"refused"`` if it raised a ValueError; ``"failed"`` if it raised
+    another error. `message` gives the epoch and the error; these two have no time.
     """
     result: dict[str, Any] = {"status": "ok", "message": None}
     result["rank"], result["states"] = stage.pose_rank, 6

@@ -1,4 +1,4 @@
-"""What filters are shown in the benchmark, the truth behind it, and how far the two differ.
+"""Simulate the worlds of the benchmark: the data of filters, the truth, and their differences.
 
 A world is a batch of episodes of a scene under a condition. Its random numbers do not depend on
 the filter, and those of motion, prior and ranges not on the condition either: every comparison
@@ -41,20 +41,20 @@ class BenchWorld(NamedTuple):
     Attributes
     ----------
     told
-        The scene as filters are told it: tags, noise, process, dt.
+        The scene as known to filters: tags, noise, process, dt.
     tags
-        True places on the body (N, 3).
+        True tag positions on the body (N, 3).
     rotation, translation
         True poses (K, B, 3, 3), (K, B, 3).
     readings
-        What filters are told, one per epoch.
+        The inputs of filters, one per epoch.
     prior
         Rotation, translation and covariance before the first epoch.
     bound
         Posterior Cramer-Rao covariance (K, B, 6, 6) under the true laws and the links that
         gave a range; reflected ones count as clean.
     anchors
-        True places (B, M, 3).
+        True positions (B, M, 3).
     """
 
     told: Scene
@@ -68,9 +68,9 @@ class BenchWorld(NamedTuple):
 
 
 def simulate_condition(scene: Scene, condition: str, trials: int, seed: int) -> BenchWorld:
-    """The world of a scene under one of `CONDITIONS`.
+    """Simulate a scene under one of `CONDITIONS`.
 
-    Anchors stay where they start.
+    Anchors are fixed.
     """
     true = _true_scene(scene, condition)
     entropy = [seed, int(scene_hash(scene), 16)]

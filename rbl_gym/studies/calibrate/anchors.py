@@ -1,4 +1,4 @@
-"""`rbl-gym calibrate` without truth, as a function: anchors by the log of a moving body."""
+"""`rbl-gym calibrate` without truth, as a function: survey anchors by the log of a moving body."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ _SCALE = 0.002
 
 @dataclass(frozen=True)
 class AnchorSettings:
-    """How anchors are surveyed.
+    """Settings for surveying anchors.
 
     Parameters
     ----------
     start
-        ``"table"``: from the places that the recording has, which may be rough. ``"ranges"``: from
-        nothing.
+        ``"table"``: from the positions in the recording, which may be rough. ``"ranges"``: without
+        positions.
     known
-        Ids of anchors whose places hold.
+        Ids of anchors with known positions.
     bias_m, bias_std_m, link_std_m, planar
-        As of `rbl_gym.estimators.calibration.survey.SurveyModel`.
+        As in `rbl_gym.estimators.calibration.survey.SurveyModel`.
     height_offset_m
-        How far the tags' mean height lies below the anchors', where planar.
+        Mean height of the anchors minus that of the tags, if planar.
     epochs
-        How many are used at most, evenly spread.
+        Maximum number of epochs used, evenly spread.
     """
 
     start: str = "table"
@@ -68,27 +68,27 @@ class AnchorSettings:
 
     @property
     def model(self) -> SurveyModel:
-        """What the estimator is told."""
+        """Return the model of the estimator."""
         return SurveyModel(self.bias_m, self.bias_std_m, self.link_std_m, self.planar)
 
 
 class SurveyedAnchors(NamedTuple):
-    """Anchors as a recording without truth tells them.
+    """Anchors surveyed with a recording without truth.
 
     Attributes
     ----------
     settings
-        As they were used.
+        The settings used.
     survey
         Anchors, poses, biases, covariance, residuals.
     times
-        (K,) of the epochs that were used.
+        (K,) times of the epochs used.
     links
-        (M, N) that have ranges.
+        (M, N) links with ranges.
     anchor_ids, tag_ids
         In the order of the arrays.
     figures
-        Plain numbers: what `rbl-gym calibrate --json` writes.
+        Plain numbers, as written by `rbl-gym calibrate --json`.
     """
 
     settings: AnchorSettings
@@ -100,7 +100,7 @@ class SurveyedAnchors(NamedTuple):
     figures: dict[str, Any]
 
     def write(self, folder: str | os.PathLike[str]) -> dict[str, str]:
-        """Write ``anchors.csv`` and ``calibration.csv`` into a folder; their paths by name."""
+        """Write ``anchors.csv`` and ``calibration.csv`` to a folder; return their paths by name."""
         paths = {name: os.path.join(folder, f"{name}.csv") for name in ("anchors", "calibration")}
         state = self.survey.state
         write_points(paths["anchors"], "anchor", self.anchor_ids, state.anchors)
@@ -116,24 +116,25 @@ class SurveyedAnchors(NamedTuple):
 
 
 def read_anchor_ranges(path: AnyPath, anchor_ids: tuple[str, ...]) -> FloatArray:
-    """Ranges between anchors: a table with the columns anchor_a, anchor_b and range.
+    """Read ranges between anchors: a table with the columns anchor_a, anchor_b and range.
 
     Parameters
     ----------
     path
-        Text with a header; ranges in metres. A pair may come more than once: the median counts.
+        Text with a header; ranges in metres. A pair may occur several times: the median is used.
     anchor_ids
         Ids of the M anchors.
 
     Returns
     -------
     pairs
-        (M, M) metres, 0 where there is none.
+        (M, M) metres, 0 without a range.
 
     Raises
     ------
     ValueError
-        On an unknown anchor, an anchor with itself, or a range that is not positive, by line.
+        If an anchor is unknown, a pair joins an anchor to itself, or a range is not positive. The
+        message names the line.
     """
     table = read_table(path)
     table.require("anchor_a", "anchor_b", "range")
@@ -155,29 +156,29 @@ def survey_anchors(
     pairs: FloatArray | None = None,
     advance: Callable[[], None] = lambda: None,
 ) -> SurveyedAnchors:
-    """Find the anchors, and biases along with them, by the ranges of a moving body.
+    """Estimate anchor positions and biases from the ranges of a moving body.
 
     Parameters
     ----------
     recording
-        Without truth, or with one that is not read. Anchors that stand; a table of tags.
+        The recording; its truth is not used. Anchors must be fixed; a table of tags is needed.
     settings
-        Start, what is known, biases.
+        Start, known anchors, biases.
     pairs
-        (M, M) ranges between anchors, metres, 0 where there is none (`read_anchor_ranges`).
+        (M, M) ranges between anchors, metres, 0 without a range (`read_anchor_ranges`).
     advance
         Called after each of the three parts of the work.
 
     Returns
     -------
     SurveyedAnchors
-        Where nothing of the frame is known: from a table, the mean shift and turn from there are
-        zero; from nothing, the first anchor is the origin and the second lies on the x axis.
+        If the frame is unknown: with a table, the mean shift and rotation from it are zero;
+        without one, the first anchor is the origin and the second is on the x axis.
 
     Raises
     ------
     ValueError
-        If anchors move, an id is unknown, nothing comes out from nothing, or ranges are too few.
+        If anchors move, an id is unknown, no start is found, or there are too few ranges.
     """
     if recording.anchors.ndim > 2:
         raise ValueError("anchors must stand to be surveyed, got anchors that move")
@@ -203,7 +204,7 @@ def survey_anchors(
 
 
 def _lasting(first: Survey, links: Any, times: FloatArray) -> float:
-    """For how many epochs an error lasts."""
+    """Return the correlation length of errors in epochs."""
     K = len(times)
     z = (first.residuals / first.noise_std_m).reshape(K, -1)
     drift = find_drift(z, links.reshape(K, -1), times)
@@ -263,7 +264,7 @@ def _misfit(ranges: FloatArray, links: Any, tags: FloatArray, state: SurveyState
 
 
 def _in_own_frame(survey: Survey, planar: bool) -> Survey:
-    """The first anchor at the origin (its height stays where planar), the second along x."""
+    """Move the first anchor to the origin (planar: keep its height), the second to the x axis."""
     state = survey.state
     along = state.anchors[1] - state.anchors[0]
     turn = rotations.exp([0.0, 0.0, -np.arctan2(along[1], along[0])])

@@ -1,4 +1,4 @@
-"""Links fitted to a log along its truth, and biases by the direction of the ray along with them."""
+"""Fit links to a log along its truth, together with biases by ray direction."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def fit_log(
     few: bool = False,
     beta: FloatArray | None = None,
 ) -> LinkFit:
-    """The fit to all epochs, or to `few` of them, by the truth so many seconds later.
+    """Return the fit to all epochs, or to `few` of them, for a clock offset of the truth.
 
-    `beta` (K, M, N) metres is taken off the ranges first.
+    `beta` (K, M, N) metres is subtracted from the ranges first.
     """
     at = slice(None, None, max(1, len(log.times) // _FEW_EPOCHS) if few else 1)
     path, known = path_at(log, settings, shift)
@@ -47,7 +47,7 @@ def fit_log(
 def with_directions(
     log: Log, settings: LinkSettings, model: LinkModel, fit: LinkFit, shift: float
 ) -> tuple[LinkFit, FoundDirections]:
-    """The fit of links once the biases by direction are taken off, and those."""
+    """Return the fit of links after biases by direction are subtracted, and these biases."""
     path, known = path_at(log, settings, shift)
     links = log.links & known[:, None, None]
     # Tags that turn or move are what a first harmonic at the tags is.
@@ -70,7 +70,7 @@ def with_directions(
 
 
 def _lasting(fit: LinkFit, times: FloatArray) -> float:
-    """For how many epochs an error of a link lasts."""
+    """Return the correlation length of link errors in epochs."""
     step = np.diff(times)
     forward = step[step > 0]
     usual = float(np.median(forward)) if len(forward) else 1.0

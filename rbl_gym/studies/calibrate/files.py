@@ -1,4 +1,4 @@
-"""Files that a calibration writes, as `rbl_gym.recordings` reads them."""
+"""Write the files of a calibration, for `rbl_gym.recordings`."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ def write_link_table(
     columns: Mapping[str, FloatArray],
     told: ArrayLike,
 ) -> None:
-    """Write ``anchor,tag,bias_m,...``, a row a link.
+    """Write ``anchor,tag,bias_m,...``, one row per link.
 
     Parameters
     ----------
     path
-        File; its folder is made.
+        File; its folder is created.
     anchor_ids, tag_ids
         In the order of the arrays.
     columns
         (M, N) each, by the names in the header.
     told
-        (M, N) links that have a row.
+        (M, N) links with a row.
     """
     _write(
         path,
@@ -59,11 +59,11 @@ def write_points(
     Parameters
     ----------
     path
-        File; its folder is made.
+        File; its folder is created.
     kind
         ``"anchor"`` or ``"tag"``.
     ids, places
-        Names, and places (n, 3) in metres.
+        Names, and positions (n, 3) in metres.
     """
     rows = [[name, *(f"{x:.6f}" for x in place)] for name, place in zip(ids, places, strict=True)]
     _write(path, (kind, "x", "y", "z"), rows)
@@ -79,9 +79,9 @@ def write_directions(
     Parameters
     ----------
     path
-        File; its folder is made.
+        File; its folder is created.
     ids
-        Of the anchors and of the tags, in the order of the arrays.
+        Ids of the anchors and of the tags, in the order of the arrays.
     law
         Ends without a harmonic have no row.
     """
@@ -103,14 +103,14 @@ def write_directions(
 
 
 def write_frame(path: str | os.PathLike[str], rotation: FloatArray) -> None:
-    """Write ``qw,qx,qy,qz`` of the rotation (3, 3) from a sensor's axes to the body's.
+    """Write ``qw,qx,qy,qz`` of the rotation (3, 3) from sensor axes to body axes.
 
     Parameters
     ----------
     path
-        File, which `replay --imu-frame` reads; its folder is made.
+        File for `replay --imu-frame`; its folder is created.
     rotation
-        Of `calibrate_inertial`, ``turn.rotation``.
+        ``turn.rotation`` from `calibrate_inertial`.
     """
     _write(path, ("qw", "qx", "qy", "qz"), [[f"{x:.8f}" for x in rotations.quaternion(rotation)]])
 

@@ -1,4 +1,4 @@
-"""How an inertial sensor sits on a body, and its clock, by the turns of a truth or a track."""
+"""Calibrate the orientation and clock of an inertial sensor by rotations of a truth or track."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _ROUNDS = 2
 
 
 class CalibratedInertial(NamedTuple):
-    """An inertial sensor as the turns tell it.
+    """The calibration of an inertial sensor.
 
     Attributes
     ----------
     turn
-        Rotation from the sensor's axes to the body's, bias of the gyroscope.
+        Rotation from sensor axes to body axes, and bias of the gyroscope.
     clock
-        How far the sensor's clock is ahead of the truth's.
+        How far the clock of the sensor is ahead of that of the truth.
     """
 
     turn: SensorTurn
@@ -39,22 +39,22 @@ class CalibratedInertial(NamedTuple):
 def calibrate_inertial(
     log: InertialLog, truth: Truth, search_s: float | None = None
 ) -> CalibratedInertial:
-    """Rotation of a sensor on its body, and its clock, by turn rates.
+    """Estimate the rotation of a sensor on its body, and its clock, from turn rates.
 
     Parameters
     ----------
     log
-        Of `rbl_gym.recordings.read_inertial`.
+        Log from `rbl_gym.recordings.read_inertial`.
     truth
         Poses of the body; or the track of a filter, as `Truth(times, rotation, translation)`.
     search_s
-        Offsets of the clock that are tried, as of `rbl_gym.recordings.time_offset`.
+        Clock offsets to try, as in `rbl_gym.recordings.time_offset`.
 
     Raises
     ------
     ValueError
-        If the poses have no rotations, the clocks do not come out, or the body turns about one
-        axis.
+        If the poses have no rotations, the clock is not determined, or the body rotates about one
+        axis only.
     """
     if truth.rotation is None:
         raise ValueError("truth must have rotations, got positions alone")
@@ -74,7 +74,7 @@ def calibrate_inertial(
 
 
 def _turn(stamps: FloatArray, gyro: FloatArray, middle: FloatArray, body: FloatArray) -> SensorTurn:
-    """The turn that takes rates of the sensor to those of the body, each at its times."""
+    """Return the rotation from turn rates of the sensor to those of the body, each at its times."""
     grid = np.arange(max(middle[0], stamps[0]), min(middle[-1], stamps[-1]), _STEP_S)
     known = np.ones(len(grid), dtype=bool)
     rates = []
@@ -86,14 +86,15 @@ def _turn(stamps: FloatArray, gyro: FloatArray, middle: FloatArray, body: FloatA
 
 
 def inertial_figures(found: CalibratedInertial, truth_offset_s: float = 0.0) -> dict[str, Any]:
-    """Plain numbers of a sensor: its axes in the body's, its bias, its clock.
+    """Return plain numbers of a sensor: its axes in the body frame, its bias, its clock.
 
     Parameters
     ----------
     found
-        Of `calibrate_inertial`.
+        Result of `calibrate_inertial`.
     truth_offset_s
-        How far the truth's clock is ahead of that of the ranges: ``imu_offset_s`` is against these.
+        How far the clock of the truth is ahead of that of the ranges; ``imu_offset_s`` is relative
+        to the ranges.
     """
     turn = found.turn
     return {

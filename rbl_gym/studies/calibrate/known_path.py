@@ -1,4 +1,4 @@
-"""The truth of recordings as the path that a calibration goes by."""
+"""Use the truth of recordings as the known path of a calibration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _COARSE, _BETTER = 400, 0.8
 
 
 class Log(NamedTuple):
-    """Runs with truth behind each other: K epochs of M anchors and N tags."""
+    """Concatenated runs with truth: K epochs of M anchors and N tags."""
 
     runs: tuple[Recording, ...]
     times: FloatArray  # (K,)
@@ -34,12 +34,12 @@ class Log(NamedTuple):
 
 
 def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
-    """The runs, checked.
+    """Check the runs and return them as one log.
 
     Raises
     ------
     ValueError
-        If runs differ in anchors or tags, or have no truth that serves.
+        If runs differ in anchors or tags, or have no usable truth.
     """
     if not recordings:
         raise ValueError("recordings must hold a run, got none")
@@ -80,7 +80,7 @@ def log_of(recordings: Mapping[str, Recording], settings: LinkSettings) -> Log:
 
 
 def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, BoolArray]:
-    """The path at the times of the ranges, by the truth so many seconds later; and where known."""
+    """Return the path at the times of the ranges, for a clock offset of the truth, and its mask."""
     rotation, translation, known = [], [], []
     for run in log.runs:
         truth = run.truth
@@ -104,7 +104,10 @@ def path_at(log: Log, settings: LinkSettings, shift: float) -> tuple[KnownPath, 
 
 
 def first_turn(log: Log, settings: LinkSettings, shift: float) -> FloatArray:
-    """What turns the table of tags (3, 3) to fit the path coarsely; the identity where it does."""
+    """Return a coarse rotation (3, 3) of the tag table that fits the path.
+
+    The identity if it fits.
+    """
     if len(log.tags) == 1 and not log.tags.any():
         return np.eye(3)
     path, known = path_at(log, settings, shift)
@@ -128,7 +131,7 @@ def first_turn(log: Log, settings: LinkSettings, shift: float) -> FloatArray:
 
 
 def _cube() -> FloatArray:
-    """The 24 rotations (24, 3, 3) of a cube, the identity first."""
+    """Return the 24 rotations (24, 3, 3) of a cube, the identity first."""
     quarter = rotations.exp(0.5 * np.pi * np.eye(3))
     found = [np.eye(3)]
     for rotation in found:
@@ -140,9 +143,9 @@ def _cube() -> FloatArray:
 
 
 def clock_of(log: Log, settings: LinkSettings, tags: FloatArray) -> Clock | None:
-    """How far the truth's clock is ahead, by the ranges; None where they do not tell.
+    """Estimate how far the clock of the truth is ahead, from ranges; None if undetermined.
 
-    `tags` (N, 3) in the truth's body frame.
+    `tags` (N, 3) in the body frame of the truth.
     """
 
     def distances(shift: float) -> tuple[FloatArray, BoolArray]:

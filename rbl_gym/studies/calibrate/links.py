@@ -1,4 +1,4 @@
-"""`rbl-gym calibrate` with truth, as a function: links, tags, noise and clock of recordings."""
+"""`rbl-gym calibrate` with truth, as a function: calibrate links, tags, noise and clock."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ _FEW_RANGES = 30
 
 
 class CalibratedLinks(NamedTuple):
-    """Links as a recording with truth tells them.
+    """Links calibrated with a recording with truth.
 
     Attributes
     ----------
     settings
-        As they were used.
+        The settings used.
     fit
         Biases, slopes, tags and noise with standard deviations; residuals of all epochs.
     clock
-        Of the truth; None where it was told or the ranges do not tell it.
+        Clock of the truth; None if it was given or the ranges do not determine it.
     anchor_ids, tag_ids
         In the order of the arrays.
     distances
-        (K, M, N) along the path, metres; NaN where there is no range.
+        (K, M, N) along the path, metres; NaN without a range.
     figures
-        Plain numbers: what `rbl-gym calibrate --json` writes.
+        Plain numbers, as written by `rbl-gym calibrate --json`.
     directions
-        Bias by the direction of the ray; None where it was not looked for.
+        Bias by ray direction; None if it was not estimated.
     """
 
     settings: LinkSettings
@@ -70,9 +70,10 @@ class CalibratedLinks(NamedTuple):
     directions: FoundDirections | None = None
 
     def write(self, folder: str | os.PathLike[str]) -> dict[str, str]:
-        """Write what was found into a folder; the paths by name.
+        """Write the results to a folder; return the paths by name.
 
-        ``calibration.csv``, ``tags.csv`` and, of biases by direction, ``directions.csv``.
+        The files are ``calibration.csv``, ``tags.csv`` and, with biases by direction,
+        ``directions.csv``.
         """
         paths = {name: os.path.join(folder, f"{name}.csv") for name in ("calibration", "tags")}
         fit = self.fit
@@ -102,22 +103,22 @@ def calibrate_links(
     Parameters
     ----------
     recordings
-        With truth, or runs by their names, of one set of anchors and tags.
+        A recording with truth, or runs by their names, with the same anchors and tags.
     settings
-        What is estimated.
+        Settings of the calibration.
     advance
         Called after each of the four parts of the work.
 
     Returns
     -------
     CalibratedLinks
-        The clock is found by how ranges change (`find_clock`), then links and tags by robust least
-        squares (`rbl_gym.estimators.calibration.fit_links`).
+        The clock is estimated from range changes (`find_clock`), then links and tags by robust
+        least squares (`rbl_gym.estimators.calibration.fit_links`).
 
     Raises
     ------
     ValueError
-        Without truth that serves, or where no range has truth.
+        If there is no usable truth, or no range has truth.
     """
     if isinstance(recordings, Recording):
         recordings = {"": recordings}
@@ -170,7 +171,7 @@ def calibrate_links(
 def _with_clock(
     log: Log, settings: LinkSettings, model: LinkModel, fit: LinkFit, clock: Clock
 ) -> LinkFit:
-    """Standard deviations with what the clock's own adds, by two fits to fewer epochs."""
+    """Return standard deviations including that of the clock, by two fits to fewer epochs."""
     fits = [
         fit_log(log, settings, model, fit.rotation, shift, few=True)
         for shift in (clock.offset_s, clock.offset_s + clock.std_s)
@@ -261,7 +262,7 @@ def _result(
 
 
 def _table_beside(table: Any, fit: LinkFit, planar: bool) -> dict[str, Any]:
-    """The rigid transform that takes the table nearest to the tags found, and what it leaves."""
+    """Return the rigid transform from the table to the estimated tags, and the residuals."""
     a, b = table - table.mean(axis=0), fit.tags - fit.tags.mean(axis=0)
     if planar:
         spread = b[:, :2].T @ a[:, :2]
@@ -283,7 +284,7 @@ def _untold(
     fit: LinkFit, model: LinkModel, settings: LinkSettings, clock: Clock | None, ids: Any,
     found: FoundDirections | None,
 ) -> list[str]:  # fmt: skip
-    """What the ranges do not determine, a sentence each."""
+    """Return notes on what the ranges do not determine, one sentence each."""
     said = []
     none = np.argwhere(fit.counts == 0)
     names = [f"{ids[0][m]}-{ids[1][n]}" for m, n in none]

@@ -1,4 +1,4 @@
-"""What a calibration estimates, and what it is told."""
+"""Settings of a calibration."""
 
 from __future__ import annotations
 
@@ -11,34 +11,35 @@ __all__ = ["LinkSettings"]
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """How links are calibrated by a log with truth.
+    """Settings for calibrating links with a log with truth.
 
     Parameters
     ----------
     biases
-        ``"link"``, ``"node"``, ``"common"`` as of `rbl_gym.estimators.calibration.LinkModel`, or
-        ``"auto"``: of links, where these have ranges enough, else of nodes.
+        ``"link"``, ``"node"``, ``"common"`` as in `rbl_gym.estimators.calibration.LinkModel`, or
+        ``"auto"``: by link, if these have enough ranges, else by node.
     slopes
-        Whether ranges grow with the distance by more or less than one.
+        Whether to estimate a scale error of ranges.
     tags
-        ``"held"``, ``"turned"`` or ``"free"``, as of `LinkModel`.
+        ``"held"``, ``"turned"`` or ``"free"``, as in `LinkModel`.
     harmonics
-        Of the bias by the direction in which a ray leaves the body: how many at the most; of
-        these as many as foretell what was left out (0: none is looked for).
+        Maximum number of harmonics of the bias by ray direction; the number is chosen by
+        cross-validation (0: no such bias).
     ends
-        ``"tags"``: of the direction at the tags; ``"both"``: at the anchors too, where these are on
-        a body themselves.
+        ``"tags"``: bias by the direction at the tags; ``"both"``: also at the anchors, if these are
+        on a body themselves.
     planar
-        The body moves in a level plane: only the heading of the truth is read, and tags keep
-        their heights.
+        The body moves in a horizontal plane: only the heading of the truth is used, and the heights
+        of tags are fixed.
     height_offset_m
-        How far the tags' mean height lies below the anchors', where the truth has no height.
+        Mean height of the anchors minus that of the tags, if the truth has no height.
     time_offset
-        How far the truth's clock is ahead of that of the ranges, seconds; ``"auto"``: found.
+        How far the clock of the truth is ahead of that of the ranges, seconds; ``"auto"``:
+        estimated.
     truth_gap_s
-        Longest gap of the truth that is bridged.
+        Longest gap of the truth that is interpolated.
     truth_exclude
-        Windows of time, pairs of start and end in seconds of the ranges' clock, that are left out.
+        Excluded time windows: pairs of start and end in seconds on the clock of the ranges.
     """
 
     biases: str = "auto"
