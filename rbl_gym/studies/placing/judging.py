@@ -1,4 +1,4 @@
-"""Does a layout do what the zones ask? Shares within, intervals, verdicts, worst places."""
+"""Evaluate a layout against the requirements: shares, intervals, verdicts, worst positions."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ _WORST, _APART = 3, 0.1
 
 
 class Judged(NamedTuple):
-    """What a layout promises in a zone.
+    """The predicted accuracy of a layout in a zone.
 
     Attributes
     ----------
     zone
         Which one.
     places
-        (L, 3), uniform over what is free of it.
+        (L, 3), positions, uniform over its free part.
     errors
         At each of them (L).
     without
-        (M, L), with each one of the anchors missing; None where none has to be spared.
+        (M, L), without each one of the anchors; None if no anchor may fail.
     """
 
     zone: Zone
@@ -61,12 +61,12 @@ class Judged(NamedTuple):
 
     @property
     def asks(self) -> bool:
-        """Whether the zone has a requirement."""
+        """Return whether the zone has a requirement."""
         return limits_of(self.zone).any()
 
     @property
     def failing(self) -> int | None:
-        """Index of the anchor that is missed most: without it the fewest places are within."""
+        """Return the index of the critical anchor: without it the fewest positions are within."""
         if self.without is None:
             return None
         if not self.asks:
@@ -77,25 +77,25 @@ class Judged(NamedTuple):
 
     @property
     def judged(self) -> Errors:
-        """By what the zone is judged (L): all anchors, or without the one that is missed most."""
+        """Return the errors (L) of the verdict: with all anchors, or without the critical one."""
         if self.without is None:
             return self.errors
         return Errors(*(values[self.failing] for values in self.without))
 
     @property
     def relative(self) -> FloatArray:
-        """The judged errors (L) over their limits, the largest at each place."""
+        """Return the errors (L) over their limits, the largest at each position."""
         return relative_errors(self.judged, limits_of(self.zone))
 
     def first(self) -> Judged:
-        """Of the first places only, which every layout is judged at."""
+        """Return the result at the first positions only, which are common to all layouts."""
         some = slice(PLACES)
         without = None if self.without is None else self.without.of_places(some)
         return Judged(self.zone, self.places[some], self.errors.of_places(some), without)
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Ends of the 95 % interval (Wilson) of the share within."""
+        """Return the 95 % interval (Wilson) of the share within."""
         return wilson_interval(int((self.relative <= 1).sum()), len(self.places))
 
     @property
@@ -110,7 +110,7 @@ class Judged(NamedTuple):
 
 
 def limits_of(zone: Zone) -> Limits:
-    """What a place of the zone may have."""
+    """Return the limits of a position of the zone."""
     given = (zone.position_m, zone.height_m, zone.heading_deg)
     horizontal, height, heading = (math.inf if limit is None else limit for limit in given)
     return Limits(horizontal, height, math.radians(heading))
@@ -124,18 +124,18 @@ def judge_zone(
     survive: int = 0,
     most: int | None = None,
 ) -> Judged:
-    """What a layout (M, 3) promises in a zone; more places are drawn until the share is decided.
+    """Evaluate a layout (M, 3) in a zone, with more positions until the verdict is decided.
 
     Parameters
     ----------
     problem, zone, anchors
-        What is placed, which zone is judged, and where the anchors are.
+        The problem, the zone, and the anchors.
     seed
-        Of the places. The same seed draws the same ones, whatever the layout.
+        Seed of the positions. The same seed draws the same ones for any layout.
     survive
         1: any one of the anchors may be missing.
     most
-        Places after which an undecided share is left so; None: `MOST_PLACES`.
+        Maximum number of positions; None: `MOST_PLACES`.
     """
     rng = np.random.default_rng([seed, 3])
     judged = None

@@ -1,5 +1,5 @@
-"""The clock of a sensor on the body, by the ranges: of odometry by their likelihood, of an inertial
-sensor by the accelerations of the path that they tell.
+"""Estimate the clock offset of a sensor from the ranges: for odometry by their likelihood, for an
+inertial sensor by the accelerations of the estimated path.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from rbl_gym.studies.replay.settings import Settings
 
 __all__ = ["CLOCK_TRIALS", "SensorClock", "sensor_clock"]
 
-# Offsets that are tried: first this far apart, on both sides of what is told, then finer.
+# Spacing of the tested offsets, on both sides of the given one, first coarse, then finer.
 _STEPS, _SIDES = (0.4, 0.1, 0.03), (7, 3, 3)
 CLOCK_TRIALS = len(_STEPS)
-# Longest part that is looked at, in epochs; of an inertial sensor in ranges, and how far (s).
+# Longest part used, in epochs; for an inertial sensor in ranges, and the search range (s).
 _MOST, _MOST_RANGES, _SEARCH_S = 1_500, 60_000, 10.0
 
 
@@ -33,10 +33,10 @@ class SensorClock(NamedTuple):
     offset_s, std_s
         The offset, and its standard deviation, seconds.
     gain
-        By how much the log-likelihood is higher: of odometry than at the offset that was given, of
-        an inertial sensor than at the best offset elsewhere.
+        Increase of the log-likelihood: for odometry relative to the given offset, for an inertial
+        sensor relative to the best other offset.
     correlation
-        Of the accelerations by the inertial sensor and by the ranges; None: of odometry.
+        Correlation of the accelerations from the inertial sensor and the ranges; None for odometry.
     """
 
     offset_s: float
@@ -51,25 +51,25 @@ def sensor_clock(
     name: str = "odometry_offset_s",
     advance: Callable[[], None] = lambda: None,
 ) -> SensorClock:
-    """The offset of a sensor's clock at which its readings fit the ranges best.
+    """Estimate the clock offset of a sensor at which its readings fit the ranges best.
 
-    Of odometry the likeliest within 2.4 s of the offset of the settings, on a grid that is made
-    finer around its best. Of an inertial sensor by `estimators.calibration.inertial_clock`, within
-    10 s. The truth is not looked at.
+    For odometry it is the most likely offset within 2.4 s of that in the settings, on a grid that
+    is refined around its best point. For an inertial sensor it is found by
+    `estimators.calibration.inertial_clock`, within 10 s. The truth is not used.
 
     Parameters
     ----------
     recording, settings
-        What is filtered, and how.
+        The recording to filter, and the settings.
     name
-        Of the setting that is the offset.
+        Name of the setting with the offset.
     advance
         Called after each of `CLOCK_TRIALS` steps.
 
     Raises
     ------
     ValueError
-        If the clocks differ by more, or the data do not tell.
+        If the clocks differ by more, or the data do not determine the offset.
     """
     if name == "imu_offset_s":
         clock = _inertial_clock(recording, settings)
@@ -118,7 +118,7 @@ def _inertial_clock(recording: Recording, settings: Settings) -> SensorClock:
     )
     start = start_of(recording, settings)[1]
     if settings.knowledge.start is None:
-        # Off the plane that anchors may stand in.
+        # Outside the plane of coplanar anchors.
         start = start - [0.0, 0.0, 0.5]
     near = settings.inertial.imu_offset_s
     try:

@@ -1,4 +1,4 @@
-"""What a log says of itself without truth, in figures and in words."""
+"""Diagnose the consistency of a log without truth, in figures and in words."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from rbl_gym.studies.replay.consistency import MOST_NIS, MOST_REFUSED, consisten
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track
 
-# Below this NIS per degree of freedom the filter expects much more scatter than there is.
+# Below this NIS per degree of freedom the filter is clearly pessimistic.
 _WIDE = 0.25
 
 
 def diagnose(
     recording: Recording, settings: Settings, track: Track
 ) -> tuple[dict[str, Any], list[str]]:
-    """Figures as of `consistency_figures`, ``causes`` of a contradiction, and notes.
+    """Return figures as in `consistency_figures`, ``causes`` of a contradiction, and notes.
 
     Parameters
     ----------
     recording, settings
-        What was filtered, and how.
+        The recording, and the settings.
     track
-        Of the filter, with its innovations.
+        Track of the filter, with its innovations.
     """
     found = track.innovations
     assert found is not None

@@ -1,4 +1,4 @@
-"""What a track is judged by, and its errors: the truth in the clock and the frame of the ranges."""
+"""Compare a track with the truth, converted to the clock and frame of the ranges."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from rbl_gym.studies.replay.truth import check_overlap, matched
 
 __all__ = ["Reference", "TrackErrors", "find_offset", "track_errors", "truth_of", "truth_path"]
 
-# Offsets that are tried where ranges and truth share time as they are (s).
+# Clock offsets to try if ranges and truth already overlap in time (s).
 _SEARCH_S = 10.0
-# Beliefs wider than so many times the median say little of the motion.
+# Beliefs with a standard deviation above this multiple of the median are not used.
 _WIDE = 5.0
 
 
 class Reference(NamedTuple):
-    """What the estimates of K epochs are judged by.
+    """The reference for the estimates of K epochs.
 
     Attributes
     ----------
     rotation
-        (K, 3, 3); None: positions alone are known.
+        (K, 3, 3); None: only positions are known.
     translation
         (K, 3).
     known
-        Epochs (K,) that count.
+        Epochs (K,) with a reference.
     planar
-        Height, roll and pitch are not judged.
+        Height, roll and pitch are not compared.
     alignment
-        What took the truth's world frame to that of the anchors.
+        The transform from the world frame of the truth to that of the anchors.
     excluded
-        Epochs with truth that were left out as they were told to.
+        Number of epochs with truth that were excluded by the settings.
     """
 
     rotation: FloatArray | None
@@ -55,40 +55,40 @@ class Reference(NamedTuple):
 
     @property
     def turn_axes(self) -> list[int]:
-        """Of the pose error (w, v), the components of the rotation that are judged."""
+        """Return the compared rotation components of the pose error (w, v)."""
         return [] if self.rotation is None else [2] if self.planar else [0, 1, 2]
 
     @property
     def place_axes(self) -> list[int]:
-        """Those of the position."""
+        """Return the compared position components."""
         return [3, 4] if self.planar else [3, 4, 5]
 
     def rotation_or(self, rotation: FloatArray) -> FloatArray:
-        """The rotation (K, 3, 3), or where it is unknown this one."""
+        """Return the rotation (K, 3, 3), or this one if it is unknown."""
         return rotation if self.rotation is None else self.rotation
 
 
 class TrackErrors(NamedTuple):
-    """Errors of K epochs where truth exists.
+    """Errors of K epochs with truth.
 
     Attributes
     ----------
     known
-        Epochs (K,) that count.
+        Epochs (K,) with truth.
     position
         Distance (K,), metres.
     yaw, rotation
-        Radians (K,); None where the truth does not tell.
+        Radians (K,); None if unknown.
     nees
-        (K,), of the `freedom` components that are judged.
+        (K,), of the `freedom` compared components.
     tags
-        Root mean square (K,) over the tags, metres; None where the truth does not tell.
+        Root mean square (K,) over the tags, metres; None if unknown.
     freedom
-        How many of the six components of the pose are judged.
+        Number of compared components of the pose, at most six.
     centre, axis
-        Distance (K,) of the tags' centre, metres, and angle (K,) of their line, radians: where
-        the tags are in a line, so that ranges tell no more; None of other bodies, the angle also
-        of a single tag.
+        Distance (K,) of the tag centre, metres, and angle (K,) of the tag line, radians, for
+        collinear tags, for which ranges determine no more. None for other bodies; the angle is
+        also None for a single tag.
     """
 
     known: BoolArray
@@ -103,14 +103,14 @@ class TrackErrors(NamedTuple):
 
 
 def find_offset(recording: Recording, track: Track, settings: Settings) -> TimeOffset | None:
-    """How far the truth's clock is ahead of that of the ranges, by the motion; None: no truth.
+    """Estimate from the motion how far the clock of the truth is ahead; None: no truth.
 
-    Windows that are left out do not count, nor do wide beliefs.
+    It is relative to the clock of the ranges. Excluded windows and uncertain beliefs are not used.
 
     Raises
     ------
     ValueError
-        If the motion does not tell it.
+        If the motion does not determine it.
     """
     truth = recording.truth
     if truth is None:
@@ -131,17 +131,17 @@ def find_offset(recording: Recording, track: Track, settings: Settings) -> TimeO
 
 
 def in_clock(truth: Truth, settings: Settings) -> Truth:
-    """The truth with the stamps of the ranges' clock; the settings tell the offset in seconds."""
+    """Return the truth in the clock of the ranges; the settings give the offset in seconds."""
     offset = settings.comparison.time_offset
     return truth._replace(times=truth.times - float(offset)) if offset else truth
 
 
 def truth_of(recording: Recording, track: Track, settings: Settings) -> Reference | None:
-    """What the estimates are judged by; None without truth.
+    """Return the reference for the estimates; None without truth.
 
-    The recording's truth in the clock of the ranges (`comparison.time_offset`), at the epochs of
-    the track (`truth.matched`), without those that are left out, aligned, and turned by the yaw
-    offset. Planar: its heading alone.
+    It is the truth of the recording in the clock of the ranges (`comparison.time_offset`), at the
+    epochs of the track (`truth.matched`) without excluded ones, aligned, and rotated by the yaw
+    offset. Planar: only its heading.
 
     Raises
     ------
@@ -175,12 +175,12 @@ def truth_of(recording: Recording, track: Track, settings: Settings) -> Referenc
 
 
 def truth_path(recording: Recording, track: Track, settings: Settings) -> FloatArray:
-    """Positions (L, 3) of the truth at its own times during the track, as `truth_of` aligns them.
+    """Return aligned positions (L, 3) of the truth at its own times during the track.
 
     Parameters
     ----------
     recording, track, settings
-        As of `truth_of`; a recording without truth gives none.
+        As in `truth_of`; a recording without truth gives no positions.
     """
     found = truth_of(recording, track, settings)
     if recording.truth is None or found is None:
@@ -191,7 +191,7 @@ def truth_path(recording: Recording, track: Track, settings: Settings) -> FloatA
 
 
 def with_offset(settings: Settings, found: TimeOffset | None) -> Settings:
-    """The settings with an offset that was found."""
+    """Return the settings with an estimated offset."""
     return settings if found is None else settings.changed(time_offset=found.offset_s)
 
 
@@ -207,7 +207,7 @@ def _is_planar(truth: Truth, settings: Settings) -> bool:
 
 
 def excluded_epochs(times: FloatArray, settings: Settings) -> BoolArray:
-    """Epochs (K,) within the windows that are left out."""
+    """Return which epochs (K,) are in the excluded windows."""
     out = np.zeros(len(times), dtype=np.bool_)
     for start, end in settings.comparison.truth_exclude:
         out |= (times >= start) & (times <= end)
@@ -215,7 +215,7 @@ def excluded_epochs(times: FloatArray, settings: Settings) -> BoolArray:
 
 
 def as_judged(rotation: FloatArray, settings: Settings, planar: bool) -> FloatArray:
-    """Rotations (K, 3, 3) of the truth, turned by the offset; planar: their headings."""
+    """Return rotations (K, 3, 3) of the truth, rotated by the offset; planar: their headings."""
     offset = rotations.exp([0.0, 0.0, math.radians(settings.comparison.yaw_offset_deg)])
     if planar:
         heading = np.zeros((len(rotation), 3))
@@ -225,10 +225,10 @@ def as_judged(rotation: FloatArray, settings: Settings, planar: bool) -> FloatAr
 
 
 def track_errors(recording: Recording, track: Track, settings: Settings) -> TrackErrors | None:
-    """Errors against the recording's truth, interpolated; None without truth.
+    """Return errors relative to the interpolated truth of the recording; None without truth.
 
-    Planar, or where the truth has no height: position in x and y, NEES of (yaw, x, y); the
-    truth's roll and pitch are not read. Truth without rotations: position alone.
+    Planar, or if the truth has no height: position in x and y, NEES of (yaw, x, y); roll and pitch
+    of the truth are not used. Truth without rotations: position only.
     """
     truth = truth_of(recording, track, settings)
     if truth is None:
@@ -241,7 +241,7 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
     if truth.rotation is not None:
         turn = rotations.yaw(track.rotation) - rotations.yaw(expected)
         yaw = (turn + np.pi) % (2 * np.pi) - np.pi
-        # A truth of a heading says nothing of roll and pitch.
+        # A truth with only a heading has no roll and pitch.
         if settings.knowledge.planar or not truth.planar:
             rotation = np.linalg.norm(error[:, :3], axis=-1)
             tags = metrics.tag_error(
@@ -265,7 +265,7 @@ def track_errors(recording: Recording, track: Track, settings: Settings) -> Trac
 def _line_errors(
     track: Track, expected: FloatArray, truth: Reference, tags: FloatArray
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Distance (K,) of the tags' centre, and angle (K,) of their line; None of a single tag."""
+    """Return distance (K,) of the tag centre, and angle (K,) of the tag line; None for one tag."""
     middle = tags.mean(axis=0)
     off = track.translation + track.rotation @ middle - truth.translation - expected @ middle
     centre = np.linalg.norm(off[:, [axis - 3 for axis in truth.place_axes]], axis=-1)

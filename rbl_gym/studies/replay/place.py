@@ -1,4 +1,4 @@
-"""What a recording and what is known of the body say of its place."""
+"""Derive the prior position of the body from a recording and the settings."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ __all__ = [
     "volume_of",
 ]
 
-# Coordinates beyond this are those of a map.
+# Larger coordinates are map coordinates.
 _MAP_M = 1e4
-# Standard deviations of a start, and of its yaw, where they are not told.
+# Default standard deviations of a start, and of its yaw.
 _START_M, _START_DEG = 0.5, 30.0
-# What the planar constraint leaves to height (m), roll and pitch (rad).
+# Standard deviations of height (m), roll and pitch (rad) under the planar constraint.
 _PLANAR_STD = 1e-3
-# Heights of anchors within this much are one plane.
+# Anchors with heights within this margin are in one plane.
 _PLANE_M = 0.1
 
 
 def origin_of(recording: Recording) -> FloatArray:
-    """Where coordinates (3,) are taken from: the origin, or for those of a map the anchors."""
+    """Return the origin (3,) of coordinates: zero, or the anchors for map coordinates."""
     if np.abs(recording.anchors).max() < _MAP_M:
         return np.zeros(3)
     return np.round(recording.anchors.reshape(-1, 3).mean(axis=0))
 
 
 def reach_of(recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Corners (3,) each of the box that the longest range leaves around the anchors."""
+    """Return the corners, (3,) each, of the box around the anchors within the longest range."""
     longest = recording.ranges.max()
     anchors = recording.anchors.reshape(-1, 3)
     return anchors.min(axis=0) - longest, anchors.max(axis=0) + longest
 
 
 def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
-    """Corners (2, 3) of where the body may be, infinite where there is no limit; None: anywhere.
+    """Return corners (2, 3) of the possible positions, infinite without a limit; None: anywhere.
 
     Raises
     ------
     ValueError
-        If the volume is further from the anchors than any range, or nothing of it is below them
-        where that is asked for.
+        If the volume is further from the anchors than any range, or no part of it is below them
+        although the body must be.
     """
     if settings.knowledge.volume is None and not settings.knowledge.below_anchors:
         return None
@@ -75,14 +75,14 @@ def volume_of(recording: Recording, settings: Settings) -> FloatArray | None:
 
 
 def start_of(recording: Recording, settings: Settings) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rotation, translation and covariance (6, 6) of the body before the first ranges.
+    """Return rotation, translation and covariance (6, 6) of the body before the first ranges.
 
-    Anywhere among the anchors, turned anyhow, but for what is known: a start, a volume, a height,
-    a level body. Coordinates are of the world.
+    The prior is anywhere among the anchors with any rotation, restricted by the known start,
+    volume, height or level body. Coordinates are those of the world.
     """
     known, anchors = settings.knowledge, recording.anchors_by_epoch[0]
     rotation, centre = np.eye(3), anchors.mean(axis=0)
-    # Anchors may stand close together, or on one body.
+    # Anchors may be close together, or on one body.
     away = float(np.median(recording.ranges[recording.links]))
     extent = max(float(np.ptp(anchors, axis=0).max()), away, 1.0)
     std = np.array([math.pi] * 3 + [extent] * 3)
@@ -113,7 +113,7 @@ def start_of(recording: Recording, settings: Settings) -> tuple[FloatArray, Floa
 
 
 def level_of(settings: Settings, origin: FloatArray) -> Level | None:
-    """What is softly known of height and tilt, relative to an origin (3,); None: nothing."""
+    """Return the soft constraint on height and tilt, relative to an origin (3,); None: none."""
     known = settings.knowledge
     if known.height_std_m is None and known.tilt_std_deg is None:
         return None
@@ -126,12 +126,12 @@ def level_of(settings: Settings, origin: FloatArray) -> Level | None:
 
 
 def has_own_std(recording: Recording, settings: Settings) -> bool:
-    """Whether every range has its own standard deviation."""
+    """Return whether every range has its own standard deviation."""
     return settings.range_std_m is None and recording.range_std is not None
 
 
 def own_std(recording: Recording, settings: Settings) -> FloatArray | None:
-    """Standard deviations (K, M, N) of the ranges' own; None: they have none that count."""
+    """Return the standard deviations (K, M, N) of a recording; None: it has none that are used."""
     std = recording.range_std
     if std is None or not has_own_std(recording, settings):
         return None
@@ -139,7 +139,7 @@ def own_std(recording: Recording, settings: Settings) -> FloatArray | None:
 
 
 def height_offset(recording: Recording, settings: Settings) -> float:
-    """How far the tags lie below the anchors [m]; a ValueError where that has to be said."""
+    """Return how far the tags are below the anchors [m]; raise ValueError if it must be given."""
     heights, known = recording.anchors[..., 2], settings.knowledge
     told = (known.height_offset_m, known.height_m, known.start)
     if known.planar and all(x is None for x in told) and np.ptp(heights) > _PLANE_M:

@@ -1,4 +1,4 @@
-"""Several runs of one log, each replayed from its own start; figures of each and together."""
+"""Replay several runs of one log, each from its own start; figures of each and together."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["ReplayedRuns", "replay_runs"]
 
 
 class ReplayedRuns(NamedTuple):
-    """Runs as a filter saw them.
+    """The results of replayed runs.
 
     Attributes
     ----------
@@ -43,16 +43,16 @@ def replay_runs(
     Parameters
     ----------
     recordings
-        Of `rbl_gym.recordings.read_runs`.
+        Runs from `rbl_gym.recordings.read_runs`.
     settings
-        How they are filtered.
+        Settings of the filter.
     advance
         Called after every epoch.
 
     Raises
     ------
     ValueError
-        As `replay_recording`, with the name of the run; before any work where it can be known.
+        As in `replay_recording`, with the name of the run; before any work if possible.
     """
     if not recordings:
         raise ValueError("recordings must hold a run, got none")
