@@ -1,4 +1,4 @@
-"""Anchors for the requirements of the zones: exchanges, the least number that meets them."""
+"""Choose anchors for the requirements of zones: exchanges, and the smallest sufficient number."""
 
 from __future__ import annotations
 
@@ -40,21 +40,20 @@ _MOST_CHOICES = 3000
 
 
 class Fewest(NamedTuple):
-    """The least number of anchors that meets the requirements of all zones.
+    """The smallest number of anchors that meets the requirements of all zones.
 
     Attributes
     ----------
     anchors
-        (M, 3); of the most that were allowed where they do not do.
+        (M, 3); of the largest allowed number if it does not suffice.
     judged
-        Of every zone; all pass where `met`.
+        Results of every zone; all pass if `met`.
     met
-        Whether they do.
+        Whether the requirements are met.
     one_less, judged_less
-        The best that was found with one anchor less, which does not do; None where none was
-        allowed.
+        The best layout found with one anchor less, which does not suffice; None if not allowed.
     proved
-        Whether all choices of one less were tried: where mounts are a list, and a short one.
+        Whether all choices of one less were tried, which is done for a short list of mounts.
     """
 
     anchors: FloatArray
@@ -69,12 +68,12 @@ class Fewest(NamedTuple):
 
 
 def candidates(problem: Problem, rng: np.random.Generator, count: int = _CANDIDATES) -> FloatArray:
-    """Up to `count` different legal mounts (K, 3); all of them where they are a list.
+    """Return up to `count` different legal mounts (K, 3); all of them if they are a list.
 
     Parameters
     ----------
     problem, rng, count
-        Where anchors may stand, random numbers, and how many are drawn.
+        The problem with the mounts, the source of randomness, and the number to draw.
     """
     listed = problem.mounts.listed()
     if listed is not None:
@@ -92,16 +91,16 @@ def _legal(problem: Problem, points: FloatArray) -> FloatArray:
 
 
 def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int | None = None) -> Stock:
-    """Candidates (K, 3) with what each tells at random poses of the zones.
+    """Return candidates (K, 3) with the information of each at random poses of the zones.
 
     Parameters
     ----------
     problem, points
-        What is placed, and the candidates.
+        The problem, and the candidates.
     seed
-        Of the poses; those of `judge_zone` are others.
+        Seed of the poses, which differ from those of `judge_zone`.
     n_places
-        In all zones together, in each a number at least; None: the usual.
+        Number of positions in all zones, with a minimum in each; None: the default.
     """
     rng = np.random.default_rng([seed, 4])
     zones, parts = [], []
@@ -120,7 +119,7 @@ def stock_of(problem: Problem, points: FloatArray, seed: int, n_places: int | No
 
 
 def is_met(judged: list[Judged]) -> bool:
-    """Whether every zone that has a requirement passes."""
+    """Return whether every zone with a requirement passes."""
     return all(zone.verdict in ("pass", "no requirement") for zone in judged)
 
 
@@ -130,19 +129,19 @@ def is_met(judged: list[Judged]) -> bool:
 def improved(
     problem: Problem, anchors: FloatArray, seed: int, survive: int = 0
 ) -> tuple[FloatArray, float]:
-    """A layout (M, 3) after exchanges for the requirements, and its value (`swaps.value`).
+    """Improve a layout (M, 3) by exchanges; return it and its value (`swaps.value`).
 
-    One anchor at a time for candidates everywhere, then near and far. The problem's fixed anchors,
-    the first ones, stay.
+    One anchor at a time is exchanged for candidates everywhere, then near and far. The fixed
+    anchors of the problem, the first ones, are kept.
 
     Parameters
     ----------
     problem, anchors
-        What is placed, and the layout to begin with.
+        The problem, and the start layout.
     seed
-        Of the candidates and poses.
+        Seed of the candidates and poses.
     survive
-        1: for the worst over the loss of any one.
+        1: use the worst case over the loss of any one anchor.
     """
     rng = np.random.default_rng([seed, len(anchors), 5])
     reached = math.inf
@@ -184,28 +183,29 @@ def fewest_anchors(
     survive: int = 0,
     advance: Advance = silent,
 ) -> Fewest:
-    """The least number of anchors that meets the requirements of all zones.
+    """Find the smallest number of anchors that meets the requirements of all zones.
 
-    Greedy up to a number that does, then one less at a time, from several starts with exchanges,
-    until none does. Where the mounts are a short list, all choices of one less are tried.
+    Anchors are added greedily up to a sufficient number. Then the number is reduced by one at a
+    time, from several starts with exchanges, until it does not suffice. For a short list of mounts,
+    all choices of one less are tried.
 
     Parameters
     ----------
     problem
-        What is placed; its fixed anchors count.
+        The problem; its fixed anchors are included in the number.
     numbers
-        How many are allowed.
+        Allowed numbers.
     seed
-        Of candidates, poses and the places that are judged.
+        Seed of candidates, poses and evaluated positions.
     survive
-        1: the requirements hold with any one of the anchors missing.
+        1: the requirements must be met without any one of the anchors.
     advance
-        Called after every number that was tried.
+        Called after every tested number.
 
     Raises
     ------
     ValueError
-        Where no zone has a requirement.
+        If no zone has a requirement.
     """
     if not any(limits_of(zone).any() for zone in problem.zones):
         raise ValueError(
@@ -313,14 +313,14 @@ def _cheapened(
 def next_anchor(
     problem: Problem, anchors: FloatArray, seed: int, survive: int = 0
 ) -> tuple[FloatArray, list[Judged]] | None:
-    """Where one more anchor (3,) helps most, and what the zones promise with it.
+    """Return the best position (3,) of one more anchor, and the zones with it.
 
-    None where no mount is left.
+    The result is None if no mount is left.
 
     Parameters
     ----------
     problem, anchors
-        What is placed, and the layout (M, 3).
+        The problem, and the layout (M, 3).
     seed, survive
         As in `improved`.
     """

@@ -1,4 +1,4 @@
-"""What anchors tell at places of a zone: information, sum over the links of every tag."""
+"""Compute the information of anchors at positions of a zone, summed over the links of every tag."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ __all__ = ["anchor_information", "layout_information", "link_shares"]
 def link_shares(
     problem: Problem, anchors: FloatArray, places: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Share (L, T, M, N) of its information that each link has: what stands between, and the gain.
+    """Return the share (L, T, M, N) of its information that each link has, by obstacles and gain.
 
-    Sight is that from the anchor to the tag.
+    The line of sight is from the anchor to the tag.
 
     Parameters
     ----------
     problem
-        Gives tags, obstacles, and how far and how wide an anchor reaches.
+        Problem with tags, obstacles, and the gain of anchors.
     anchors
         (M, 3), metres.
     places, rotation
-        (L, 3), and turns (T, 3, 3) of the body at each.
+        (L, 3), and rotations (T, 3, 3) of the body at each.
     """
     tags = problem.tags
     share = np.ones((len(places), len(rotation), len(anchors), len(tags)))
@@ -43,7 +43,10 @@ def link_shares(
 def layout_information(
     problem: Problem, anchors: FloatArray, places: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Information (L, T, 6, 6) of the ranges to all anchors. Arguments as `link_shares`."""
+    """Return information (L, T, 6, 6) of the ranges to all anchors.
+
+    Arguments as in `link_shares`.
+    """
     share = link_shares(problem, anchors, places, rotation)
     return bounds.information_at(
         anchors, problem.tags, rotation, places[:, None], problem.noise, share
@@ -53,7 +56,10 @@ def layout_information(
 def anchor_information(
     problem: Problem, anchors: FloatArray, places: FloatArray, rotation: FloatArray
 ) -> FloatArray:
-    """Information (M, L, T, 6, 6) of the ranges to each anchor. Arguments as `link_shares`."""
+    """Return information (M, L, T, 6, 6) of ranges to each anchor.
+
+    Arguments as in `link_shares`.
+    """
     share = np.moveaxis(link_shares(problem, anchors, places, rotation), 2, 0)[..., None, :]
     return bounds.information_at(
         anchors[:, None, None, None], problem.tags, rotation, places[:, None], problem.noise, share
