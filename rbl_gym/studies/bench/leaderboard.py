@@ -1,4 +1,4 @@
-"""Every filter on every scene: the runs of `rbl-gym bench`, their records and their summary.
+"""Run every filter on every scene for `rbl-gym bench`: tasks, records and summary.
 
 A task is one world (scene and condition) and the filters that are run on it; it gives a record
 for each, plain numbers that depend on nothing but what the record itself names. Timings are kept
@@ -51,7 +51,7 @@ KEY = ("scene_hash", "condition", "filter", "filter_source", "trials", "seed", "
 
 
 class Task(NamedTuple):
-    """One world, the filters to run on it, how many trials, and the seed."""
+    """One world, the filters to run on it, the number of trials, and the seed."""
 
     label: str
     scene: str | dict[str, Any]
@@ -70,7 +70,7 @@ def default_filters() -> list[str]:
 
 
 def further_filters(spec: str | Mapping[str, Any]) -> list[str]:
-    """Filters made for what a scene has and others have not; none for a recording."""
+    """Return the filters for special features of a scene; none for a recording."""
     if is_recording(spec):
         return []
     scene = scenes.get(spec)
@@ -85,7 +85,7 @@ def further_filters(spec: str | Mapping[str, Any]) -> list[str]:
 
 
 def parse_filter(text: str) -> tuple[str, dict[str, Any]]:
-    """``name/option=value/...`` as a name and options; values are JSON, or else text."""
+    """Parse ``name/option=value/...`` to a name and options; values are JSON, or else text."""
     name, *parts = text.split("/")
     options: dict[str, Any] = {}
     for part in parts:
@@ -106,24 +106,24 @@ def tasks(
     trials: int,
     seed: int,
 ) -> list[Task]:
-    """One task for every scene and condition.
+    """Return one task for every scene and condition.
 
     Parameters
     ----------
     specs
-        Scenes (of `scenes.get`) and recordings by the label they have in the table.
+        Scenes (for `scenes.get`) and recordings by their label in the table.
     conditions
-        Of `CONDITIONS`.
+        Names in `CONDITIONS`.
     filters
         Names, with options as `parse_filter` reads them; None: `default_filters`, and of every
         scene its `further_filters`.
     trials, seed
-        Of the simulated scenes, and of all randomness.
+        Number of trials of simulated scenes, and seed of all randomness.
 
     Raises
     ------
     ValueError
-        On a condition, filter, option or scene that is not known, before anything is run.
+        If a condition, filter, option or scene is unknown, before anything is run.
     """
     for condition in conditions:
         check_one_of("condition", condition, list(CONDITIONS))
@@ -145,36 +145,36 @@ def tasks(
 
 
 def is_recording(spec: str | Mapping[str, Any]) -> bool:
-    """Whether a scene of the benchmark is a recording."""
+    """Return whether a scene of the benchmark is a recording."""
     return isinstance(spec, Mapping) and "ranges" in spec
 
 
 def digest_of(spec: str | Mapping[str, Any]) -> str:
-    """The hash of a scene, or of a recording with its files."""
+    """Return the hash of a scene, or of a recording with its files."""
     if is_recording(spec):
         return recordings.load_recording(spec).digest  # pyright: ignore[reportArgumentType]
     return worlds.scene_hash(scenes.get(spec))
 
 
 def key_of(record: Mapping[str, Any]) -> str:
-    """What a record is the result of, as text."""
+    """Return the inputs of a record, as text."""
     return json.dumps([record[name] for name in KEY], sort_keys=True)
 
 
 def timing_key(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """What a time belongs to within one run."""
+    """Return the key of a time within one run."""
     return row["scene_hash"], row["condition"], row["filter"]
 
 
 def keys_of(task: Task) -> dict[str, str]:
-    """The key of every filter's record of a task."""
+    """Return the keys of the records of all filters of a task."""
     return {filter: key_of(_head(task, filter)) for filter in task.filters}
 
 
 def run_task(task: Task) -> list[tuple[dict[str, Any], float | None]]:
-    """Records of a task's filters, each with its microseconds per step (None: it did not finish).
+    """Return the records of a task, each with its microseconds per step (None: not finished).
 
-    Every filter meets the same world.
+    Every filter runs on the same world.
     """
     if is_recording(task.scene):
         stage = stages.recording_stage(task.scene, task.condition, task.seed)  # pyright: ignore[reportArgumentType]
@@ -188,7 +188,7 @@ def run_task(task: Task) -> list[tuple[dict[str, Any], float | None]]:
 
 
 def _head(task: Task, filter: str) -> dict[str, Any]:
-    """What a record says of itself before its figures."""
+    """Return the header of a record."""
     return {
         "scene": task.label,
         "spec": task.scene,
@@ -203,7 +203,7 @@ def _head(task: Task, filter: str) -> dict[str, Any]:
 
 
 def source_of(name: str) -> str:
-    """Where a filter comes from: a package and its version, or the digest of its module's file."""
+    """Return the source of a filter: a package and its version, or its module digest."""
     factory = factory_of(name)
     while isinstance(factory, functools.partial):
         factory = factory.func
@@ -220,7 +220,7 @@ def source_of(name: str) -> str:
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Versions of what the figures depend on; `code` is a digest of this package's own files."""
+    """Return the versions that the figures depend on; `code` is a digest of this package."""
     folders = [
         Path(rbl_gym.__file__).parent,
         *map(Path, (*estimators.__path__, *wrappers.__path__)),
@@ -244,12 +244,12 @@ def _digest(files: list[Path]) -> str:
 def summary(
     records: Sequence[Mapping[str, Any]], timings: Mapping[tuple[str, ...], float | None]
 ) -> dict[str, Any]:
-    """The leaderboard as plain numbers.
+    """Return the leaderboard as plain numbers.
 
     Parameters
     ----------
     records
-        Of one run.
+        Records of one run.
     timings
         Microseconds per step by `timing_key` of a record.
 

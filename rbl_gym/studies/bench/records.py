@@ -1,4 +1,4 @@
-"""Records of the benchmark in a file of JSON lines: saved as they come, taken up, run again.
+"""Store records of the benchmark in a file of JSON lines: save, resume, run again.
 
 Lines are in the order of the tasks once a run is complete, and hold nothing that changes from
 run to run; how long each filter took stands in a file beside it.
@@ -30,7 +30,7 @@ _COMMON = ("trials", "seed", "versions")
 
 
 def timings_path(path: Path) -> Path:
-    """The file of the times beside a file of records."""
+    """Return the file of the times that belongs to a file of records."""
     return path.with_suffix(".timings.jsonl")
 
 
@@ -42,24 +42,24 @@ def run_tasks(
     fresh: bool = False,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> tuple[Records, dict[tuple[str, ...], float]]:
-    """Run what a file lacks of some tasks; all their records, in order, and their times.
+    """Run tasks that are missing in a file; return all records, in order, and their times.
 
-    Every finished task is on disk before the next result is waited for: what was stopped, by
-    whatever, is taken up by the same call. Records of other scenes, conditions or filters of the
-    same trials, seed and versions stay in the file, behind those of the tasks.
+    Every finished task is written before the next result is awaited. The same call resumes an
+    interrupted run. Records of other scenes, conditions or filters of the same trials, seed and
+    versions stay in the file, behind those of the tasks.
 
     Parameters
     ----------
     tasks
-        Of `leaderboard.tasks`.
+        Tasks from `leaderboard.tasks`.
     path
         File of the records.
     workers
-        Where they are run.
+        Where to run them.
     fresh
-        Overwrite the file in place of taking it up.
+        Overwrite the file instead of resuming it.
     advance
-        Called with the number of records that are there, as they come.
+        Called with the number of finished records.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def run_tasks(
 
 
 def _left(tasks: Sequence[Task], found: Mapping[str, Any]) -> list[Task]:
-    """The tasks without the filters whose records are there."""
+    """Return the tasks without the filters that have records."""
     left = []
     for task in tasks:
         filters = tuple(f for f, key in leaderboard.keys_of(task).items() if key not in found)
@@ -118,12 +118,12 @@ def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None
 
 
 def read_records(path: Path) -> Records:
-    """Records of a file; a last line that was cut off is left out.
+    """Read the records of a file; a last line that was cut off is left out.
 
     Raises
     ------
     ValueError
-        On any other line that is not a record, with its number.
+        If another line is not a record; the message names it.
     """
     records: Records = []
     lines = _text(path).split("\n")
@@ -142,7 +142,7 @@ def read_records(path: Path) -> Records:
 
 
 def read_timings(path: Path) -> dict[tuple[str, ...], float]:
-    """Microseconds per step by scene hash, condition and filter."""
+    """Read microseconds per step by scene hash, condition and filter."""
     file = timings_path(path)
     times: dict[tuple[str, ...], float] = {}
     if not file.exists():
@@ -183,7 +183,7 @@ def _write(path: Path, records: Records) -> None:
 
 
 def tasks_of(records: Sequence[Mapping[str, Any]]) -> list[Task]:
-    """The tasks that give these records again."""
+    """Return the tasks that reproduce these records."""
     grouped: dict[str, Task] = {}
     for record in records:
         task = Task(
@@ -203,7 +203,7 @@ def tasks_of(records: Sequence[Mapping[str, Any]]) -> list[Task]:
 
 
 def compare(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """What differs between two records, by path: both values; None where one has it not."""
+    """Return the differences of two records, by path: both values; None if one is missing."""
     before, after = dict(_flat("", old)), dict(_flat("", new))
     return {
         path: (before.get(path), after.get(path))
@@ -223,7 +223,7 @@ def _flat(path: str, value: Any) -> list[tuple[str, Any]]:
 
 
 def relative_change(pair: tuple[Any, Any]) -> float:
-    """How far two numbers are apart beside the larger; inf of anything else that differs."""
+    """Return the relative difference of two numbers; inf for other values that differ."""
     if not all(isinstance(value, int | float) for value in pair):
         return float("inf")
     return abs(pair[0] - pair[1]) / max(abs(pair[0]), abs(pair[1]))
@@ -235,16 +235,16 @@ def rerun(
     workers: Workers = HERE,
     advance: Callable[[int], None] = lambda steps: None,
 ) -> dict[str, Any]:
-    """Run again what made some records, and say what came out differently.
+    """Reproduce records, and return the differences.
 
     Parameters
     ----------
     records
-        Of `read_records`.
+        Records from `read_records`.
     workers
-        Where they are run.
+        Where to run them.
     advance
-        Called with the number of records that are done, as they come.
+        Called with the number of finished records.
 
     Returns
     -------

@@ -54,7 +54,7 @@ _SIGMAS = 4.0
 
 
 class Example(NamedTuple):
-    """One trial of K steps, and what some filters make of it, by their labels.
+    """One trial of K steps, and the results of some filters, by label.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Claim(NamedTuple):
 
 
 def paper_scene() -> Scene:
-    """The paper's world, cut to its 20 epochs."""
+    """Return the world of the paper, with its 20 epochs."""
     return scenes.get({"name": "camsap2013", "steps": STEPS - 1})
 
 
@@ -94,18 +94,18 @@ def tracking_experiment(
     world: Scene | None = None,
     filters: Filters = FILTERS,
 ) -> dict[str, Any]:
-    """The tracking paper's experiment.
+    """Run the experiment of the tracking paper.
 
     Parameters
     ----------
     trials, seed
-        How many, and of which random numbers.
+        Number of trials, and the random seed.
     advance
         Called after every epoch of every filter.
     trade
-        Also run ET-KF over `THRESHOLDS`: its error against how often it projects.
+        Also run ET-KF over `THRESHOLDS`: its error versus its rate of projections.
     world
-        Another scene in place of `paper_scene`.
+        Another scene instead of `paper_scene`.
     filters
         Label -> name and options. KF, KF-ortho, UC-KF and the iterated EKF must be among them.
 

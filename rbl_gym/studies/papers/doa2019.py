@@ -44,7 +44,7 @@ _NEAR = 6.0
 
 
 def doa_experiment(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
-    """Every method at every noise of both settings, with the constrained Cramer-Rao bound.
+    """Run every method at every noise of both settings, with the constrained Cramer-Rao bound.
 
     Returns
     -------

@@ -46,11 +46,11 @@ class Setting(NamedTuple):
     low, high
         Corners of the cube the anchors are drawn from, metres.
     anchors
-        None: drawn anew for every trial; an int: that many drawn once; or places (M, 3).
+        None: drawn again for every trial; an int: this number drawn once; or positions (M, 3).
     perturbation_m
-        Standard deviation of the tags' places.
+        Standard deviation of the tag positions.
     tags
-        (N, 3), as the estimators know them.
+        (N, 3), as known to the estimators.
     """
 
     low: float
@@ -82,16 +82,16 @@ def static_experiment(
     seed: int,
     advance: Advance = silent,
 ) -> dict[str, Any]:
-    """Every method at every reference range of every setting, with the bounds.
+    """Run every method at every reference range of every setting, and compute the bounds.
 
     Parameters
     ----------
     name
-        What the result calls itself.
+        Name of the result.
     settings
         By label: `static_settings`, or others.
     trials, seed
-        Of each setting and reference range, and of which random numbers.
+        Number of trials of each setting and reference range, and the random seed.
     advance
         Called after every reference range of every setting.
 
