@@ -1,9 +1,9 @@
-"""Layouts from a list of candidates, by what each of them tells at the poses of the zones.
+"""Choose layouts from a list of candidates, by their information at the poses of the zones.
 
 Information is a sum over the anchors, so that of a candidate is computed once, and a layout is a
-choice of candidates. What is made small is how far the zones are from their requirements, or b
-where none has one; for layouts that must survive the loss of any one anchor, the worst that is
-left. The layouts are choices ``list[int]`` of candidates, those that stay come first.
+choice of candidates. The objective is the distance of the zones from their requirements, or b
+without requirements. For layouts that must survive the loss of any one anchor, it is the worst
+remaining case. The layouts are choices ``list[int]`` of candidates, those that stay come first.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _CHUNK = 64
 
 
 class ZonePoses(NamedTuple):
-    """Poses of a zone, and what is asked of them.
+    """Poses of a zone, and their requirements.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Stock(NamedTuple):
 
     @property
     def asks(self) -> bool:
-        """Whether any zone has a requirement."""
+        """Return whether any zone has a requirement."""
         return any(zone.limits.any() for zone in self.zones)
 
 
@@ -91,7 +91,7 @@ Base = Sequence[FloatArray]  # information (L, T, 6, 6) of each zone
 
 
 def value(stock: Stock, chosen: Sequence[int], survive: int = 0) -> float:
-    """What the search makes small; with requirements, those are met where it is at most 1.
+    """Return the objective of the search; requirements are met if it is at most 1.
 
     The relative error at the place that fills the share of its zone, of the zone where it is
     largest, with a hundredth of the mean relative error. Without requirements, b.
@@ -112,7 +112,7 @@ def value(stock: Stock, chosen: Sequence[int], survive: int = 0) -> float:
 def grown(
     stock: Stock, chosen: Sequence[int], count: int, survive: int = 0
 ) -> Iterator[tuple[list[int], float]]:
-    """Layouts of more and more anchors, each the one before with the candidate that helps most.
+    """Return greedy layouts: each is the previous one plus the candidate that helps most.
 
     Ends with `count` anchors, or where no candidate is left.
 
@@ -136,7 +136,7 @@ def grown(
 def swapped(
     stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0, sweeps: int = 20
 ) -> tuple[list[int], float]:
-    """A layout after exchanges of one anchor for one candidate, as long as they help; its value.
+    """Exchange single anchors for candidates while it helps; return the layout and its value.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def swapped(
 def dropped(
     stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
 ) -> tuple[list[int], float]:
-    """The layout without the anchor that is missed least; the first `keep` stay.
+    """Return the layout without the least important anchor; the first `keep` are kept.
 
     Arguments as `swapped`.
     """
@@ -177,7 +177,7 @@ def dropped(
 
 
 def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0) -> list[int]:
-    """A layout that still meets the requirements, after exchanges that save most.
+    """Return a layout that still meets the requirements, after exchanges that save most cost.
 
     Arguments as `swapped`.
     """
@@ -202,7 +202,7 @@ def cheaper(stock: Stock, chosen: Sequence[int], keep: int = 0, survive: int = 0
 def all_choices(
     stock: Stock, count: int, keep: int = 0, survive: int = 0
 ) -> tuple[list[int], float]:
-    """The best of all layouts of `count` candidates; the first `keep` candidates stay.
+    """Return the best of all layouts of `count` candidates; the first `keep` are kept.
 
     Arguments as `swapped`.
     """

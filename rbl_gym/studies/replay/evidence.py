@@ -1,4 +1,4 @@
-"""Logs of one length under many suppositions at once: how likely each makes their ranges."""
+"""Compute the likelihood of ranges under many hypotheses at once, for logs of one length."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _TOGETHER = 64
 
 
 class Trial(NamedTuple):
-    """A recording as it is supposed to be, and how it is filtered."""
+    """A recording under a hypothesis, and its settings."""
 
     recording: Recording
     settings: Settings
 
 
 class Evidence(NamedTuple):
-    """What B trials make of K epochs.
+    """Results of B trials over K epochs.
 
     Attributes
     ----------
@@ -60,9 +60,9 @@ class Evidence(NamedTuple):
 
 
 def evidence(trials: Sequence[Trial]) -> Evidence:
-    """The likelihood of recordings of the same epochs and links, each under its own supposition.
+    """Return the likelihood of recordings with the same epochs and links, one per hypothesis.
 
-    A trial that cannot be filtered is minus infinity everywhere.
+    It is minus infinity for a trial that cannot be filtered.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def _readings(trials: list[Trial]) -> Iterator[Reading]:
 
 
 def std_of(recording: Recording, settings: Settings) -> FloatArray:
-    """Standard deviations (K, M, N) of the ranges."""
+    """Return the standard deviations (K, M, N) of the ranges."""
     own = own_std(recording, settings)
     if own is not None:
         return own

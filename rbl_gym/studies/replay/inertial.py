@@ -1,4 +1,4 @@
-"""A recording with an inertial sensor: the epochs it covers, and how the body stands at first."""
+"""Prepare a recording with an inertial sensor: the covered epochs, and the initial attitude."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LOOK_S, _TILT_RAD = 0.25, np.deg2rad(3.0)
 
 
 def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> Recording:
-    """The epochs for which there are readings of the inertial sensor, and a margin.
+    """Return the epochs with readings of the inertial sensor, including a margin.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def covered(recording: Recording, settings: Settings, margin_s: float = 0.0) -> 
 
 
 def clocked(recording: Recording, settings: Settings) -> InertialLog | None:
-    """The readings on the clock of the ranges."""
+    """Return the readings on the clock of the ranges."""
     log = recording.inertial
     return None if log is None else log._replace(times=log.times - settings.inertial.imu_offset_s)
 
@@ -66,7 +66,7 @@ def standing(
     settings: Settings,
     prior: tuple[FloatArray, FloatArray, FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A prior with roll and pitch by gravity; its yaw stays, and how well that is known."""
+    """Return a prior with roll and pitch from gravity; its yaw and yaw variance are unchanged."""
     log = clocked(recording, settings)
     assert log is not None
     rotation, translation, covariance = prior

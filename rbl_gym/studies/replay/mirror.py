@@ -1,4 +1,4 @@
-"""Does a mirror pose explain a recording as well? Both are followed, and the ranges judge."""
+"""Test whether a mirror pose explains a recording equally well: track and compare both."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def other_pose(
     track: tuple[FloatArray, FloatArray, FloatArray],
     volume: FloatArray | None = None,
 ) -> Mirror | None:
-    """The mirror pose of a track where the ranges do not rule it out at once; else None.
+    """Return the mirror pose of a track, or None if the ranges exclude it at once.
 
     Parameters
     ----------
@@ -183,10 +183,10 @@ def _update(
 
 
 def covering(other: Mirror, track: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
-    """Covariances (K, 6, 6) of the track's beliefs, of both poses where both are alive.
+    """Return covariances (K, 6, 6) of the track, which include both poses if both are alive.
 
-    Second moments about the track's pose, each pose weighed by its odds. A belief that is wide
-    enough already stays.
+    They are second moments about the pose of the track, each pose weighted by its odds. A belief
+    that is already wide enough is unchanged.
     """
     rotation, translation, covariance = track
     step = np.concatenate(
@@ -201,7 +201,7 @@ def covering(other: Mirror, track: tuple[FloatArray, FloatArray, FloatArray]) ->
 
 
 def is_outside(volume: FloatArray, translation: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Where places (..., 3) are outside a box (2, 3) by more than three standard deviations."""
+    """Return whether positions (..., 3) are outside a box (2, 3) by more than three sigma."""
     margin = _APART * np.sqrt(np.einsum("...ii->...i", covariance)[..., 3:])
     off = (translation < volume[0] - margin) | (translation > volume[1] + margin)
     return np.asarray(off.any(axis=-1))

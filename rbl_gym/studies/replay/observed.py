@@ -1,4 +1,4 @@
-"""What the ranges of a recording determine of the body's pose, and since when."""
+"""Find which pose directions the ranges of a recording determine, and since when."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _THIN = 0.01
 
 
 class Observed(NamedTuple):
-    """Directions of a pose of six that are known, epoch by epoch.
+    """The known directions of the pose, epoch by epoch.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Observed(NamedTuple):
 
 
 def observed(track: Track, tags: FloatArray) -> Observed:
-    """What the beliefs (K,) of a track say of themselves; tags (N, 3)."""
+    """Return the known directions of the beliefs (K,) of a track; tags (N, 3)."""
     Q, P = track.rotation, track.covariance
     # Of the tags' centre: v + w x Q c.
     T = np.broadcast_to(np.eye(6), P.shape).copy()
@@ -57,7 +57,7 @@ def observed(track: Track, tags: FloatArray) -> Observed:
 
 
 def rank_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], list[str]]:
-    """Rank of the pose at the end, the time since when, and notes on what is not known."""
+    """Return the final rank of the pose, the time since when, and notes on unknown directions."""
     found, times = observed(track, recording.tags), track.times - track.times[0]
     rank = found.turns + found.places
     result: dict[str, Any] = {"rank": int(rank[-1]), "rank_since_s": _since(rank, times)}
@@ -79,7 +79,7 @@ def rank_figures(recording: Recording, track: Track) -> tuple[dict[str, Any], li
 
 
 def is_line(tags: FloatArray) -> bool:
-    """Whether tags (N, 3) are about in a line, or one: no range tells a rotation about it."""
+    """Return whether tags (N, 3) are one or nearly collinear: rotation about them is unknown."""
     values = np.linalg.svd(tags - tags.mean(axis=0), compute_uv=False) ** 2
     return len(tags) < 3 or bool(values[1] <= _THIN * values[0])
 

@@ -1,4 +1,4 @@
-"""Truth beside a track: which epochs have it, and what constant fault would explain the errors."""
+"""Match truth to a track, and find constant faults of the truth that would explain the errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SI = ((1e-3, "milliseconds"), (1e-6, "microseconds"), (1e-9, "nanoseconds"))
 def matched(
     truth: Truth, times: FloatArray, rotation: FloatArray, translation: FloatArray, gap_s: float
 ) -> tuple[FloatArray | None, FloatArray, BoolArray]:
-    """The truth at the epochs of a track: rotation (K, 3, 3), translation (K, 3), known (K,).
+    """Return truth at the epochs of a track: rotation (K, 3, 3), translation (K, 3), known (K,).
 
     The rotation is None where the truth has none. Between two of its poses it is interpolated where
     they are at most `gap_s` apart. A pose of the truth without such a neighbour is compared with
@@ -65,7 +65,7 @@ def matched(
 
 
 def check_overlap(truth: Truth, times: FloatArray, gap_s: float) -> None:
-    """A ValueError that names the gap where no epoch would have truth."""
+    """Raise ValueError with the gap if no epoch would have truth."""
     still = np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros((len(times), 3))
     if matched(truth, times, *still, gap_s)[2].any():
         return
@@ -130,7 +130,7 @@ class Judged(NamedTuple):
     has_rotation: bool = True
 
     def excess(self) -> float:
-        """Mean squared errors over what the beliefs expect of them: 1 where they are honest."""
+        """Return mean squared errors over their expectation: 1 if the beliefs are consistent."""
         if not self.has_rotation:
             place = ((self.translation - self.true_translation) ** 2).sum(axis=-1)
             return float((place / self.place_variance).mean())
@@ -150,7 +150,7 @@ class Judged(NamedTuple):
 def fault_hints(
     at: Callable[[float, bool], Judged], seen: Callable[[FloatArray], FloatArray], planar: bool
 ) -> list[str]:
-    """Constant faults of the truth that explain most of the errors, at most two.
+    """Return at most two constant faults of the truth that explain most of the errors.
 
     Tried: the order and the direction of the quaternions, the unit of the places, a shift of
     time, and, alone or on top of these, a rigid transform of the world frame or of the body frame.
