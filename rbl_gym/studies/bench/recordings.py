@@ -78,7 +78,7 @@ def _load(items: tuple[tuple[str, Any], ...], stamps: tuple[tuple[int, int], ...
 
 
 class Stressed(NamedTuple):
-    """A recording as filters are told it under a condition."""
+    """A recording under a condition, as given to filters."""
 
     told: Recording
     settings: replay.Settings

@@ -130,7 +130,7 @@ def _draws(scene: Scene, true: Scene, trials: int, entropy: list[int]) -> simula
 def _told(
     scene: Scene, condition: str, anchors: FloatArray, rng: np.random.Generator
 ) -> tuple[Scene, FloatArray]:
-    """The scene and the anchors (B, M, 3) that filters are told."""
+    """Return the scene and the anchors (B, M, 3) as known to filters."""
     if condition == "anchor-off":
         return scene, off_by(anchors, ANCHOR_ERROR_M, rng)
     if condition == "tag-off":

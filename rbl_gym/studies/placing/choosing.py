@@ -168,7 +168,7 @@ def _around(
 
 
 def _first(anchors: FloatArray, points: FloatArray) -> FloatArray:
-    """The anchors, then those of the points that are none of them."""
+    """Return the anchors, then the points that are not among them."""
     known = (np.abs(points[:, None] - anchors).max(axis=-1) < 1e-9).any(axis=1)
     return np.concatenate([anchors, points[~known]])
 
@@ -221,7 +221,7 @@ def fewest_anchors(
     starts = path, _growth(plain, keep, max(path), survive)
 
     def attempt(count: int, more: list[FloatArray]) -> tuple[FloatArray, list[Judged], bool]:
-        """The best layout of so many anchors, from all starts, and what it promises."""
+        """Return the best layout of a number of anchors, from all starts, and its results."""
         some = rng.permutation(np.arange(keep, len(points)))[: count - keep].tolist()
         paths = [path[count] for path in starts if count in path]
         tried = [swapped(stock, path, keep, survive) for path in [*paths, [*range(keep), *some]]]
@@ -260,7 +260,7 @@ def fewest_anchors(
 
 
 def _growth(stock: Stock, keep: int, most: int, survive: int) -> dict[int, list[int]]:
-    """Number -> the greedy choice of so many, the first `keep` among them."""
+    """Return the greedy choice by number of anchors, with the first `keep` among them."""
     path = {keep: list(range(keep))}
     for chosen, reached in grown(stock, range(keep), most, survive):
         path[len(chosen)] = chosen

@@ -14,15 +14,15 @@ from rbl_gym.recordings.recording import Recording
 
 __all__ = ["contradicts", "nis_curve", "residual_tables"]
 
-# A filter contradicts its data where the normalised innovations squared of a log, or of a tenth of
-# it, are more than so many times what they should be, or so large a share of ranges is refused ...
+# The data contradict a filter if the normalised innovations squared of a log, or of a tenth of it,
+# exceed this multiple of their expectation, or this share of ranges is rejected ...
 MOST_NIS, MOST_REFUSED, _PART = 1.5, 0.2, 0.1
-# ... and chance does not explain it.
+# ... and this is not random.
 _CHANCE = 1e-6
 _BLOCKS = 20
-# And where the squares of an anchor's or a tag's whitened innovations, none counted beyond a
-# refused one, are on average so large, and so many times what the others have; or more than half
-# of a link's (of so many ranges at least) are beyond two standard deviations.
+# Also if the mean squared whitened innovation of an anchor or tag, clipped at that of a rejected
+# one, exceeds this value and this multiple of that of the others; or if more than half of those of
+# a link (with this number of ranges at least) exceed two standard deviations.
 _MOST_SQUARE, _BEYOND_OTHERS, _FAR, _FEWEST = 2.5, 2.0, 2.0, 20
 
 

@@ -36,7 +36,7 @@ class Evidence(NamedTuple):
     Attributes
     ----------
     log_likelihood, nis, dof
-        As of `estimators.Innovations`, (B, K).
+        As in `estimators.Innovations`, (B, K).
     rotation, translation
         Poses after every epoch, (B, K, 3, 3) and (B, K, 3).
     residual

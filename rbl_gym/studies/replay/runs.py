@@ -88,7 +88,7 @@ def _named(run: str, work: Callable[[], Any]) -> Any:
 
 
 def _joined(found: list[TrackErrors]) -> TrackErrors:
-    """Errors of several runs as those of one; what one run does not tell is not told."""
+    """Join the errors of several runs; figures missing in one run are left out."""
 
     def told(arrays: list[FloatArray | None]) -> FloatArray | None:
         known = [a for a in arrays if a is not None]

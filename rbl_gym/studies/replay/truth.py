@@ -17,8 +17,8 @@ _LONG_STEP_S = 10.0
 # A fault is named where the mean square of the errors is at least this much of what the beliefs
 # expect, and where mending it leaves less than this share of it.
 _LARGE, _EXPLAINED = 0.5, 0.25
-# A constant transform explains any error of a body that stands still: it has to explain more of
-# one that moves further than the error, or the errors are so many times what is expected.
+# A constant transform explains any error of a body at rest. For a body that moves further than the
+# error, it must explain more, or the errors must exceed this multiple of their expectation.
 _MOST_EXPLAINED, _HUGE = 0.1, 4.0
 # Of faults that explain about as much, the one named first is taken.
 _AS_GOOD = 1.5
