@@ -386,7 +386,9 @@ def test_a_file_takes_one_run_unless_it_is_replaced(tmp_path, short, capsys):
     _, first = bench(tmp_path, *options)
     status, kept = bench(tmp_path, *options, "--seed", 1)
     assert (status, kept) == (2, first)
-    assert "has records of seed 0, this run is of 1" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "has records of seed 0, this run is of 1" in said
+    assert "use --out F, or --fresh, which drops the old records" in said
     status, other = bench(tmp_path, *options, "--seed", 1, "--fresh")
     assert status == 0
     assert rows(other)[0]["tags_m"] != rows(first)[0]["tags_m"]
@@ -455,7 +457,10 @@ def test_a_missing_library_is_said_before_a_bar_is_drawn(tmp_path, short, capsys
     status, data = bench(tmp_path, "--scenes", short, "--jobs", "2")
     assert (status, data) == (2, b"")
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == "rbl-gym: this command needs the extra parallel: pip install 'rbl-gym[parallel]'"
+    assert line == (
+        "rbl-gym: this command needs the extra parallel: pip install 'rbl-gym[parallel]', or leave "
+        "out --jobs"
+    )
 
 
 # --- recordings -----------------------------------------------------------------------------

@@ -82,8 +82,25 @@ def test_columns_are_mapped_and_others_are_named_once(tmp_path):
 def test_a_column_that_is_mapped_and_not_there(tmp_path):
     with pytest.raises(ValueError, match=r"ranges.csv, line 1: missing column 'to' for anchor"):
         read_as(tmp_path, LONG, columns={"anchor": "to"})
-    with pytest.raises(ValueError, match=r"missing column 't', .* say which it is by columns, t=N"):
+    with pytest.raises(ValueError, match=r"missing column 't', .* say .*, --columns t=NAME$"):
         read(tmp_path, LONG.replace("t,", "when,", 1))
+    message = r"anchors.csv, line 1: missing column 'x', 'y', 'z', got .* "
+    names = "anchors.x=NAME,anchors.y=NAME,anchors.z=NAME"
+    with pytest.raises(ValueError, match=f"{message}.*--columns {names}$"):
+        read(tmp_path, anchors="anchor,px,py,pz\nA,0,0,1\n")
+    columns = {f"anchors.{axis}": f"p{axis}" for axis in "xyz"}
+    files = write(tmp_path, ranges=LONG, anchors=ANCHORS.replace("x,y,z", "px,py,pz"), tags=TAGS)
+    assert read_recording(**files, format=Format(columns=columns)).anchors.shape == (3, 3)
+
+
+def test_a_pair_of_columns_the_wrong_way_round(tmp_path):
+    text = LONG.replace("t,", "zeit,", 1)
+    with pytest.raises(ValueError, match=r"'zeit' is no quantity; did you mean time=zeit\?$"):
+        read_as(tmp_path, text, columns={"zeit": "time"})
+    assert len(read_as(tmp_path, text, columns={"time": "zeit"}).times) == 2
+    files = write(tmp_path, ranges=LONG, anchors=ANCHORS.replace("x", "ost", 1), tags=TAGS)
+    with pytest.raises(ValueError, match=r"did you mean anchors.x=ost\?$"):
+        read_recording(**files, format=Format(columns={"anchors.ost": "x"}))
 
 
 def test_wide_columns_by_a_pattern(tmp_path):

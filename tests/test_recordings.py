@@ -157,7 +157,7 @@ ERRORS = {
     "ragged wide": ({"ranges": WIDE + "0.2\n"}, r"ranges.csv, line 4: must have 5 .*, got 1"),
     "missing column": (
         {"anchors": "anchor,x,z\nA,0,0\n"},
-        r"anchors.csv, line 1: missing column 'y', got \['anchor', 'x', 'z'\]; say .* y=NAME",
+        r"anchors.csv, line 1: missing column 'y', got \['anchor', 'x', 'z'\]; .* anchors.y=NAME$",
     ),
     "missing range": (
         {"ranges": "# x\nt,anchor,tag\n0,A,1\n"},

@@ -240,6 +240,8 @@ def test_free_points_fill_the_box_and_leave_the_obstacles_out():
         ("region.high", [9, 5, 2], "region must lie inside the room"),
         ("region.high", [7, 5, 4], "region must lie inside the room"),
         ("region.size", 1, "region has an unknown key 'size'"),
+        ("region.position_m", 0.3, "region has an unknown key 'position_m'; it may have low, high"),
+        ("region.heading_deg", 3, "use [[zones]], in place of [region]"),
         ("region.high", None, "region must have the key 'high'"),
         ("obstacles", {"low": 1}, "obstacles must be a list"),
         ("obstacles.0", 4, "obstacles[0] must be a table"),

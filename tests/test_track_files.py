@@ -41,6 +41,9 @@ def track(seed=0) -> Any:
 def test_a_csv_holds_all_of_a_track(tmp_path):
     want = track()
     write_track(tmp_path / "track.csv", want)
+    for name in ("new/of/track.csv", "other/track.tum"):  # in folders that are made
+        write_track(tmp_path / name, want)
+    assert (tmp_path / "new/of/track.csv").read_text() == (tmp_path / "track.csv").read_text()
     got: Any = read_track(tmp_path / "track.csv")
     for name in ("times", "translation", "nis", "dof", "rank"):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)

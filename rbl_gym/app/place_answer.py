@@ -6,6 +6,10 @@ from typing import Any, NamedTuple
 
 # Verdicts also have a sign and a word, because not everyone can distinguish colours.
 SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? UNDECIDED", "no requirement": "-"}
+HOW_TO_ASK = (
+    "To set one, use [[zones]] in the file, in place of [region], each with low, high, position_m "
+    "or heading_deg, and share."
+)
 _NAMES = {
     "position_m": ("horizontal position", "m"),
     "height_m": ("height", "m"),

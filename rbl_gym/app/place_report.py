@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from rbl_gym.app.page import digits
+from rbl_gym.app.place_answer import HOW_TO_ASK
 from rbl_gym.app.place_survey import survey_table
 from rbl_gym.app.tables import new_console, new_table
 
@@ -49,16 +50,17 @@ def verdict(result: dict[str, Any]) -> str:
     survives = ", with any one anchor missing" if result["survive"] else ""
     count = f"{result['n_anchors']} anchors{survives}"
     if result["verdict"] == "no requirement":
-        return f"{count}: no zone has a requirement."
+        return f"{count}: no zone has a requirement. {HOW_TO_ASK}"
     words = {"pass": "PASS", "fail": "FAIL", "undecided": "UNDECIDED"}
     zones = [row for row in result["zones"] if row["verdict"] != "no requirement"]
     passed = sum(row["verdict"] == "pass" for row in zones)
     text = f"{words[result['verdict']]}: {count}, {passed} of {len(zones)} zones pass."
     fewest = result.get("fewest")
     if fewest is None:
-        return text
+        how = "--optimise" if "given" in result["layouts"] else "--fewest"
+        return f"{text} Try {how}, or more --anchors." if result["verdict"] == "fail" else text
     if not fewest["met"]:
-        return f"{text} No layout with so many was found that meets the requirements."
+        return f"{text} No layout with so many meets the requirements; allow more by --anchors."
     less = fewest["one_less"]
     if less is None:
         return f"{text} That is the least number that was allowed."

@@ -144,8 +144,7 @@ def of_mapping(
     if region is not None:
         zones = (_box_zone("region", *_corners("region", region)),)
     elif "region" in tables:
-        values = read_table("region", tables["region"])
-        zones = (_box_zone("region", values["low"], values["high"]),)
+        zones = (_region(tables["region"]),)
     else:
         zones = _zones(lists["zones"])
     return check_problem(
@@ -271,6 +270,18 @@ def _zones(rows: list[dict[str, Any]]) -> tuple[Zone, ...]:
             Zone(title, polygon, low, high, row["weight"], row["attitude"], **asked, share=share)
         )
     return tuple(zones)
+
+
+def _region(table: Any) -> Zone:
+    for key in as_table(table, "region"):
+        if key in (*_REQUIREMENTS, "share"):
+            raise ValueError(
+                f"region has an unknown key {key!r}; it may have low, high: for a "
+                "requirement use [[zones]], in place of [region], each with low, high, "
+                f"{', '.join(_REQUIREMENTS)}, share"
+            )
+    values = read_table("region", table)
+    return _box_zone("region", values["low"], values["high"])
 
 
 def _box_zone(name: str, low: Any, high: Any) -> Zone:

@@ -87,7 +87,7 @@ class Format:
 
     def of(self, file: str) -> Source:
         """Return the column names and row selection of one of the files."""
-        return Source(*(_of(file, names) for names in (self.columns, self.where)))
+        return Source(_of(file, self.columns), _of(file, self.where), file)
 
 
 def _of(file: str, names: Mapping[str, str]) -> dict[str, str]:

@@ -57,7 +57,7 @@ def read_inertial(
     force = FORCE_UNITS[check_one_of("force_unit", force_unit, list(FORCE_UNITS))]
     for name in columns or {}:
         check_one_of("columns", name, list(_COLUMNS))
-    table = read_table(path, Source(dict(columns or {})))
+    table = read_table(path, Source(dict(columns or {}), file="imu"))
     table.require(*_COLUMNS)
     times = table.times()
     values = [table.numbers(name) for name in _COLUMNS[1:]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,6 +36,10 @@ _OTHER_NAMES = {
     "run": ("run", "run_id"),
     **{f"a{axis}": (f"a{axis}", f"anchor_{axis}") for axis in "xyz"},
 }
+_QUANTITIES = {
+    *_OTHER_NAMES, *itertools.chain(*_OTHER_NAMES.values()), "std", "var", "valid", "run", "id",
+    *"xyz", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz", "left", "right",
+}  # fmt: skip
 _UNIT = re.compile(
     "\\s*[\\[(](|s|ms|[u\u00b5\u03bc]s|ns|m|cm|mm|deg|rad)[\\])]$|_(s|ms|us|ns|m|cm|mm)$"
 )
@@ -45,11 +50,18 @@ class Source(NamedTuple):
 
     `columns` maps the content of a column to its name in the file. ``{"*": "B_*"}`` names all
     columns with this prefix. A unit may follow a name in brackets, ``"stamp[ms]"``. `where` gives,
-    by column, the cell that the rows to use must have.
+    by column, the cell that the rows to use must have. `file` is the kind of the file in a
+    `Format`, ``"ranges"`` or ``"anchors"``; empty if it is none of these.
     """
 
     columns: Mapping[str, str] = {}
     where: Mapping[str, str] = {}
+    file: str = ""
+
+    def given(self, **names: str) -> str:
+        """Return the names of columns as `Format.columns` and the command line take them."""
+        prefix = "" if self.file == "ranges" else f"{self.file}."
+        return ",".join(f"{prefix}{content}={name}" for content, name in names.items())
 
 
 AS_NAMED = Source()
@@ -67,15 +79,21 @@ class Table(NamedTuple):
     decimal: str  # "." or ","
     cut: int | None  # line of a last row that was cut off and left out
     chosen_by: tuple[str, ...]  # names in the file of the columns that selected the rows
+    source: Source = AS_NAMED
 
     def require(self, *columns: str) -> None:
         """Raise ValueError unless all `columns` exist."""
-        for column in columns:
-            if column not in self.columns:
-                raise ValueError(
-                    f"{self.path}, line {self.header_line}: missing column {column!r}, got "
-                    f"{[*self.names.values()]!r:.200}; say which it is by columns, {column}=NAME"
-                )
+        missing = [column for column in columns if column not in self.columns]
+        if not missing:
+            return
+        text = (
+            f"{self.path}, line {self.header_line}: missing column "
+            f"{', '.join(map(repr, missing))}, got {[*self.names.values()]!r:.200}"
+        )
+        if self.source.file:
+            names = self.source.given(**dict.fromkeys(missing, "NAME"))
+            text += f"; say which it is by columns, --columns {names}"
+        raise ValueError(text)
 
     def name(self, column: str) -> str:
         """Return the name of `column` in the file."""
@@ -219,7 +237,7 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
         raise ValueError(f"{where}: column {name!r} comes twice")
     by_name = dict(zip(header, cells.columns, strict=True))
     said = {role: _name_and_unit(name) for role, name in source.columns.items()}
-    names = _roles(where, header, {role: name for role, (name, _) in said.items()})
+    names = _roles(where, header, {role: name for role, (name, _) in said.items()}, source)
     units |= {name: unit for name, unit in said.values() if unit}
     rows = np.ones(len(cells.lines), dtype=bool)
     for column, want in source.where.items():
@@ -239,6 +257,7 @@ def read_table(path: AnyPath, source: Source = AS_NAMED, headless: Sequence[str]
         cells.decimal,
         cells.cut,
         tuple(names.get(column, column) for column in source.where),
+        source,
     )
     return table if rows.all() else table.select(rows)
 
@@ -260,7 +279,9 @@ def _column(cells: tuple[str, ...]) -> NDArray[np.object_]:
     return column
 
 
-def _roles(where: str, header: list[str], columns: dict[str, str]) -> dict[str, str]:
+def _roles(
+    where: str, header: list[str], columns: dict[str, str], source: Source
+) -> dict[str, str]:
     """Return the names in the file by the content of the columns."""
     if "time" in columns:
         columns["t"] = columns.pop("time")
@@ -279,6 +300,9 @@ def _roles(where: str, header: list[str], columns: dict[str, str]) -> dict[str, 
         if "{" in name:
             continue  # a pattern of links
         if name not in header:
+            if role in header and role not in _QUANTITIES and name in _QUANTITIES:
+                swapped = source.given(**{name: role})
+                raise ValueError(f"{where}: {role!r} is no quantity; did you mean {swapped}?")
             raise ValueError(f"{where}: missing column {name!r} for {role}, got {header!r:.200}")
         names[role] = name
     taken = set(names.values())

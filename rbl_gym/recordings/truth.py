@@ -122,18 +122,18 @@ def read_truth(
         if not rows.any():
             raise ValueError(f"{table.path}: has no run {run!r} in column {table.name('run')!r}")
         table = table.select(rows)
-    table.require("x", "y")
+    once = times is not None and len(table.lines) == 1  # one pose for all times
+    table.require(*(() if once else ("t",)), "x", "y")
     places = [axis for axis in "xyz" if axis in table.columns]
     rotation, angles = _rotations(table)
     planar = len(places) == 2
     translation = np.pad(table.points(places), ((0, 0), (0, 3 - len(places))))
     said.read(table, ("t", "run", *places, *angles))
     form = _form(table, len(angles), planar)
-    if "t" not in table.columns and times is not None and len(table.lines) == 1:
+    if "t" not in table.columns and times is not None and once:
         shape = len(times), 3
         held = None if rotation is None else np.broadcast_to(rotation, (*shape, 3))
         return Truth(times, held, np.broadcast_to(translation, shape), planar, form)
-    table.require("t")
     unit = table.units.get("t")
     if unit is None and is_number(table.columns["t"][0]):
         # Poses may be rare, so their spacing does not distinguish seconds from milliseconds.

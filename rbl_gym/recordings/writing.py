@@ -72,7 +72,7 @@ def write_track(path: AnyPath, track: TrackFile) -> None:
     Parameters
     ----------
     path
-        Path of the file.
+        Path of the file. Its folder is made.
     track
         The track to write. An infinite NIS becomes an empty cell.
 
@@ -84,6 +84,7 @@ def write_track(path: AnyPath, track: TrackFile) -> None:
         If the file cannot be written.
     """
     check_track_path(path)
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     times = check_array("times", track.times, ("K",))
     q = rotations.quaternion(check_array("rotation", track.rotation, (len(times), 3, 3)))
     place = check_array("translation", track.translation, (len(times), 3))

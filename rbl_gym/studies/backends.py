@@ -76,7 +76,7 @@ def check(workers: Workers) -> None:
     jobs, backend, _ = workers
     if backend is None and jobs == 1:
         return
-    require("joblib", "parallel")
+    require("joblib", "parallel", instead="leave out --jobs" if backend is None else "")
     if backend == "dask":
         require("distributed", "parallel")
     elif backend == "ray":

@@ -112,8 +112,8 @@ def _check_same_run(where: Any, records: Records, tasks: Sequence[Task]) -> None
             if record[name] != common[name]:
                 raise ValueError(
                     f"{where} has records of {name} {record[name]}, this run is of "
-                    f"{common[name]}: a file takes one run (write another, or --fresh), and "
-                    "workers need the same versions"
+                    f"{common[name]}: a file takes one run: use --out F, or --fresh, which "
+                    "drops the old records; workers need the same versions"
                 )
 
 

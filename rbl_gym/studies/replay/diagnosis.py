@@ -10,8 +10,8 @@ from rbl_gym.studies.replay.consistency import MOST_NIS, MOST_REFUSED, consisten
 from rbl_gym.studies.replay.settings import Settings
 from rbl_gym.studies.replay.tracking import Track
 
-# Below this NIS per degree of freedom the filter is clearly pessimistic.
-_WIDE = 0.25
+# Below this NIS per degree of freedom the filter is pessimistic.
+_WIDE = 0.7
 
 
 def diagnose(
