@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import os
 import threading
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,10 +15,12 @@ from rbl_gym import placement, studio
 from rbl_gym.placement import scene_files
 from rbl_gym.placement.layout_files import read_layout
 from rbl_gym.placement.problem import PlacementTask
+from rbl_gym.studies.placing import design
 from rbl_gym.studies.placing.accuracy import accuracy
-from rbl_gym.studio import files, maps
+from rbl_gym.studio import files, keeping, maps, place
 from rbl_gym.studio.figures import body_figures, figures, usual_scores
 from rbl_gym.studio.panel import Shown, headline, length, status
+from rbl_gym.studio.place import PlacePage
 from rbl_gym.studio.rays import under_pointer
 from rbl_gym.studio.searches import add_best, optimise
 from rbl_gym.studio.state import (
@@ -432,6 +436,149 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(room, tmp_path):
 def test_a_layout_is_kept_as_it_is_worked_on(room, tmp_path):
     path = files.autosave(room, files.tables_of(room.world.base), tmp_path)
     np.testing.assert_array_equal(scene_files.problem(str(path)).fixed, room.anchors)
+
+
+def test_the_last_session_is_offered_unless_it_was_saved_since(room, tmp_path):
+    tables = files.tables_of(room.world.base)
+    more = add(room)
+    kept = files.autosave(more, tables, tmp_path)
+    saved, _ = files.save(more, tables, tmp_path, "by hand")
+    for seconds, offered in ((-5, True), (5, False)):
+        os.utime(saved, (kept.stat().st_mtime + seconds,) * 2)
+        found = files.last_session(room, tmp_path)
+        assert (found is not None) is offered
+    # Neither of these is a save of this problem.
+    saved.write_text(saved.read_text().replace('"uwb_room"', '"another"'))
+    (tmp_path / "broken.toml").write_text(f"# {files.HEAD}\nname =")
+    (tmp_path / "other.toml").write_text("name = 'uwb_room'\n")
+    for path in tmp_path.glob("*.toml"):
+        os.utime(path, (kept.stat().st_mtime + 5 * (path != kept),) * 2)
+    found = files.last_session(room, tmp_path)
+    assert found is not None
+    np.testing.assert_array_equal(found, more.anchors)
+
+
+# --- the page without a server ---------------------------------------------------------------
+
+
+class NoDisplay:
+    """Shows nothing."""
+
+    def __init__(self, *_):
+        self.panel = self
+
+    def offer_restore(self, visible):
+        self.offered = visible
+
+    def show(self, shown):
+        self.shown = shown
+
+    def notify(self, *_):
+        pass
+
+
+@pytest.fixture
+def opened(tmp_path, monkeypatch):
+    """Opens pages without a server; a search finds the grid around the fixed anchors."""
+    searched, pages = [], []
+
+    def search(problem, seed):
+        searched.append(problem.fixed)
+        grid = design.usual_layouts(problem, seed)["grid"][len(problem.fixed) :]
+        return design.Design(np.concatenate([problem.fixed, grid]), "grid", {})
+
+    def opening(start):
+        page = PlacePage(None, start, files.tables_of(start.world.base), tmp_path)
+        pages.append(page)
+        assert page.settle()
+        return page
+
+    monkeypatch.setattr(place, "Display", NoDisplay)
+    monkeypatch.setattr(place.design, "design_layout", search)
+    opening.searched = searched
+    yield opening
+    for page in pages:
+        page.stop()
+
+
+def designed(page: PlacePage) -> float:
+    """b of the designed layout, once it was searched beside the page."""
+    end = time.monotonic() + 30
+    while page._display.shown.others.get("designed") is None:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    return float(page._display.shown.others["designed"])
+
+
+def worse(room: State) -> State:
+    """Anchors near one another: much is to be gained."""
+    return open_state(room.world.base, snap(room.world, room.anchors * [0.2, 0.2, 1.0] + [2, 2, 3]))
+
+
+@with_kernels
+def test_an_optimised_layout_is_in_the_autosave(room, opened, tmp_path):
+    page = opened(worse(room))
+    before = page.state.score
+    page.optimise()
+    assert page.settle()
+    assert page.state.score < before
+    kept = scene_files.problem(str(tmp_path / "uwb_room-layout-autosave.toml")).fixed
+    np.testing.assert_array_equal(kept, page.state.anchors)
+
+
+@with_kernels
+def test_an_optimisation_is_in_the_autosave_as_it_goes_and_when_stopped(
+    room, opened, tmp_path, monkeypatch
+):
+    steps = [move(room, 0, np.array([0.1 * step, 0.0, 9.0])) for step in range(1, 5)]
+    clock, seen = [0.0], []
+
+    def kept():
+        found = scene_files.problem(str(tmp_path / "uwb_room-layout-autosave.toml")).fixed
+        return [np.array_equal(found, step.anchors) for step in steps].index(True)
+
+    def search(*_):
+        for number, better in enumerate(steps):
+            clock[0] = 0.6 * number
+            if number == 3:
+                page.stop_work()
+            yield 0.5, better
+            seen.append(kept())
+
+    monkeypatch.setattr(place.searches, "optimise", search)
+    monkeypatch.setattr(keeping, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    page = opened(room)
+    page.optimise()
+    assert page.settle()
+    # Once a second at most; and where it was stopped.
+    assert seen == [0, 0, 2]
+    assert kept() == 3
+
+
+def test_a_saved_layout_is_not_kept_once_more(room, opened, tmp_path):
+    page = opened(room)
+    page.edit(add)
+    page.settle()
+    path = tmp_path / "uwb_room-layout-autosave.toml"
+    page.save("by hand")
+    page.cut(share=0.2)
+    page.settle()
+    os.utime(path, (1, 1))
+    page.stop()
+    assert path.stat().st_mtime == 1
+    assert not opened(room)._display.offered
+
+
+def test_what_is_designed_of_a_saved_file_is_designed_freely(room, opened, tmp_path):
+    start = worse(room)
+    scene, _ = files.save(start, files.tables_of(room.world.base), tmp_path, "by hand")
+    page = opened(open_state(scene_files.problem(str(scene))))
+    assert designed(page) < 0.8 * page.state.score
+    assert [len(fixed) for fixed in opened.searched] == [0]
+    # Those that the user fixed stay.
+    again = opened(fix(page.state, 1))
+    assert designed(again) < again.state.score
+    np.testing.assert_array_equal(opened.searched[1], start.anchors[1:2])
 
 
 # --- the worker ------------------------------------------------------------------------------

@@ -118,6 +118,7 @@ def test_optimising_can_be_stopped_and_goes_on_while_the_slice_moves(served):
 def test_files_are_saved_in_the_folder_and_nowhere_else(served, tmp_path):
     page = served.page
     page.edit(state.add)
+    page.settle()
     page.save("hall")
     page.settle()
     page.write_report("hall")
@@ -211,7 +212,9 @@ def test_the_command_serves_a_file_with_its_tables_and_report(tmp_path, monkeypa
     assert main(["studio", WAREHOUSE, *arguments]) == 0
     assert seen["status"] == "Saved: hall.toml, hall.csv, hall.pdf"
     assert seen["anchors"].shape == (4, 3)
-    assert seen["url"] in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert seen["url"] in told
+    assert str(folder) in told
     # What only the file knows is kept: its region, its name.
     tables = scene_files.load(str(folder / "hall.toml"))
     assert tables["name"] == "warehouse"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.plan_options import add_plan_options, is_plan, read_plan, read_problem
@@ -101,6 +102,8 @@ def _studio(options: argparse.Namespace) -> int:
         ),
     )
     print(f"{page.url}   (Ctrl-C ends it)", flush=True)
+    if shown:
+        print(f"Layouts are saved in {Path(options.folder).resolve()}", flush=True)
     page.wait()
     return 0
 

@@ -6,6 +6,7 @@ of the old one when it is whole.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
@@ -88,14 +89,36 @@ def autosave(state: State, tables: Mapping[str, Any], folder: Path) -> Path:
 
 
 def last_session(state: State, folder: Path) -> FloatArray | None:
-    """Anchors of the autosave of a problem, where they differ from those of the state."""
+    """Anchors of the autosave of a problem, where they differ from those of the state.
+
+    None where there is no autosave, or the studio saved the problem in the folder after it.
+    """
     path = folder / f"{default_name(state.problem)}{_AUTOSAVE}.toml"
     try:
         anchors = scene_files.problem(str(path)).fixed
         open_state(state.world.base, anchors)
+        if _is_saved_since(path, state.problem.name):
+            return None
     except (ValueError, OSError, ModuleNotFoundError):
         return None
     return None if np.array_equal(anchors, state.anchors) else anchors
+
+
+def _is_saved_since(autosave: Path, name: str) -> bool:
+    """Whether the studio saved a problem of a name beside its autosave, and after it."""
+    written = autosave.stat().st_mtime_ns
+    for path in autosave.parent.glob("[!.]*.toml"):
+        # One that cannot be read is no save.
+        with contextlib.suppress(ValueError, OSError):
+            is_later = path.stat().st_mtime_ns > written and _is_ours(path)
+            if is_later and scene_files.load(str(path)).get("name") == name:
+                return True
+    return False
+
+
+def _is_ours(scene: Path) -> bool:
+    with scene.open("rb") as file:
+        return file.read(len(HEAD) + 2) == f"# {HEAD}".encode()
 
 
 def save_report(
@@ -126,9 +149,7 @@ def owned(folder: Path, name: str) -> Path:
     stem = folder / check_name(name)
     scene = stem.with_name(f"{stem.name}.toml")
     if scene.exists():
-        with scene.open("rb") as file:
-            ours = file.read(len(HEAD) + 2) == f"# {HEAD}".encode()
-        others = [] if ours else [scene]
+        others = [] if _is_ours(scene) else [scene]
     else:
         ends = (".csv", ".pdf")
         others = [p for p in (stem.with_name(f"{stem.name}{end}") for end in ends) if p.exists()]
@@ -168,7 +189,8 @@ def scene_text(state: State, tables: Mapping[str, Any], folder: Path) -> str:
         f"{len(anchors)} anchors, b = {state.score:.4g} m. All of them are listed as fixed: "
         "`rbl-gym place --scene` judges this layout, `rbl-gym studio` goes on with it.",
     ]
-    changed = {key: value for key, value in tables.items() if key != "$schema"}
+    named = {"name": state.problem.name, **tables}
+    changed = {key: value for key, value in named.items() if key != "$schema"}
     changed["anchors"] = {
         **tables.get("anchors", {}),
         "number": len(anchors),

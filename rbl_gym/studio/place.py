@@ -20,6 +20,7 @@ from rbl_gym.studies.placing import design
 from rbl_gym.studio import files, maps, searches, state
 from rbl_gym.studio.display import Display
 from rbl_gym.studio.figures import Others, body_figures, figures
+from rbl_gym.studio.keeping import Keeper
 from rbl_gym.studio.panel import Shown
 from rbl_gym.studio.rays import on_plane, under_pointer
 from rbl_gym.studio.state import Layout, State
@@ -55,7 +56,6 @@ class PlacePage:
         report: files.Report | None = None,
         seed: int = 0,
     ) -> None:
-        self._tables, self._folder = tables, folder
         self._report, self._seed = report, seed
         self.state = start
         self.figures = figures(start)
@@ -67,7 +67,7 @@ class PlacePage:
         self.status = "Drag an anchor. Click one to select it."
         self._progress: float | None = None
         self._others = Others()
-        self._autosave_found = files.last_session(start, folder)
+        self._keeper = Keeper(start, tables, folder)
         self._worker = Worker(self._failed)
         actions = {
             "undo": lambda: self.edit(state.undo),
@@ -91,7 +91,7 @@ class PlacePage:
             "load": self.load,
         }
         self._display = Display(server, start, actions, report is not None)
-        self._display.panel.offer_restore(self._autosave_found is not None)
+        self._display.panel.offer_restore(self._keeper.found is not None)
         self._worker.post(self._refine)
         threading.Thread(target=self._search, args=(start,), daemon=True).start()
 
@@ -200,7 +200,7 @@ class PlacePage:
         """Write the scene file and the mounting list into the folder."""
 
         def task() -> None:
-            paths = files.save(self.state, self._tables, self._folder, name)
+            paths = self._keeper.save(self.state, name)
             self._say("Saved", files.names(paths), "teal")
 
         self._worker.post(task)
@@ -223,7 +223,7 @@ class PlacePage:
 
         def task() -> None:
             try:
-                paths = files.save_report(now, self._tables, self._folder, name, report)
+                paths = self._keeper.save_report(now, name, report)
             except Exception as error:
                 self._worker.post(functools.partial(self._failed, error))
             else:
@@ -234,7 +234,7 @@ class PlacePage:
 
     def restore(self) -> None:
         """Put the layout of the last session in place."""
-        anchors = self._autosave_found
+        anchors = self._keeper.found
         if anchors is not None:
             restored = Layout(anchors, np.zeros(len(anchors), bool))
             self.edit(lambda now: state.set_layout(now, restored))
@@ -246,7 +246,7 @@ class PlacePage:
 
     def stop(self) -> None:
         """Keep the layout, and end the worker."""
-        self._worker.post(self._autosave)
+        self._worker.post(lambda: self._keeper.keep(self.state))
         self._worker.stop()
 
     # --- tasks of the worker ----------------------------------------------------------------
@@ -317,6 +317,7 @@ class PlacePage:
             self._adopt(better)
             self._progress = done
             self._show_coarse()
+            self._keeper.keep_meanwhile(self.state)
             yield
         gain = 100 * (1 - self.state.score / before)
         self._end_work()
@@ -324,7 +325,7 @@ class PlacePage:
         if gain >= 0.05:
             self.status = f"Optimised: b is {gain:.1f} % smaller."
         self._show()
-        yield from self._refined()
+        self._refine()
 
     def _end_work(self) -> None:
         """Leave an optimisation where it is."""
@@ -349,10 +350,10 @@ class PlacePage:
         self.map = maps.slice_map(self.state, maps.REFINED).beside(self.map)
         self._show()
         yield
+        self._keeper.keep(self.state)
+        yield
         self._others.search_usual(self.state.world, len(self.state.anchors))
         self._show()
-        yield
-        self._autosave()
 
     def _show(self) -> None:
         now = self.state
@@ -365,9 +366,8 @@ class PlacePage:
     def _search(self, now: State, apply: bool = False) -> None:
         """Design a layout: around the fixed anchors and in place of this one, or to compare."""
         world, count = now.world, len(now.anchors)
-        problem = now.problem if apply else world.problem.with_anchors(count)
         try:
-            found = design.design_layout(problem, self._seed).anchors
+            found = design.design_layout(now.problem, self._seed).anchors
         except Exception as error:
             self._worker.post(functools.partial(self._failed, error))
             return
@@ -376,16 +376,12 @@ class PlacePage:
             if not apply or not now.fixed.any():
                 self._others.designed[world.knobs, count] = found
             if apply:
-                stays = np.arange(count) < len(problem.fixed)
+                stays = np.arange(count) < now.fixed.sum()
                 self._edit(lambda at: state.set_layout(at, Layout(found, stays)))
             else:
                 self._show()
 
         self._worker.post(task)
-
-    def _autosave(self) -> None:
-        if self.state.past or self.state.future:
-            files.autosave(self.state, self._tables, self._folder)
 
     def _say(self, title: str, text: str, colour: str) -> None:
         self.status = f"{title}: {text}"
