@@ -68,7 +68,7 @@ class VectorEstimatePose(VectorWrapper, RecordConstructorArgs):
             self._scene = env.unwrapped.world  # pyright: ignore[reportAttributeAccessIssue]
         self._reward = reward_of(reward)
         self._viewer = viewer_of(observation)
-        ranged = "ranges" in env.single_observation_space  # pyright: ignore[reportOperatorIssue]
+        ranged = "ranges" in getattr(env.single_observation_space, "spaces", {})
         self._stacks = self._varied and ranged and _takes_stacks(env, self._scene, *self._named)
         self._parts = self._parted()
         self._state: Any = None

@@ -233,7 +233,7 @@ class TrackingEnv(StatedLength, gym.Env[Any, Any]):  # pyright: ignore[reportInc
             info["anchors"] = self._anchors.copy()
         observation["twist"] = at.twist
         if at.readings is not None and at.velocity is not None and at.bias is not None:
-            observation["inertial"] = at.readings
+            observation["inertial"] = at.readings.copy()
             info["velocity"], info["inertial_bias"] = at.velocity, at.bias
         if self.family is not None:
             observation = self.family.padded(observation, self.scene)
