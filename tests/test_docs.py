@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -81,7 +83,9 @@ def test_every_python_block_of_a_page_runs(page, monkeypatch, tmp_path, capsys):
         test_bags.write_bag(tmp_path / "flight", "ros1", types, messages)
     monkeypatch.setattr(design, "STAGES", (64, 64, 64))  # pages show how, not how well
     write_files_that_pages_read(tmp_path)
-    names: dict = {}
+    module = ModuleType("of_the_page")  # classes of a page can be pickled, as in a notebook
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    names = vars(module)
     for block in blocks(page, "python"):
         code = compile(block, str(page.name), "exec")
         if not FOREIGN.search(block):

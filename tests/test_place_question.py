@@ -395,6 +395,16 @@ def test_a_layout_that_survives(files, capsys):
     assert "with any one anchor missing" in place_report.verdict(result)
 
 
+def test_the_verdict_says_what_to_do_next():
+    result = {"survive": 0, "n_anchors": 6, "verdict": "fail", "zones": [{"verdict": "fail"}]}
+    said = place_report.verdict(result | {"layouts": {"designed": {}}})
+    assert said == "FAIL: 6 anchors, 0 of 1 zones pass. Try --fewest, or more --anchors."
+    said = place_report.verdict(result | {"layouts": {"given": {}}})
+    assert said.endswith("Try --optimise, or more --anchors.")
+    said = place_report.verdict({"survive": 0, "n_anchors": 6, "verdict": "no requirement"})
+    assert "use [[zones]] in the file, in place of [region]" in said
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -60,7 +60,7 @@ def verdict(result: dict[str, Any]) -> str:
         how = "--optimise" if "given" in result["layouts"] else "--fewest"
         return f"{text} Try {how}, or more --anchors." if result["verdict"] == "fail" else text
     if not fewest["met"]:
-        return f"{text} No layout with so many meets the requirements; allow more by --anchors."
+        return f"{text} No layout was found that meets them: allow more anchors, or ask less."
     less = fewest["one_less"]
     if less is None:
         return f"{text} That is the least number that was allowed."
