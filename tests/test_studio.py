@@ -444,7 +444,8 @@ def test_the_last_session_is_offered_unless_it_was_saved_since(room, tmp_path):
     kept = files.autosave(more, tables, tmp_path)
     saved, _ = files.save(more, tables, tmp_path, "by hand")
     for seconds, offered in ((-5, True), (5, False)):
-        os.utime(saved, (kept.stat().st_mtime + seconds,) * 2)
+        at = kept.stat().st_mtime + seconds
+        os.utime(saved, (at, at))
         found = files.last_session(room, tmp_path)
         assert (found is not None) is offered
     # Neither of these is a save of this problem.
@@ -504,10 +505,11 @@ def opened(tmp_path, monkeypatch):
 def designed(page: PlacePage) -> float:
     """b of the designed layout, once it was searched beside the page."""
     end = time.monotonic() + 30
-    while page._display.shown.others.get("designed") is None:
+    display: Any = page._display
+    while display.shown.others.get("designed") is None:
         assert time.monotonic() < end
         time.sleep(0.01)
-    return float(page._display.shown.others["designed"])
+    return float(display.shown.others["designed"])
 
 
 def worse(room: State) -> State:
