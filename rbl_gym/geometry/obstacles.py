@@ -297,7 +297,7 @@ def share_behind(
             free = free & ~met
         else:
             own = np.where(met, limit[6] * own, own)
-    return np.where(free, 1.0, blocked) * own
+    return np.where(free, 1.0, np.asarray(blocked)[..., None, None]) * own
 
 
 def _meets(
