@@ -14,10 +14,10 @@ import time
 
 import numpy as np
 
-from rbl_gym import studio
+from rbl_gym.app import studio
+from rbl_gym.app.studio import place
 from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import design
-from rbl_gym.studio import place
 
 MOVES = 40
 

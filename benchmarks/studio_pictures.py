@@ -19,9 +19,9 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from rbl_gym import studio
+from rbl_gym.app import studio
+from rbl_gym.app.studio.scene_view import view_axes
 from rbl_gym.placement import scene_files
-from rbl_gym.studio.scene_view import view_axes
 
 WINDOW = {"width": 1120, "height": 680}
 # Width of the animation, pixels; a frame, and the last one, milliseconds.

@@ -16,8 +16,8 @@ from pathlib import Path
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from rbl_gym import studio
-from rbl_gym.studio.watch.live import Disturbances
+from rbl_gym.app import studio
+from rbl_gym.studies.watching.live import Disturbances
 from rbl_gym.worlds import scenes
 
 WINDOW = {"width": 1120, "height": 680}

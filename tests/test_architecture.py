@@ -95,7 +95,7 @@ def test_versions_of_pyproject_and_package_agree():
 
 # --- who imports whom -------------------------------------------------------------------------
 
-ABOVE = ("estimators", "wrappers", "studies", "studio", "app")
+ABOVE = ("estimators", "wrappers", "studies", "app")
 WORLD = [name for name in MODULES if not any(within(name, f"rbl_gym.{above}") for above in ABOVE)]
 
 
@@ -113,18 +113,12 @@ def test_estimators_import_only_the_plain_models(name):
 
 @pytest.mark.parametrize("name", modules_of("rbl_gym.wrappers"))
 def test_wrappers_import_neither_studies_nor_the_app(name):
-    for above in ("studies", "studio", "app"):
+    for above in ("studies", "app"):
         assert not [m for m in imports(name) if within(m, f"rbl_gym.{above}")]
 
 
 @pytest.mark.parametrize("name", modules_of("rbl_gym.studies"))
-def test_studies_import_neither_the_studio_nor_the_app(name):
-    for above in ("studio", "app"):
-        assert not [m for m in imports(name) if within(m, f"rbl_gym.{above}")]
-
-
-@pytest.mark.parametrize("name", modules_of("rbl_gym.studio"))
-def test_the_studio_does_not_import_the_app(name):
+def test_studies_do_not_import_the_app(name):
     assert not [m for m in imports(name) if within(m, "rbl_gym.app")]
 
 
@@ -197,7 +191,7 @@ import sys, gymnasium
 env = gymnasium.make("rbl_gym:RBL/Tracking-v0")
 env.reset(seed=0)
 env.step(0)
-ours = ("estimators", "wrappers", "studies", "studio", "app")
+ours = ("estimators", "wrappers", "studies", "app")
 heavy = (*(f"rbl_gym.{name}" for name in ours), "filterpy", "matplotlib")
 print([m for m in heavy if m in sys.modules])
 """)

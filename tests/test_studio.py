@@ -12,19 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import placement, studio
-from rbl_gym.placement import scene_files
-from rbl_gym.placement.layout_files import read_layout
-from rbl_gym.placement.problem import PlacementTask
-from rbl_gym.studies.placing import design
-from rbl_gym.studies.placing.accuracy import accuracy
-from rbl_gym.studio import files, keeping, maps, place
-from rbl_gym.studio.figures import body_figures, figures, usual_scores
-from rbl_gym.studio.panel import Shown, headline, length, status
-from rbl_gym.studio.place import PlacePage
-from rbl_gym.studio.rays import under_pointer
-from rbl_gym.studio.searches import add_best, optimise
-from rbl_gym.studio.state import (
+from rbl_gym import placement
+from rbl_gym.app import studio
+from rbl_gym.app.studio import files, keeping, maps, place
+from rbl_gym.app.studio.figures import body_figures, figures, usual_scores
+from rbl_gym.app.studio.panel import Shown, headline, length, status
+from rbl_gym.app.studio.place import PlacePage
+from rbl_gym.app.studio.rays import under_pointer
+from rbl_gym.app.studio.searches import add_best, optimise
+from rbl_gym.app.studio.state import (
     Layout,
     Slice,
     State,
@@ -42,8 +38,13 @@ from rbl_gym.studio.state import (
     turn_knobs,
     undo,
 )  # fmt: skip
-from rbl_gym.studio.worker import Worker
-from rbl_gym.studio.world import Knobs, knobs_of
+from rbl_gym.app.studio.worker import Worker
+from rbl_gym.app.studio.world import Knobs, knobs_of
+from rbl_gym.placement import scene_files
+from rbl_gym.placement.layout_files import read_layout
+from rbl_gym.placement.problem import PlacementTask
+from rbl_gym.studies.placing import design
+from rbl_gym.studies.placing.accuracy import accuracy
 from tests.helpers import ROOT, with_kernels
 
 WAREHOUSE = str(ROOT / "examples" / "warehouse.toml")

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rbl_gym import studio
-from rbl_gym.app import place_pdf
+from rbl_gym.app import place_pdf, studio
 from rbl_gym.app.cli import main
+from rbl_gym.app.studio import Studio, place, state
+from rbl_gym.app.studio.panel import length
 from rbl_gym.placement import scene_files
 from rbl_gym.studies.placing import design
-from rbl_gym.studio import Studio, place, state
-from rbl_gym.studio.panel import length
 from tests.helpers import ROOT, with_kernels
 from tests.test_studio import placement_score
 
@@ -245,7 +244,7 @@ def browser() -> Iterator[Any]:
 
 def on_screen(camera: Any, point: np.ndarray) -> tuple[float, float]:
     """Pixels of a point in the window of a client's camera."""
-    from rbl_gym.studio.scene_view import view_axes
+    from rbl_gym.app.studio.scene_view import view_axes
 
     forward = np.asarray(camera.look_at) - np.asarray(camera.position)
     right, up, ahead = view_axes(forward) @ (point - np.asarray(camera.position))

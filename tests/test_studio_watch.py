@@ -14,7 +14,7 @@ from rbl_gym.studies import replay
 from rbl_gym.studies.learning import policies, rollouts
 from rbl_gym.studies.learning.evaluation import layouts_of
 from rbl_gym.studies.learning.rl_tasks import rl_task
-from rbl_gym.studio.watch.frames import (
+from rbl_gym.studies.watching.frames import (
     LINKS,
     Frame,
     Links,
@@ -24,8 +24,8 @@ from rbl_gym.studio.watch.frames import (
     filter_named,
     link_kinds,
 )
-from rbl_gym.studio.watch.learned import learned_frames, learned_program
-from rbl_gym.studio.watch.live import (
+from rbl_gym.studies.watching.learned import learned_frames, learned_program
+from rbl_gym.studies.watching.live import (
     CALM,
     Disturbances,
     Stage,
@@ -33,8 +33,8 @@ from rbl_gym.studio.watch.live import (
     stage_of_problem,
     stage_of_scene,
 )
-from rbl_gym.studio.watch.played import env_frames
-from rbl_gym.studio.watch.recorded import recorded_frames, track_all
+from rbl_gym.studies.watching.played import env_frames
+from rbl_gym.studies.watching.recorded import recorded_frames, track_all
 from rbl_gym.worlds import scenes
 from rbl_gym.wrappers import EstimatePose, controllers
 from tests.helpers import ROOT

@@ -9,13 +9,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from rbl_gym import recordings, studio
+from rbl_gym import recordings
+from rbl_gym.app import studio
 from rbl_gym.app.cli import main
+from rbl_gym.app.studio import Studio
+from rbl_gym.app.studio.watch_view import ellipsoid, letterbox, link_lines
 from rbl_gym.studies import replay
-from rbl_gym.studio import Studio
-from rbl_gym.studio.watch.frames import Frame
-from rbl_gym.studio.watch.live import Disturbances, stage_of_scene
-from rbl_gym.studio.watch.program import (
+from rbl_gym.studies.watching.frames import Frame
+from rbl_gym.studies.watching.live import Disturbances, stage_of_scene
+from rbl_gym.studies.watching.program import (
     LIVE,
     Program,
     env_program,
@@ -24,7 +26,6 @@ from rbl_gym.studio.watch.program import (
     recorded_program,
     room_of,
 )
-from rbl_gym.studio.watch.view import ellipsoid, letterbox, link_lines
 from rbl_gym.worlds import scenes
 from tests.helpers import ROOT
 from tests.test_studio_page import ARGUMENTS, CHROMIUM, until

@@ -76,8 +76,8 @@ def _count_or_file(text: str) -> int | str:
 
 def _studio(options: argparse.Namespace) -> int:
     require("viser", "studio")
-    from rbl_gym import studio
-    from rbl_gym.studio.opening import Options
+    from rbl_gym.app import studio
+    from rbl_gym.app.studio.opening import Options
 
     shown = {}
     if any((options.ranges, options.watch, options.env, options.policy)):
@@ -125,13 +125,13 @@ def _layout(options: argparse.Namespace) -> Any:
 def _program(options: argparse.Namespace) -> Any:
     """Return the program to watch."""
     from rbl_gym.studies import replay
-    from rbl_gym.studio.watch import program
-    from rbl_gym.studio.watch.frames import filter_named
-    from rbl_gym.studio.watch.recorded import track_all
+    from rbl_gym.studies.watching import program
+    from rbl_gym.studies.watching.frames import filter_named
+    from rbl_gym.studies.watching.recorded import track_all
 
     labels = tuple(filter(None, (options.filter or "").split(",")))
     if options.policy:
-        from rbl_gym.studio.watch import learned
+        from rbl_gym.studies.watching import learned
 
         return learned.learned_program(options.policy, options.reference, options.seed)
     if options.env:
@@ -156,7 +156,7 @@ def _episode(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
     """Return an episode of an environment, in SCENE if given."""
     import gymnasium as gym
 
-    from rbl_gym.studio.watch import program
+    from rbl_gym.studies.watching import program
 
     scene = {} if options.scene is None else {"scene": options.scene}
     name = options.env.removeprefix("rbl_gym:")
@@ -169,8 +169,8 @@ def _episode(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
 
 def _simulation(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
     """Return an episode of a named scene with the anchors of --layout, or of a building."""
-    from rbl_gym.studio.state import open_state
-    from rbl_gym.studio.watch import live, program
+    from rbl_gym.app.studio.state import open_state
+    from rbl_gym.studies.watching import live, program
     from rbl_gym.worlds import scenes
 
     layout = _layout(options)

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.app.studio.panel import length
+from rbl_gym.app.studio.watch_view import FILTERS, GHOSTS, LINK_COLOURS, TRUTH, swatches
 from rbl_gym.checks import FloatArray
-from rbl_gym.studio.panel import length
-from rbl_gym.studio.watch.frames import LINKS, Frame
-from rbl_gym.studio.watch.live import CALM, Disturbances
-from rbl_gym.studio.watch.program import Program
-from rbl_gym.studio.watch.view import FILTERS, GHOSTS, LINK_COLOURS, TRUTH, swatches
+from rbl_gym.studies.watching.frames import LINKS, Frame
+from rbl_gym.studies.watching.live import CALM, Disturbances
+from rbl_gym.studies.watching.program import Program
 
 # Width of the charts, pixels.
 CHARTS_WIDTH = 270

@@ -13,8 +13,8 @@ from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.tracking import TrackingEnv
 from rbl_gym.placement.problem import Context
-from rbl_gym.studio.watch.frames import Frame, Links, Named, Pose
-from rbl_gym.studio.watch.live import Moment, make_filters, moment_of, tracked_moments
+from rbl_gym.studies.watching.frames import Frame, Links, Named, Pose
+from rbl_gym.studies.watching.live import Moment, make_filters, moment_of, tracked_moments
 from rbl_gym.worlds import simulation
 from rbl_gym.wrappers import EstimatePose
 from rbl_gym.wrappers.compositions import TaskEnv

@@ -16,7 +16,7 @@ from rbl_gym.measurements.ranging import Measurement
 from rbl_gym.placement.building import Problem
 from rbl_gym.studies.epochs import Reading, track_epochs
 from rbl_gym.studies.monte_carlo import scene_filter, told_reading
-from rbl_gym.studio.watch.frames import Frame, Links, Named, Pose, tracked
+from rbl_gym.studies.watching.frames import Frame, Links, Named, Pose, tracked
 from rbl_gym.worlds import simulation
 from rbl_gym.worlds.scene import Scene
 

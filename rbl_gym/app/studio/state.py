@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rbl_gym.app.studio.world import Knobs, World, knobs_of
 from rbl_gym.checks import BoolArray, FloatArray, check_array
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.file_keys import MAX_ANCHORS, MIN_ANCHORS
 from rbl_gym.studies.placing import choosing, design
-from rbl_gym.studio.world import Knobs, World, knobs_of
 
 __all__ = [
     "Layout",

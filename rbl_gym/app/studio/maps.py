@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from rbl_gym.app.studio.state import State, plane
 from rbl_gym.checks import FloatArray
 from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studies.placing.judging import limits_of
 from rbl_gym.studies.placing.requirements import Errors, relative_errors
-from rbl_gym.studio.state import State, plane
 
 # Cells of a map while an anchor is dragged, and when it is let go; links of so many anchors.
 COARSE, REFINED, _ANCHORS = 800, 3200, 8

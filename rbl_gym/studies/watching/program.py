@@ -18,16 +18,16 @@ from rbl_gym.placement.building import Prior, Problem, Zone
 from rbl_gym.placement.gain import Gain
 from rbl_gym.recordings import Recording
 from rbl_gym.studies.replay import Settings, Track
-from rbl_gym.studio.watch.frames import Frame, filter_named
-from rbl_gym.studio.watch.live import Disturbances, Stage, frames, stage_of_scene
-from rbl_gym.studio.watch.played import (
+from rbl_gym.studies.watching.frames import Frame, filter_named
+from rbl_gym.studies.watching.live import Disturbances, Stage, frames, stage_of_scene
+from rbl_gym.studies.watching.played import (
     Act,
     env_frames,
     own_filter,
     places_anchors,
     world_of,
 )
-from rbl_gym.studio.watch.recorded import recorded_frames, track_all
+from rbl_gym.studies.watching.recorded import recorded_frames, track_all
 from rbl_gym.worlds.scene import Scene
 
 __all__ = [
@@ -82,12 +82,12 @@ LIVE, RECORDED = ("iekf", "iekf-robust"), ("iekf-log",)
 
 
 def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:
-    """The program of what `rbl_gym.studio.show` is given, but for problems.
+    """The program of what `rbl_gym.app.studio.show` is given, but for problems.
 
     Parameters
     ----------
     what, beside
-        As of `rbl_gym.studio.show`.
+        As of `rbl_gym.app.studio.show`.
     seed
         Of an episode.
 

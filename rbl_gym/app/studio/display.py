@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.studio import files, moving_view, scene_view
-from rbl_gym.studio.panel import Panel, Shown
-from rbl_gym.studio.state import State
+from rbl_gym.app.studio import files, moving_view, scene_view
+from rbl_gym.app.studio.panel import Panel, Shown
+from rbl_gym.app.studio.state import State
 
 # Size at which the body is seen well: shares of the extents of the room and of all zones.
 _BODY, _OF_ZONES = 0.03, 0.12

@@ -11,7 +11,7 @@ from rbl_gym.estimators import PoseBelief
 from rbl_gym.recordings import Recording
 from rbl_gym.studies import replay
 from rbl_gym.studies.replay import Reference, Settings, Track, TrackErrors
-from rbl_gym.studio.watch.frames import Frame, Links, Named, Pose, Tracked
+from rbl_gym.studies.watching.frames import Frame, Links, Named, Pose, Tracked
 
 __all__ = ["recorded_frames", "track_all"]
 

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
+from rbl_gym.app.studio.moving_view import ANCHOR
+from rbl_gym.app.studio.scene_view import lines
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements.ranging import tag_positions
 from rbl_gym.rendering.drawing import body_edges
-from rbl_gym.studio.moving_view import ANCHOR
-from rbl_gym.studio.scene_view import lines
-from rbl_gym.studio.watch.frames import LINKS, Frame, Tracked, link_kinds
+from rbl_gym.studies.watching.frames import LINKS, Frame, Tracked, link_kinds
 
 TRUTH = (33, 37, 41)
 # Of the filters, in their order; and of other layouts.

@@ -8,13 +8,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rbl_gym.app.studio import files, serving
+from rbl_gym.app.studio.place import PlacePage
+from rbl_gym.app.studio.state import open_state
+from rbl_gym.app.studio.watch_page import WatchPage
 from rbl_gym.checks import FloatArray, check_count
 from rbl_gym.placement.building import Problem
-from rbl_gym.studio import files, serving
-from rbl_gym.studio.place import PlacePage
-from rbl_gym.studio.state import open_state
-from rbl_gym.studio.watch.page import WatchPage
-from rbl_gym.studio.watch.program import program_of
+from rbl_gym.studies.watching.program import program_of
 
 __all__ = ["Options", "Studio", "show"]
 
@@ -98,7 +98,7 @@ def show(
     what
         A `Problem` of `placement.scene_files`: its anchors are placed by hand. Or what is watched:
         a `Scene` (an episode), an environment, raw or wrapped, a `Recording` with its track, a
-        `rbl_gym.studio.watch.program.Program`.
+        `rbl_gym.studies.watching.program.Program`.
     beside
         Of a problem, anchors (M, 3), metres; None: its own, or a usual layout. Of a recording, its
         `Track` or a mapping of tracks by labels; None: that of the filter ``"iekf-log"``. Of a

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.app.studio.state import State, open_state
+from rbl_gym.app.studio.world import knobs_of, noise_field
 from rbl_gym.checks import FloatArray
 from rbl_gym.geometry.regions import Box, Shell, Walls
 from rbl_gym.measurements.noise_laws import NOISE_LAWS
@@ -24,8 +26,6 @@ from rbl_gym.placement import scene_files
 from rbl_gym.placement.building import Problem
 from rbl_gym.placement.plans.toml_text import to_toml
 from rbl_gym.studies.placing.layout_export import write_layout
-from rbl_gym.studio.state import State, open_state
-from rbl_gym.studio.world import knobs_of, noise_field
 
 # Writes a report of a problem and a layout (M, 3) to a path.
 Report = Callable[[Problem, FloatArray, str], None]

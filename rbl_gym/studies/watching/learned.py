@@ -14,9 +14,9 @@ from rbl_gym import placement
 from rbl_gym.checks import FloatArray, check_one_of
 from rbl_gym.studies.learning import evaluation, policies, rollouts
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask, rl_task
-from rbl_gym.studio.watch.frames import Frame
-from rbl_gym.studio.watch.played import env_frames
-from rbl_gym.studio.watch.program import Disturb, Program, env_program
+from rbl_gym.studies.watching.frames import Frame
+from rbl_gym.studies.watching.played import env_frames
+from rbl_gym.studies.watching.program import Disturb, Program, env_program
 from rbl_gym.wrappers import controllers
 
 __all__ = ["learned_frames", "learned_program"]

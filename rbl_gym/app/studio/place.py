@@ -14,18 +14,18 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.app.studio import files, maps, searches, state
+from rbl_gym.app.studio.display import Display
+from rbl_gym.app.studio.figures import Others, body_figures, figures
+from rbl_gym.app.studio.keeping import Keeper
+from rbl_gym.app.studio.panel import Shown
+from rbl_gym.app.studio.rays import on_plane, under_pointer
+from rbl_gym.app.studio.state import Layout, State
+from rbl_gym.app.studio.worker import Worker
+from rbl_gym.app.studio.world import knobs_of
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.layout_files import parse_layout
 from rbl_gym.studies.placing import design
-from rbl_gym.studio import files, maps, searches, state
-from rbl_gym.studio.display import Display
-from rbl_gym.studio.figures import Others, body_figures, figures
-from rbl_gym.studio.keeping import Keeper
-from rbl_gym.studio.panel import Shown
-from rbl_gym.studio.rays import on_plane, under_pointer
-from rbl_gym.studio.state import Layout, State
-from rbl_gym.studio.worker import Worker
-from rbl_gym.studio.world import knobs_of
 
 
 class PlacePage:

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.studio import files
-from rbl_gym.studio.state import Layout, State
-from rbl_gym.studio.world import Knobs
+from rbl_gym.app.studio import files
+from rbl_gym.app.studio.state import Layout, State
+from rbl_gym.app.studio.world import Knobs
 
 # Time between autosaves of a layout that goes on changing, seconds.
 _APART_S = 1.0

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rbl_gym.app.studio.state import Layout, State, set_layout, with_one_more
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.descent import descend
 from rbl_gym.placement.exchange import refresh
 from rbl_gym.placement.file_keys import MAX_ANCHORS
 from rbl_gym.placement.setting import Setting
 from rbl_gym.studies.placing import choosing
-from rbl_gym.studio.state import Layout, State, set_layout, with_one_more
 
 __all__ = ["add_best", "optimise"]
 

@@ -10,9 +10,9 @@ import socket
 from collections.abc import Iterator
 from typing import Any
 
+from rbl_gym.app.studio.scene_view import PANEL
 from rbl_gym.checks import check_count
 from rbl_gym.studies.extras import require
-from rbl_gym.studio.scene_view import PANEL
 
 # Ports that are tried from the first on.
 _PORTS = 50

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from rbl_gym.studio import scene_view
-from rbl_gym.studio.watch.frames import Frame
-from rbl_gym.studio.watch.live import CALM, Disturbances
-from rbl_gym.studio.watch.panel import CHARTS_WIDTH, WatchPanel
-from rbl_gym.studio.watch.program import Program
-from rbl_gym.studio.watch.view import WatchView
-from rbl_gym.studio.worker import Worker
+from rbl_gym.app.studio import scene_view
+from rbl_gym.app.studio.watch_panel import CHARTS_WIDTH, WatchPanel
+from rbl_gym.app.studio.watch_view import WatchView
+from rbl_gym.app.studio.worker import Worker
+from rbl_gym.studies.watching.frames import Frame
+from rbl_gym.studies.watching.live import CALM, Disturbances
+from rbl_gym.studies.watching.program import Program
 
 # Pictures and charts a second at most; the longest wait between two looks at what is asked for.
 _PICTURES_HZ, _CHARTS_HZ, _WAIT_S = 20.0, 4.0, 0.05

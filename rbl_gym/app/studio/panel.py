@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rbl_gym.studio.figures import Figures, ZoneFigures
-from rbl_gym.studio.maps import BEYOND, QUANTITIES, WITHIN, SliceMap, css_gradient
-from rbl_gym.studio.moving_view import SEEN, SIGNS, VERDICTS
-from rbl_gym.studio.state import State
+from rbl_gym.app.studio.figures import Figures, ZoneFigures
+from rbl_gym.app.studio.maps import BEYOND, QUANTITIES, WITHIN, SliceMap, css_gradient
+from rbl_gym.app.studio.moving_view import SEEN, SIGNS, VERDICTS
+from rbl_gym.app.studio.state import State
 
 PLANES = {"Floor plan (x, y)": 1, "Section (x, z)": 2}
 _NOBODY = "none"

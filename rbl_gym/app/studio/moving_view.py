@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from rbl_gym.app.studio.figures import ZoneFigures
+from rbl_gym.app.studio.maps import SliceMap, picture
+from rbl_gym.app.studio.scene_view import lines, prism_edges
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.placement.building import Zone
-from rbl_gym.studio.figures import ZoneFigures
-from rbl_gym.studio.maps import SliceMap, picture
-from rbl_gym.studio.scene_view import lines, prism_edges
 
 ANCHOR, SELECTED, FIXED = (24, 100, 171), (232, 89, 12), (73, 80, 87)
 BODY, FREE, BLOCKED = (33, 37, 41), (43, 138, 62), (224, 49, 49)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rbl_gym.app.studio.state import State
+from rbl_gym.app.studio.world import Knobs, World
 from rbl_gym.checks import FloatArray
 from rbl_gym.placement.building import Problem, Zone
 from rbl_gym.studies.monte_carlo import rms
@@ -13,8 +15,6 @@ from rbl_gym.studies.placing import design
 from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studies.placing.judging import Judged
 from rbl_gym.studies.placing.requirements import share_within
-from rbl_gym.studio.state import State
-from rbl_gym.studio.world import Knobs, World
 
 # Links at the places of all zones while an anchor is dragged, about.
 _FEW = 1200

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rbl_gym.app.studio.world import World
 from rbl_gym.checks import FloatArray
-from rbl_gym.studio.world import World
 
 # Mounts whose directions from the camera differ by less than this lie equally well, radians.
 _SAME_RAD = 2e-3

@@ -1,0 +1,1 @@
+"""Frames of filters at work, as plain data: simulations, environments, recordings, policies."""

@@ -1,1 +1,0 @@
-"""Filters at work: frames as plain data, and the page on which they are watched."""
