@@ -162,6 +162,22 @@ print(kernel.scaled.build()(1.0))
 
 
 @needs_numba
+def test_an_untried_numba_compiles_in_its_own_way(tmp_path):
+    package = package_of_its_own(tmp_path)
+    (package / "helper.py").write_text(_HELPER.format(2.0))
+    code = f"""
+import sys
+import numba
+numba.__version__ = "99.0.0"
+sys.path.insert(0, {str(tmp_path)!r})
+from rbl_gym.kernels import helper_code, kernel
+print(helper_code.Compiler)
+print(kernel.scaled.build()(1.0))
+"""
+    assert run_python(code) == ["None", "2.0"]
+
+
+@needs_numba
 def test_one_process_compiles_at_a_time(tmp_path):
     fcntl = pytest.importorskip("fcntl")
     package = package_of_its_own(tmp_path)

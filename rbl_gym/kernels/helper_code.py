@@ -2,7 +2,8 @@
 
 By default numba compiles a function again for every literal and every memory layout of its
 arguments, and generates machine code for each that never runs. All kernels together then take twice
-as long.
+as long. This module uses private names of numba for that. With versions of numba in which these
+were not tried, everything compiles as numba does by default.
 """
 
 from __future__ import annotations
@@ -17,7 +18,12 @@ import numba
 from numba.core import config
 from numba.core.types import Array, BaseFunction, BaseTuple, Boolean, Number, unliteral
 
-try:  # private names of numba: without them compilation takes longer
+# Oldest and newest version of numba with which this was tried.
+_TRIED = ((0, 61), (0, 68))
+
+try:
+    if not _TRIED[0] <= tuple(map(int, numba.__version__.split(".")[:2])) <= _TRIED[1]:
+        raise ImportError
     from llvmlite.binding import parse_assembly
     from numba.core.codegen import JITCodeLibrary
     from numba.core.compiler import Compiler
@@ -52,16 +58,12 @@ def compile_helper(function: Any, unrolled: bool, **options: Any) -> Callable[..
 
     `unrolled` compiles once for each layout, and optimizes completely before inlining.
     """
-    if Compiler is not None:
-        options["pipeline_class"] = _UnrolledCompiler if unrolled else _HelperCompiler
-    made = _njit(
-        error_model="numpy",
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        # Otherwise references to each array are counted in every function that gets it.
-        _nrt=_counts_references(function),
-        **options,
-    )(function)
+    options |= {"error_model": "numpy", "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    if Compiler is None:
+        return _njit(**options)(function)
+    options["pipeline_class"] = _UnrolledCompiler if unrolled else _HelperCompiler
+    # Otherwise references to each array are counted in every function that gets it.
+    made = _njit(_nrt=_counts_references(function), **options)(function)
     made.gives_arrays = function.__annotations__.get("return") == "Any"
     find = made.get_call_template
     general = unliteral if unrolled else _as_any
@@ -75,6 +77,9 @@ def types_remembered() -> Iterator[None]:
 
     Otherwise numba tries all signatures of an operator at every place, a quarter of its time.
     """
+    if Compiler is None:
+        yield
+        return
     find: Any = BaseFunction.get_call_type
     known: dict[Any, Any] = {}
 
@@ -100,7 +105,7 @@ def _is_plain(kind: Any) -> bool:
 
 
 @contextlib.contextmanager
-def optimizing(level: int) -> Iterator[None]:
+def _optimizing(level: int) -> Iterator[None]:
     """Context in which the optimizer works at a level from 0 to 3."""
     before = _config.OPT
     _config.OPT = type(before)(level)
@@ -112,12 +117,15 @@ def optimizing(level: int) -> Iterator[None]:
 
 @contextlib.contextmanager
 def as_code() -> Iterator[None]:
-    """Context in which compiled code stays LLVM code; compilations in other threads wait."""
+    """Context in which compiled code stays LLVM code, hardly optimized.
+
+    Compilations in other threads wait.
+    """
     if Compiler is None:
         yield
         return
     codegen = _target.target_context.codegen()
-    with _lock:
+    with _lock, _optimizing(1):
         codegen._library_class = _Code
         try:
             yield
@@ -157,11 +165,11 @@ if Compiler is not None:
 
     class _UnrolledCode(_Code):
         def _optimize_functions(self, ll_module: Any) -> None:
-            with optimizing(3):
+            with _optimizing(3):
                 super()._optimize_functions(ll_module)
 
         def _optimize_final_module(self) -> None:
-            with optimizing(3):
+            with _optimizing(3):
                 super()._optimize_final_module()
 
     class _HelperCompiler(Compiler):  # pyright: ignore[reportGeneralTypeIssues]

@@ -15,7 +15,7 @@ from typing import IO, Any, TypeVar, cast
 
 import numba
 
-from rbl_gym.kernels.helper_code import as_code, compile_helper, optimizing, types_remembered
+from rbl_gym.kernels.helper_code import as_code, compile_helper, types_remembered
 
 try:
     import fcntl
@@ -120,7 +120,7 @@ def _compile(function: Callable[..., Any], signature: str, arguments: tuple[Any,
     second step is optimized.
     """
     made: Any = numba.guvectorize(signature, cache=_KEPT)(function)
-    with optimizing(1), as_code():
+    with as_code():
         made.add(arguments)
     made.disable_compile()
     return made.build_ufunc()
