@@ -141,7 +141,7 @@ def test_lists_are_loaded_and_bad_ones_get_a_message(served):
     assert page.status.startswith("Not done: bad.csv")
     page.load("off.csv", b"x_m,y_m,z_m\n0,0,1\n1,1,1\n2,2,1\n")
     page.settle()
-    assert "stands where none may" in page.status
+    assert "is not a legal position" in page.status
     np.testing.assert_array_equal(page.state.anchors, anchors)
     page.load("three.csv", b"x_m,y_m,z_m\n0,0,6\n1,1,6\n2,10,1\n")
     page.settle()

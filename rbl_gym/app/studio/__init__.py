@@ -1,4 +1,4 @@
-"""A page in the browser on which anchors are placed by hand; extra ``studio``."""
+"""The web page on which a user places anchors by hand; extra ``studio``."""
 
 from rbl_gym.app.studio.opening import Options, Studio, show
 

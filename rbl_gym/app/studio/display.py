@@ -1,4 +1,4 @@
-"""All that a browser shows of a layout: the scene in 3-D and the panel beside it."""
+"""The display of a layout in a browser: the scene in 3-D and the panel beside it."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from rbl_gym.app.studio import files, moving_view, scene_view
 from rbl_gym.app.studio.panel import Panel, Shown
 from rbl_gym.app.studio.state import State
 
-# Size at which the body is seen well: shares of the extents of the room and of all zones.
+# Minimum displayed size of the body: shares of the extents of the room and of all zones.
 _BODY, _OF_ZONES = 0.03, 0.12
-# A message goes away after so long, seconds.
+# Time after which a message disappears, seconds.
 _MESSAGE_S = 6.0
 
 
 class Display:
-    """Draws what does not change, and then every `Shown`.
+    """Draws the static parts once, then every `Shown`.
 
     Parameters
     ----------
     server
         The viser server.
     start
-        What is shown first.
+        The initial state.
     actions
-        As `Panel` takes them; and ``drag``, ``drag_body``, as
-        `moving_view.AnchorView` and `BodyView` call them.
+        Callbacks of `Panel`, and ``drag`` and ``drag_body``, which `moving_view.AnchorView` and
+        `BodyView` call.
     has_report
-        Whether there is a button for the report.
+        Whether the panel has a button for the report.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Display:
         self.panel = Panel(server.gui, start, files.default_name(problem), actions, has_report)
 
     def show(self, shown: Shown) -> None:
-        """Show all of it; what has not changed is not sent."""
+        """Show the complete content. Only the changes are sent."""
         now, figures = shown.state, shown.figures
         with self._server.atomic():
             self._map.show(shown.map)
@@ -66,6 +66,6 @@ class Display:
         self._server.flush()
 
     def notify(self, title: str, text: str, colour: str) -> None:
-        """A message in every browser that is open."""
+        """Show a message in every open browser."""
         for client in self._server.get_clients().values():
             client.add_notification(title, text, auto_close_seconds=_MESSAGE_S, color=colour)

@@ -1,4 +1,4 @@
-"""The figures beside the map: the score, the zones, other layouts."""
+"""The figures of the panel: the score, the zones and the scores of other layouts."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studies.placing.judging import Judged
 from rbl_gym.studies.placing.requirements import share_within
 
-# Links at the places of all zones while an anchor is dragged, about.
+# Approximate number of links over the positions of all zones while an anchor is dragged.
 _FEW = 1200
 
 
 class ZoneFigures(NamedTuple):
-    """What a layout promises in a zone: root mean squares, and the share that meets what it asks.
+    """Expected errors of a layout in a zone: RMS values, and the share that meets the requirement.
 
     Attributes
     ----------
     name, verdict
-        Of the zone; ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``.
+        Name of the zone; ``"pass"``, ``"fail"``, ``"undecided"`` or ``"no requirement"``.
     share, required
-        Of the places; NaN where nothing is asked.
+        Shares of the positions; NaN if there is no requirement.
     position_m, height_m, heading_deg
-        Horizontal position, height, heading: one sigma.
+        Standard deviations of the horizontal position, the height and the heading.
     """
 
     name: str
@@ -43,7 +43,7 @@ class ZoneFigures(NamedTuple):
 
 
 class BodyFigures(NamedTuple):
-    """What a layout promises where the body is: one sigma; shares (M,) of links that are left."""
+    """Standard deviations at the body's pose, and shares (M,) of information that links keep."""
 
     position_m: float
     heading_deg: float
@@ -51,7 +51,7 @@ class BodyFigures(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """b of a layout in metres, each zone, and the body."""
+    """Score b of a layout in metres, figures of each zone, and figures at the body."""
 
     score_m: float
     zones: tuple[ZoneFigures, ...]
@@ -59,14 +59,14 @@ class Figures(NamedTuple):
 
 
 def figures(state: State, few: bool = False) -> Figures:
-    """The figures of a state; of `few` places while an anchor is dragged.
+    """Return the figures of a state, with fewer positions while an anchor is dragged.
 
     Parameters
     ----------
     state
         The problem and the layout.
     few
-        Fewer places of each zone; the score is the same.
+        Use fewer positions of each zone; the score is the same.
     """
     world, anchors = state.world, state.anchors
     zones = world.problem.zones
@@ -82,7 +82,7 @@ def figures(state: State, few: bool = False) -> Figures:
 
 
 def body_figures(state: State) -> BodyFigures:
-    """What the layout promises at the body's place, at the attitude of the zone that it is in."""
+    """Return the expected errors at the body's position, with the attitude of its zone."""
     problem, place = state.world.problem, state.body[None]
     zone = next((zone for zone in problem.zones if zone.contains(place)[0]), problem.zones[0])
     errors = accuracy(problem, state.anchors, place, zone)
@@ -111,19 +111,19 @@ def _zone_figures(
 
 
 def usual_scores(world: World, n_anchors: int) -> dict[str, float]:
-    """b of the usual layouts of so many anchors by their names, the best first, metres."""
+    """Return b of the usual layouts with `count` anchors by name, the best first, metres."""
     found = design.usual_layouts(world.problem.with_anchors(n_anchors), 0)
     scores = {name: world.score(anchors) for name, anchors in found.items()}
     return dict(sorted(scores.items(), key=lambda item: item[1]))
 
 
 class Others:
-    """Layouts beside the one that is shown: the usual ones, and designed ones.
+    """Layouts for comparison: the usual ones and designed ones.
 
     Attributes
     ----------
     designed
-        Layouts by the knobs for which they were designed, and by their number of anchors.
+        Layouts by knobs and number of anchors.
     """
 
     def __init__(self) -> None:
@@ -133,12 +133,12 @@ class Others:
         self._scored: tuple[World | None, FloatArray | None, float] = None, None, 0.0
 
     def search_usual(self, world: World, count: int) -> None:
-        """Score the usual layouts of so many anchors, unless that is done."""
+        """Score the usual layouts with `count` anchors, unless this is done already."""
         if self._of != (world, count):
             self._usual, self._of = usual_scores(world, count), (world, count)
 
     def scores(self, world: World, count: int) -> dict[str, float | None]:
-        """b by names; None while the first design is searched; the usual ones where known."""
+        """Return b by name; None while a design runs. The usual layouts appear when scored."""
         same = [found for (_, number), found in self.designed.items() if number == count]
         designed = self.designed.get((world.knobs, count), same[0] if same else None)
         found: dict[str, float | None] = {}

@@ -1,7 +1,7 @@
-"""Files of the studio: a layout as a scene file and a list, kept safe, in one folder.
+"""Files of the studio in one folder: a layout as a scene file and as a list.
 
-Nothing is written outside of the folder, and no file is half written: a new one takes the place
-of the old one when it is whole.
+The studio writes nothing outside the folder. It writes a new file completely, then replaces the old
+one.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from rbl_gym.studies.placing.layout_export import write_layout
 
 # Writes a report of a problem and a layout (M, 3) to a path.
 Report = Callable[[Problem, FloatArray, str], None]
-# The first line of a scene file of the studio: only such files are written over.
+# First line of the studio's scene files. Only files with this line are overwritten.
 HEAD = "Written by rbl-gym studio."
 _AUTOSAVE = "-autosave"
 
 
 def check_name(name: str) -> str:
-    """A name for files that stays within a folder, or a ValueError.
+    """Return a file name that stays within a folder, or raise ValueError.
 
-    Letters, digits, spaces, and ``_ . -`` inside of it.
+    Letters, digits, spaces, ``_``, ``.`` and ``-`` are allowed.
     """
     name = name.strip()
     if not re.fullmatch(r"[\w][\w .-]{0,79}", name) or name.endswith("."):
@@ -48,7 +48,7 @@ def check_name(name: str) -> str:
 
 
 def default_name(problem: Problem) -> str:
-    """A name for the files of a problem."""
+    """Return the default file name of a problem."""
     plain = re.sub(r"[^\w.-]+", "-", problem.name).strip("-.")[:60] or "scene"
     return plain if plain.endswith("-layout") else f"{plain}-layout"
 
@@ -59,16 +59,16 @@ def save(state: State, tables: Mapping[str, Any], folder: Path, name: str) -> li
     Parameters
     ----------
     state
-        What is saved.
+        The state to save.
     tables
-        Of the file from which the problem was read, or `tables_of` it.
+        Tables of the file from which the problem was read, or the result of `tables_of`.
     folder, name
-        Where; the folder is made.
+        The folder, created if needed, and the name of the files.
 
     Raises
     ------
     ValueError
-        On a name that is none, and where a file of that name was not written by the studio.
+        If the name is not valid, or a file of that name was not written by the studio.
     """
     stem = owned(folder, name)
     scene, layout = stem.with_name(f"{stem.name}.toml"), stem.with_name(f"{stem.name}.csv")
@@ -80,7 +80,7 @@ def save(state: State, tables: Mapping[str, Any], folder: Path, name: str) -> li
 
 
 def autosave(state: State, tables: Mapping[str, Any], folder: Path) -> Path:
-    """Keep the layout as it is in NAME-autosave.toml. Arguments as `save`."""
+    """Save the current layout in NAME-autosave.toml. Arguments as in `save`."""
     stem = owned(folder, default_name(state.problem) + _AUTOSAVE)
     path = stem.with_name(f"{stem.name}.toml")
     text = scene_text(state, tables, folder)
@@ -89,9 +89,9 @@ def autosave(state: State, tables: Mapping[str, Any], folder: Path) -> Path:
 
 
 def last_session(state: State, folder: Path) -> FloatArray | None:
-    """Anchors of the autosave of a problem, where they differ from those of the state.
+    """Return the anchors of a problem's autosave if they differ from those of the state.
 
-    None where there is no autosave, or the studio saved the problem in the folder after it.
+    None if there is no autosave, or if the studio saved the problem in the folder later.
     """
     path = folder / f"{default_name(state.problem)}{_AUTOSAVE}.toml"
     try:
@@ -105,10 +105,10 @@ def last_session(state: State, folder: Path) -> FloatArray | None:
 
 
 def _is_saved_since(autosave: Path, name: str) -> bool:
-    """Whether the studio saved a problem of a name beside its autosave, and after it."""
+    """Return whether the studio saved a problem of this name after its autosave."""
     written = autosave.stat().st_mtime_ns
     for path in autosave.parent.glob("[!.]*.toml"):
-        # One that cannot be read is no save.
+        # An unreadable file does not count as saved.
         with contextlib.suppress(ValueError, OSError):
             is_later = path.stat().st_mtime_ns > written and _is_ours(path)
             if is_later and scene_files.load(str(path)).get("name") == name:
@@ -124,12 +124,12 @@ def _is_ours(scene: Path) -> bool:
 def save_report(
     state: State, tables: Mapping[str, Any], folder: Path, name: str, report: Report
 ) -> list[Path]:
-    """`save`, and NAME.pdf, the report. Arguments and errors as there.
+    """Run `save` and write NAME.pdf, the report. Raises the same errors.
 
     Parameters
     ----------
     state, tables, folder, name
-        As in `save`.
+        Arguments as in `save`.
     report
         Writes the report.
     """
@@ -140,12 +140,12 @@ def save_report(
 
 
 def names(paths: list[Path]) -> str:
-    """The names of files, with commas."""
+    """Return the names of files, separated by commas."""
     return ", ".join(path.name for path in paths)
 
 
 def owned(folder: Path, name: str) -> Path:
-    """Folder and name, where no file of that name is somebody else's."""
+    """Return folder and name. Raises ValueError if the studio did not write a file of that name."""
     stem = folder / check_name(name)
     scene = stem.with_name(f"{stem.name}.toml")
     if scene.exists():
@@ -155,13 +155,13 @@ def owned(folder: Path, name: str) -> Path:
         others = [p for p in (stem.with_name(f"{stem.name}{end}") for end in ends) if p.exists()]
     if others:
         raise ValueError(
-            f"{others[0].name} is there, and was not written by the studio: choose another name"
+            f"{others[0].name} exists and was not written by the studio: choose another name"
         )
     return stem
 
 
 def replace(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file beside its place, then put it there in one step."""
+    """Write a temporary file, then move it to its path in one step."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
     os.close(handle)
@@ -182,12 +182,12 @@ def replace(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def scene_text(state: State, tables: Mapping[str, Any], folder: Path) -> str:
-    """The scene file (TOML) of a state, in a folder: `tables` with its anchors and its knobs."""
+    """Return the scene file (TOML) of a state: `tables` with its anchors and its knobs."""
     anchors = state.anchors.tolist()
     head = [
         HEAD,
-        f"{len(anchors)} anchors, b = {state.score:.4g} m. All of them are listed as fixed: "
-        "`rbl-gym place --scene` judges this layout, `rbl-gym studio` goes on with it.",
+        f"{len(anchors)} anchors, b = {state.score:.4g} m. All are listed as fixed: "
+        "`rbl-gym place --scene` judges this layout, `rbl-gym studio` continues from it.",
     ]
     named = {"name": state.problem.name, **tables}
     changed = {key: value for key, value in named.items() if key != "$schema"}
@@ -198,7 +198,7 @@ def scene_text(state: State, tables: Mapping[str, Any], folder: Path) -> str:
     }
     plan = state.world.base.plan
     if plan is not None and "plan" in tables:
-        # Paths of a file are relative to where it is.
+        # Paths in a scene file are relative to its folder.
         paths = {key: getattr(plan, key) for key in ("image", "drawing")}
         found = {key: os.path.relpath(path, folder) for key, path in paths.items() if path}
         changed["plan"] = {**tables["plan"], **found}
@@ -206,7 +206,7 @@ def scene_text(state: State, tables: Mapping[str, Any], folder: Path) -> str:
 
 
 def _with_knobs(tables: dict[str, Any], state: State) -> dict[str, Any]:
-    """Tables with the knobs that were turned."""
+    """Return the tables with the changed knobs."""
     world, problem = state.world, state.world.problem
     now, was = world.knobs, knobs_of(world.base)
     if now.noise_m != was.noise_m:
@@ -230,12 +230,12 @@ def _with_knobs(tables: dict[str, Any], state: State) -> dict[str, Any]:
 
 
 def tables_of(problem: Problem) -> dict[str, Any]:
-    """The tables of a scene file for a problem of a named scene, without its anchors.
+    """Return the tables of a scene file for a problem of a named scene, without its anchors.
 
     Raises
     ------
     ValueError
-        Where the problem has what only its own file can say: mounts or prisms.
+        If the problem has mounts or prisms, which only its own file can describe.
     """
     mounts, noise = problem.mounts, problem.noise
     kinds = {Walls: "room", Box: "box", Shell: "shell"}

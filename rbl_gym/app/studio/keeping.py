@@ -1,4 +1,4 @@
-"""The work of a session is kept: saved where that is asked for, and every change in an autosave."""
+"""Saving of a session: on request, and every change in an autosave."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rbl_gym.app.studio import files
 from rbl_gym.app.studio.state import Layout, State
 from rbl_gym.app.studio.world import Knobs
 
-# Time between autosaves of a layout that goes on changing, seconds.
+# Minimum time between two autosaves, seconds.
 _APART_S = 1.0
 
 
@@ -22,16 +22,16 @@ class Keeper:
     Parameters
     ----------
     start
-        What is shown first.
+        The initial state.
     tables
-        Of the file from which the problem was read.
+        Tables of the file from which the problem was read.
     folder
-        In which files are written, and only there.
+        Folder for all files.
 
     Attributes
     ----------
     found
-        Anchors (M, 3) of the last session, metres, where they are not saved; or None.
+        Unsaved anchors (M, 3) of the last session, metres, or None.
     """
 
     def __init__(self, start: State, tables: Mapping[str, Any], folder: Path) -> None:
@@ -41,7 +41,7 @@ class Keeper:
         self.found = files.last_session(start, folder)
 
     def keep(self, now: State) -> None:
-        """Write the autosave, unless this layout and these knobs were written last."""
+        """Write the autosave, unless it has this layout and these knobs already."""
         layout, knobs = self._kept
         is_kept = now.layout is layout and now.world.knobs == knobs
         if (now.past or now.future) and not is_kept:
@@ -50,17 +50,17 @@ class Keeper:
             self._kept = now.layout, now.world.knobs
 
     def keep_meanwhile(self, now: State) -> None:
-        """`keep`, at most once a second; where it fails, `keep` at the end will tell."""
+        """Run `keep` at most once a second. Errors are left to `keep` at the end."""
         if time.monotonic() - self._time >= _APART_S:
             with contextlib.suppress(OSError, ValueError):
                 self.keep(now)
 
     def save(self, now: State, name: str) -> list[Path]:
-        """`files.save`."""
+        """Run `files.save`."""
         paths = files.save(now, self._tables, self._folder, name)
         self._kept = now.layout, now.world.knobs
         return paths
 
     def save_report(self, now: State, name: str, report: files.Report) -> list[Path]:
-        """`files.save_report`; from any thread."""
+        """Run `files.save_report`; any thread may call it."""
         return files.save_report(now, self._tables, self._folder, name, report)

@@ -1,4 +1,4 @@
-"""The map of a slice: what the Cramer-Rao bound promises there, and its picture."""
+"""The map of the Cramer-Rao bound on a slice, and its picture."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from rbl_gym.studies.placing.accuracy import accuracy
 from rbl_gym.studies.placing.judging import limits_of
 from rbl_gym.studies.placing.requirements import Errors, relative_errors
 
-# Cells of a map while an anchor is dragged, and when it is let go; links of so many anchors.
+# Cells of a map while an anchor is dragged, and after; links for this number of anchors.
 COARSE, REFINED, _ANCHORS = 800, 3200, 8
-# Cells of a map, at least.
+# Minimum number of cells of a map.
 _LEAST_CELLS = 200
-# A map that hardly varies must not look as if it did: its colours span at least this ratio.
+# Minimum ratio of the colour limits, so that a nearly constant map looks constant.
 _LEAST_CONTRAST = 1.3
-# Colours are kept as long as the values at their ends change by less than this factor.
+# Colour limits are kept while the values at their ends change by less than this factor.
 _KEPT = 1.5
-# Pixels along a cell; the browser smooths the picture too. Shades of the colours.
+# Pixels along a cell, smoothed by the browser as well; number of colours.
 _ZOOM, _SHADES = 6, 256
-# Of the map, up to 255: what lies below it is seen through it.
+# Opacity of the map, up to 255: objects below it stay visible.
 _OPACITY = 215
-# Within and beyond a requirement (Okabe and Ito): told apart by everyone.
+# Colours within and beyond a requirement (Okabe and Ito), safe for colour-blind readers.
 WITHIN, BEYOND = (86, 180, 233), (213, 94, 0)
-# Green for small errors over yellow to red for large ones, light enough for black lines.
+# Green for small errors, yellow, then red for large ones; light enough for black lines.
 _COLOURS = np.array(
     [
         (38, 130, 142), (66, 173, 141), (140, 205, 130), (222, 227, 140),
@@ -40,7 +40,7 @@ _COLOURS = np.array(
 
 
 class Quantity(NamedTuple):
-    """What a map can show: a field of `Errors`, its name, its unit, and metres or radians to it."""
+    """A quantity of the map: a field of `Errors`, its name, its unit and the factor from SI."""
 
     field: str
     name: str
@@ -64,16 +64,17 @@ class SliceMap(NamedTuple):
     Attributes
     ----------
     values
-        (rows, columns), NaN off the zones and inside of obstacles. In the unit of the quantity;
-        of ``"requirement"`` the error over its limit, the largest: within where at most 1.
+        (rows, columns), in the unit of the quantity. NaN outside the zones and inside obstacles.
+        For ``"requirement"`` the largest ratio of an error to its limit; at most 1 meets the
+        requirement.
     low, high
         Corners (3,) of the plane, metres.
     up
-        The axis of the rows; that of the columns is x.
+        Axis of the rows; the axis of the columns is x.
     quantity
-        What is shown.
+        The quantity.
     limits
-        Between which values the colours run.
+        Values at the two ends of the colour scale.
     """
 
     values: FloatArray
@@ -84,12 +85,12 @@ class SliceMap(NamedTuple):
     limits: tuple[float, float]
 
     def is_like(self, other: SliceMap) -> bool:
-        """Whether both show the same on the same plane."""
+        """Return whether both maps show the same quantity on the same plane."""
         same = self.quantity is other.quantity and self.up == other.up
         return same and bool((self.low == other.low).all())
 
     def beside(self, before: SliceMap) -> SliceMap:
-        """In the colours of the map before, where that is like it and its values fit them."""
+        """Return the map with the colour limits of a previous map, if they still fit."""
         fits = all(
             1 / _KEPT < new / old < _KEPT
             for new, old in zip(self.limits, before.limits, strict=True)
@@ -99,7 +100,7 @@ class SliceMap(NamedTuple):
 
 
 def own_limits(values: FloatArray, quantity: Quantity) -> tuple[float, float]:
-    """Between which values the colours of a map run: most of its cells lie there."""
+    """Return the colour limits of a map; most of its cells lie between them."""
     if quantity is QUANTITIES["requirement"] or not np.isfinite(values).any():
         return 0.0, 2.0
     low, high = np.nanquantile(values, (0.02, 0.98)).tolist()
@@ -108,25 +109,25 @@ def own_limits(values: FloatArray, quantity: Quantity) -> tuple[float, float]:
 
 
 def shape_of(extent: FloatArray, cells: int) -> tuple[int, int]:
-    """Rows and columns of about so many cells over an extent (2,): columns, rows."""
+    """Return columns and rows of about `cells` cells over an extent (2,)."""
     width, height = np.maximum(extent, 1e-9)
     columns = math.sqrt(cells * width / height)
-    # A long slice still has some rows.
+    # A long slice keeps a minimum number of rows.
     columns = min(max(columns, 4.0), cells / 4)
     return max(1, round(cells / columns)), max(1, round(columns))
 
 
 def slice_map(state: State, cells: int = COARSE, before: SliceMap | None = None) -> SliceMap:
-    """The map of the slice of a state.
+    """Return the map of the slice of a state.
 
     Parameters
     ----------
     state
-        Gives the problem, the layout and the slice.
+        The problem, the layout and the slice.
     cells
-        About how many there are, with few anchors; with many there are fewer.
+        Approximate number of cells for few anchors; many anchors reduce it.
     before
-        A map whose colours are kept where it is like this one, whatever its values; None: its own.
+        Previous map, whose colour limits are kept if they still fit; None uses the map's own.
     """
     problem, at = state.world.problem, state.slice
     low, high = plane(state)
@@ -161,10 +162,10 @@ def _shown(errors: Errors, quantity: str, zone: object) -> FloatArray:
 
 
 def picture(found: SliceMap) -> np.ndarray:
-    """The map as pixels (height, width, 4), the upper row first; clear where there is no value."""
+    """Return pixels (height, width, 4), the upper row first; transparent if there is no value."""
     values = found.values[::-1]
     free = np.isfinite(values)
-    # Colours do not run into the gaps.
+    # Fill the gaps first, so that colours do not run into them.
     if free.any() and not free.all():
         nearest: Any = ndimage.distance_transform_edt(
             ~free, return_distances=False, return_indices=True
@@ -181,7 +182,7 @@ def picture(found: SliceMap) -> np.ndarray:
 
 
 def colours(values: FloatArray, limits: tuple[float, float]) -> np.ndarray:
-    """Colours (..., 3) of values between limits, by their logarithms."""
+    """Return the colours (..., 3) of values between limits, on a logarithmic scale."""
     low, high = limits
     span = math.log(high / low) if high > low > 0 else 1.0
     share = np.log(np.maximum(values, 1e-300) / max(low, 1e-300)) / span
@@ -190,14 +191,14 @@ def colours(values: FloatArray, limits: tuple[float, float]) -> np.ndarray:
 
 @functools.cache
 def _shades() -> np.ndarray:
-    """The colours (256, 3) from small to large."""
+    """Return the colours (256, 3) from small to large."""
     at, known = np.linspace(0, 1, _SHADES), np.linspace(0, 1, len(_COLOURS))
     columns = [np.interp(at, known, column) for column in _COLOURS.T]
     return np.round(np.stack(columns, axis=-1)).astype(np.uint8)
 
 
 def _enlarged(values: FloatArray, zoom: int) -> FloatArray:
-    """Every cell as zoom x zoom pixels, linear between the middles of cells."""
+    """Enlarge every cell to zoom x zoom pixels, linear between the centres of cells."""
     for axis in (0, 1):
         count = values.shape[axis]
         at = ((np.arange(count * zoom) + 0.5) / zoom - 0.5).clip(0, count - 1)
@@ -209,6 +210,6 @@ def _enlarged(values: FloatArray, zoom: int) -> FloatArray:
 
 
 def css_gradient() -> str:
-    """The colours from small to large, as a background of a page."""
+    """Return the colour scale from small to large as a CSS background."""
     stops = ", ".join(f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in _COLOURS)
     return f"linear-gradient(to right, {stops})"

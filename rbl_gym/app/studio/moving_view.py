@@ -1,4 +1,4 @@
-"""What changes in 3-D: the map, zones in the colours of their verdicts, the body, anchors."""
+"""The moving parts in 3-D: the map, zones in the colours of their verdicts, the body, anchors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rbl_gym.placement.building import Zone
 
 ANCHOR, SELECTED, FIXED = (24, 100, 171), (232, 89, 12), (73, 80, 87)
 BODY, FREE, BLOCKED = (33, 37, 41), (43, 138, 62), (224, 49, 49)
-# Of a zone: meets what it asks, does not, too close to tell, asks nothing.
+# Colours of zones: requirement met, not met, undecided, no requirement.
 VERDICTS = {
     "pass": (47, 158, 68),
     "fail": (201, 42, 42),
@@ -23,18 +23,18 @@ VERDICTS = {
     "no requirement": (73, 80, 87),
 }
 SIGNS = {"pass": "\u2713", "fail": "\u2717", "undecided": "?", "no requirement": ""}
-# Radius of an anchor: a share of the room's largest extent.
+# Radius of an anchor as a share of the room's largest extent.
 _ANCHOR = 0.013
-# More anchors than so many are drawn smaller.
+# Anchors are drawn smaller above this number.
 _FEW = 16
-# A link that keeps this share of its information counts as seen.
+# A link that keeps this share of its information counts as in sight.
 SEEN = 0.5
 
 Dragged = Callable[[int, str, FloatArray, FloatArray], None]
 
 
 class MapView:
-    """The map on its plane. The picture alone is sent as long as the plane is the same."""
+    """The map on its plane. Only the picture is sent while the plane is the same."""
 
     def __init__(self, scene: Any) -> None:
         self._scene = scene
@@ -43,7 +43,7 @@ class MapView:
         self._shown: Any = None
 
     def show(self, found: SliceMap) -> None:
-        """Draw a map; the same one is not sent again."""
+        """Draw a map. An unchanged map is not sent again."""
         if found is self._shown:
             return
         image, at = picture(found), (*found.low, *found.high, found.up)
@@ -51,7 +51,7 @@ class MapView:
             self._handle.image = image
         else:
             size = (found.high - found.low)[[0, found.up]]
-            # The picture's own axes are x to the right and y down.
+            # The picture's axes are x to the right and y down.
             turn = (0.0, 1.0, 0.0, 0.0) if found.up == 1 else (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
             self._handle = self._scene.add_image(
                 "/map", image, float(size[0]), float(size[1]), format="png",
@@ -62,7 +62,7 @@ class MapView:
 
 
 class ZoneView:
-    """The edges of zones in the colours of their verdicts; names and shares where there are."""
+    """The edges of zones in the colours of their verdicts, with names and shares if known."""
 
     def __init__(self, scene: Any, zones: tuple[Zone, ...]) -> None:
         self._scene, self._zones = scene, zones
@@ -76,7 +76,7 @@ class ZoneView:
             )
 
     def show(self, found: tuple[ZoneFigures, ...]) -> None:
-        """Draw what the zones get."""
+        """Draw the zones with their figures."""
         for index, (zone, figures) in enumerate(zip(self._zones, found, strict=True)):
             if self._verdicts[index] != figures.verdict:
                 self._verdicts[index] = figures.verdict
@@ -92,14 +92,14 @@ class ZoneView:
 
 
 class BodyView:
-    """The body with its tags, and a line to every anchor: green where it is in sight, else red.
+    """The body with its tags, and a line to every anchor: green if in sight, else red.
 
     Parameters
     ----------
     scene, least_m
-        Where it is drawn, and how large at least, metres, so that it can be seen.
+        The viser scene, and the minimum displayed size in metres, so that the body is visible.
     dragged
-        Called with 0, the phase, the camera's place (3,) and a point (3,) under the pointer.
+        Called with 0, the phase, the camera's position (3,) and a point (3,) under the pointer.
     """
 
     def __init__(self, scene: Any, least_m: float, dragged: Dragged) -> None:
@@ -109,7 +109,7 @@ class BodyView:
         self._links: Any = None
 
     def show(self, tags: FloatArray, place: FloatArray, anchors: FloatArray, seen: Any) -> None:
-        """Draw tags (N, 3) about a place (3,), and links to anchors (M, 3) of shares (M,)."""
+        """Draw tags (N, 3) about a position (3,), and links to anchors (M, 3) with shares (M,)."""
         if tags is not self._tags:
             self._tags = tags
             self._add(tags)
@@ -143,17 +143,17 @@ class BodyView:
 
 
 class AnchorView:
-    """The anchors as balls that can be taken by the hand.
+    """The anchors as balls that a user can drag.
 
     Parameters
     ----------
     scene, extent
-        Where they are drawn, and the largest extent of the room, metres.
+        The viser scene, and the largest extent of the room in metres.
     dragged
-        Called with the number of the anchor, the phase (``"start"``, ``"update"``, ``"end"``),
-        the camera's place (3,) and a point (3,) under the pointer.
+        Called with the anchor's index, the phase (``"start"``, ``"update"``, ``"end"``),
+        the camera's position (3,) and a point (3,) under the pointer.
     clicked
-        Called with the number of the anchor.
+        Called with the anchor's index.
     """
 
     def __init__(
@@ -166,14 +166,14 @@ class AnchorView:
         self._looks: list[Any] = []
 
     def show(self, anchors: FloatArray, fixed: BoolArray, selected: int | None) -> None:
-        """Draw them where they are (M, 3); only what changed is sent."""
+        """Draw the anchors at their positions (M, 3). Only the changes are sent."""
         while len(self.balls) > len(anchors):
             self.balls.pop().remove()
             self._labels.pop().remove()
             self._looks.pop()
         while len(self.balls) < len(anchors):
             self._add(len(self.balls))
-        # Many are drawn smaller.
+        # Many anchors are drawn smaller.
         size = round(min(1.0, (_FEW / len(anchors)) ** 0.5), 2)
         up = np.array([0.0, 0.0, 1.3 * size * self._radius])
         for k, place in enumerate(anchors):

@@ -1,4 +1,4 @@
-"""`show`: what can be opened in the studio, and the page that it gets."""
+"""`show` opens a problem, scene, environment or recording on a page of the studio."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ __all__ = ["Options", "Studio", "show"]
 
 
 class Options(NamedTuple):
-    """How a page is served.
+    """Options of serving a page.
 
     Attributes
     ----------
     host, port
-        Address, loopback unless it is said otherwise, and the first port that is tried; 0: any.
+        Address, by default loopback, and the first port to try; 0 selects any free port.
     folder
-        In which files are written, and only there.
+        Folder for all files.
     seed
-        Of all searches.
+        Seed of all searches.
     browser
-        Whether a browser is opened on the page.
+        Whether to open a browser on the page.
     report
-        Writes a report of a problem and a layout (M, 3) to a path; None: there is none.
+        Writes a report of a problem and a layout (M, 3) to a path; None: no report.
     """
 
     host: str = "127.0.0.1"
@@ -45,14 +45,14 @@ class Options(NamedTuple):
 
 
 class Studio:
-    """A page that is being served.
+    """A running page.
 
     Parameters
     ----------
     server
         The viser server.
     page
-        What it shows.
+        The page that it serves.
     """
 
     def __init__(self, server: Any, page: Any) -> None:
@@ -60,13 +60,13 @@ class Studio:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """The address of the page."""
         host = self.server.get_host()
         host = "127.0.0.1" if host in ("0.0.0.0", "::") else host
         return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def _repr_html_(self) -> str:
-        """The page within a notebook."""
+        """Return the page as a frame of a notebook."""
         return f'<iframe src="{self.url}" width="100%" height="650" frameborder="0"></iframe>'
 
     def wait(self) -> None:
@@ -79,7 +79,7 @@ class Studio:
             self.stop()
 
     def stop(self) -> None:
-        """Keep the layout, and end the server."""
+        """Save the layout and stop the server."""
         self.page.stop()
         serving.stop_server(self.server)
 
@@ -91,30 +91,31 @@ def show(
     tables: Mapping[str, Any] | None = None,
     options: Options | None = None,
 ) -> Studio:
-    """Open the studio on something, and return at once.
+    """Open the studio and return at once.
 
     Parameters
     ----------
     what
-        A `Problem` of `placement.scene_files`: its anchors are placed by hand. Or what is watched:
-        a `Scene` (an episode), an environment, raw or wrapped, a `Recording` with its track, a
+        A `Problem` of `placement.scene_files`, to place its anchors by hand. Or an object to watch:
+        a `Scene` (an episode), an environment, raw or wrapped, a `Recording` with its track, or a
         `rbl_gym.studies.watching.program.Program`.
     beside
-        Of a problem, anchors (M, 3), metres; None: its own, or a usual layout. Of a recording, its
-        `Track` or a mapping of tracks by labels; None: that of the filter ``"iekf-log"``. Of a
-        scene or environment, labels of filters; None: ``"iekf"`` and ``"iekf-robust"``, or the
-        environment's own.
+        For a problem, anchors (M, 3) in metres; None: its own, or a usual layout. For a recording,
+        its `Track` or a mapping of tracks by labels; None: the track of the filter ``"iekf-log"``.
+        For a scene or environment, labels of filters; None: ``"iekf"`` and ``"iekf-robust"``, or
+        the environment's own.
     tables
-        Of the file from which the problem was read, for saving; None: made of the problem.
+        Tables of the file from which the problem was read, for saving; None: derived from the
+        problem.
     options
-        How the page is served; None: on loopback, in a browser.
+        Options of serving; None: on loopback, in a browser.
 
     Raises
     ------
     ValueError
-        On what cannot be shown.
+        If `what` cannot be shown.
     MissingExtraError
-        Without viser (extra ``studio``).
+        If viser is missing (extra ``studio``).
     """
     options = Options() if options is None else options
     check_count("seed", options.seed, least=0)
@@ -137,7 +138,7 @@ def show(
 def _placing(
     what: Any, layout: FloatArray | None, tables: Mapping[str, Any] | None, options: Options
 ) -> Callable[[Any], Any] | None:
-    """Makes the page of a problem; None: it is none."""
+    """Return a function that makes the page of a problem; None if `what` is not a problem."""
     if not isinstance(what, Problem):
         return None
     start = open_state(what, layout)

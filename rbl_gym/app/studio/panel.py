@@ -1,4 +1,4 @@
-"""The panel beside the scene: figures, buttons, sliders. No figure is computed here."""
+"""The panel beside the scene: figures, buttons, sliders. It computes no figure."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rbl_gym.app.studio.state import State
 
 PLANES = {"Floor plan (x, y)": 1, "Section (x, z)": 2}
 _NOBODY = "none"
-# So many values that a user asked for are remembered of an input.
+# Number of recent values of an input that are remembered.
 _MOST_ASKED = 64
 _CSS = (
     "font-family:inherit;font-size:12.5px;line-height:1.4;color:#212529;"
@@ -26,20 +26,20 @@ _CSS = (
 
 
 class Shown(NamedTuple):
-    """What the panel shows.
+    """The content of the panel.
 
     Attributes
     ----------
     state, figures, map
         The layout, its figures, and the map.
     others
-        b of other layouts by their names, metres; None: not known yet.
+        b of other layouts by name, metres; None: not known yet.
     selected
         Index of an anchor, or None.
     progress
-        From 0 to 1 of a long work, or None.
+        Progress of long work, from 0 to 1, or None.
     status
-        One line.
+        The message, one line.
     """
 
     state: State
@@ -52,24 +52,23 @@ class Shown(NamedTuple):
 
 
 class Panel:
-    """Handles of the panel.
+    """Controls of the panel.
 
     Parameters
     ----------
     gui
-        The GUI of a viser server, in the place where the panel goes.
+        The GUI of a viser server, in the container of the panel.
     state
-        What is shown first.
+        The initial state.
     name
-        First name for files.
+        Default name of files.
     actions
-        What is called, by name: ``undo``, ``redo``, ``add``, ``add_best``, ``remove``, ``fix``,
-        ``optimise``, ``stop``, ``design``, ``reset_knobs``, ``restore`` without
-        arguments; ``select`` with an index or None;
-        ``cut`` and ``knobs`` with keywords; ``save`` and ``report`` with a name,
-        ``load`` with a file's name and its bytes.
+        Callbacks by name: ``undo``, ``redo``, ``add``, ``add_best``, ``remove``, ``fix``,
+        ``optimise``, ``stop``, ``design``, ``reset_knobs``, ``restore`` without arguments;
+        ``select`` with an index or None; ``cut`` and ``knobs`` with keywords; ``save`` and
+        ``report`` with a name, ``load`` with a file's name and its bytes.
     has_report
-        Whether there is a button for the report.
+        Whether the panel has a button for the report.
     """
 
     def __init__(
@@ -120,7 +119,7 @@ class Panel:
         with gui.add_folder("Save", expand_by_default=False):
             self._name = gui.add_text("Name", name)
             save = gui.add_button("Scene and list", icon="device-floppy")
-            save.hint = "NAME.toml for rbl-gym place and studio, NAME.csv to mount by"
+            save.hint = "NAME.toml for rbl-gym place and studio, NAME.csv as mounting list"
             save.on_click(lambda _: actions["save"](self._name.value))
             if has_report:
                 report = gui.add_button("Report (PDF)", icon="file-text")
@@ -156,7 +155,7 @@ class Panel:
             self._input(handle, lambda n=name, h=handle: self._actions["knobs"](**{n: h.value}))
 
     def _input(self, handle: Any, call: Callable[[], None]) -> None:
-        """Call when a user changes an input, not when `show` does."""
+        """Connect a callback that runs if a user changes an input, but not if `show` does."""
         asked = self._asked[id(handle)] = deque(maxlen=_MOST_ASKED)
 
         def changed(event: Any) -> None:
@@ -167,9 +166,10 @@ class Panel:
         handle.on_update(changed)
 
     def _fill(self, handle: Any, value: Any) -> None:
-        """Show a value in an input, unless it is what a user asked for.
+        """Show a value in an input, unless a user asked for it.
 
-        While a slider is moved the state comes some values behind: it must not be moved back.
+        While a user moves a slider, the state lags behind by some values. It must not move the
+        slider back.
         """
         asked = self._asked[id(handle)]
         if not any(_same(value, one) for one in (handle.value, *asked)):
@@ -192,14 +192,14 @@ class Panel:
         text = str(self._selected.value)
         return None if text == _NOBODY else int(text.split()[0]) - 1
 
-    # --- what it shows ---------------------------------------------------------------------
+    # # --- content ---------------------------------------------------------------------------
 
     def offer_restore(self, visible: bool) -> None:
-        """Show or hide the button that goes back to the last session."""
+        """Show or hide the button that restores the last session."""
         self._restore.visible = visible
 
     def show(self, shown: Shown) -> None:
-        """Show all of it."""
+        """Show the complete content."""
         state, selected = shown.state, shown.selected
         _set(self._headline, "content", headline(shown))
         _set(self._legend, "content", legend(shown.map))
@@ -221,7 +221,7 @@ class Panel:
             self._fill(handle, getattr(state.world.knobs, name))
 
     def _show_at(self, state: State) -> None:
-        """Where the slice is, in metres along the axis that it cuts."""
+        """Show the position of the slice, in metres along its normal axis."""
         axis = 3 - state.slice.up
         low, high = (float(corner[axis]) for corner in state.world.base.corners())
         _set(self._at, "visible", high > low)
@@ -234,7 +234,7 @@ class Panel:
 
 
 def _set(handle: Any, name: str, value: Any) -> bool:
-    """Set a property, and whether it was another: what is as it should be is not sent."""
+    """Set a property, and return whether it changed. An unchanged value is not sent."""
     if getattr(handle, name) == value:
         return False
     setattr(handle, name, value)
@@ -248,7 +248,7 @@ def _same(one: Any, other: Any) -> bool:
 
 
 def _range(value: float, most: float) -> tuple[float, float, float]:
-    """Least, most and step of a slider that has `value` on it."""
+    """Return minimum, maximum and step of a slider whose range includes `value`."""
     step = 10.0 ** int(np.floor(np.log10(max(value, 1e-9)))) / 20
     return step, round(round(most / step) * step, 9), step
 
@@ -312,7 +312,7 @@ def _row(colour: str, name: str, figures: str, right: str = "") -> str:
 
 
 def _bars(own: float, others: Mapping[str, float | None]) -> str:
-    """This layout among the others, the best first, each as a bar of its score."""
+    """This layout among the others, the best first, each with a bar of its score."""
     known = {name: score for name, score in others.items() if score is not None}
     rows = sorted([("this layout", own), *known.items()], key=lambda row: row[1])
     largest = max(score for _, score in rows)
@@ -340,7 +340,7 @@ def _bars(own: float, others: Mapping[str, float | None]) -> str:
 
 
 def status(shown: Shown) -> str:
-    """The last message, in red where something was not done."""
+    """The last message, in red if an action failed."""
     colour = "#c92a2a" if shown.status.startswith("Not done") else "#495057"
     return f'<div style="{_CSS};color:{colour};min-height:18px">{_text(shown.status)}</div>'
 
@@ -367,7 +367,7 @@ def legend(found: SliceMap) -> str:
 
 
 def length(metres: float) -> str:
-    """Three digits at most, in the unit in which they are read."""
+    """Format a length with at most three digits, in a suitable unit."""
     for unit, scale in (("mm", 1000), ("cm", 100), ("m", 1)):
         value = scale * metres
         if value < (10 if unit == "mm" else 100):

@@ -1,4 +1,4 @@
-"""The page on which anchors are placed: one state on the server, the same for every browser."""
+"""The page for placing anchors. The server has one state, which every browser shows."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from rbl_gym.studies.placing import design
 
 
 class PlacePage:
-    """Ties a state to a viser server.
+    """Shows a state in a viser server, and changes it as the user asks.
 
     Parameters
     ----------
     server
-        On which it is shown.
+        The viser server.
     start
-        What is shown first.
+        The initial state.
     tables
-        Of the file from which the problem was read.
+        Tables of the file from which the problem was read.
     folder
-        In which files are written, and only there.
+        Folder for all files.
     report
-        Writes a report of a problem and a layout to a path; None: there is no button for it.
+        Writes a report of a problem and a layout to a path; None: the page has no report button.
     seed
-        Of all searches.
+        Seed of all searches.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class PlacePage:
         self.figures = figures(start)
         self.map = maps.slice_map(start)
         self.seconds: deque[float] = deque(maxlen=256)
-        # The anchor that is held, and the state before that.
+        # The dragged anchor, and the state before the drag.
         self._held: tuple[int, State] | None = None
         self._selected: int | None = None
         self.status = "Drag an anchor. Click one to select it."
@@ -95,30 +95,30 @@ class PlacePage:
         self._worker.post(self._refine)
         threading.Thread(target=self._search, args=(start,), daemon=True).start()
 
-    # --- what the page asks for -------------------------------------------------------------
+    # # --- requests of the page ---------------------------------------------------------------
 
     def edit(self, change: Callable[[State], State]) -> None:
-        """Replace the state by what `change` makes of it, and show that; later, in order."""
+        """Replace the state by the result of `change` and show it, in order."""
         self._worker.post(lambda: self._edit(change))
 
     def drag(self, index: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
-        """An anchor is held under a pointer: the mount on its line of sight takes it.
+        """Move an anchor to the mount under the pointer.
 
         Parameters
         ----------
         index
-            Of the anchor.
+            Index of the anchor.
         phase
             ``"start"``, ``"update"``, ``"end"``.
         camera, point
-            Two points (3,) of the line, metres.
+            Two points (3,) of the line of sight, metres.
         """
         asked = time.perf_counter()
         key = None if phase != "update" else ("drag", index)
         self._worker.post(lambda: self._drag(index, phase, camera, point, asked), key)
 
     def select(self, index: int | None) -> None:
-        """Select an anchor; None: none."""
+        """Select an anchor; None clears the selection."""
 
         def task() -> None:
             self._selected = index
@@ -127,7 +127,7 @@ class PlacePage:
         self._worker.post(task)
 
     def cut(self, **fields: Any) -> None:
-        """Show another map: fields of `Slice`."""
+        """Show another map; arguments are fields of `Slice`."""
 
         def task() -> None:
             self.state = state.cut(self.state, **fields)
@@ -138,7 +138,7 @@ class PlacePage:
         self._worker.post(task, "slice")
 
     def drag_body(self, _: int, phase: str, camera: FloatArray, point: FloatArray) -> None:
-        """The body is held under a pointer: it moves on the slice. Arguments as `drag`."""
+        """Move the body on the slice to the point under the pointer. Arguments as in `drag`."""
 
         def task() -> None:
             axis, (low, _) = 3 - self.state.slice.up, state.plane(self.state)
@@ -150,7 +150,7 @@ class PlacePage:
         self._worker.post(task, "body")
 
     def turn_knobs(self, **knobs: float) -> None:
-        """Turn `Knobs`, given by their names."""
+        """Change `Knobs`, given by name."""
 
         def task() -> None:
             self.state = state.turn_knobs(self.state, **knobs)
@@ -161,7 +161,7 @@ class PlacePage:
         self._worker.post(task, ("knobs", *knobs))
 
     def optimise(self) -> None:
-        """Improve the layout from where it is, a step at a time; any change ends it."""
+        """Improve the current layout step by step. Any change ends this."""
 
         def task() -> None:
             self._progress, self.status = 0.0, "Optimising ..."
@@ -171,7 +171,7 @@ class PlacePage:
         self._worker.post(task)
 
     def stop_work(self) -> None:
-        """End what runs; what was found stays."""
+        """Stop the running work and keep its result."""
 
         def task() -> None:
             self._end_work()
@@ -182,7 +182,7 @@ class PlacePage:
         self._worker.post(task)
 
     def redesign(self) -> None:
-        """Put the designed layout of as many anchors in place; it is searched if need be."""
+        """Show the designed layout for this number of anchors. Search it first if needed."""
 
         def task() -> None:
             now = self.state
@@ -206,7 +206,7 @@ class PlacePage:
         self._worker.post(task)
 
     def load(self, name: str, content: bytes) -> None:
-        """Put the anchors of a list (CSV) in place."""
+        """Replace the anchors by those of a list (CSV)."""
 
         def task() -> None:
             places = parse_layout(name, content).positions
@@ -217,9 +217,9 @@ class PlacePage:
         self._worker.post(task)
 
     def write_report(self, name: str) -> None:
-        """`save`, and the report; that takes a while, beside everything else."""
+        """Run `save` and write the report in the background."""
         now, report = self.state, self._report
-        assert report is not None  # else there is no button
+        assert report is not None  # else the page has no report button
 
         def task() -> None:
             try:
@@ -233,7 +233,7 @@ class PlacePage:
         threading.Thread(target=task, daemon=True).start()
 
     def restore(self) -> None:
-        """Put the layout of the last session in place."""
+        """Restore the layout of the last session."""
         anchors = self._keeper.found
         if anchors is not None:
             restored = Layout(anchors, np.zeros(len(anchors), bool))
@@ -241,11 +241,11 @@ class PlacePage:
             self._display.panel.offer_restore(False)
 
     def settle(self, timeout: float = 60.0) -> bool:
-        """Wait until all that was asked for is shown; whether that was so in time."""
+        """Wait until all requests are shown; return whether this was within the time limit."""
         return self._worker.settle(timeout)
 
     def stop(self) -> None:
-        """Keep the layout, and end the worker."""
+        """Save the layout and stop the worker."""
         self._worker.post(lambda: self._keeper.keep(self.state))
         self._worker.stop()
 
@@ -298,7 +298,7 @@ class PlacePage:
         if not start.fixed[index]:
             place = under_pointer(self.state.world, camera, point, self.state.anchors[index])
             moved = state.move(start, index, place)
-            # Over an obstacle it stays where it was last.
+            # Over an obstacle the anchor keeps its last position.
             if moved is not start:
                 self._adopt(moved)
             self._show_coarse()
@@ -307,7 +307,7 @@ class PlacePage:
             self._refine()
 
     def _adopt(self, other: State) -> None:
-        """Take the layout of another state, and its past."""
+        """Take the layout of another state, with its undo history."""
         fields = {name: getattr(other, name) for name in ("layout", "past", "future")}
         self.state = dataclasses.replace(self.state, **fields)
 
@@ -321,14 +321,14 @@ class PlacePage:
             yield
         gain = 100 * (1 - self.state.score / before)
         self._end_work()
-        self.status = "No step from here helps."
+        self.status = "No step improves this layout."
         if gain >= 0.05:
             self.status = f"Optimised: b is {gain:.1f} % smaller."
         self._show()
         self._refine()
 
     def _end_work(self) -> None:
-        """Leave an optimisation where it is."""
+        """Stop an optimisation and keep its result."""
         if self._progress is not None:
             self._progress, self.status = None, ""
         self._worker.when_idle(None)
@@ -361,10 +361,10 @@ class PlacePage:
         marks = self._selected, self._progress, self.status
         self._display.show(Shown(now, self.figures, self.map, others, *marks))
 
-    # --- beside the worker ------------------------------------------------------------------
+    # # --- background threads -----------------------------------------------------------------
 
     def _search(self, now: State, apply: bool = False) -> None:
-        """Design a layout: around the fixed anchors and in place of this one, or to compare."""
+        """Design a layout to replace this one, around the fixed anchors, or for comparison."""
         world, count = now.world, len(now.anchors)
         try:
             found = design.design_layout(now.problem, self._seed).anchors

@@ -1,4 +1,4 @@
-"""Which mount stands under the pointer."""
+"""The mount under the pointer."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import numpy as np
 from rbl_gym.app.studio.world import World
 from rbl_gym.checks import FloatArray
 
-# Mounts whose directions from the camera differ by less than this lie equally well, radians.
+# Mounts whose directions from the camera differ by less than this count as equal, radians.
 _SAME_RAD = 2e-3
 
 
 def under_pointer(
     world: World, camera: FloatArray, point: FloatArray, near: FloatArray
 ) -> FloatArray:
-    """The mount (3,) that a line of sight meets; of several, the one nearest to `near`.
+    """Return the mount (3,) that a line of sight meets; of several, the one nearest to `near`.
 
-    Where it meets none it is the mount that is seen nearest to the line.
+    If the line meets no mount, return the mount with the smallest angle from the line.
 
     Parameters
     ----------
     world
-        Gives the mounts.
+        The world with the mounts.
     camera, point
-        Two points (3,) of the line, metres.
+        Two points (3,) of the line of sight, metres.
     near
-        (3,), where the anchor is now.
+        Present position (3,) of the anchor, metres.
     """
     mounts = world.problem.mounts
     direction = point - camera
@@ -35,7 +35,7 @@ def under_pointer(
     found = [point[None], near[None]]
     if len(flat):
         axes, extents = faces.axes[flat], faces.extents[flat]
-        # Of each face the axis along which it has no extent; of a wall that has none, the cross.
+        # The axis along which each face has no extent; for an oblique wall, the cross product.
         first = np.take_along_axis(axes, np.argsort(-extents, axis=1)[:, :2, None], axis=1)
         normal = np.cross(first[:, 0], first[:, 1])
         slope = normal @ direction
@@ -53,7 +53,7 @@ def under_pointer(
 
 
 def on_plane(camera: FloatArray, point: FloatArray, axis: int, at: float) -> FloatArray:
-    """Where the line of sight meets the plane on which a coordinate is `at`; else the point."""
+    """Return the intersection with the plane where a coordinate equals `at`, else the point."""
     slope = point[axis] - camera[axis]
     share = (at - camera[axis]) / slope if abs(slope) > 1e-9 else 0.0
     return camera + share * (point - camera) if share > 0 else point

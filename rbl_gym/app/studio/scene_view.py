@@ -1,4 +1,4 @@
-"""What stands still in 3-D: floor, walls, obstacles, where anchors may stand; and the camera."""
+"""The static parts in 3-D: floor, walls, obstacles and mounts; and the camera."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ PANEL = 310
 INK = (52, 58, 64)
 WALL, FLOOR, GRID, RACK = (206, 212, 218), (241, 243, 245), (222, 226, 230), (173, 181, 189)
 EDGE = (173, 181, 189)
-# Where the camera stands, its vertical field of view, and how much of the window is filled.
+# Direction of the camera, its vertical field of view, and the filled share of the window.
 _TOWARDS = np.array([-0.25, -1.0, 0.85])
 _FOV_RAD, _FILLED = 0.7, 0.92
-# What reaches above this share of the height is a wall, and seen through.
+# An obstacle above this share of the height is a wall and drawn transparent.
 _TALL = 0.8
 
 
 def corners(problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Corners (3,) of the smallest box around mounts, zones and obstacles, metres."""
+    """Return the corners (3,) of the bounding box of mounts, zones and obstacles, metres."""
     lows, highs = zip(problem.corners(), problem.mounts.bounds(), strict=True)
     low, high = np.min(lows, axis=0), np.max(highs, axis=0)
     boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
@@ -42,14 +42,14 @@ def corners(problem: Problem) -> tuple[FloatArray, FloatArray]:
 
 
 def extent_of(problem: Problem) -> float:
-    """The largest side of `corners`, metres."""
+    """Return the largest side of `corners`, metres."""
     return float(np.ptp(corners(problem), axis=0).max())
 
 
 def set_camera(server: Any, problem: Problem, panels: int = PANEL) -> None:
-    """A view from the south and above in which all of it is seen, for every browser that comes.
+    """Show the complete problem from the south and above, in every new browser.
 
-    `panels`: how wide all panels are together, pixels.
+    `panels` is the total width of all panels in pixels.
     """
     camera = server.initial_camera
     camera.fov = _FOV_RAD
@@ -63,23 +63,23 @@ def set_camera(server: Any, problem: Problem, panels: int = PANEL) -> None:
 
 
 def look(client: Any, problem: Problem, panels: int = PANEL) -> None:
-    """The camera of a browser where all of a problem is seen."""
+    """Set the camera of a browser so that the complete problem is visible."""
     view = client.camera
-    # What the panels leave of the window.
+    # Width of the window without the panels.
     aspect = max(view.image_width - panels, 0.4 * view.image_width) / view.image_height
     look_at, position = view_of(problem, aspect)
-    # The place takes the point that is looked at with it.
+    # Setting the position also moves the target point, so set the target last.
     client.camera.position = position
     client.camera.look_at = look_at
 
 
 def view_of(problem: Problem, aspect: float) -> tuple[FloatArray, FloatArray]:
-    """Where a camera looks and stands, (3,) each, to see all of a problem in a window.
+    """Return target and position (3,) of a camera that shows the complete problem.
 
     Parameters
     ----------
     problem
-        What is seen.
+        The problem to show.
     aspect
         Width of the window over its height.
     """
@@ -89,25 +89,25 @@ def view_of(problem: Problem, aspect: float) -> tuple[FloatArray, FloatArray]:
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     across, up, ahead = axes @ (signs * half).T
     limit = math.tan(0.5 * _FOV_RAD)
-    # How far away each corner comes to the edge of the window.
+    # Distances at which each corner reaches the edge of the window.
     needed = np.maximum(np.abs(across) / aspect, np.abs(up)) / (_FILLED * limit) - ahead
     return middle, middle - needed.max() * axes[2]
 
 
 def view_axes(forward: FloatArray) -> FloatArray:
-    """Axes (3, 3) of a camera that looks along a direction (3,): right, up, forward."""
+    """Return axes (3, 3) of a camera that looks along a direction (3,): right, up, forward."""
     right = np.cross(forward, [0.0, 0.0, 1.0])
     axes = np.stack([right, np.cross(right, forward), forward])
     return axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-# --- what stands still -----------------------------------------------------------------------
+# # --- static parts ----------------------------------------------------------------------------
 
 
 def draw_room(server: Any, problem: Problem, floor_opacity: float | None = None) -> None:
-    """Floor, walls, obstacles and where anchors may stand.
+    """Draw floor, walls, obstacles and mounts.
 
-    `floor_opacity` None: nothing is seen below the floor.
+    If `floor_opacity` is None, nothing below the floor is visible.
     """
     scene = server.scene
     scene.configure_default_lights(cast_shadow=False)
@@ -117,7 +117,7 @@ def draw_room(server: Any, problem: Problem, floor_opacity: float | None = None)
         _draw_floor(scene, low, high, floor_opacity)
     if isinstance(problem.mounts, Walls):
         faces = _room_faces(*problem.mounts.bounds())
-        # Seen from the inside alone: the walls between camera and room are left out.
+        # Visible from the inside only: the walls between camera and room are hidden.
         scene.add_mesh_simple(
             "/room/walls", *faces, color=WALL, opacity=0.35, side="back",
             cast_shadow=False, receive_shadow=False,
@@ -147,7 +147,7 @@ def draw_room(server: Any, problem: Problem, floor_opacity: float | None = None)
 
 
 def _draw_floor(scene: Any, low: FloatArray, high: FloatArray, opacity: float | None) -> None:
-    """A floor with a grid of whole metres below all of it."""
+    """Draw a floor with a grid of whole metres, below everything else."""
     extent = float((high - low).max())
     flat = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
     floor = np.column_stack([flat, np.full(4, low[2] - 0.002 * extent)])
@@ -160,7 +160,7 @@ def _draw_floor(scene: Any, low: FloatArray, high: FloatArray, opacity: float | 
 
 
 def _circles(radius: float) -> FloatArray:
-    """Segments (S, 2, 3) of three great circles of a sphere about the origin."""
+    """Return segments (S, 2, 3) of three great circles of a sphere about the origin."""
     angle = np.linspace(0, 2 * np.pi, 97)
     found = []
     for axis in range(3):
@@ -170,14 +170,14 @@ def _circles(radius: float) -> FloatArray:
 
 
 def lines(scene: Any, name: str, segments: FloatArray, colour: Any, width: float) -> Any:
-    """Segments (S, 2, 3) so many pixels wide."""
+    """Draw segments (S, 2, 3) with a width in pixels."""
     return scene.add_line_segments(
         name, np.asarray(segments, np.float32), colour, thickness=width, thickness_units="screen"
     )
 
 
 def _grid(low: FloatArray, high: FloatArray, step: float, z: float) -> FloatArray:
-    """Lines (S, 2, 3) at whole multiples of a step."""
+    """Return lines (S, 2, 3) at whole multiples of a step."""
     found = []
     for axis in (0, 1):
         for at in np.arange(np.ceil(low[axis] / step), np.floor(high[axis] / step) + 1) * step:
@@ -188,20 +188,20 @@ def _grid(low: FloatArray, high: FloatArray, step: float, z: float) -> FloatArra
 
 
 def box_edges(low: FloatArray, high: FloatArray) -> FloatArray:
-    """The twelve edges (12, 2, 3) of a box."""
+    """Return the twelve edges (12, 2, 3) of a box."""
     ring = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
     return prism_edges(ring, low[2], high[2])
 
 
 def prism_edges(ring: FloatArray, low: float, high: float) -> FloatArray:
-    """The edges (3 V, 2, 3) of a prism over corners (V, 2)."""
+    """Return the edges (3 V, 2, 3) of a prism over corners (V, 2)."""
     bottom, top = (np.insert(ring, 2, z, axis=1) for z in (low, high))
     around = [np.stack([one, np.roll(one, -1, axis=0)], axis=1) for one in (bottom, top)]
     return np.concatenate([*around, np.stack([bottom, top], axis=1)])
 
 
 def _room_faces(low: FloatArray, high: FloatArray) -> tuple[FloatArray, np.ndarray]:
-    """Walls and ceiling of a room, their front outwards."""
+    """Return walls and ceiling of a room, with their front sides outwards."""
     x, y, z = zip(low, high, strict=True)
     points = np.array([[x[i], y[j], z[k]] for k in (0, 1) for j in (0, 1) for i in (0, 1)])
     quads = [(0, 1, 5, 4), (1, 3, 7, 5), (3, 2, 6, 7), (2, 0, 4, 6), (4, 5, 7, 6)]
@@ -209,7 +209,7 @@ def _room_faces(low: FloatArray, high: FloatArray) -> tuple[FloatArray, np.ndarr
 
 
 def _mount_faces(mounts: Mounts) -> tuple[FloatArray, np.ndarray]:
-    """Pieces of mounts as triangles: strips of walls, parts of ceilings; points are left out."""
+    """Return mounts as triangles: strips of walls, parts of ceilings; points are left out."""
     vertices: list[Any] = []
     triangles: list[Any] = []
     for a0, a1, b0, b1, c0, c1, low, high in mounts.pieces.tolist():
@@ -227,7 +227,7 @@ Solid = tuple[FloatArray, float, float]
 
 
 def solids_of(problem: Problem) -> list[Solid]:
-    """All obstacles: corners (V, 2) in the plan, lower and upper height."""
+    """Return all obstacles: corners (V, 2) in the plan, lower and upper height."""
     boxes, prisms = problem.obstacles.boxes, problem.obstacles.prisms
     turns = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     found = [(box[:2] + turns * box[3:5], box[2] - box[5], box[2] + box[5]) for box in boxes]
@@ -235,7 +235,7 @@ def solids_of(problem: Problem) -> list[Solid]:
 
 
 def mesh_of(solids: list[Solid]) -> tuple[FloatArray, np.ndarray]:
-    """Solids as vertices (K, 3) and triangles (T, 3)."""
+    """Return solids as vertices (K, 3) and triangles (T, 3)."""
     points, triangles, count = [], [], 0
     for ring, low, high in solids:
         # Corners of prisms are repeated up to a common number.

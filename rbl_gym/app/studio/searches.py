@@ -1,4 +1,4 @@
-"""Better layouts from the one that is shown: downhill from it, and the best place for one more."""
+"""Searches from the current layout: gradient descent, and the best position for one more anchor."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from rbl_gym.studies.placing import choosing
 
 __all__ = ["add_best", "optimise"]
 
-# Rounds of an optimisation, steps along the gradient in each; it ends where a round gains less.
+# Rounds of an optimisation, gradient steps of a round, and the minimum gain of a round.
 _ROUNDS, _STEPS, _LEAST_GAIN = 12, 8, 2e-3
 
 
 def add_best(state: State, seed: int = 0) -> State:
-    """One more anchor where it helps most. Arguments and errors as `add`.
+    """Add an anchor at the best position. Arguments as in `add`, and the same errors.
 
     Parameters
     ----------
     state
-        The layout as it is.
+        The current state.
     seed
-        Of the candidates.
+        Seed of the candidates.
     """
     if len(state.anchors) >= MAX_ANCHORS:
-        raise ValueError(f"there may be {MAX_ANCHORS} anchors at most")
+        raise ValueError(f"a layout has at most {MAX_ANCHORS} anchors")
     found = choosing.next_anchor(state.problem, state.anchors, seed)
     if found is None:
         raise ValueError("no mount is left for one more anchor")
@@ -39,21 +39,21 @@ def add_best(state: State, seed: int = 0) -> State:
 
 
 def optimise(state: State, seed: int = 0) -> Iterator[tuple[float, State]]:
-    """Better and better layouts, from this one on; the fixed anchors stay.
+    """Improve the layout step by step; the fixed anchors do not move.
 
-    In every round some steps along the gradient, and fresh candidates where something is in the
-    way. All of them are one change: undo goes back to the layout at the beginning.
+    Every round takes some gradient steps, and draws fresh candidates if there are obstacles. All
+    rounds count as one change: undo restores the layout from before the first.
 
     Parameters
     ----------
     state
-        Where it begins.
+        The initial state.
     seed
-        Of the fresh candidates.
+        Seed of the fresh candidates.
 
     Yields
     ------
-    How much is done, from 0 to 1, and a state whose score is at most that of the one before.
+    Progress from 0 to 1, and a state whose score is at most the previous one.
     """
     world, (start, fixed) = state.world, state.layout
     free = np.flatnonzero(~fixed)
@@ -84,7 +84,7 @@ def optimise(state: State, seed: int = 0) -> Iterator[tuple[float, State]]:
 
 
 def _with_fixed(setting: Setting, fixed: FloatArray) -> Setting:
-    """The setting in which anchors count as known."""
+    """Return the setting in which fixed anchors count as known."""
     if not len(fixed):
         return setting
     return setting._replace(sample=setting.sample._replace(prior=setting.told(fixed)))

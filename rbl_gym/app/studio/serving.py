@@ -1,4 +1,4 @@
-"""The server of the studio's page: viser, on loopback unless told otherwise."""
+"""The server of the studio's page: viser, by default on loopback."""
 
 from __future__ import annotations
 
@@ -14,40 +14,40 @@ from rbl_gym.app.studio.scene_view import PANEL
 from rbl_gym.checks import check_count
 from rbl_gym.studies.extras import require
 
-# Ports that are tried from the first on.
+# Number of ports to try, from the first on.
 _PORTS = 50
 BRAND = (24, 100, 171)
-# Origins of pages that this machine serves, by whatever port.
+# Origins of pages that this machine serves, on any port.
 _LOOPBACK = re.compile(r"https?://(127\.0\.0\.1|localhost|\[::1\])(:\d+)?")
 
 
 def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym studio") -> Any:
-    """A viser server with the studio's looks.
+    """Open a viser server with the theme of the studio.
 
     Parameters
     ----------
     host
-        Address on which it listens. Other machines can open the page where it is not loopback.
+        Address on which it listens. Other machines can open the page unless it is loopback.
     port
-        The first that is free from here on; 0: any.
+        First port to try; the first free one is used. 0 selects any.
     title
-        Of the panel.
+        Title of the panel.
 
     Raises
     ------
     MissingExtraError
-        Without viser (extra ``studio``).
+        If viser is missing (extra ``studio``).
     ValueError
-        Where the address is none of this machine, or no port is free.
+        If the address does not belong to this machine, or no port is free.
     """
     require("viser", "studio")
     import viser
 
     port = _free_port(host, check_count("port", port, least=0, most=65535))
-    # It would print a frame of its own.
+    # viser would print a frame of its own.
     with contextlib.redirect_stdout(io.StringIO()), _own_pages_only(host):
         server: Any = viser.ViserServer(host=host, port=port, label=title, verbose=False)
-    # A browser could ask for a tunnel to the outside.
+    # A browser could request a tunnel to the internet.
     server.request_share_url = lambda *_, **__: None
     server.gui.configure_theme(
         control_width="medium", show_logo=False, show_share_button=False, brand_color=BRAND
@@ -61,9 +61,9 @@ def open_server(host: str = "127.0.0.1", port: int = 8080, title: str = "rbl-gym
 
 @contextlib.contextmanager
 def _own_pages_only(host: str) -> Iterator[None]:
-    """On loopback, a server that is made here speaks to pages of this machine alone.
+    """Let servers on loopback, made in this context, accept pages of this machine only.
 
-    Any page that is open in a browser may connect to loopback; the browser says whose it is.
+    Any page that is open in a browser may connect to loopback. The browser sends the page's origin.
     """
     from websockets.asyncio import server
 
@@ -77,7 +77,7 @@ def _own_pages_only(host: str) -> Iterator[None]:
 
 
 def stop_server(server: Any) -> None:
-    """End a server quietly."""
+    """Stop a server without messages."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 

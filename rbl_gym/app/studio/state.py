@@ -1,6 +1,6 @@
-"""What the studio shows: a world, a layout of anchors, a slice; and what can be done to it.
+"""The state of the studio: a world, a layout of anchors, a slice; and the functions that change it.
 
-A state is never changed: every function takes one and returns another.
+States are immutable: every function takes a state and returns a new one.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ __all__ = [
     "undo",
 ]
 
-# Layouts that undo goes back to, at most.
+# Maximum number of layouts that undo can restore.
 _MOST_PAST = 200
-# Anchors nearer to each other than this stand at one place, metres.
+# Anchors closer than this count as one position, metres.
 _APART_M = 1e-3
-# Candidates among which a new anchor is the farthest from the others.
+# Candidates for a new anchor; the one farthest from the others is taken.
 _CANDIDATES = 400
 
 
 class Layout(NamedTuple):
-    """Anchors (M, 3) in metres, and which of them (M,) stay where they are."""
+    """Anchors (M, 3) in metres, and which of them (M,) are fixed."""
 
     anchors: FloatArray
     fixed: BoolArray
 
 
 class Slice(NamedTuple):
-    """What the map shows, and where.
+    """Quantity and plane of the map.
 
     Attributes
     ----------
@@ -61,7 +61,8 @@ class Slice(NamedTuple):
     up
         1: over x and y; 2: over x and z.
     share
-        Where the plane cuts the third axis: 0 is the lower side of all zones, 1 the upper one.
+        Position of the plane along the third axis: 0 is the lower side of all zones, 1 the upper
+        side.
     """
 
     quantity: str = "position"
@@ -74,7 +75,7 @@ _FIRST_SLICE = Slice()
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What the studio shows.
+    """The state of the studio.
 
     Parameters
     ----------
@@ -83,11 +84,11 @@ class State:
     layout
         The anchors.
     body
-        (3,): where the body is shown, metres; on the slice.
+        Position (3,) of the body on the slice, metres.
     slice
-        What the map shows.
+        Quantity and plane of the map.
     past, future
-        Layouts that undo and redo go to, the nearest last.
+        Layouts for undo and redo, the next one last.
     """
 
     world: World
@@ -104,12 +105,12 @@ class State:
 
     @property
     def fixed(self) -> BoolArray:
-        """(M,): which anchors stay where they are."""
+        """(M,): which anchors are fixed."""
         return self.layout.fixed
 
     @property
     def problem(self) -> Problem:
-        """The problem of this layout: its number of anchors, and those that stay."""
+        """The problem with this layout's number of anchors and its fixed anchors."""
         anchors, fixed = self.layout
         return dataclasses.replace(self.world.problem, n_anchors=len(anchors), fixed=anchors[fixed])
 
@@ -120,20 +121,20 @@ class State:
 
 
 def open_state(problem: Problem, anchors: FloatArray | None = None) -> State:
-    """The state in which a problem is opened.
+    """Return the initial state of a problem.
 
     Parameters
     ----------
     problem
-        What is placed. Of a problem whose anchors are all fixed, these are the layout, and none
-        of them stays.
+        The placement problem. If all its anchors are fixed, they become the layout and are
+        released.
     anchors
-        (M, 3), metres; None: the fixed ones, and the best of the usual layouts for the others.
+        (M, 3), metres; None: the fixed anchors, and the best usual layout for the others.
 
     Raises
     ------
     ValueError
-        Where the layout has too few or too many anchors, or one that stands where none may.
+        If the layout has too few or too many anchors, or an anchor at an illegal position.
     """
     world, fixed = World(problem, knobs_of(problem)), problem.fixed
     if anchors is None:
@@ -141,7 +142,7 @@ def open_state(problem: Problem, anchors: FloatArray | None = None) -> State:
     anchors = check_array("anchors", anchors, ("M", 3))
     if anchors.ndim != 2 or not MIN_ANCHORS <= len(anchors) <= MAX_ANCHORS:
         raise ValueError(
-            f"anchors must be {MIN_ANCHORS} to {MAX_ANCHORS} places (M, 3), "
+            f"anchors must be {MIN_ANCHORS} to {MAX_ANCHORS} positions (M, 3), "
             f"got shape {anchors.shape}"
         )
     among = (np.abs(anchors[:, None] - fixed).max(axis=-1) < 1e-9).any(axis=1)
@@ -150,7 +151,7 @@ def open_state(problem: Problem, anchors: FloatArray | None = None) -> State:
     if not legal.all():
         k = int(np.argmin(legal))
         raise ValueError(
-            f"anchors[{k}] = {anchors[k].tolist()} stands where none may: off the mounts, or "
+            f"anchors[{k}] = {anchors[k].tolist()} is not a legal position: off the mounts, or "
             "inside of an obstacle"
         )
     start = State(world, Layout(anchors, stays), np.mean(problem.corners(), axis=0))
@@ -158,7 +159,7 @@ def open_state(problem: Problem, anchors: FloatArray | None = None) -> State:
 
 
 def _first_layout(world: World) -> FloatArray:
-    """The best of the usual layouts whose anchors are legal and apart; the fixed ones are first."""
+    """Return the best usual layout with legal, distinct anchors; the fixed ones are first."""
     problem, fixed = world.problem, world.problem.fixed
     count = problem.n_anchors - len(fixed)
     drawn = design.design.free_candidates(problem, np.random.default_rng(0), max(count, 4))
@@ -169,7 +170,7 @@ def _first_layout(world: World) -> FloatArray:
 
 
 def _is_proper(world: World, anchors: FloatArray, n_fixed: int) -> bool:
-    """Whether no two anchors stand at one place, and those after the fixed ones are legal."""
+    """Return whether all anchors are distinct, and those after the fixed ones are legal."""
     apart = np.abs(anchors[:, None] - anchors).max(axis=-1) + 2 * _APART_M * np.eye(len(anchors))
     return bool((apart > _APART_M).all() and world.setting.legal(anchors[n_fixed:]).all())
 
@@ -178,15 +179,15 @@ def _is_proper(world: World, anchors: FloatArray, n_fixed: int) -> bool:
 
 
 def snap(world: World, point: FloatArray) -> FloatArray:
-    """The legal mount (3,) nearest to a point, to the millimetre where the mount allows it."""
+    """Return the legal mount (3,) nearest to a point, rounded to millimetres if possible."""
     mounts = world.problem.mounts
     return mounts.project(np.round(mounts.project(np.asarray(point, float)), 3))
 
 
 def move(state: State, index: int, point: FloatArray) -> State:
-    """The anchor at the legal mount nearest to a point.
+    """Move an anchor to the legal mount nearest to a point.
 
-    It stays where it was where that mount is inside of an obstacle, or has an anchor.
+    The anchor keeps its position if that mount is inside an obstacle or taken.
 
     Raises
     ------
@@ -206,15 +207,15 @@ def move(state: State, index: int, point: FloatArray) -> State:
 
 
 def add(state: State, point: FloatArray | None = None) -> State:
-    """One more anchor, the last: at the mount nearest to a point, or far from the others.
+    """Add an anchor, as the last one, at the mount nearest to a point, or far from the others.
 
     Raises
     ------
     ValueError
-        If there are as many as there may be, or that mount is inside of an obstacle or taken.
+        If the number of anchors is at its maximum, or that mount is inside an obstacle or taken.
     """
     if len(state.anchors) >= MAX_ANCHORS:
-        raise ValueError(f"there may be {MAX_ANCHORS} anchors at most")
+        raise ValueError(f"a layout has at most {MAX_ANCHORS} anchors")
     if point is None:
         problem, rng = state.world.problem, np.random.default_rng(len(state.anchors))
         drawn = choosing.candidates(problem, rng, _CANDIDATES)
@@ -223,29 +224,29 @@ def add(state: State, point: FloatArray | None = None) -> State:
     else:
         place = snap(state.world, point)
     if not _is_free(state, place, state.anchors):
-        raise ValueError("no anchor may stand there: inside of an obstacle, or taken")
+        raise ValueError("the position is inside an obstacle, or another anchor is there")
     return with_one_more(state, place)
 
 
 def remove(state: State, index: int) -> State:
-    """Without an anchor.
+    """Remove an anchor.
 
     Raises
     ------
     ValueError
-        If there is no such anchor, it is fixed, or too few would be left.
+        If there is no such anchor, it is fixed, or too few anchors would be left.
     """
     _check_index(state, index)
     if state.fixed[index]:
         raise ValueError(f"anchor {index + 1} is fixed: release it first")
     if len(state.anchors) <= MIN_ANCHORS:
-        raise ValueError(f"fewer than {MIN_ANCHORS} anchors never tell a pose")
+        raise ValueError(f"a pose needs at least {MIN_ANCHORS} anchors")
     anchors = np.delete(state.anchors, index, axis=0)
     return set_layout(state, Layout(anchors, np.delete(state.fixed, index)))
 
 
 def fix(state: State, index: int, fixed: bool = True) -> State:
-    """An anchor that stays where it is, in optimising too; or one that is released."""
+    """Fix an anchor, also for optimisation, or release it."""
     _check_index(state, index)
     if state.fixed[index] == fixed:
         return state
@@ -255,7 +256,7 @@ def fix(state: State, index: int, fixed: bool = True) -> State:
 
 
 def with_one_more(state: State, place: FloatArray) -> State:
-    """An anchor more, the last, at a legal place."""
+    """Add an anchor, as the last one, at a legal position."""
     anchors = np.concatenate([state.anchors, place[None]])
     return set_layout(state, Layout(anchors, np.append(state.fixed, False)))
 
@@ -271,7 +272,7 @@ def _is_free(state: State, place: FloatArray, others: FloatArray) -> bool:
 
 
 def _are_one(place: FloatArray, others: FloatArray) -> BoolArray:
-    """Which of the others (..., 3) stand at a place (3,)."""
+    """Return which of the others (..., 3) coincide with a position (3,)."""
     return np.abs(others - place).max(axis=-1) <= _APART_M
 
 
@@ -279,7 +280,7 @@ def _are_one(place: FloatArray, others: FloatArray) -> BoolArray:
 
 
 def plane(state: State) -> tuple[FloatArray, FloatArray]:
-    """Corners (3,) of the slice: all zones, cut at its share of the third axis; metres."""
+    """Return corners (3,) of the slice: the box of all zones, cut at its share; metres."""
     low, high = (corner.copy() for corner in state.world.base.corners())
     third = 3 - state.slice.up
     low[third] = high[third] = low[third] + state.slice.share * (high - low)[third]
@@ -287,15 +288,15 @@ def plane(state: State) -> tuple[FloatArray, FloatArray]:
 
 
 def cut(state: State, **fields: Any) -> State:
-    """With other fields of the `Slice`; the body moves onto it."""
+    """Change fields of the `Slice`; the body moves onto it."""
     changed = dataclasses.replace(state, slice=state.slice._replace(**fields))
     return place_body(changed, state.body)
 
 
 def place_body(state: State, point: FloatArray) -> State:
-    """The body at the place of the slice that is nearest to a point, inside of no obstacle.
+    """Move the body to the position on the slice nearest to a point, outside of all obstacles.
 
-    Inside of one only its height on the slice, or its y, is changed.
+    If that position is inside an obstacle, only the coordinate normal to the slice changes.
     """
     low, high = plane(state)
     place = np.clip(point, low, high)
@@ -305,7 +306,7 @@ def place_body(state: State, point: FloatArray) -> State:
 
 
 def _beside(state: State) -> State:
-    """The body at the free place of the zones that is nearest to where it is."""
+    """Move the body to the free position of the zones nearest to its own."""
     places = state.world.sample.places
     return dataclasses.replace(
         state, body=places[np.linalg.norm(places - state.body, axis=1).argmin()]
@@ -316,13 +317,13 @@ def _beside(state: State) -> State:
 
 
 def set_layout(state: State, layout: Layout) -> State:
-    """Another layout; undo goes back to the one before."""
+    """Replace the layout; undo restores the previous one."""
     past = (*state.past, state.layout)[-_MOST_PAST:]
     return dataclasses.replace(state, layout=layout, past=past, future=())
 
 
 def undo(state: State) -> State:
-    """The layout before the last change; the same where there is none."""
+    """Restore the layout before the last change; without one the state is unchanged."""
     if not state.past:
         return state
     *past, layout = state.past
@@ -331,7 +332,7 @@ def undo(state: State) -> State:
 
 
 def redo(state: State) -> State:
-    """The layout before the last undo; the same where there is none."""
+    """Restore the layout before the last undo; without one the state is unchanged."""
     if not state.future:
         return state
     *future, layout = state.future
@@ -340,6 +341,6 @@ def redo(state: State) -> State:
 
 
 def turn_knobs(state: State, **knobs: float) -> State:
-    """With other `Knobs`, given by their names."""
+    """Change `Knobs`, given by name."""
     changed: Knobs = state.world.knobs._replace(**knobs)
     return dataclasses.replace(state, world=state.world.with_knobs(changed))

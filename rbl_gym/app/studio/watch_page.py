@@ -1,4 +1,4 @@
-"""The page on which filters are watched: a player of frames, the same for every browser."""
+"""The page for watching filters: a player of frames, the same for every browser."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from rbl_gym.studies.watching.frames import Frame
 from rbl_gym.studies.watching.live import CALM, Disturbances
 from rbl_gym.studies.watching.program import Program
 
-# Pictures and charts a second at most; the longest wait between two looks at what is asked for.
+# Pictures and charts per second at most; the longest wait between two checks for requests.
 _PICTURES_HZ, _CHARTS_HZ, _WAIT_S = 20.0, 4.0, 0.05
-# What filters believe may be below the floor.
+# The floor is transparent, because estimates may lie below it.
 _FLOOR = 0.5
-# From where a camera that follows the body looks at it, in radii of the body.
+# Position of a camera that follows the body, relative to it, in radii of the body.
 _BEHIND = np.array([-2.5, -7.0, 5.0])
 
 
 class WatchPage:
-    """Ties the frames of a program to a viser server.
+    """Shows the frames of a program in a viser server.
 
     Parameters
     ----------
     server
-        On which they are shown.
+        The viser server.
     program
-        What is watched.
+        The program to show.
     """
 
     def __init__(self, server: Any, program: Program) -> None:
@@ -72,13 +72,13 @@ class WatchPage:
         self._worker = Worker(self._failed)
         self._worker.post(lambda: self._show(True))
         if self.frames[0].picture is not None:
-            # It is fitted to the window.
+            # The picture is fitted to the window.
             server.on_client_connect(lambda _: self._worker.post(lambda: self._show(True)))
 
-    # --- what the page asks for -------------------------------------------------------------
+    # # --- requests of the page ---------------------------------------------------------------
 
     def play_or_pause(self) -> None:
-        """Play from here on, or stop; at the end, from the start."""
+        """Play from the current frame, or stop; at the end, start again."""
 
         def task() -> None:
             if not self._playing and self._over and self.at == len(self.frames) - 1:
@@ -89,7 +89,7 @@ class WatchPage:
         self._worker.post(task)
 
     def step(self) -> None:
-        """Stop, and show one frame more."""
+        """Stop, and show the next frame."""
 
         def task() -> None:
             self._set_playing(False)
@@ -99,15 +99,15 @@ class WatchPage:
         self._worker.post(task)
 
     def restart(self) -> None:
-        """The same again from its first frame, with the disturbances that there are now."""
+        """Play again from the first frame, with the present disturbances."""
         self._worker.post(lambda: self._begin(self._filters, self._seed))
 
     def begin(self, filters: tuple[str, ...], seed: int) -> None:
-        """From the first frame, with these filters and this seed."""
+        """Start at the first frame with these filters and this seed."""
         self._worker.post(lambda: self._begin(filters, seed))
 
     def seek(self, at: int) -> None:
-        """Stop, and show a frame that was played."""
+        """Stop, and show a frame that was played before."""
 
         def task() -> None:
             self._set_playing(False)
@@ -117,7 +117,7 @@ class WatchPage:
         self._worker.post(task, "seek")
 
     def set_speed(self, factor: float) -> None:
-        """Play so many times as fast as the clock; inf: as fast as it goes."""
+        """Set the speed relative to the clock; inf plays as fast as possible."""
 
         def task() -> None:
             self._speed = factor
@@ -127,12 +127,12 @@ class WatchPage:
         self._worker.post(task)
 
     def disturb(self, disturbances: Disturbances) -> None:
-        """Disturb all frames that are not made yet."""
+        """Disturb all frames that are not computed yet."""
 
         def task() -> None:
             self._disturbances = disturbances
             self._panel.show_disturbances(disturbances)
-            # What was played further on goes: it knew nothing of this.
+            # Frames computed ahead are dropped: they lack the new disturbances.
             if not self._over and self.at < len(self.frames) - 1:
                 self.at = len(self.frames) - 1
                 self._show(True)
@@ -140,11 +140,11 @@ class WatchPage:
         self._worker.post(task, "disturb")
 
     def settle(self, timeout: float = 60.0) -> bool:
-        """Wait until all that was asked for is shown; whether that was so in time."""
+        """Wait until all requests are shown; return whether this was within the time limit."""
         return self._worker.settle(timeout)
 
     def stop(self) -> None:
-        """End the worker."""
+        """Stop the worker."""
         self._worker.stop()
 
     def _set_links(self, which: int) -> None:
@@ -167,7 +167,7 @@ class WatchPage:
     # --- tasks of the worker ----------------------------------------------------------------
 
     def _start(self) -> None:
-        """The first frame; a ValueError leaves everything as it is."""
+        """Show the first frame; a ValueError leaves the page unchanged."""
         source = self.program.start(self._filters, self._seed, lambda epoch: self._disturbances)
         self.frames, self.at, self._source, self._over = [next(source)], 0, source, False
 
@@ -193,7 +193,7 @@ class WatchPage:
         self._show(True)
 
     def _advance(self) -> bool:
-        """Go on by one frame; False at the end."""
+        """Go on by one frame; return False at the end."""
         if self.at == len(self.frames) - 1:
             found = next(self._source, None)
             if found is None:
@@ -204,14 +204,14 @@ class WatchPage:
         return True
 
     def _play(self) -> Iterator[None]:
-        """Frames by the clock; a step of it is short, so that tasks come between."""
+        """Play frames by the clock. Each step is short, so that tasks can run in between."""
         start, first = time.perf_counter(), self.frames[self.at].time_s
         while self._advance():
             due = start + (self.frames[self.at].time_s - first) / self._speed
             while (wait := due - time.perf_counter()) > 0:
                 time.sleep(min(wait, _WAIT_S))
                 yield
-            # Behind the clock by much: it goes on from here.
+            # Far behind the clock: restart the clock here.
             if wait < -1.0 and np.isfinite(self._speed):
                 start, first = time.perf_counter(), self.frames[self.at].time_s
             self._show()
@@ -239,7 +239,7 @@ class WatchPage:
         self._server.flush()
 
     def _aspect(self) -> float | None:
-        """Width of the first browser's window over its height; None: no browser is open."""
+        """Return the aspect ratio of the first browser's window; None if no browser is open."""
         cameras = [client.camera for client in self._server.get_clients().values()]
         return cameras[0].image_width / cameras[0].image_height if cameras else None
 

@@ -1,4 +1,4 @@
-"""The panel of what is watched: figures, charts, the player, disturbances. Computes nothing."""
+"""The panel for watching: figures, charts, the player, disturbances. It computes nothing."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ from rbl_gym.studies.watching.program import Program
 # Width of the charts, pixels.
 CHARTS_WIDTH = 270
 NONE = "none"
-# What is offered; any other name of a filter comes with the command.
+# Filters on offer; the command accepts any other name.
 OFFERED = ("iekf", "iekf-robust", "iekf-late", "uc-kf", "kf", "et-kf", "iekf-bias", "iekf-bank")
-# Place error of the wrong anchor in metres, and the factor on the noise.
+# Error of the wrong anchor position in metres, and the factor on the noise.
 WRONG_M, NOISIER = 0.5, 2.0
-# Epochs over which NIS is averaged in the table, and the longest charts.
+# Epochs over which the table averages NIS, and the maximum length of the charts.
 _RECENT, _CHARTED = 10, 300
-# Mean NIS per degree of freedom above which a filter is surer than it may be.
+# Mean NIS per degree of freedom above which a filter is overconfident.
 _TOO_SURE = 1.5
 _CSS = (
     "font-family:inherit;font-size:12.5px;line-height:1.45;color:#212529;"
     "font-variant-numeric:tabular-nums;padding:0 12px 4px 10px"
 )
-# Of charts: name, the least value that is shown, what of a track.
+# Charts: name, minimum displayed value, quantity of a track.
 CHARTS: Mapping[str, tuple[float, Callable[[Any], float]]] = {
     "Position error (m)": (1e-3, lambda track: track.position_m),
     "Rotation error (deg)": (1e-2, lambda track: track.rotation_deg),
-    "NIS per range (honest: 1)": (1e-1, lambda track: track.nis_ratio),
+    "NIS per range (consistent: 1)": (1e-1, lambda track: track.nis_ratio),
 }
 
 
 class WatchPanel:
-    """Handles of the panel.
+    """Controls of the panel.
 
     Parameters
     ----------
     gui
-        The GUI of a viser server, in the place where the panel goes.
+        The GUI of a viser server, in the container of the panel.
     program
-        What is watched.
+        The program to show.
     actions
-        What is called, by name: ``play``, ``step``, ``restart`` without arguments; ``speed`` with
-        a factor; ``seek`` with the number of a frame; ``begin`` with labels of filters and a seed;
-        ``disturb`` with `Disturbances`; ``links`` with the index of a filter; ``follow`` with
-        whether the camera does.
+        Callbacks by name: ``play``, ``step``, ``restart`` without arguments; ``speed`` with a
+        factor; ``seek`` with the number of a frame; ``begin`` with labels of filters and a seed;
+        ``disturb`` with `Disturbances`; ``links`` with the index of a filter; ``follow`` with True
+        if the camera follows the body.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class WatchPanel:
         self._charts = self._add_charts(gui) if self._filters else []
 
     def _add_charts(self, gui: Any) -> list[Any]:
-        """Charts in a panel of their own, to the left."""
+        """Add charts in a panel of their own, to the left."""
         panel = gui.add_panel()
         with panel.add_tab("Errors"):
             charts = [self._chart(gui, name) for name in CHARTS]
@@ -101,7 +101,9 @@ class WatchPanel:
         nlos = gui.add_slider("Reflected (%)", 0, 50, 1, 0)
         lost = gui.add_slider("Lost (%)", 0, 95, 1, 0)
         wrong = gui.add_checkbox(
-            "Wrong anchor", False, hint=f"Filters are told a place of anchor 1 {WRONG_M:g} m off"
+            "Wrong anchor",
+            False,
+            hint=f"Filters assume a position of anchor 1 that is {WRONG_M:g} m off",
         )
         noise = gui.add_checkbox(f"Noise x {NOISIER:g}", False)
         handles = self._disturbed = (nlos, lost, wrong, noise)
@@ -176,10 +178,10 @@ class WatchPanel:
         ]
         return (times, *curves), (uplot.Series(label="s"), *looks)
 
-    # --- what it shows ---------------------------------------------------------------------
+    # # --- content ---------------------------------------------------------------------------
 
     def show(self, frames: Sequence[Frame], at: int, playing: bool, status: str) -> None:
-        """Show a frame, and those before it in the charts."""
+        """Show a frame, and charts of the frames before it."""
         self._table.content = headline(self._program.title, frames[: at + 1])
         icon, label = ("player-pause", "Pause") if playing else ("player-play", "Play")
         if self._play.label != label:
@@ -191,7 +193,7 @@ class WatchPanel:
         self._status.content = f'<div style="{_CSS}">{html.escape(status)}</div>'
 
     def show_disturbances(self, now: Disturbances) -> None:
-        """Show what disturbs the ranges."""
+        """Show the present disturbances."""
         values = round(100 * now.nlos), round(100 * now.lost), now.wrong_m > 0, now.noise > 1
         for handle, value in zip(self._disturbed, values, strict=False):
             if handle.value != value:
@@ -204,7 +206,7 @@ class WatchPanel:
             chart.data = self._curves(shown, least, of)[0]
 
     def name_filters(self, labels: tuple[str, ...]) -> None:
-        """Other filters than before."""
+        """Replace the names of the filters."""
         self._filters = labels
         self._seen_by.options = labels or (NONE,)
         self._seen_by.visible = len(labels) > 1
@@ -213,7 +215,7 @@ class WatchPanel:
 
 
 def _input(handle: Any, call: Callable[[], None]) -> None:
-    """Call when a user changes an input, not when the page does."""
+    """Connect a callback that runs if a user changes an input, but not if the page does."""
 
     def changed(event: Any) -> None:
         if event.client is not None:
@@ -223,7 +225,7 @@ def _input(handle: Any, call: Callable[[], None]) -> None:
 
 
 def headline(title: str, frames: Sequence[Frame]) -> str:
-    """Title, time, links and figures of the filters at the last of some frames (HTML)."""
+    """Return title, time, links and figures of the filters at the last of some frames (HTML)."""
     frame = frames[-1]
     links = frame.links
     parts = [

@@ -1,4 +1,4 @@
-"""What moves in 3-D: the body, what filters believe of it, links, anchors, ways."""
+"""The moving parts in 3-D: the true body, the filters' estimates, links, anchors and paths."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from rbl_gym.rendering.drawing import body_edges
 from rbl_gym.studies.watching.frames import LINKS, Frame, Tracked, link_kinds
 
 TRUTH = (33, 37, 41)
-# Of the filters, in their order; and of other layouts.
+# Colours of the filters, in order; and of other layouts.
 FILTERS = ((28, 126, 214), (174, 62, 201), (12, 133, 153))
 GHOSTS = ((232, 89, 12), (12, 133, 153), (92, 148, 13))
 WRONG = (224, 49, 49)
-# Of the kinds of links, by their numbers: lost, used, reflected, refused, weak.
+# Colours of links by kind: lost, used, reflected, refused, weak.
 LINK_COLOURS = ((206, 212, 218), (64, 160, 90), (224, 49, 49), (245, 159, 0), (140, 170, 225))
 LINK_WIDTHS = (0.6, 1.2, 1.8, 1.8, 0.8)
-# Least size of the body, size of anchors: shares of the largest extent.
+# Minimum size of the body and size of anchors, as shares of the largest extent.
 _BODY, _ANCHOR = 0.045, 0.006
-# Axes that hold 95 % of a position.
+# Scale of the axes of a 95 % ellipsoid of a position.
 _RADIUS = float(np.sqrt(special.chdtri(3, 0.05)))
-# So many epochs of the ways are drawn, at most.
+# Maximum number of epochs of the drawn paths.
 _WAY = 150
 
 
 class Ellipsoid(NamedTuple):
-    """Half axes (3,) in metres, and the rotation (3, 3) that turns x, y, z into them."""
+    """Half axes (3,) in metres, and the rotation (3, 3) from x, y, z to them."""
 
     half: FloatArray
     rotation: FloatArray
 
 
 def ellipsoid(covariance: FloatArray) -> Ellipsoid | None:
-    """Where the position is with 95 %, of a pose covariance (6, 6); None: it is not finite."""
+    """Return the 95 % ellipsoid of position of a pose covariance (6, 6); None if not finite."""
     if not np.isfinite(covariance).all():
         return None
     values, axes = np.linalg.eigh(covariance[3:, 3:])
@@ -52,16 +52,16 @@ def ellipsoid(covariance: FloatArray) -> Ellipsoid | None:
 def link_lines(
     frame: Frame, which: int, tags: FloatArray, enlarged: float
 ) -> dict[str, FloatArray]:
-    """Links (S, 2, 3) by their kinds, from the anchors to the tags.
+    """Return links (S, 2, 3) by kind, from the anchors to the tags.
 
     Parameters
     ----------
     frame
-        What is drawn. Without truth the links end at the first filter's body.
+        The frame to draw. Without truth the links end at the first filter's estimate.
     which
-        Index of the filter that refuses.
+        Index of the filter whose rejections are shown.
     tags, enlarged
-        The body (N, 3), and by how much it is drawn larger.
+        The body (N, 3), and its enlargement factor.
     """
     kinds = link_kinds(frame.links, frame.tracks[which].refused if frame.tracks else None)
     pose: Any = frame.truth
@@ -78,7 +78,7 @@ def link_lines(
 
 
 def letterbox(picture: np.ndarray, aspect: float) -> np.ndarray:
-    """A picture (height, width, 3) with white beside it, so that it has an aspect ratio."""
+    """Add white margins to a picture (height, width, 3) to reach an aspect ratio."""
     height, width = picture.shape[:2]
     missing = max(0, round(width / aspect) - height), max(0, round(height * aspect) - width)
     sides = [(size // 2, size - size // 2) for size in missing]
@@ -93,7 +93,7 @@ class WatchView:
     scene
         The scene of a viser server.
     extent
-        The largest side of what is seen, metres.
+        Largest side of the scene, metres.
     tags
         (N, 3) on the body, metres.
     """
@@ -110,9 +110,9 @@ class WatchView:
     def show(
         self, frame: Frame, way: Sequence[Frame], which: int, aspect: float | None = None
     ) -> None:
-        """Draw a frame, the frames before it as ways, and links as a filter takes them.
+        """Draw a frame, the paths of the frames before it, and the links as a filter uses them.
 
-        `aspect`: width of the window over its height, for pictures; None: not known.
+        `aspect` is the aspect ratio of the window, for pictures; None if it is not known.
         """
         if frame.picture is not None:
             picture = frame.picture if aspect is None else letterbox(frame.picture, aspect)
@@ -135,7 +135,7 @@ class WatchView:
         self._show_ways(frame, way[-_WAY:])
 
     def clear(self) -> None:
-        """Take away all that was drawn."""
+        """Remove all drawn objects."""
         for handle in self._handles.values():
             handle.remove()
         self._handles.clear()
@@ -143,7 +143,7 @@ class WatchView:
         self._bodies.clear()
 
     def centre(self, frame: Frame) -> FloatArray | None:
-        """Where a camera that follows the body looks."""
+        """Return the target of a camera that follows the body."""
         poses = [frame.truth, *(track.belief for track in frame.tracks)]
         return next((np.array(pose.translation) for pose in poses if pose is not None), None)
 
@@ -195,7 +195,7 @@ class WatchView:
         if found is None or not np.isfinite(track.belief.translation).all():
             self._remove(name)
             return
-        # Never so flat that it cannot be seen, nor larger than what is looked at.
+        # Keep flat bodies visible, and limit the size to that of the scene.
         half = np.clip(found.half, 1e-3 * self._extent, self._extent)
         if name not in self._handles:
             self._handles[name] = self._scene.add_icosphere(
@@ -230,7 +230,7 @@ class WatchView:
 
 
 def swatches(names: Mapping[str, Any]) -> str:
-    """A legend (HTML) of names and their colours."""
+    """Return a legend (HTML) of names and their colours."""
     return "".join(
         f'<span style="white-space:nowrap"><span style="display:inline-block;width:14px;height:3px;'
         f'background:rgb{colour};margin:0 4px 3px 0"></span>{name}</span> &ensp;'

@@ -1,4 +1,4 @@
-"""One thread that does what the page asks, in order; when it is idle it goes on with long work."""
+"""One thread that runs the tasks of the page in order, and long work while it is idle."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import traceback
 from collections.abc import Callable, Iterator
 from typing import Any
 
-# Threads that wait look this often whether they should end, seconds.
+# Interval at which waiting threads check whether to stop, seconds.
 _WAIT_S = 0.2
 
 
 class Worker:
-    """Runs tasks one after the other, and steps of a long work between them.
+    """Runs tasks one after the other, and steps of long work in between.
 
-    The callbacks of the page come from threads of their own. All of them hand what is to be done
-    to one worker, so that the state has one writer and needs no lock.
+    The callbacks of the page run in their own threads. They pass all tasks to one worker. The state
+    then has a single writer and needs no lock.
 
     Parameters
     ----------
     failed
-        Called with the exception of a task that failed; the worker goes on.
+        Called with the exception of a failed task; the worker continues.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -34,14 +34,14 @@ class Worker:
         self._thread.start()
 
     def post(self, task: Callable[[], object], key: object = None) -> None:
-        """Do a task after those before it.
+        """Queue a task.
 
         Parameters
         ----------
         task
-            What is done.
+            The task.
         key
-            A task of the same key that still waits is left out: the last one counts.
+            A waiting task with the same key is dropped, so that only the last one runs.
         """
         with self._changed:
             self._tasks.pop(key, None)
@@ -49,25 +49,25 @@ class Worker:
             self._changed.notify_all()
 
     def when_idle(self, steps: Iterator[Any] | None) -> None:
-        """Go on with this in place of what was there, a step at a time, while no task waits."""
+        """Replace the long work; its steps run while no task waits."""
         with self._changed:
             self._idle = steps
             self._changed.notify_all()
 
     @property
     def is_working(self) -> bool:
-        """Whether some long work is not done."""
+        """Whether long work is unfinished."""
         return self._idle is not None
 
     def settle(self, timeout: float = 60.0) -> bool:
-        """Wait until nothing is left to do; whether that was so in time."""
+        """Wait until all work is done; return whether this was within the time limit."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: not self._tasks and self._idle is None and not self._busy, timeout
             )
 
     def stop(self) -> None:
-        """Do what waits, leave long work as it is, and end."""
+        """Finish the waiting tasks, drop long work, and stop."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()

@@ -1,4 +1,4 @@
-"""What is placed, and with which radios: a problem, and the knobs that change it."""
+"""The world of a page: a problem, and the knobs that change it and its radios."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from rbl_gym.placement.sample import Sample, sample
 from rbl_gym.placement.setting import Setting
 from rbl_gym.studies.placing.accuracy import draw_places
 
-# Poses over which layouts are compared, and places of each zone at which it is judged.
+# Number of poses for comparing layouts, and of positions of each zone for its verdict.
 N_POSES, N_PLACES = 1024, 600
-# A link that loses more than this counts as lost, decibels; fewer tags never tell a pose.
+# A link with a larger loss counts as lost, decibels; fewer tags do not determine a pose.
 MOST_LOSS_DB, LEAST_TAGS = 60.0, 3
 
 
 class Knobs(NamedTuple):
-    """What can be changed of a problem without moving anchors.
+    """Properties of a problem that can change while the anchors stay.
 
     Attributes
     ----------
     noise_m
         The constant part of a range's standard deviation, metres.
     n_tags
-        How many tags the body has. Another number than the body's own stands evenly on a sphere.
+        Number of tags. If it differs from the body's own, the tags are spread evenly on a sphere.
     size_m
         Largest extent of the tags, metres.
     loss_db
-        What an opaque obstacle takes from a link's information; those with a share of their own
-        change in proportion, in decibels.
+        Loss of a link's information behind an opaque obstacle, decibels. Obstacles with a share of
+        their own change in proportion.
     """
 
     noise_m: float
@@ -46,7 +46,7 @@ class Knobs(NamedTuple):
 
 
 def knobs_of(problem: Problem) -> Knobs:
-    """The knobs at which the problem is as it is."""
+    """Return the knobs that describe the problem unchanged."""
     return Knobs(
         float(getattr(problem.noise, noise_field(problem))),
         len(problem.tags),
@@ -56,13 +56,13 @@ def knobs_of(problem: Problem) -> Knobs:
 
 
 def noise_field(problem: Problem) -> str:
-    """The name of the constant part of the problem's noise law: its first length."""
+    """Return the name of the constant term of the problem's noise law: its first length."""
     fields: Any = dataclasses.fields(problem.noise)  # pyright: ignore[reportArgumentType]
     return next(field.name for field in fields if field.name.endswith("_m"))
 
 
 def loss_db(share: float) -> float:
-    """Decibels that an obstacle takes, of the share that it leaves."""
+    """Return the loss in decibels of an obstacle that leaves a share."""
     return min(-10 * math.log10(max(share, 1e-12)), MOST_LOSS_DB)
 
 
@@ -75,7 +75,7 @@ class World:
     base
         The problem as it was opened.
     knobs
-        What is changed of it.
+        The changes to it.
     """
 
     base: Problem
@@ -83,7 +83,7 @@ class World:
 
     @functools.cached_property
     def problem(self) -> Problem:
-        """The problem that is placed. Where no knob was turned it is the one that was opened."""
+        """The problem to place anchors for. Without changed knobs it is the original one."""
         base, now, was = self.base, self.knobs, knobs_of(self.base)
         changes: dict[str, Any] = {}
         if now.noise_m != was.noise_m:
@@ -102,7 +102,7 @@ class World:
 
     @functools.cached_property
     def setting(self) -> Setting:
-        """What layouts are compared by; no anchor counts as fixed."""
+        """The setting that compares layouts; no anchor counts as fixed."""
         problem = self.problem
         return Setting(
             problem.tags,
@@ -115,20 +115,20 @@ class World:
 
     @functools.cached_property
     def places(self) -> tuple[FloatArray, ...]:
-        """Places (L, 3) of every zone at which it is judged: those of `rbl-gym place`, seed 0."""
+        """Positions (L, 3) of every zone for its verdict, as in `rbl-gym place` with seed 0."""
         return tuple(
             draw_places(self.base, zone, np.random.default_rng([0, 3]), N_PLACES)
             for zone in self.base.zones
         )
 
     def score(self, anchors: FloatArray) -> float:
-        """b of a layout (M, 3) over the poses, metres: what `placement.score` says of them."""
+        """Return b of a layout (M, 3) over the poses, metres, as `placement.score` computes it."""
         return self.setting.score(anchors)
 
     def with_knobs(self, knobs: Knobs) -> World:
-        """The same problem with other knobs."""
+        """Return the same problem with other knobs."""
         changed = World(self.base, knobs)
-        # Neither hangs on a knob.
+        # Neither depends on a knob.
         for name in ("sample", "places"):
             if name in self.__dict__:
                 changed.__dict__[name] = self.__dict__[name]
@@ -136,7 +136,7 @@ class World:
 
 
 def _tags(tags: FloatArray, count: int, size_m: float) -> FloatArray:
-    """Tags (count, 3) of such an extent: the body's own, or evenly on a sphere."""
+    """Return tags (count, 3) of an extent: the body's own, or spread evenly on a sphere."""
     if count != len(tags):
         z = 1 - (2 * np.arange(count) + 1) / count
         turn = np.pi * (3 - 5**0.5) * np.arange(count)
@@ -146,7 +146,7 @@ def _tags(tags: FloatArray, count: int, size_m: float) -> FloatArray:
 
 
 def _with_loss(obstacles: Obstacles, db: float) -> Obstacles:
-    """Obstacles that take so much from a link; shares of their own change in proportion."""
+    """Return obstacles with another loss; shares of their own change in proportion."""
     was = loss_db(obstacles.blocked_information)
     prisms = obstacles.prisms
     share = prisms.share ** (db / was) if was > 0 else prisms.share

@@ -1,11 +1,11 @@
-"""The training of the network that places anchors, `placement.amortised`.
+"""Training of the network that places anchors, `placement.amortised`.
 
     python -m rbl_gym.studies.learning.amortised --out out/amortised.npz
 
-The loss is log b of the layout, b the score of `placement.score` in units of the problem, and its
-gradient goes through the Fisher information. Where anchors choose among candidates, an anchor's
-probabilities get the exact gradient of the expected loss, the others standing where they were
-drawn. Needs torch (extra ``rl``).
+The loss is log b of the layout, with b the score of `placement.score` in units of the problem. Its
+gradient passes through the Fisher information. If anchors choose among candidates, the
+probabilities of one anchor get the exact gradient of the expected loss, while the other anchors
+keep their sampled candidates. Needs torch (extra ``rl``).
 """
 
 from __future__ import annotations
@@ -41,33 +41,33 @@ from rbl_gym.studies.learning.torch_layouts import (
 
 __all__ = ["save", "train"]
 
-# Problems of each family in a step of the first round, and of others; buildings in every other
-# step only.
+# Problems of each family per step, in the first round and later; buildings take part in every
+# second step only.
 GROUPS = (
     (("boxes", 32), ("boxes", 32), ("boxes", 32), ("shells", 16), ("rooms", 32), ("buildings", 16)),
     (("boxes", 32), ("boxes", 32), ("shells", 8), ("rooms", 32), ("rooms", 32), ("buildings", 16)),
 )
-# Steps of the rounds that made the package's network.
+# Steps of the rounds that trained the package's network.
 STEPS = (5000, 1500)
-# Anchors of a building whose choice gets its gradient in a step.
+# Anchors of a building whose choice gets a gradient in a step.
 _CHOICES = 1
-# Learning rates at their height, of the first round and of others; steps until there; weight of
-# the entropy of choices at first.
+# Peak learning rates of the first round and of the others; warm-up steps; initial weight of the
+# entropy of choices.
 _RATES, _WARM, _ENTROPY = (2e-3, 1e-3), 150, 0.02
-# Width of the edges of sight past racks, in units, at first and at last.
+# Initial and final width of the edges of sight past racks, in units of the problem.
 _BLUR = (0.06, 0.01)
 _WIDTH, _LAYERS = 64, 4
-# The weights that are kept are a running mean, which forgets by so much a step.
+# The saved weights are a moving average with this decay per step.
 _FORGET = 0.005
 
 
 def tensors(tokens: Tokens) -> Any:
-    """Tokens as tensors."""
+    """Return tokens as tensors."""
     return Tokens(*(torch.as_tensor(x, dtype=torch.float32) for x in tokens))  # pyright: ignore[reportArgumentType]
 
 
 def case_of(batch: Batch) -> Case:
-    """A batch in its own units, the information of fixed anchors in the prior."""
+    """Return a batch in its own units, with the information of fixed anchors in the prior."""
     seen = batch.seen
     origin, unit = seen.frame()
     at, by = origin[:, None], unit[:, None, None]
@@ -104,7 +104,7 @@ def case_of(batch: Batch) -> Case:
 def loss_of(
     network: Network, batch: Batch, blur: float, entropy: float, generator: torch.Generator
 ) -> tuple[torch.Tensor, float]:
-    """Loss of a batch, to be differentiated, and the mean of log b."""
+    """Return the loss of a batch, to differentiate, and the mean of log b."""
     tokens = tensors(tokens_of(batch.seen, batch.count))
     steps, scores = network(tokens, batch.count, batch.count + batch.seen.fixed.shape[1])
     case = case_of(batch)
@@ -118,7 +118,7 @@ def loss_of(
         loss = log_score(case, told).mean()
     else:
         loss = log_score_in_sight(case, anchors).mean()
-    # Far outside of the region there is nothing to learn.
+    # Far outside the region there is nothing to learn.
     return loss + 1e-4 * (steps**2).mean(), float(loss.detach())
 
 
@@ -160,17 +160,17 @@ def _choice_loss(
 def train(
     steps: Sequence[int], seed: int, log: Callable[[str], object] = print
 ) -> tuple[Network, dict[str, Any]]:
-    """A trained network, and how it was made; the same arguments give the same network.
+    """Train a network and return it with its history. Equal arguments give equal networks.
 
     Parameters
     ----------
     steps
-        Of each round. In a round the learning rate falls to zero; the next begins with the weights
-        that the one before gave.
+        Steps of each round. The learning rate falls to zero within a round. The next round starts
+        from the resulting weights.
     seed
-        Of all randomness.
+        Seed of all random numbers.
     log
-        Takes a line of text after every hundred steps.
+        Called with a line of text after every hundred steps.
     """
     torch.set_num_threads(1)
     torch.manual_seed(seed)
@@ -195,7 +195,7 @@ def _round(
     generator: torch.Generator,
     log: Callable[[str], object],
 ) -> None:
-    """The weights trained for so many steps, and then replaced by their running mean."""
+    """Train the weights for `steps` steps, then replace them by their moving average."""
     mean_of = {name: value.detach().clone() for name, value in network.weights.items()}
     optimizer = torch.optim.AdamW(network.parameters(), lr=_RATES[turn > 0], weight_decay=1e-3)
     means: dict[str, list[float]] = {}
@@ -230,14 +230,14 @@ def _round(
 
 
 def _sizes(rng: np.random.Generator) -> dict[str, int]:
-    """Lengths of the rows of the tokens."""
+    """Return the row lengths of the tokens."""
     batch = placement_families.draw("rooms", rng, 2)
     found = tokens_of(batch.seen, batch.count)
     return {name: getattr(found, name).shape[-1] for name in Tokens._fields}
 
 
 def save(network: Network, meta: dict[str, Any], path: str | Path) -> None:
-    """Write the weights in half precision, with what made them."""
+    """Write the weights in half precision, with the history of the training."""
     versions = {"torch": torch.__version__, "numpy": np.__version__}
     versions["python"] = platform.python_version()
     arrays: dict[str, Any] = {k: v.astype(np.float16) for k, v in network.arrays().items()}

@@ -1,9 +1,9 @@
-"""PPO of a policy for any number of craft, which starts as the orbit.
+"""PPO of a policy for any number of craft; it starts as the orbit.
 
-Proximal policy optimisation (Schulman et al., 2017) with networks over sets: the policy is the same
-for every craft, and so is the critic, whose outputs are averaged. stable-baselines3 has no such
-networks. Worlds with the same number of craft are learned from together, so that nothing is
-computed for craft that are not there.
+Proximal policy optimisation (Schulman et al., 2017) with networks over sets. All craft share one
+policy and one critic, and the critic's outputs are averaged. stable-baselines3 has no such
+networks. Worlds with the same number of craft are trained together, so that nothing is computed for
+padding.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rbl_gym.wrappers.craft_tokens import OWN, PAIR
 
 __all__ = ["train_craft"]
 
-# Passes over a rollout, samples of an update, the ratio's limit, the highest norm of a gradient.
+# Passes over a rollout, samples of an update, limit of the ratio, maximum norm of a gradient.
 _EPOCHS, _SAMPLES, _LIMIT, _CLIP = 4, 640, 0.2, 0.5
 _LEARNING_RATE, _CRITICS_RATE, _STD = 6e-4, 1e-3, 0.3
 
@@ -30,8 +30,8 @@ _LEARNING_RATE, _CRITICS_RATE, _STD = 6e-4, 1e-3, 0.3
 class _Rollout(NamedTuple):
     """Steps of all worlds (T, B, ...) with M craft each, single precision.
 
-    `velocity` is in the frames of the craft, before it is cut; `chance` the logarithm of its
-    density; `value` the critic's; `last` whether the episode ended with the step.
+    `velocity` is in the frames of the craft, before clipping; `chance` is its log density; `value`
+    is from the critic; `last` is whether the episode ended with the step.
     """
 
     own: np.ndarray
@@ -47,7 +47,7 @@ class _Rollout(NamedTuple):
 
 
 class _Learner(NamedTuple):
-    """Networks, the logarithm of the standard deviation of velocities, and what steps them."""
+    """Networks, the log standard deviation of velocities, and the optimiser."""
 
     actor: SetNetwork
     critic: SetNetwork
@@ -56,7 +56,7 @@ class _Learner(NamedTuple):
 
     @classmethod
     def new(cls) -> _Learner:
-        """One whose policy is the orbit."""
+        """Return a learner whose policy is the orbit."""
         actor = SetNetwork(OWN, PAIR, 2)
         critic = SetNetwork(OWN, PAIR, 1, inner=(32, 32), outer=(64, 64))
         with torch.no_grad():
@@ -78,18 +78,19 @@ def train_craft(
     Parameters
     ----------
     task
-        Of `RBL/MobileAnchors-v0`; its `gamma`, `gae_lambda`, `num_envs` and `rollout` count.
+        A task of `RBL/MobileAnchors-v0`. Its `gamma`, `gae_lambda`, `num_envs` and `rollout` are
+        used.
     steps
-        Of all worlds together.
+        Steps of all worlds together.
     seed
-        Of worlds, networks and actions.
+        Seed of worlds, networks and actions.
     advance
-        Told of the steps of each rollout.
+        Called with the steps of each rollout.
 
     Returns
     -------
-    The network, and the learning curve: steps, and the mean reward of the rollouts since the point
-    before.
+    The network, and the learning curve: steps, and the mean reward of the rollouts since the
+    previous point.
     """
     torch.manual_seed(seed)
     rng, learner = np.random.default_rng(seed), _Learner.new()
@@ -113,14 +114,14 @@ def train_craft(
 
 
 def _by_count(there: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Numbers of craft, and the rows of the masks (S, M) that have so many."""
+    """Return numbers of craft, and for each the rows of the masks (S, M) that have it."""
     counts = there.sum(axis=-1).astype(int)
     for count in np.unique(counts).tolist():
         yield count, np.flatnonzero(counts == count)
 
 
 def _trimmed(count: int, rows: np.ndarray, *arrays: np.ndarray) -> tuple[Any, ...]:
-    """Own tokens, pairs and masks of some rows with `count` craft each, in torch."""
+    """Return own tokens, pairs and masks of some rows with `count` craft each, in torch."""
     own, pairs, others = (array[rows, :count] for array in arrays)
     return tuple(map(torch.from_numpy, (own, pairs[:, :, :count], others[:, :, :count])))
 
@@ -128,7 +129,7 @@ def _trimmed(count: int, rows: np.ndarray, *arrays: np.ndarray) -> tuple[Any, ..
 def _rolled_out(
     env: Any, learner: _Learner, steps: int, rng: np.random.Generator
 ) -> tuple[_Rollout, np.ndarray]:
-    """Some steps of the worlds, and the values of where they lead to."""
+    """Run some steps of the worlds; return them and the values of the final states."""
     std, rows = np.exp(learner.log_std.detach().numpy()), []
     for k in range(steps + 1):
         seen = craft_seen(env)
@@ -156,10 +157,10 @@ def _rolled_out(
 def _advantages(
     rollout: _Rollout, beyond: np.ndarray, gamma: float, mixing: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Generalised advantages (T, B), and what the critic is taught; all in units of a reward.
+    """Return generalised advantages (T, B) and targets of the critic, in units of a reward.
 
-    The critic tells values times 1 - gamma. Episodes end by their length: the value of their
-    end is taken to be that of the step before.
+    The critic predicts values times 1 - gamma. Episodes end by their length, so the value of the
+    end is taken from the step before.
     """
     scale = 1 / (1 - gamma)
     value = scale * rollout.value
@@ -180,7 +181,7 @@ def _learn(
     target: FloatArray,
     rng: np.random.Generator,
 ) -> None:
-    """Some passes over a rollout."""
+    """Make some passes over a rollout."""
     flat = _Rollout(*(field.reshape(-1, *field.shape[2:]) for field in rollout))
     advantage, target = advantage.ravel(), target.ravel()
     groups = list(_by_count(flat.there))

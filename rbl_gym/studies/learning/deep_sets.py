@@ -1,4 +1,4 @@
-"""A network over sets in numpy: the same for every element, whatever their number and order."""
+"""A network over sets in numpy, equal for every element, whatever their number and order."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ __all__ = ["DeepSets"]
 
 # Weight (n_out, n_in) and bias (n_out,) of each layer.
 Layers = tuple[tuple[FloatArray, FloatArray], ...]
-# What sums over the others are multiplied by, so that they are of order one.
+# Factor on sums over the other elements, so that they are of order one.
 SUM_SCALE = 0.25
 
 
 class DeepSets(NamedTuple):
-    """Two multilayer perceptrons: one of each pair, and one of an element and its pairs pooled.
+    """Two multilayer perceptrons: one for each pair, one for an element and its pooled pairs.
 
     ``outer([own_i, SUM_SCALE sum_j inner([own_i, pair_ij]), max_j inner([own_i, pair_ij])])``
 
     Attributes
     ----------
     inner
-        Tanh after every layer.
+        Layers, each with tanh.
     outer
-        Tanh after every layer but the last.
+        Layers, each but the last with tanh.
     """
 
     inner: Layers
     outer: Layers
 
     def __call__(self, own: FloatArray, pairs: FloatArray, others: FloatArray) -> FloatArray:
-        """Outputs (..., M, n) of elements (..., M, a), their pairs (..., M, E, b) and masks.
+        """Return outputs (..., M, n) of elements (..., M, a), their pairs (..., M, E, b) and masks.
 
-        The masks (..., M, E) are 1 where there is such a pair. The maximum of no pairs is -1.
+        The masks (..., M, E) are 1 for existing pairs. The maximum over no pairs is -1.
         """
         (weight, bias), *rest = self.inner
         n_own = own.shape[-1]
-        # The part of the element is the same for all of its pairs.
+        # The part of the element is the same for all its pairs.
         hidden = np.tanh(
             (own @ weight[:, :n_own].T + bias)[..., None, :] + pairs @ weight[:, n_own:].T
         )
@@ -59,7 +59,7 @@ class DeepSets(NamedTuple):
 
 
 def check_sets(network: DeepSets, n_own: int, n_pair: int, n_out: int) -> None:
-    """A ValueError unless the layers are finite, fit together, and have these ends."""
+    """Raise ValueError unless the layers are finite, fit together, and have these sizes."""
     pooled = n_own + 2 * _checked("inner", network.inner, n_own + n_pair)
     got = _checked("outer", network.outer, pooled)
     if got != n_out:

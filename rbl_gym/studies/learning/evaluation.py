@@ -1,10 +1,10 @@
-"""Policies and references on held-out worlds, side by side, with confidence intervals.
+"""Policies and references on the same held-out worlds, with confidence intervals.
 
 The loss L of a policy in a world is the mean of log b: of the final layout in a placement task, of
-all steps in a task with a filter in the loop; where anchors have a price, minus the mean
-reward. Normalised = (L_random - L) / (L_random - L_best). L_best is that of the strongest
-reference; in a placement task that of the best layout known of each world, whichever of the
-strongest searches found it.
+all steps in a task with a filter in the loop. If anchors have a price, L is minus the mean reward.
+The normalised score is (L_random - L) / (L_random - L_best). L_best is the loss of the strongest
+reference. In a placement task it is that of the best layout in each world over the strongest
+searches.
 """
 
 from __future__ import annotations
@@ -33,31 +33,31 @@ __all__ = [
     "references",
 ]
 
-# The reference that is one layout for all contexts, and the contexts it is optimised over.
+# The reference with one layout for all contexts, and the number of contexts for its search.
 _ONE_LAYOUT, _TRAINING_CONTEXTS = "one-for-all", 64
-# The row of the best layouts of the strongest searches.
+# Row of the best layouts of the strongest searches.
 BEST_KNOWN = "best-known"
-# Random layouts of each context; and evaluations of the gradient that refine a policy's proposal.
+# Random layouts of each context, and gradient evaluations that refine a policy's layout.
 _RANDOM_TRIES = 8
 REFINE_EVALUATIONS = 20
 _RESAMPLES = 2000
 
 
 def references(task: RlTask) -> list[str]:
-    """Names of a task's references; the last are the `strongest`."""
+    """Return the names of a task's references; the last are the `strongest`."""
     if task.env_id == "RBL/AnchorPlacement-v0":
         if task.arguments.get("mode") == "mounts":
             return ["random", "greedy", "greedy-swaps"]
         last = search.STRONGEST
         others = [name for name in search.SEARCHES if name not in last]
-        # No layout is one for rooms that differ.
+        # There is no single layout for different rooms.
         one = [] if "scenes" in task.arguments else [_ONE_LAYOUT]
         return [*layouts.LAYOUTS, *one, *others, *last]
     return list(_controllers(task))
 
 
 def strongest(task: RlTask) -> list[str]:
-    """The references of which the best, in each world, counts as 1."""
+    """Return the references of which the best, in each world, defines the score 1."""
     known = references(task)
     return known[-len(search.STRONGEST) :] if known[-1] in search.STRONGEST else known[-1:]
 
@@ -75,27 +75,27 @@ def evaluate(
     seed: int,
     advance: Advance = silent,
 ) -> dict[str, Any]:
-    """Losses of policies and references on the same `worlds` held-out worlds.
+    """Return losses of policies and references on the same `worlds` held-out worlds.
 
     Parameters
     ----------
     task
-        What is played.
+        The task.
     policies
-        By the label they are to have. In a placement task each also comes refined by a few
-        steps along the gradient, ``LABEL + gradient``.
+        Policies by label. A placement task also refines each by a few gradient steps, as ``LABEL +
+        gradient``.
     names
-        Of `references`; ``random`` and the strongest come in any case. Where there are several
-        strongest, ``best-known`` is the best of them in each world.
+        Names of `references`; ``random`` and the strongest are always included. If there are
+        several strongest, ``best-known`` is the best of them in each world.
     worlds, seed
-        How many, and which.
+        Number and seed of the worlds.
     advance
-        Called after each.
+        Called after each reference and policy.
 
     Raises
     ------
     ValueError
-        On an unknown reference, or a policy that does not fit the task.
+        If a reference is unknown, or a policy does not fit the task.
     """
     known = references(task)
     names = [check_one_of("reference", name, known) for name in names]
@@ -114,7 +114,7 @@ def evaluate(
         for name, loss in losses.items()
     }
     for figures in methods.values():
-        # With a price in it, a loss is no longer the logarithm of metres.
+        # With a price, a loss is not the logarithm of metres.
         priced = task.arguments.get("mode") == "priced"
         figures["score_m"] = None if priced else math.exp(figures["loss"])
     return {
@@ -127,16 +127,16 @@ def evaluate(
 
 
 def held_out_returns(task: RlTask, policy: AnyPolicy, worlds: int, seed: int) -> dict[str, Any]:
-    """Returns of the policy as it is saved, and of random actions, in the worlds of `evaluate`.
+    """Return sums of rewards of a saved policy and of random actions, in the worlds of `evaluate`.
 
-    A training's own returns are those of actions drawn about the policy's, in other worlds.
+    The returns of a training differ: its actions are random around the policy's, in other worlds.
 
     Parameters
     ----------
     task, policy
-        What is played, and by whom.
+        The task and its policy.
     worlds, seed
-        How many, and which.
+        Number and seed of the worlds.
     """
     check_fit(policy, str(policy.meta.get("task")), task.make(1))
 
@@ -155,7 +155,7 @@ def held_out_returns(task: RlTask, policy: AnyPolicy, worlds: int, seed: int) ->
 def _figures(
     loss: FloatArray, random: FloatArray, best: FloatArray, resamples: np.ndarray
 ) -> dict[str, float]:
-    """Mean loss, and the normalised value with a paired bootstrap interval."""
+    """Return mean loss, and the normalised score with a paired bootstrap interval."""
     means = [array[resamples].mean(axis=-1) for array in (random, loss, best)]
     normalised = (means[0] - means[1]) / (means[0] - means[2])
     low, high = np.quantile(normalised, [0.025, 0.975])
@@ -169,7 +169,7 @@ def _figures(
 
 
 def _check_policies(task: RlTask, policies: dict[str, AnyPolicy]) -> None:
-    """Before hours of references: a ValueError on a policy that cannot be played or told apart."""
+    """Raise ValueError for unfit policies or equal labels, before the slow references."""
     envs = task.make(1)
     for label, policy in policies.items():
         if label in {*references(task), BEST_KNOWN}:
@@ -186,7 +186,7 @@ def _of_all(
     of_reference: Callable[[str, np.random.Generator], Any],
     of_policy: Callable[[AnyPolicy], Any],
 ) -> dict[str, Any]:
-    """What two functions give of references, each with a generator of its own, and of policies."""
+    """Run one function on references, each with its own generator, and another on policies."""
     _check_policies(task, policies)
     advance(0, more=len(names) + len(policies))
     found = {}
@@ -200,7 +200,7 @@ def _of_all(
     return found
 
 
-# --- tasks played step by step ----------------------------------------------------------------
+# # --- step-by-step tasks -----------------------------------------------------------------------
 
 
 def _loop_losses(
@@ -224,7 +224,7 @@ def _loop_losses(
 def _rollout(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> FloatArray:
-    """Losses (worlds,) of one episode of each world."""
+    """Return losses (worlds,) of one episode of each world."""
     returns, steps = rollouts.returns(task, act, worlds, seed)
     return -returns / steps
 
@@ -264,9 +264,9 @@ class Layouts(NamedTuple):
     Attributes
     ----------
     problem, contexts
-        What is to be placed, and the work regions.
+        The placement problem, and the work regions.
     found
-        Layouts (C, M, 3) by label; the random ones are (C, 8, M, 3).
+        Layouts (C, M, 3) by label; random layouts are (C, 8, M, 3).
     """
 
     problem: PlacementTask
@@ -282,7 +282,7 @@ def layouts_of(
     seed: int,
     advance: Advance = silent,
 ) -> list[Layouts]:
-    """Layouts of references and policies in held-out contexts.
+    """Return layouts of references and policies in held-out contexts.
 
     Parameters
     ----------
@@ -291,13 +291,13 @@ def layouts_of(
     policies, names
         Policies by label, and names of `references`.
     worlds, seed
-        How many contexts, and which.
+        Number and seed of the contexts.
     advance
         Called after each reference and policy.
 
     Returns
     -------
-    Those of all contexts together; of scenes that are drawn, of each world by itself.
+    One entry for all contexts together; if scenes are random, one entry for each world.
     """
     problems = _problems(task, worlds, seed)
     found = _of_all(
@@ -363,7 +363,7 @@ def _policy_layouts(
 
 
 def _loss_of(problem: PlacementTask, contexts: Context, anchors: FloatArray) -> FloatArray:
-    """Log scores (C,) of layouts, of several the mean."""
+    """Return log scores (C,) of layouts, the mean if there are several."""
     if anchors.ndim == 4:
         scores = placement.score(problem, search.expand(contexts), anchors)
         return np.log(scores).mean(axis=-1)

@@ -1,7 +1,7 @@
 """Random placement problems, batch by batch, on which `amortised` trains.
 
-Four families: boxes, shells, rooms with racks, and buildings with inner walls, zones and mounts. In
-a batch all problems have the same numbers of anchors, tags and fixed anchors.
+There are four families: boxes, shells, rooms with racks, and buildings with inner walls, zones and
+mounts. All problems of a batch have the same numbers of anchors, tags and fixed anchors.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from rbl_gym.studies.learning.random_problems import (
     priors,
 )
 
-# Half size of a work region as a share of the volume's, as contexts have it.
+# Half size of a work region as a share of the volume's, as in contexts.
 _LEAST, _SPAN = np.array([0.15, 0.15, 0.3]), np.array([0.45, 0.45, 0.7])
 _POSES = 32
 # Candidates in rooms with racks.
@@ -36,12 +36,12 @@ ROOM_CANDIDATES = 48
 
 
 def draw(family: str, rng: np.random.Generator, size: int) -> Batch:
-    """A batch of problems of a family."""
+    """Return a batch of problems of a family."""
     return FAMILIES[family](rng, size)
 
 
 def _work(rng: np.random.Generator, low: FloatArray, high: FloatArray) -> FloatArray:
-    """A zone (B, 1, 10) inside volumes: smaller boxes, or all of them."""
+    """Return a zone (B, 1, 10) inside each volume: a smaller box, or all of it."""
     size = len(low)
     share = _LEAST + _SPAN * rng.random((size, 3))
     share[rng.random(size) < 0.15] = 1.0
@@ -56,7 +56,7 @@ _TASK = placement.task("uwb_room")
 
 
 def _poses(rng: np.random.Generator, zones: FloatArray, even: bool) -> tuple[FloatArray, ...]:
-    """Rotations, places and weights of the poses in one zone each."""
+    """Return rotations, positions and weights of the poses in one zone each."""
     size = len(zones)
     rotation, offset = _TASK.poses
     rotation = np.broadcast_to(rotation, (size, *rotation.shape))
@@ -68,7 +68,7 @@ def _poses(rng: np.random.Generator, zones: FloatArray, even: bool) -> tuple[Flo
 
 
 class _Where(NamedTuple):
-    """Region, zones and what is in the way; fields as in `Scenery` and `Batch`."""
+    """Region, zones and obstacles; fields as in `Scenery` and `Batch`."""
 
     kind: str
     low: FloatArray
@@ -83,7 +83,7 @@ class _Where(NamedTuple):
 
 
 def _plain(rng: np.random.Generator, where: _Where) -> Batch:
-    """A batch in boxes, shells or rooms: with a body, noise and poses."""
+    """Return a batch in boxes, shells or rooms: with a body, noise and poses."""
     low, high, zones, left = where.low, where.high, where.zones, where.left
     size = len(low)
     even = bool(rng.random() < 0.25)
@@ -126,7 +126,7 @@ def _plain(rng: np.random.Generator, where: _Where) -> Batch:
 
 
 def _inward(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Normals (B, C, 3) of points on walls and ceilings: of the first face that holds each."""
+    """Return normals (B, C, 3) of points on walls and ceilings, of the first matching face."""
     at_low, at_high = points == low, points == high
     at_low[..., 2] = False
     on = at_low | at_high
@@ -139,14 +139,14 @@ def _kept(free: FloatArray, left: FloatArray) -> FloatArray:
 
 
 def _nearest(where: _Where) -> FloatArray:
-    """From the middle of the zones to the region (B,)."""
+    """Return the distance from the centre of the zones to the region (B,)."""
     origin, low, high = where.zones[:, 0, :3], where.low, where.high
     if where.kind == "shell":
         radius = np.linalg.norm(origin, axis=-1)
         return np.maximum(np.maximum(where.inner - radius, radius - where.outer), 0.0)
     if where.kind == "box":
         return np.linalg.norm(origin - origin.clip(low, high), axis=-1)
-    # All faces but the floor.
+    # All faces except the floor.
     gaps = np.concatenate([origin - low, high - origin], axis=-1)[:, [0, 1, 3, 4, 5]]
     return np.abs(gaps).min(axis=-1)
 
@@ -155,7 +155,7 @@ def _nearest(where: _Where) -> FloatArray:
 
 
 def _boxes(rng: np.random.Generator, size: int) -> Batch:
-    """Boxes and planes below, above and around where the body moves."""
+    """Boxes and planes below, above and around the body's volume."""
     half = np.stack(
         [np.ones(size), log_uniform(rng, 0.5, 1.0, size), log_uniform(rng, 0.05, 1.0, size)],
         axis=-1,
@@ -166,7 +166,7 @@ def _boxes(rng: np.random.Generator, size: int) -> Batch:
     reach = half * np.array([1, 1, 0]) * log_uniform(rng, 0.6, 2.5, size)[:, None]
     middle = rng.uniform(-0.3, 0.3, (size, 3)) * half * (rng.random((size, 1)) < 0.5)
     low, high = middle - reach, middle + reach
-    # Where it lies: a plane above or below, a slab there, or a box around.
+    # Types of region: a plane above or below, a slab there, or a box around.
     which = rng.integers(4, size=size)
     gap = (
         half[:, 2] * rng.choice([0.0, 1.0], size, p=[0.2, 0.8]) * log_uniform(rng, 0.05, 1.5, size)

@@ -1,4 +1,4 @@
-"""Trained policies as small files, played by numpy: no learning library needed."""
+"""Trained policies as small files, run by numpy without a learning library."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ KINDS = ("box", "discrete", "multi-binary")
 
 
 class Lstm(NamedTuple):
-    """A layer with a memory, its gates in the order input, forget, cell, output (torch).
+    """A layer with a memory, with gates in the order input, forget, cell, output (as in torch).
 
     Attributes
     ----------
     reads, recalls, bias
-        (4 H, n_in), (4 H, H) and (4 H,).
+        Weights (4 H, n_in) of the input, weights (4 H, H) of the hidden state, and biases (4 H,).
     """
 
     reads: FloatArray
@@ -37,7 +37,7 @@ class Lstm(NamedTuple):
     def __call__(
         self, observation: FloatArray, hidden: FloatArray, cell: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Hidden and cell state (..., H) after an observation (..., n_in)."""
+        """Return hidden and cell state (..., H) after an observation (..., n_in)."""
         gates = observation @ self.reads.T + hidden @ self.recalls.T + self.bias
         enter, keep, new, out = np.split(gates, 4, axis=-1)
         cell = _sigmoid(keep) * cell + _sigmoid(enter) * np.tanh(new)
@@ -50,15 +50,15 @@ class Policy(NamedTuple):
     Attributes
     ----------
     weights, biases
-        Of each layer, (n_out, n_in) and (n_out,).
+        Weights (n_out, n_in) and biases (n_out,) of each layer.
     kind
-        ``"box"``: actions cut to [-1, 1]. ``"discrete"``: the largest of the outputs.
+        ``"box"``: actions clipped to [-1, 1]. ``"discrete"``: index of the largest output.
         ``"multi-binary"``: which outputs are positive.
     meta
-        Where it comes from: task, seed, steps, the command that makes it again. With
-        ``"algorithm": "maskable-ppo"`` it is played with the environment's action masks.
+        Origin: task, seed, steps, the command that repeats the training. With ``"algorithm":
+        "maskable-ppo"`` the policy uses the environment's action masks.
     lstm
-        A layer with a memory before the others; None: there is none.
+        A layer with a memory before the others, or None.
     """
 
     weights: tuple[FloatArray, ...]
@@ -69,21 +69,21 @@ class Policy(NamedTuple):
 
     @property
     def n_inputs(self) -> int:
-        """Entries of an observation."""
+        """Number of entries of an observation."""
         first = self.weights[0] if self.lstm is None else self.lstm.reads
         return first.shape[1]
 
     def __call__(self, observation: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-        """Actions (...,) or (..., n) of observations (..., n_in).
+        """Return actions (...,) or (..., n) for observations (..., n_in).
 
-        `mask` (..., n), of a discrete policy: True for the actions that there are.
+        `mask` (..., n), for a discrete policy, is True for the allowed actions.
         """
         if self.lstm is not None:
             raise ValueError("a policy with a memory is played by player(), one for each episode")
         return self._action(self._checked(observation), mask)
 
     def player(self) -> Callable[[Any, np.ndarray], np.ndarray]:
-        """A function ``(env, observation) -> actions``: make one for each episode."""
+        """Return a function ``(env, observation) -> actions`` for one episode."""
         masked = self.meta.get("algorithm") == "maskable-ppo"
         state = None
 
@@ -152,9 +152,9 @@ def load(path: str | Path) -> AnyPolicy:
     Raises
     ------
     ValueError
-        If the file is no policy.
+        If the file is not a policy.
     """
-    # numpy keeps the handle of a file that is no archive.
+    # numpy leaves the file open if it is not an archive.
     data = io.BytesIO(Path(path).read_bytes())
     try:
         with np.load(data, allow_pickle=False) as file:
@@ -175,20 +175,20 @@ def load(path: str | Path) -> AnyPolicy:
         )
         policy = Policy(weights, biases, kind, meta, lstm)
         _check_layers(policy)
-    # What zipfile and numpy raise of a broken archive has no common kind but this.
+    # zipfile and numpy raise unrelated exceptions for a broken archive.
     except Exception as error:
         raise ValueError(f"{path} is no policy of rbl-gym: {error}") from error
     return policy
 
 
 def _layers(arrays: dict[str, np.ndarray], name: str) -> tuple[tuple[FloatArray, FloatArray], ...]:
-    """Weights and biases whose names begin with `name`."""
+    """Return weights and biases whose names begin with `name`."""
     count = sum(key.startswith(f"{name}weight_") for key in arrays)
     return tuple((arrays[f"{name}weight_{k}"], arrays[f"{name}bias_{k}"]) for k in range(count))
 
 
 def _check_layers(policy: Policy) -> None:
-    """A ValueError unless the layers are finite and fit together."""
+    """Raise ValueError unless the layers are finite and fit together."""
     if not policy.weights:
         raise ValueError("it has no layers")
     n_in = policy.weights[0].shape[-1]
@@ -206,7 +206,7 @@ def _check_layers(policy: Policy) -> None:
 
 
 def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
-    """Of which kind a policy for an action space is, and how many outputs it has."""
+    """Return the kind of a policy for an action space, and its number of outputs."""
     if isinstance(space, gym.spaces.Discrete):
         return "discrete", int(space.n)
     kind = "multi-binary" if isinstance(space, gym.spaces.MultiBinary) else "box"
@@ -214,7 +214,7 @@ def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
 
 
 def check_fit(policy: AnyPolicy, label: str, envs: Any) -> None:
-    """A ValueError unless a policy reads and acts as a vector environment asks for."""
+    """Raise ValueError unless a policy fits the spaces of a vector environment."""
     trained = f"policy {label!r} does not fit: it was trained on {policy.meta.get('task')!r}"
     if isinstance(policy, SetPolicy):
         wanted = SET_KINDS[policy.kind][0]

@@ -1,4 +1,4 @@
-"""Random buildings to train on: inner walls, furniture, zones, mounts on walls and ceilings."""
+"""Random buildings for training: inner walls, furniture, zones, mounts on walls and ceilings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CANDIDATES, _PLACES = 96, 16
 
 
 def buildings(rng: np.random.Generator, size: int) -> Batch:
-    """Floors with inner walls, furniture, zones, and mounts on walls and ceilings."""
+    """Return floors with inner walls, furniture, zones, and mounts on walls and ceilings."""
     n_fixed = draw_fixed(rng)
     rows = [_building(rng, n_fixed) for _ in range(size)]
     found = _Building(*(np.stack(column) for column in zip(*rows, strict=True)))
@@ -67,7 +67,7 @@ def buildings(rng: np.random.Generator, size: int) -> Batch:
 
 
 class _Building(NamedTuple):
-    """One building in metres: zones, boxes in the way, candidates, poses; as in `Scenery`."""
+    """One building in metres: zones, boxes of obstacles, candidates, poses; as in `Scenery`."""
 
     zones: FloatArray
     extent: FloatArray
@@ -87,7 +87,7 @@ _MOST_ZONES, _MOST_BOXES = 3, 12
 
 
 def _building(rng: np.random.Generator, n_fixed: int) -> _Building:
-    """One building; `fixed` are candidates."""
+    """Return one building; `fixed` are candidates."""
     x, y = rng.uniform(8, 40), rng.uniform(6, 25)
     if rng.random() < 0.5:
         x, y = y, x
@@ -127,7 +127,7 @@ def _ring(box: FloatArray) -> FloatArray:
 
 
 def _inner_walls(rng: np.random.Generator, size: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Boxes (K, 6) of walls that begin at an outer wall, and of furniture; and their shares."""
+    """Return boxes (K, 6) of walls from an outer wall and of furniture, and their shares."""
     boxes, shares = [], []
     for _ in range(int(rng.integers(0, 7))):
         axis = int(rng.integers(2))
@@ -151,7 +151,7 @@ def _inner_walls(rng: np.random.Generator, size: FloatArray) -> tuple[FloatArray
 
 
 def _zones(rng: np.random.Generator, size: FloatArray) -> tuple[FloatArray, float]:
-    """Zones (Z, 10), of which some may be padding, and the extent of all of them."""
+    """Return zones (Z, 10), some of which may be padding, and the extent of all of them."""
     zones = np.zeros((_MOST_ZONES, 10))
     attitude = int(rng.choice(3, p=[0.3, 0.5, 0.2]))
     for index in range(int(rng.integers(1, _MOST_ZONES + 1))):
@@ -171,7 +171,7 @@ def _zones(rng: np.random.Generator, size: FloatArray) -> tuple[FloatArray, floa
 def _zone_poses(
     rng: np.random.Generator, zones: FloatArray, extent: float, obstacles: Obstacles
 ) -> tuple[FloatArray, ...]:
-    """Poses shared among the zones, at least some in each."""
+    """Return poses, divided among the zones with a minimum number in each."""
     real = zones[zones[:, 6] > 0]
     share = real[:, 6] / real[:, 6].sum()
     which = np.searchsorted(np.cumsum(share), (np.arange(_PLACES) + 0.5) / _PLACES)
@@ -194,7 +194,7 @@ def _zone_poses(
 def _spots(
     rng: np.random.Generator, size: FloatArray, solid: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Candidates and their normals on outer walls, the ceiling and inner walls."""
+    """Return candidates and their normals on outer walls, the ceiling and inner walls."""
     low, high = rng.uniform(0.5, 0.85) * size[2], rng.uniform(0.86, 0.98) * size[2]
     faces = []  # origin, u, v, normal
     x, y = size[:2]

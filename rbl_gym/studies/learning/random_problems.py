@@ -1,4 +1,4 @@
-"""What random placement problems have in common: bodies, noise, numbers of anchors."""
+"""Common parts of random placement problems: bodies, noise, numbers of anchors."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ _TURN_STD = math.radians(60)
 
 
 class Batch(NamedTuple):
-    """Problems of one family, arrays with one leading axis.
+    """Problems of one family as arrays with one leading axis.
 
     Attributes
     ----------
     seen
-        What the network is told.
+        Input of the network.
     count
-        How many anchors are placed.
+        Number of anchors to place.
     rotation, weight
-        Of the poses at `Scenery.places`: (B, P, 3, 3), (B, P).
+        Rotations (B, P, 3, 3) and weights (B, P) of the poses at `Scenery.places`.
     prior
-        (B, P, 6, 6).
+        Prior information (B, P, 6, 6).
     outer
         (B,): outer radius of shells.
     left
-        (B,): what boxes leave of a link.
+        (B,): share of a link's information that boxes leave.
     fixed_share
-        (B, P, F): of the links of fixed anchors.
+        (B, P, F): shares of the links of fixed anchors.
     """
 
     seen: Scenery
@@ -46,18 +46,18 @@ class Batch(NamedTuple):
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float, size: int) -> FloatArray:
-    """Numbers (size,) whose logarithms are uniform."""
+    """Return numbers (size,) whose logarithms are uniform."""
     return np.exp(rng.uniform(math.log(low), math.log(high), size))
 
 
 def draw_count(rng: np.random.Generator, fixed: int = 0) -> int:
-    """Anchors to place: 3 to 16 with the fixed ones, fewer more often."""
+    """Return the number of anchors to place: 3 to 16 with the fixed ones, mostly few."""
     most = 12 if rng.random() < 0.8 else 16
     return max(int(rng.integers(3, most + 1)) - fixed, 1)
 
 
 def _tags(rng: np.random.Generator, radius: FloatArray) -> FloatArray:
-    """Bodies (B, N, 3) of one kind, their root mean square radius as given."""
+    """Return bodies (B, N, 3) of one kind with the given root mean square radius."""
     kind = int(rng.integers(6))
     size = len(radius)
     known = (bodies.octahedron(), bodies.pyramid(), bodies.cube(), bodies.plate(1.0, 0.6))
@@ -74,7 +74,7 @@ def _tags(rng: np.random.Generator, radius: FloatArray) -> FloatArray:
 def body_and_noise(
     rng: np.random.Generator, size: int, reach: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Tags (B, N, 3) and noise (B, 2) of worlds of a size (B,)."""
+    """Return tags (B, N, 3) and noise (B, 2) of worlds of a size (B,)."""
     radius = reach * log_uniform(rng, 0.003, 0.4, size)
     floor = radius * log_uniform(rng, 0.01, 0.5, size)
     growth = log_uniform(rng, 1e-4, 1e-2, size) * (rng.random(size) < 0.75)
@@ -82,7 +82,7 @@ def body_and_noise(
 
 
 def priors(extent: FloatArray, n_poses: int) -> FloatArray:
-    """Information (B, P, 6, 6) before the first range: 60 degrees, half of the extent (B,)."""
+    """Return prior information (B, P, 6, 6): 60 degrees, and half of the extent (B,)."""
     prior = np.zeros((len(extent), n_poses, 6, 6))
     axes = np.arange(3)
     prior[..., axes, axes] = _TURN_STD**-2
@@ -91,5 +91,5 @@ def priors(extent: FloatArray, n_poses: int) -> FloatArray:
 
 
 def draw_fixed(rng: np.random.Generator) -> int:
-    """How many anchors stay: often none."""
+    """Return the number of fixed anchors, often zero."""
     return int(rng.integers(1, 4)) if rng.random() < 0.2 else 0

@@ -1,4 +1,4 @@
-"""The learning tasks by name: their environments, and the settings PPO learns them with."""
+"""The learning tasks by name: their environments and the settings of PPO."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ __all__ = [
     "rl_task",
 ]
 
-# Worlds of a training, or of an evaluation, have the seeds from SEED_STRIDE times its own seed on;
-# those of evaluations begin beyond all of trainings.
+# Worlds of a training or evaluation have the seeds from SEED_STRIDE times its own seed on. Seeds of
+# evaluations lie beyond those of all trainings.
 SEED_STRIDE = 1_000_000
 HELD_OUT_SEED = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class RlTask:
-    """An environment with arguments, and how PPO is set for it.
+    """An environment with arguments, and the settings of PPO.
 
     Parameters
     ----------
     env_id, arguments
-        What `gym.make_vec` gets.
+        Arguments of `gym.make_vec`.
     steps
         Environment steps of a training.
     rollout
         Steps of each world between two updates.
     gamma, gae_lambda
-        Discount and advantage mixing; 1 where only the end counts.
+        Discount and advantage mixing; 1 if only the end counts.
     num_envs, batch_size, epochs, learning_rate, hidden, log_std_init
-        As their names say; the learning rate falls linearly to zero.
+        Settings of PPO; the learning rate falls linearly to zero.
     algorithm
-        What learns it unless told otherwise, of `training.ALGORITHMS`.
+        Default algorithm, a name of `training.ALGORITHMS`.
     """
 
     env_id: str
@@ -58,7 +58,7 @@ class RlTask:
     algorithm: str = "ppo"
 
     def make(self, num_envs: int, autoreset_mode: str = "SameStep") -> Any:
-        """The vector environment."""
+        """Return the vector environment."""
         return gym.make_vec(
             f"rbl_gym:{self.env_id}",
             num_envs=num_envs,
@@ -67,14 +67,14 @@ class RlTask:
         )
 
     def in_worlds(self, scene: Any = None, scenes: Any = None) -> RlTask:
-        """The task in another scene, or in a family of scenes.
+        """Return the task in another scene, or in a family of scenes.
 
         Parameters
         ----------
         scene
-            As the environment takes it; what the task says of its own scene goes.
+            Scene as in the environment's argument; it replaces the task's own.
         scenes
-            A family in its place, see `rbl_gym.worlds.families.family`.
+            A family of scenes instead, see `rbl_gym.worlds.families.family`.
         """
         if scene is None and scenes is None:
             return self
@@ -85,20 +85,20 @@ class RlTask:
         return dataclasses.replace(self, arguments={**kept, **given})
 
     def family(self) -> SceneFamily:
-        """The scenes of the environment, of a task with a filter in the loop."""
+        """The scenes of the environment, for a task with a filter in the loop."""
         env = self.make(1)
         return env.family or family([env.scene])
 
 
 def _mobile(steps: int, rollout: int, **arguments: Any) -> RlTask:
-    # A step of the filter costs each of 256 worlds a third of what it does each of 64.
+    # Per world, a step of the filter with 256 worlds costs a third of that with 64.
     return RlTask(
         "RBL/MobileAnchors-v0", arguments, steps, rollout, gamma=0.95, gae_lambda=0.9, num_envs=256
     )
 
 
 def _selection(**arguments: Any) -> RlTask:
-    # What is chosen now is felt for a few steps only: a short horizon is learned faster.
+    # A choice affects a few steps only, and a short horizon is learned faster.
     return RlTask(
         "RBL/AnchorSelection-v0", arguments, 600_000, 13, gamma=0.8, gae_lambda=0.9, num_envs=256
     )
@@ -125,7 +125,7 @@ _RACK = {
         [{"uniform": [-15, 15]}, {"uniform": [-7, 7]}, 1.5, 4.0, 0.5, 1.5],
     ]
 }
-# Halls 24 to 56 m long with 2 to 6 racks and 6 to 12 anchors; and, once in four, `hall` itself.
+# Halls 24 to 56 m long with 2 to 6 racks and 6 to 12 anchors; one in four is `hall` itself.
 _DRAWN_HALL = {
     "name": "hall",
     "n_anchors": {"integers": [6, 12]},
@@ -156,5 +156,5 @@ TASKS: dict[str, RlTask] = {
 
 
 def rl_task(name: str) -> RlTask:
-    """The named task, or a ValueError."""
+    """Return the named task, or raise ValueError."""
     return TASKS[check_one_of("task", name, list(TASKS))]

@@ -1,4 +1,4 @@
-"""Episodes of held-out worlds, played by policies and references."""
+"""Episodes of held-out worlds with policies and references."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
 
 
 def held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str, Any]]:
-    """An environment at the start of its held-out episodes, its observation and info."""
+    """Return an environment at the start of its held-out episodes, its observation and info."""
     env = task.make(worlds, "Disabled")
     return env, *env.reset(seed=HELD_OUT_SEED + SEED_STRIDE * seed)
 
@@ -20,7 +20,7 @@ def held_out(task: RlTask, worlds: int, seed: int) -> tuple[Any, Any, dict[str, 
 def returns(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> tuple[FloatArray, np.ndarray]:
-    """Sums of the rewards (worlds,) of one episode of each world, and their steps (worlds,)."""
+    """Return sums of rewards (worlds,) of one episode of each world, and their steps (worlds,)."""
     total, count = np.zeros(worlds), np.zeros(worlds, dtype=np.int64)
     for going, reward, _, _ in steps(task, act, worlds, seed):
         total += np.where(going, reward, 0.0)
@@ -31,10 +31,10 @@ def returns(
 def steps(
     task: RlTask, act: Callable[[Any, np.ndarray], np.ndarray], worlds: int, seed: int
 ) -> Iterator[tuple[np.ndarray, FloatArray, np.ndarray, dict[str, Any]]]:
-    """Steps until the first episodes of all worlds are over.
+    """Yield steps until the first episodes of all worlds are over.
 
-    Of each: which worlds are in their first episode, rewards, which of these end, infos. Worlds
-    whose episode is over sooner than those of others begin another.
+    Each step has: which worlds are in their first episode, rewards, which of these episodes end,
+    infos. A world whose episode is over before those of others starts another one.
     """
     env, observation, _ = held_out(task, worlds, seed)
     env.action_space.seed(seed)

@@ -1,4 +1,4 @@
-"""`deep_sets.DeepSets` in torch, to train."""
+"""`deep_sets.DeepSets` in torch, for training."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class SetNetwork(nn.Module):
     Parameters
     ----------
     n_own, n_pair, n_out
-        Numbers of an element, of a pair, and of the output.
+        Lengths of the rows of elements, of pairs and of the output.
     inner, outer
         Sizes of the hidden layers.
     """
@@ -38,7 +38,7 @@ class SetNetwork(nn.Module):
         self.outer = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
 
     def forward(self, own: Any, pairs: Any, others: Any) -> Any:
-        """Outputs (..., M, n); arguments as `DeepSets`."""
+        """Return outputs (..., M, n). Arguments as in `DeepSets`."""
         repeated = own[..., None, :].expand(*pairs.shape[:-1], own.shape[-1])
         hidden = torch.cat([repeated, pairs], -1)
         for layer in self.inner:
@@ -51,7 +51,7 @@ class SetNetwork(nn.Module):
         return self.outer[-1](output)
 
     def arrays(self) -> DeepSets:
-        """The network in numpy."""
+        """Return the network in numpy."""
 
         def of(layers: Any) -> Any:
             return tuple(

@@ -1,4 +1,4 @@
-"""Policies for any number of anchors, played by numpy: craft that move, links that have sight."""
+"""Policies for any number of anchors, run by numpy: motion of craft, links chosen by sight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rbl_gym.wrappers.situations import action_of, situations
 
 __all__ = ["SET_KINDS", "SetPolicy"]
 
-# What a policy of a kind plays, and the numbers of its network: element, pair, output.
+# Environment of a policy of each kind, and row lengths of its network: element, pair, output.
 SET_KINDS: dict[str, tuple[str, tuple[int, int, int]]] = {
     "craft": ("RBL/MobileAnchors-v0", (craft_tokens.OWN, craft_tokens.PAIR, 2)),
     "sight": ("RBL/AnchorSelection-v0", (sight_tokens.QUERY, sight_tokens.EVENT, 1)),
@@ -28,13 +28,13 @@ class SetPolicy(NamedTuple):
     Attributes
     ----------
     network
-        What is learned.
+        The trained network.
     kind
         ``"craft"``: the network corrects the orbit of `controllers`, for 2 craft or more.
-        ``"sight"``: it tells from what was measured so far which anchors will see the body, and the
-        anchors are chosen greedily by the score to be expected.
+        ``"sight"``: the network predicts from the previous measurements which anchors will see the
+        body. The anchors are chosen greedily by the expected score.
     meta
-        Where it comes from.
+        Origin of the policy.
     """
 
     network: DeepSets
@@ -42,7 +42,7 @@ class SetPolicy(NamedTuple):
     meta: dict[str, Any]
 
     def player(self) -> Callable[[Any, Any], np.ndarray]:
-        """A function ``(env, observation) -> actions`` that remembers: make one for each episode.
+        """Return a function ``(env, observation) -> actions`` with a memory, for one episode.
 
         `env` is the environment of a task, scalar or vector, after `reset` or `step`.
         """
@@ -51,12 +51,12 @@ class SetPolicy(NamedTuple):
         return _Chooser(self.network)
 
     def check(self) -> None:
-        """A ValueError unless the network is one of its kind."""
+        """Raise ValueError unless the network fits its kind."""
         check_sets(self.network, *SET_KINDS[self.kind][1])
 
 
 def _batched(env: Any, *arrays: np.ndarray) -> list[np.ndarray]:
-    """Arrays of one world or of many, as those of many."""
+    """Return arrays of one world or of many with a leading axis of worlds."""
     one = env.anchors.ndim == 2
     return [np.asarray(array)[None] if one else np.asarray(array) for array in arrays]
 
@@ -68,7 +68,7 @@ def _mask(env: Any) -> np.ndarray:
 
 
 def craft_seen(env: Any) -> craft_tokens.CraftTokens:
-    """What each craft of an environment sees now, arrays (B, M, ...); of a scalar one B is 1."""
+    """Return the input (B, M, ...) of each craft of an environment; B is 1 for a scalar one."""
     rotation, translation, covariance = _batched(env, *env.belief[:3])
     twist, craft = _batched(env, env.twist, env.anchors)
     reach = np.broadcast_to(views.reach_of_craft(env.world), len(craft))
@@ -78,7 +78,7 @@ def craft_seen(env: Any) -> craft_tokens.CraftTokens:
 
 
 def craft_actions(env: Any, seen: craft_tokens.CraftTokens, own: np.ndarray) -> np.ndarray:
-    """Actions of an environment of level velocities (B, M, 2) in the frames of the craft."""
+    """Return actions for level velocities (B, M, 2) in the frames of the craft."""
     length = np.linalg.norm(own, axis=-1, keepdims=True)
     velocity = own / np.maximum(length, 1.0)
     velocity = (np.swapaxes(seen.frames, -1, -2) @ velocity[..., None])[..., 0]
@@ -96,7 +96,7 @@ def _craft_player(network: DeepSets) -> Callable[[Any, Any], np.ndarray]:
 
 
 class _Chooser:
-    """Chooses anchors greedily by the sight that the network expects, and remembers what it saw."""
+    """Chooses anchors greedily by the sight that the network predicts, and remembers past sight."""
 
     def __init__(self, network: DeepSets) -> None:
         self._network = network
@@ -127,14 +127,14 @@ class _Chooser:
 
 
 def _sight(env: Any) -> np.ndarray:
-    """1 where an anchor saw the body in the last step, else -1."""
+    """Return 1 if an anchor saw the body in the last step, else -1."""
     (links,) = _batched(env, env.seen["links"])
     (quality,) = _batched(env, env.seen.get("quality", np.ones(env.anchors.shape[:-1])))
     return np.where(links.any(axis=-1) & (quality > 0.5), 1.0, -1.0)
 
 
 def volumes(world: Any, batch: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and half sizes (B, 3) of the volumes of a scene or of scenes side by side."""
+    """Return centres and half sizes (B, 3) of the volumes of one scene or of several."""
     scenes = (world,) * batch if isinstance(world, Scene) else world.scenes
     corners = np.array([one.volume.bounds() for one in scenes])
     return corners.mean(axis=1), np.maximum(0.5 * (corners[:, 1] - corners[:, 0]), 1.0)

@@ -1,8 +1,8 @@
-"""A policy for choosing anchors: which of them will see the body, learned from what was in sight.
+"""A policy for choosing anchors by predicted sight, trained on simulated sight.
 
-In a simulated hall it is known what every anchor sees, so the network is taught directly: it
-follows bodies through halls that are drawn anew, chooses anchors by what it expects, remembers
-what the chosen ones saw, and is corrected for all of them.
+A simulated hall gives the sight of every anchor, so the training is supervised. It follows bodies
+through random halls, chooses anchors by the prediction and remembers the sight of those. The loss
+covers all anchors.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from rbl_gym.wrappers.sight_tokens import EVENT, QUERY, forgotten, remember, sig
 
 __all__ = ["train_sight"]
 
-# Tracks at once; samples of an update; how often each sample is used.
+# Tracks at once; samples of an update; uses of each sample.
 _TRACKS, _SAMPLES, _EPOCHS = 128, 256, 2
 _LEARNING_RATE, _CLIP = 3e-3, 1.0
-# Share of choices that are made at random; the error of a belief's place, metres; how well it is
-# known before the ranges of a step, metres.
+# Share of random choices; error of a belief's position, metres; its standard deviation before the
+# ranges of a step, metres.
 _RANDOM, _ERROR_M, _SPREAD_M = 0.15, 0.06, (0.05, 0.3)
 
 
 class _Tracks(NamedTuple):
-    """Bodies (B, T + 1, 3) among anchors (B, M, 3), and what sees them (B, T + 1, M): 1 or -1."""
+    """Bodies (B, T + 1, 3) among anchors (B, M, 3), and sight (B, T + 1, M): 1 or -1."""
 
     body: FloatArray
     anchors: FloatArray
@@ -39,7 +39,7 @@ class _Tracks(NamedTuple):
     sight: FloatArray
     middle: FloatArray
     half: FloatArray
-    # Variance of a position by the ranges of one anchor, at the bodies (B, T + 1, M).
+    # Variance of a position from the ranges of one anchor, at the bodies (B, T + 1, M).
     variance: FloatArray
 
 
@@ -51,20 +51,19 @@ def train_sight(
     Parameters
     ----------
     family
-        The scenes.
+        The family of scenes.
     k
-        Anchors that are chosen in a step.
+        Number of anchors chosen in a step.
     steps
         Steps of all bodies together.
     seed
-        Of scenes, tracks and network.
+        Seed of scenes, tracks and network.
     advance
-        Told of steps done.
+        Called with the number of finished steps.
 
     Returns
     -------
-    The network, and the learning curve: steps, and the mean logarithm of the likelihood of what
-    was in sight.
+    The network, and the learning curve: steps, and the mean log-likelihood of the sight.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -109,7 +108,7 @@ def _draw(family: SceneFamily, rng: np.random.Generator) -> _Tracks:
     for row in range(_TRACKS):
         scene, _ = family.draw(rng)
         one, m = simulation.draw_episode(scene, rng), scene.n_anchors
-        # A shorter episode stands still at its end.
+        # After the end of a shorter episode the body stands still.
         body[row] = one.translation[np.minimum(np.arange(shape[1]), scene.steps)]
         anchors[row, :m], mask[row, :m] = one.anchors, 1.0
         if scene.obstacles:
@@ -126,7 +125,7 @@ def _draw(family: SceneFamily, rng: np.random.Generator) -> _Tracks:
 def _followed(
     tracks: _Tracks, network: DeepSets, k: int, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Questions, events, masks and answers (S, M, ...) of all steps of all tracks."""
+    """Return elements, pairs, masks and targets (S, M, ...) of all steps of all tracks."""
     batch, epochs, most = tracks.sight.shape
     memory, samples = forgotten(batch, most), []
     spread = rng.uniform(*_SPREAD_M, batch)
@@ -150,7 +149,7 @@ def _chosen(
     k: int,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """k anchors of each world, greedily by what they tell of the place; some at random."""
+    """Return k anchors of each world, greedily by their position information; some at random."""
     gap = tracks.body[:, t, None] - tracks.anchors
     unit = gap / np.linalg.norm(gap, axis=-1, keepdims=True)
     weight = likely * tracks.mask / tracks.variance[:, t]

@@ -1,6 +1,6 @@
 """The network of `placement.amortised` in torch, and the score of a layout with its gradient.
 
-Lengths are in units of the problem, its origin in the middle of where the body works.
+Lengths are in units of the problem, with the origin in the centre of the work zones.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Network(nn.Module):
     Parameters
     ----------
     sizes
-        Lengths of the rows of `tokens.Tokens`.
+        Row lengths of `tokens.Tokens`.
     width, layers
-        Of the tokens, and how many.
+        Width of the tokens, and number of layers.
     """
 
     def __init__(self, sizes: dict[str, int], width: int = 64, layers: int = 4) -> None:
@@ -50,13 +50,13 @@ class Network(nn.Module):
         self.layers = layers
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The weights as `placement.amortised` plays them."""
+        """Return the weights in the form of `placement.amortised`."""
         return {
             name.replace("/", "."): value.detach().numpy() for name, value in self.weights.items()
         }
 
     def forward(self, tokens: Any, count: int, total: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Steps (B, M, 3) and scores of the candidates (B, M, C); see `amortised.forward`."""
+        """Return steps (B, M, 3) and scores of candidates (B, M, C), as `amortised.forward`."""
         w = {name.replace("/", "."): value for name, value in self.weights.items()}
         rows, masks = [], []
         for kind in ("world", "zones", "obstacles", "fixed"):
@@ -107,17 +107,17 @@ class Case(NamedTuple):
     tags
         (B, N, 3).
     floor, growth
-        (B,): of the noise.
+        (B,): parameters of the noise.
     rotation, places, weight
-        Poses (B, P, 3, 3), (B, P, 3), and what they count (B, P).
+        Poses (B, P, 3, 3), (B, P, 3), and their weights (B, P).
     prior
-        Information (B, P, 6, 6), with that of fixed anchors.
+        Information (B, P, 6, 6), including that of fixed anchors.
     low, high, inner, outer
-        Corners (B, 3) of the region; radii (B,) of a shell, and its middle (B, 3).
+        Corners (B, 3) of the region; inner and outer radius (B,) of a shell.
     middle
-        Middle (B, 3) of the shell.
+        Centre (B, 3) of the shell.
     boxes, left
-        (B, K, 6): in the way; (B,): what they leave of a link.
+        (B, K, 6): obstacles; (B,): share of a link's information that they leave.
     """
 
     tags: torch.Tensor
@@ -137,7 +137,7 @@ class Case(NamedTuple):
 
 
 class _Clip(torch.autograd.Function):
-    """Clipped to limits; the gradient passes but where it pushes further out."""
+    """Clip to limits. The gradient passes except if it pushes further out."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
@@ -148,13 +148,13 @@ class _Clip(torch.autograd.Function):
     def backward(ctx: Any, *slopes: torch.Tensor) -> Any:
         x, low, high = ctx.saved_tensors
         (slope,) = slopes
-        # A step goes against the slope.
+        # A step goes against the gradient.
         outward = ((x > high) & (slope < 0)) | ((x < low) & (slope > 0))
         return torch.where(outward, 0.0, slope), None, None
 
 
 def legal(kind: str, case: Case, points: torch.Tensor) -> torch.Tensor:
-    """Points (B, M, 3) of the region that those (B, M, 3) stand for, as `amortised.legal`."""
+    """Return legal points (B, M, 3) of the region for points (B, M, 3), as `amortised.legal`."""
     low, high = case.low[:, None], case.high[:, None]
     if kind == "box":
         return _Clip.apply(points, low, high)  # pyright: ignore[reportReturnType]
@@ -174,7 +174,7 @@ def legal(kind: str, case: Case, points: torch.Tensor) -> torch.Tensor:
 
 
 def rows(case: Case, anchors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rows q (B, P, M, N, 6) of the information of links and their weights (B, P, M, N)."""
+    """Return rows q (B, P, M, N, 6) of the information of links, and their weights (B, P, M, N)."""
     c = torch.einsum("bpij,bnj->bpni", case.rotation, case.tags)
     s = c + case.places[:, :, None]
     d = s[:, :, None] - anchors[:, None, :, None]
@@ -185,29 +185,29 @@ def rows(case: Case, anchors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]
 
 
 def information(case: Case, anchors: torch.Tensor, share: torch.Tensor | None) -> torch.Tensor:
-    """Information (B, P, 6, 6) of layouts, the prior in it; shares (B, P, M)."""
+    """Return information (B, P, 6, 6) of layouts, including the prior, and shares (B, P, M)."""
     q, weight = rows(case, anchors)
     if share is not None:
         weight = weight * share[..., None]
-    # In double precision: the sum may be nearly singular.
+    # Double precision, because the sum may be nearly singular.
     told = (q * weight.sqrt()[..., None]).flatten(2, 3).double()
     return told.transpose(-1, -2) @ told + case.prior
 
 
 def parts(case: Case, candidates: torch.Tensor, share: torch.Tensor) -> torch.Tensor:
-    """Information (B, C, P, 6, 6) of each candidate alone; shares (B, P, C)."""
+    """Return information (B, C, P, 6, 6) of each single candidate, and shares (B, P, C)."""
     q, weight = rows(case, candidates)
     told = (q * (weight * share[..., None]).sqrt()[..., None]).double()
     return (told.transpose(-1, -2) @ told).transpose(1, 2)
 
 
 def log_score(case: Case, told: torch.Tensor) -> torch.Tensor:
-    """Log of the score (B,) of information (B, P, 6, 6)."""
+    """Return the log score (B,) of information (B, P, 6, 6)."""
     return 0.5 * (case.weight * _Square.apply(told, spread(case))).sum(dim=-1).log()
 
 
 def spread(case: Case) -> torch.Tensor:
-    """``mean_n J_n^T J_n`` (B, P, 6, 6)."""
+    """Return ``mean_n J_n^T J_n`` (B, P, 6, 6)."""
     c = torch.einsum("bpij,bnj->bpni", case.rotation, case.tags)
     J = c.new_zeros((*c.shape[:-1], 3, 6))
     x, y, z = c.unbind(dim=-1)
@@ -219,7 +219,7 @@ def spread(case: Case) -> torch.Tensor:
 
 
 def log_score_in_sight(case: Case, anchors: torch.Tensor) -> torch.Tensor:
-    """Log of the score (B,) of layouts with nothing in the way: the kernel's, and its gradient."""
+    """Return the kernel's log score (B,) of layouts without obstacles, with its gradient."""
     found: Any = _InSight.apply(anchors, case)
     return found
 
@@ -247,7 +247,7 @@ class _InSight(torch.autograd.Function):
 
 
 def some_poses(case: Case, generator: torch.Generator) -> Case:
-    """The case over a half of its poses, drawn at random: those of a batch weigh the same."""
+    """Return the case over a random half of its poses. All poses of a batch have equal weight."""
     index = torch.randperm(case.places.shape[1], generator=generator)[: case.places.shape[1] // 2]
     return case._replace(
         rotation=case.rotation[:, index],
@@ -274,7 +274,7 @@ class _Square(torch.autograd.Function):
 
 
 def sight(case: Case, anchors: torch.Tensor, blur: float) -> torch.Tensor | None:
-    """Share (B, P, M) of links past boxes, with edges as wide as `blur`, so that it has a slope."""
+    """Return shares (B, P, M) of links past boxes; edges of width `blur` give a gradient."""
     if not case.boxes.shape[1]:
         return None
     start, end = anchors[:, None, :, None], case.places[:, :, None, None]

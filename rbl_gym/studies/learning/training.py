@@ -1,6 +1,6 @@
-"""Training on a learning task: PPO and its kin, or what a task knows better; the result is a file.
+"""Training on a learning task by PPO, its variants, or a method of the task; writes a file.
 
-PPO is stable-baselines3's, `MaskablePPO` and `RecurrentPPO` are sb3-contrib's.
+PPO is from stable-baselines3; `MaskablePPO` and `RecurrentPPO` are from sb3-contrib.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rbl_gym.studies.learning.set_policies import SetPolicy
 
 __all__ = ["ALGORITHMS", "train"]
 
-# What learns, and the policies that it makes.
+# The algorithms, and the kinds of policies that they train.
 ALGORITHMS = {
     "ppo": "a multilayer perceptron",
     "maskable-ppo": "the same, which is told the actions that there are",
@@ -27,7 +27,7 @@ ALGORITHMS = {
     "set-ppo": "one network for craft of any number, which starts as the orbit",
     "supervised": "a choice of any number of anchors by what will be in sight",
 }
-# Units of the memory, and of the layer behind it.
+# Units of the memory, and of the layer after it.
 _MEMORY, _BEHIND = 64, 64
 
 
@@ -39,32 +39,32 @@ def train(
     advance: Callable[[int], None] = lambda steps: None,
     algorithm: str | None = None,
 ) -> tuple[AnyPolicy, dict[str, Any]]:
-    """Train a policy, and say how it went.
+    """Train a policy, and return it with figures of the training.
 
     Parameters
     ----------
     name, task
-        What is learned, and the name that the policy's file gives it.
+        The task, and its name in the policy's file.
     steps, seed
-        Environment steps, and the seed of worlds, networks and actions.
+        Number of environment steps, and the seed of worlds, networks and actions.
     advance
         Called after every rollout, with its environment steps.
     algorithm
-        Of `ALGORITHMS`; None: the task's own.
+        A name of `ALGORITHMS`; None: the task's own.
 
     Returns
     -------
     The deterministic policy, and figures: learning curve (environment steps, mean return of the
-    episodes since the point before), seconds, and the share that the environment took of them
-    (None where it is not a step by itself).
+    episodes since the previous point), seconds, and the environment's share of them (None if it
+    cannot be measured).
 
     Raises
     ------
     ValueError
-        On a seed whose worlds are held out for evaluations, or an algorithm that cannot learn the
+        If the worlds of the seed are held out for evaluations, or the algorithm cannot learn the
         task.
     ModuleNotFoundError
-        Without stable-baselines3 or sb3-contrib (extra ``rl``).
+        If stable-baselines3 or sb3-contrib is missing (extra ``rl``).
     """
     if seed * SEED_STRIDE >= HELD_OUT_SEED:
         raise ValueError(
@@ -75,7 +75,7 @@ def train(
     _check_goes_with(algorithm, task)
     import torch  # pyright: ignore[reportMissingImports]
 
-    # Small networks: threads cost more than they give, and vary the sums.
+    # One thread: small networks gain nothing from more, and the sums would vary.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     learn = _taught if algorithm in _TAUGHT else _explored
@@ -93,7 +93,7 @@ def train(
 
 
 def _check_goes_with(algorithm: str, task: RlTask) -> None:
-    """A ValueError where an algorithm cannot learn a task."""
+    """Raise ValueError if an algorithm cannot learn a task."""
     if algorithm in _TAUGHT:
         if task.env_id != _TAUGHT[algorithm]:
             raise ValueError(
@@ -108,9 +108,9 @@ def _check_goes_with(algorithm: str, task: RlTask) -> None:
             )
 
 
-# --- policies that are taught -----------------------------------------------------------------
+# # --- supervised policies ----------------------------------------------------------------------
 
-# Algorithms that make policies for any number of anchors, and what they are for.
+# Algorithms for policies with any number of anchors, and the environments that they fit.
 _TAUGHT = {"set-ppo": "RBL/MobileAnchors-v0", "supervised": "RBL/AnchorSelection-v0"}
 
 
@@ -132,7 +132,7 @@ def _taught(
     return lambda meta: SetPolicy(network.arrays(), kind, meta), figures
 
 
-# --- policies that explore --------------------------------------------------------------------
+# # --- reinforcement learning -------------------------------------------------------------------
 
 
 def _explored(
@@ -145,11 +145,11 @@ def _explored(
     envs = _Timed(Sb3VecEnv(task.make(task.num_envs)))
     model = _model(algorithm, task, envs.venv, seed)
     if task.gamma < 1:
-        # Rewards that never end sum to far from zero: a critic that starts there learns what
-        # matters, the differences, from the first update on.
+        # Rewards without an end have a sum far from zero. A critic that starts at this value learns
+        # the differences, which matter, from the first update on.
         with torch.no_grad():
             model.policy.value_net.bias.fill_(_mean_reward(task, seed) / (1 - task.gamma))
-    # After PPO has seeded the worlds itself, with seeds that neighbouring trainings share.
+    # Seed again after PPO, whose own seeds overlap between neighbouring trainings.
     envs.venv.seed(seed * SEED_STRIDE)
     curve, cpu = _Curve(advance), time.process_time()
     model.learn(steps, callback=curve.callback())
@@ -162,7 +162,7 @@ def _explored(
 
 
 def _model(algorithm: str, task: RlTask, envs: Any, seed: int) -> Any:
-    """The algorithm of stable-baselines3 or sb3-contrib, set for the task."""
+    """Return the algorithm of stable-baselines3 or sb3-contrib, configured for the task."""
     kind = kind_and_outputs(envs.action_space)[0]
     network: dict[str, Any] = {"net_arch": list(task.hidden)}
     if kind == "box":
@@ -182,7 +182,7 @@ def _model(algorithm: str, task: RlTask, envs: Any, seed: int) -> Any:
 
         form = PPO
     with warnings.catch_warnings():
-        # The last batch of a rollout may be a smaller one.
+        # The last batch of a rollout may be smaller.
         warnings.filterwarnings("ignore", "You have specified a mini-batch size")
         return form(
             policy,
@@ -200,7 +200,7 @@ def _model(algorithm: str, task: RlTask, envs: Any, seed: int) -> Any:
 
 
 def _mean_reward(task: RlTask, seed: int) -> float:
-    """Mean reward of a step under random actions, over a short rollout."""
+    """Return the mean reward of a step under random actions, over a short rollout."""
     envs = task.make(16)
     envs.reset(seed=seed * SEED_STRIDE)
     envs.action_space.seed(seed)
@@ -208,7 +208,7 @@ def _mean_reward(task: RlTask, seed: int) -> float:
 
 
 class _Timed:
-    """A vector environment whose steps are timed (process time)."""
+    """A vector environment that measures the process time of its steps."""
 
     def __init__(self, venv: Any) -> None:
         self.venv = venv
@@ -225,7 +225,7 @@ class _Timed:
 
 
 class _Curve:
-    """Mean returns along the training."""
+    """Mean returns during the training."""
 
     def __init__(self, advance: Callable[[int], None]) -> None:
         self.points: list[dict[str, float]] = []
@@ -255,7 +255,7 @@ class _Curve:
 
 
 def _policy(model: Any, meta: dict[str, Any]) -> Policy:
-    """The policy network of a model as arrays."""
+    """Return the policy network of a model as arrays."""
     import torch  # pyright: ignore[reportMissingImports]
 
     def array(tensor: Any) -> Any:
@@ -267,7 +267,7 @@ def _policy(model: Any, meta: dict[str, Any]) -> Policy:
     biases = [array(layer.bias) for layer in layers]
     kind, n_outputs = kind_and_outputs(model.action_space)
     if kind == "multi-binary" and len(biases[-1]) == 2 * n_outputs:
-        # With masks an anchor has an output for leaving it out, and one for choosing it.
+        # With masks an anchor has one output for leaving it out, and one for choosing it.
         weights[-1] = weights[-1][1::2] - weights[-1][::2]
         biases[-1] = biases[-1][1::2] - biases[-1][::2]
     lstm, memory = getattr(model.policy, "lstm_actor", None), None

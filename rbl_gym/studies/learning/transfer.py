@@ -1,8 +1,8 @@
-"""Do layouts that are good by the bound track well? They are rolled through real filters.
+"""Tracking errors of layouts, measured with real filters, in comparison to the bound.
 
-Bodies move through way-points in each work region among anchors that a method placed; a filter
-tracks them from the scene's prior, told which links lack sight. Compared are the score b, which
-the layouts were made for, and the filter's root mean square tag error.
+Bodies move through way-points in each work region, among the anchors of a method. A filter tracks
+them from the scene's prior, and knows which links lack sight. The comparison is between the score
+b, which the layouts minimise, and the filter's root mean square tag error.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ __all__ = [
     "transfer_references",
 ]
 
-# Steps of an episode, of which the first are the filter's settling; way-points of an episode.
+# Steps of an episode, settling steps at its start, and way-points of an episode.
 _STEPS, _SETTLING, _POINTS = 40, 10, 12
-# Links over a reflected path in the column of that name: how many, and how much longer.
+# The column of reflected paths: share of links, and their additional length.
 NLOS_PROBABILITY, NLOS_BIAS_M = 0.1, 5.0
 FILTERS = {
     "iekf": ("iekf", {"iterations": 2}, False),
@@ -48,13 +48,13 @@ FILTERS = {
 
 
 def transfer_references(task: RlTask) -> list[str]:
-    """Layouts besides those of policies, as far as the task knows them."""
+    """References for layouts besides policies, as far as the task has them."""
     known = evaluation.references(task)
     return [name for name in ("random", "ring", "greedy-swaps", "hybrid") if name in known]
 
 
 def tracking_filters(task: RlTask) -> list[str]:
-    """Filters that can track in the task's scene: UC-KF needs anchors that are not coplanar."""
+    """Return filters for the task's scene. UC-KF needs anchors that are not coplanar."""
     env = task.make(1)
     known = env.family.corners if "scenes" in task.arguments else (env.task,)
     corners = [one.scene.anchor_region.bounds() for one in known]
@@ -63,7 +63,7 @@ def tracking_filters(task: RlTask) -> list[str]:
 
 
 class Bodies(NamedTuple):
-    """Moving bodies (T + 1, B, ...): poses, twists into each epoch, normals of their ranges."""
+    """Moving bodies (T + 1, B, ...): poses, twists into each epoch, normal variates."""
 
     rotation: FloatArray
     translation: FloatArray
@@ -82,24 +82,24 @@ def transfer_layouts(
     seed: int,
     advance: Advance = silent,
 ) -> dict[str, Any]:
-    """Let policies and references place anchors in held-out worlds, and track bodies among them.
+    """Place anchors by policies and references in held-out worlds, and track bodies among them.
 
     Parameters
     ----------
     task
         A placement task.
     policies
-        By the label they are to have.
+        Policies by label.
     names
-        Of `evaluation.references`.
+        Names of `evaluation.references`.
     worlds, repeats, seed
-        Held-out worlds, bodies in each, and which.
+        Number of held-out worlds, number of bodies in each, and the seed.
     advance
-        Told of each layout, then of each filter and label.
+        Called after each layout, then after each filter and label.
 
     Returns
     -------
-    See `track_layouts`; with `worlds` and `seed`.
+    The result of `track_layouts`, with `worlds` and `seed`.
     """
     groups = evaluation.layouts_of(task, policies, names, worlds, seed, advance)
     found = track_layouts(groups, tracking_filters(task), repeats, seed, advance)
@@ -113,24 +113,24 @@ def track_layouts(
     seed: int,
     advance: Advance = silent,
 ) -> dict[str, Any]:
-    """Scores and filter errors of layouts; every layout meets the same bodies.
+    """Return scores and filter errors of layouts. All layouts meet the same bodies.
 
     Parameters
     ----------
     groups
         Layouts of C worlds of one problem each, or L layouts of each world (C, L, M, 3).
     filters
-        Of `FILTERS`.
+        Names of `FILTERS`.
     repeats, seed
-        Bodies in each world, and which.
+        Number of bodies in each world, and the seed.
     advance
         Called after every filter and label.
 
     Returns
     -------
-    A dict: ``filters[name][label]`` has the exponentials of the mean logarithms of score
-    (`score_m`) and error (`tag_rmse_m`), and the correlation of these logarithms over the
-    layouts (None of fewer than three).
+    A dict. ``filters[name][label]`` has the geometric means of score (`score_m`) and error
+    (`tag_rmse_m`), and the correlation of their logarithms over the layouts (None for fewer than
+    three).
     """
     several = [
         _bodies(*one[:2], repeats, np.random.default_rng([seed, 2, *([i] if i else [])]))
@@ -160,7 +160,7 @@ def track_layouts(
 def _logs(
     group: Layouts, label: str, bodies: Bodies, name: str, repeats: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Logarithms of the scores of layouts and of a filter's errors, flat."""
+    """Return logarithms of the scores of layouts and of a filter's errors, flat."""
     task, contexts, found = group
     anchors = found[label]
     each = search.expand(contexts) if anchors.ndim == 4 else contexts
@@ -180,7 +180,7 @@ def _correlation(first: FloatArray, second: FloatArray) -> float | None:
 def _bodies(
     task: PlacementTask, contexts: Context, repeats: int, rng: np.random.Generator
 ) -> Bodies:
-    """`repeats` bodies in each work region, flat over both."""
+    """Return `repeats` bodies in each work region, flat over both."""
     scene = task.scene
     centre, half = (np.repeat(array, repeats, axis=0) for array in contexts[:2])
     batch = len(centre)
@@ -215,7 +215,7 @@ def _tag_rmse(
     name: str,
     repeats: int,
 ) -> FloatArray:
-    """Root mean square tag error (C,) of a filter, after settling."""
+    """Return the root mean square tag error (C,) of a filter after settling."""
     scene, tags = task.scene, np.asarray(task.scene.tags)
     kind, options, reflections = FILTERS[name]
     anchors = np.repeat(anchors, repeats, axis=0)
@@ -235,7 +235,7 @@ def _tag_rmse(
 def _readings(
     scene: Scene, obstacles: Obstacles, anchors: FloatArray, bodies: Bodies, reflections: bool
 ) -> Iterator[Reading]:
-    """What a filter is told of the bodies: ranges of all links, the law of those without sight."""
+    """Return the filter's data: ranges of all links, and the law of links without sight."""
     for k, (rotation, translation) in enumerate(
         zip(bodies.rotation, bodies.translation, strict=True)
     ):

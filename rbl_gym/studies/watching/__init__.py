@@ -1,1 +1,1 @@
-"""Frames of filters at work, as plain data: simulations, environments, recordings, policies."""
+"""Frames of running filters as plain data: simulations, environments, recordings, policies."""

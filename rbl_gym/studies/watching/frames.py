@@ -1,4 +1,4 @@
-"""Frames: what is seen of a body, its links and its filters at an epoch, as plain data."""
+"""Frames: a body, its links and its filters at an epoch, as plain data."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from rbl_gym.studies.epochs import Step, innovations_of, pose_errors
 
 __all__ = ["LINKS", "Frame", "Links", "Named", "Pose", "Tracked", "filter_named", "link_kinds"]
 
-# Kinds of links, in the order of their numbers.
+# Kinds of links; a link's number is an index of this tuple.
 LINKS = ("lost", "used", "reflected", "refused", "behind an obstacle")
 LOST, USED, REFLECTED, REFUSED, WEAK = range(5)
 
 
 class Pose(NamedTuple):
-    """A pose: rotation (3, 3), None where it is not known, and translation (3,), metres."""
+    """A pose: rotation (3, 3), None if unknown, and translation (3,), metres."""
 
     rotation: FloatArray | None
     translation: FloatArray
 
 
 class Links(NamedTuple):
-    """What became of the links of an epoch.
+    """State of the links at an epoch.
 
     Attributes
     ----------
     measured
-        (M, N): which gave a range.
+        (M, N): links that gave a range.
     reflected
-        (M, N): which of these came over a reflected path; only a simulation knows.
+        (M, N): measured links over a reflected path; known in simulations only.
     weak
-        (M, 1) or (M, N): which have less than half of their information, for what stands in the
-        way; filters are told.
+        (M, 1) or (M, N): links that lose more than half of their information to obstacles;
+        filters know this.
     """
 
     measured: BoolArray
@@ -46,22 +46,22 @@ class Links(NamedTuple):
 
 
 class Tracked(NamedTuple):
-    """What a filter makes of an epoch.
+    """Result of a filter at an epoch.
 
     Attributes
     ----------
     label
-        Of the filter.
+        Label of the filter.
     belief
-        After the ranges of the epoch.
+        Belief after the ranges of the epoch.
     refused
-        (M, N): ranges that a robust filter leaves out.
+        (M, N): ranges that a robust filter rejects.
     position_m, rotation_deg, nees
-        Errors against the truth and their normalised square, of mean 6 where the belief is honest;
-        NaN where there is no truth.
+        Errors against the truth, and the normalised estimation error squared, of mean 6 for a
+        consistent filter; NaN if there is no truth.
     nis, dof
-        Normalised innovation squared of the ranges that fit, and their number. The ratio has mean
-        1 where the filter is honest.
+        Normalised innovation squared of the accepted ranges, and their number. The ratio has mean
+        1 for a consistent filter.
     """
 
     label: str
@@ -75,33 +75,33 @@ class Tracked(NamedTuple):
 
     @property
     def nis_ratio(self) -> float:
-        """NIS per degree of freedom; NaN without a range."""
+        """Return NIS per degree of freedom; NaN without a range."""
         return self.nis / self.dof if self.dof else np.nan
 
 
 class Frame(NamedTuple):
-    """All that is seen at an epoch.
+    """The complete picture of an epoch.
 
     Attributes
     ----------
     time_s
-        Since the start.
+        Time since the start.
     truth
-        The true pose; None where nobody knows it.
+        The true pose; None if unknown.
     anchors, told
-        Where the anchors stand and where filters are told that they do, (M, 3), metres.
+        True anchor positions, and the positions that the filters assume, (M, 3), metres.
     links
-        What became of the links.
+        State of the links.
     tracks
-        The filters.
+        Results of the filters.
     score_m
-        What an environment scores, b in metres; NaN where there is no score.
+        The environment's score b in metres; NaN if there is none.
     ghosts
-        Anchors (M, 3) of others by their names, to compare with.
+        Other layouts (M, 3) by name, for comparison.
     scores
-        Their scores, metres.
+        Scores of the ghosts, metres.
     picture
-        What an environment renders, (height, width, 3); None where the frame is drawn in 3-D.
+        Picture that an environment renders, (height, width, 3); None if the frame is drawn in 3-D.
     """
 
     time_s: float
@@ -124,7 +124,7 @@ class Named(NamedTuple):
     options: dict[str, Any]
 
 
-# What a name may end with.
+# Suffixes of labels and the options that they set.
 _LOSSES: dict[str, dict[str, Any]] = {
     "-robust": {"robust": True},
     "-late": {"robust": "late"},
@@ -132,7 +132,7 @@ _LOSSES: dict[str, dict[str, Any]] = {
 
 
 def filter_named(label: str) -> Named:
-    """A filter by a label: its name, which may end in ``-robust`` or ``-late``.
+    """Return a filter by label: its name, optionally with the suffix ``-robust`` or ``-late``.
 
     ``iekf-robust`` is the filter ``iekf`` with the option ``robust=True``.
     """
@@ -144,14 +144,14 @@ def filter_named(label: str) -> Named:
 
 
 def link_kinds(links: Links, refused: BoolArray | None = None) -> np.ndarray:
-    """Numbers (M, N) of what became of links, indices of `LINKS`.
+    """Return the kinds (M, N) of links as indices of `LINKS`.
 
     Parameters
     ----------
     links
-        Of a frame.
+        Links of a frame.
     refused
-        (M, N), of a filter; a reflected range that it refuses counts as refused.
+        (M, N), rejected ranges of a filter. A rejected reflected range counts as refused.
     """
     kinds = np.where(links.measured, np.where(links.weak, WEAK, USED), LOST)
     kinds = np.where(links.measured & links.reflected, REFLECTED, kinds)
@@ -163,24 +163,24 @@ def link_kinds(links: Links, refused: BoolArray | None = None) -> np.ndarray:
 def tracked(
     label: str, filter: Filter, step: Step, tags: FloatArray, noise: NoiseLaw, truth: Pose | None
 ) -> Tracked:
-    """What a filter makes of an epoch.
+    """Return the result of a filter at an epoch.
 
     Parameters
     ----------
     label, filter
         The filter.
     step
-        Of `studies.epochs.track_epochs`.
+        A step of `studies.epochs.track_epochs`.
     tags, noise
-        The body (N, 3), and the law of the ranges where the epoch has none.
+        The tags (N, 3), and the noise law of the ranges if the epoch has none.
     truth
-        The true pose, if it is known.
+        The true pose, if known.
     """
     ((_, found),) = innovations_of(filter, [step], tags, noise)
     found = Innovations(*(field[0] for field in found))
     links = step.reading.links
     measured = np.ones(found.used.shape, np.bool_) if links is None else links
-    # A filter that is not robust takes whatever comes.
+    # A filter that is not robust accepts all ranges.
     refused = measured & ~found.used & bool(is_robust(filter))
     errors = np.full(3, np.nan)
     if truth is not None and truth.rotation is not None:
@@ -193,7 +193,7 @@ def tracked(
 
 
 def is_robust(filter: Any) -> bool:
-    """Whether a filter leaves out ranges that contradict the others."""
+    """Return whether a filter rejects ranges that contradict the others."""
     while filter is not None:
         robust = getattr(filter, "robust", None)
         if robust is not None:

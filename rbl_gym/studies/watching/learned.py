@@ -1,4 +1,4 @@
-"""Trained policies at work, step by step, beside references."""
+"""Frames of trained policies, step by step, beside references."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ Policy = policies.AnyPolicy
 
 
 def learned_program(path: str, reference: str | None = None, seed: int = 0) -> Program:
-    """A trained policy in a held-out world of its task, beside a reference.
+    """Return the program of a trained policy in a held-out world, beside a reference.
 
     Parameters
     ----------
     path
-        A policy of `rbl-gym train`.
+        File of a policy of `rbl-gym train`.
     reference
-        A name of `evaluation.references`; None: the strongest, of placement ``"gradient"``.
+        A name of `evaluation.references`; None: the strongest, for placement ``"gradient"``.
     seed
-        Which world: the first of those that `rbl-gym evaluate` has with this seed.
+        Seed of the world, the first one of `rbl-gym evaluate` with this seed.
 
     Raises
     ------
     ValueError
-        If the file is no policy, its task or the reference is not known, or it does not fit.
+        If the file is not a policy, its task or the reference is unknown, or it does not fit.
     """
     policy = policies.load(path)
     task = rl_task(str(policy.meta.get("task")))
@@ -59,19 +59,20 @@ def learned_program(path: str, reference: str | None = None, seed: int = 0) -> P
 
 
 def learned_frames(task: RlTask, policy: Policy, reference: str, seed: int) -> Iterator[Frame]:
-    """A held-out episode of a task as a policy plays it, beside a reference.
+    """Yield frames of a held-out episode that a policy plays, beside a reference.
 
-    The ghosts of a frame are the reference's anchors at the same step; the scores of both are those
-    so far: of a placement that of the anchors placed, else the geometric mean of b over the steps.
+    The ghosts of a frame are the reference's anchors at the same step. Scores are those up to this
+    step: in a placement the score of the anchors placed so far, else the geometric mean of b over
+    the steps.
 
     Parameters
     ----------
     task, policy
-        What is played, and by whom.
+        The task and its policy.
     reference
         A name of `evaluation.references`.
     seed
-        Which world.
+        Seed of the world.
     """
     env = _env(task)
     frames = env_frames(env, (), _held_out(seed), policy.player())
@@ -88,7 +89,7 @@ def learned_frames(task: RlTask, policy: Policy, reference: str, seed: int) -> I
     others: list[float] = []
     beside = _reference_steps(task, reference, seed)
     for frame, (anchors, score) in zip(frames, beside, strict=False):
-        # At the reset nobody has done anything.
+        # At the reset nobody has acted yet.
         if frame.time_s > 0:
             logs.append(math.log(frame.score_m))
             others.append(math.log(score))
@@ -102,7 +103,7 @@ def _mean(logs: list[float]) -> float:
 
 
 def _reference_steps(task: RlTask, name: str, seed: int) -> Iterator[tuple[FloatArray, float]]:
-    """Anchors (M, 3) and b, metres, at every step of a held-out episode, from its start on."""
+    """Yield anchors (M, 3) and b, metres, of a held-out episode from its reset on."""
     mobile = task.env_id == "RBL/MobileAnchors-v0"
     table: Any = controllers.MOBILE if mobile else controllers.SELECTION
     rng = np.random.default_rng([seed, evaluation.references(task).index(name)])

@@ -1,4 +1,4 @@
-"""Simulated episodes as frames: filters side by side, and disturbances while they run."""
+"""Simulated episodes as frames: filters side by side, with disturbances that can change."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from rbl_gym.worlds.scene import Scene
 
 __all__ = ["CALM", "Disturbances", "Stage", "frames", "stage_of_problem", "stage_of_scene"]
 
-# How long an episode is watched where the body keeps within its volume, seconds.
+# Minimum length of an episode if the body stays within its volume, seconds.
 _WATCHED_S = 60.0
-# A body in a building: speed, turn rate, seconds a step, and the noise of its motion after 1 s.
+# A body in a building: speed, turn rate, time step, and process noise after 1 s.
 _SPEED, _SPIN, _DT = 1.0, 0.29, 0.1
 _ROTATION_RAD, _TRANSLATION_M = 0.083, 0.095
-# A link that keeps this share of its information counts as seen.
+# A link that keeps this share of its information counts as in sight.
 SEEN = 0.5
 _STAYS = ("waypoints", "orbit", "lawn-mower")
 
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What disturbs the ranges, beside what the scene itself does.
+    """Disturbances of the ranges, in addition to those of the scene.
 
     Parameters
     ----------
     nlos, lost
-        Chance that a range comes over a reflected path, and that a link gives none.
+        Probability that a range has a reflected path, and that a link gives no range.
     wrong_m
-        By how much the place that filters are told of the first anchor is off, towards the middle
-        of the volume, metres.
+        Error of the first anchor's position as the filters know it, towards the centre of the
+        volume, metres.
     noise
-        Factor on the noise of all ranges. Filters are not told.
+        Factor on the noise of all ranges. Filters do not know it.
     """
 
     nlos: float = 0.0
@@ -64,22 +64,22 @@ CALM = Disturbances()
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """Where an episode is played.
+    """The world of an episode.
 
     Parameters
     ----------
     scene
-        The world.
+        The scene.
     share
-        Share (M,) of its information that each link from anchors (M, 3) to a place (3,) keeps;
-        None: as the scene's obstacles tell.
+        Returns the share (M,) of its information that each link from anchors (M, 3) to a position
+        (3,) keeps; None: computed from the scene's obstacles.
     """
 
     scene: Scene
     share: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     def quality(self, at: simulation.Epoch, anchors: FloatArray) -> FloatArray | None:
-        """Share (M,) of its information that each link keeps; None: all of it."""
+        """Return the share (M,) of information that each link keeps; None if all of it."""
         if self.share is not None:
             return self.share(anchors, at.translation)
         if self.scene.weakens:
@@ -88,15 +88,15 @@ class Stage:
 
 
 def stage_of_scene(scene: Scene, steps: int | None = None) -> Stage:
-    """A named scene as it is watched.
+    """Return the stage of a scene.
 
     Parameters
     ----------
     scene
-        The world.
+        The scene.
     steps
-        Of the episode; None: those of the scene, and a minute at least where the body keeps within
-        its volume.
+        Length of the episode; None: that of the scene, but at least a minute if the body stays
+        within its volume.
     """
     if steps is None:
         watched = int(np.ceil(_WATCHED_S / scene.dt)) if scene.trajectory in _STAYS else 0
@@ -105,9 +105,9 @@ def stage_of_scene(scene: Scene, steps: int | None = None) -> Stage:
 
 
 def stage_of_problem(problem: Problem, anchors: FloatArray, steps: int | None = None) -> Stage:
-    """A building with anchors (M, 3), as it is watched: the body goes about in the first zone.
+    """Return the stage of a building with anchors (M, 3); the body moves in the first zone.
 
-    Links are weakened by all obstacles and by the anchors' gain. Obstacles do not stop the body.
+    All obstacles and the anchors' gain weaken the links. Obstacles do not stop the body.
     """
     low, high = problem.zones[0].bounds()
     volume = dataclasses.replace(problem.scene.volume, low=tuple(low), high=tuple(high))
@@ -134,7 +134,7 @@ def stage_of_problem(problem: Problem, anchors: FloatArray, steps: int | None = 
 
 
 class Moment(NamedTuple):
-    """An epoch of a world, and what filters are told of it."""
+    """An epoch of a world, and the data that filters get."""
 
     time_s: float
     truth: Pose
@@ -153,18 +153,18 @@ def moment_of(
     told: FloatArray,
     quality: FloatArray | None,
 ) -> Moment:
-    """An epoch as it was measured.
+    """Return an epoch with its measurements.
 
     Parameters
     ----------
     scene, epoch, at
-        The world, and the epoch with its number.
+        The scene, the epoch, and its number.
     measured
-        What was measured.
+        The measurements.
     anchors, told
-        Where the anchors (M, 3) stand, and where filters are told that they do.
+        True anchor positions (M, 3), and the positions that the filters assume.
     quality
-        Share (M,) of its information that each link keeps; None: all of it.
+        Share (M,) of its information that each link keeps; None if all keep all of it.
     """
     links = Links(measured.links, measured.nlos, weak_links(measured.links, quality))
     reading = told_reading(scene, at, measured, told, quality, first=not epoch)
@@ -177,27 +177,27 @@ def frames(
     seed: int,
     disturb: Callable[[int], Disturbances] = lambda epoch: CALM,
 ) -> Iterator[Frame]:
-    """An episode, a frame an epoch, with filters side by side.
+    """Yield one frame per epoch of an episode, with filters side by side.
 
-    All random numbers are drawn at the start: the same seed and disturbances give the same frames,
-    and epochs without disturbances are the same whatever came before. Undisturbed it is the
-    episode that ``RBL/Tracking-v0`` plays after ``reset(seed=seed)``, while both last.
+    All random numbers are drawn at the start. The same seed and disturbances give the same frames,
+    and an undisturbed epoch is the same whatever happened before. An undisturbed episode is the one
+    that ``RBL/Tracking-v0`` plays after ``reset(seed=seed)``, as long as both last.
 
     Parameters
     ----------
     stage
-        Where it is played.
+        The world of the episode.
     filters
-        Of `filter_named`.
+        Filters of `filter_named`.
     seed
-        Of all random numbers.
+        Seed of all random numbers.
     disturb
-        Called with the number of every epoch, says what disturbs its ranges.
+        Called with the number of every epoch, returns the disturbances of its ranges.
 
     Raises
     ------
     ValueError
-        On a filter that is not known, or that does not fit the scene; before the first frame.
+        If a filter is unknown or does not fit the scene; before the first frame.
     """
     check_count("seed", seed, least=0)
     scene = stage.scene
@@ -210,14 +210,14 @@ Made = Sequence[tuple[str, Filter]]
 
 
 def make_filters(scene: Scene, filters: Sequence[Named]) -> Made:
-    """Filters that know a scene, with their labels."""
+    """Return filters for a scene, with their labels."""
     return [(one.label, scene_filter(scene, one.name, one.options)) for one in filters]
 
 
 def tracked_moments(
     scene: Scene, episode: simulation.Episode, moments: Iterator[Moment], filters: Made
 ) -> Iterator[Frame]:
-    """Moments of an episode with filters side by side, started from its prior."""
+    """Yield moments of an episode with the filters' results, started from its prior."""
     prior = episode.prior_rotation, episode.prior_translation, episode.prior_covariance
     first, *copies = itertools.tee(moments, len(filters) + 1)
     runs = [
@@ -249,7 +249,7 @@ def _moments(
 
 
 def weak_links(links: BoolArray, quality: FloatArray | None) -> BoolArray:
-    """Which links (M, N) have less than half of their information, of its share (M,)."""
+    """Return links (M, N) that keep less than half of their information, from shares (M,)."""
     if quality is None:
         return np.zeros(links.shape, np.bool_)
     return np.broadcast_to(quality[:, None] < SEEN, links.shape)
@@ -262,7 +262,7 @@ def _measured(
     quality: FloatArray | None,
     now: Disturbances,
 ) -> Measurement:
-    """The ranges of an epoch under disturbances."""
+    """Return the ranges of an epoch under disturbances."""
     links = scene.links
     lost = 1 - (1 - links.drop_probability) * (1 - now.lost)
     nlos = 1 - (1 - links.nlos_probability) * (1 - now.nlos)

@@ -22,7 +22,7 @@ from rbl_gym.wrappers.estimate import unpadded
 
 __all__ = ["env_frames"]
 
-# What is done: the action of an environment and its observation.
+# Returns the action for an environment and its observation.
 Act = Callable[[Any, Any], Any]
 
 _NO_LINKS = Links(*(np.zeros((0, 0), np.bool_),) * 3)
@@ -31,28 +31,28 @@ _NO_LINKS = Links(*(np.zeros((0, 0), np.bool_),) * 3)
 def env_frames(
     env: gym.Env[Any, Any], filters: tuple[Named, ...] = (), seed: int = 0, act: Act | None = None
 ) -> Iterator[Frame]:
-    """An episode of an environment, a frame a step.
+    """Yield one frame per step of an episode of an environment.
 
-    Where a body is tracked in it, filters run beside what the environment does itself: they are
-    told what an `EstimatePose` in the environment is told, which is one of them. Of a placement
-    the frames show the anchors placed so far, of any other environment what it renders.
+    If the environment tracks a body, filters run beside the environment's own estimates. They get
+    the same data as an `EstimatePose` in the environment, which is one of them. In a placement the
+    frames show the anchors placed so far; for any other environment they show its rendered picture.
 
     Parameters
     ----------
     env
         A scalar environment, raw or wrapped.
     filters
-        Of `filter_named`, beside that of the environment.
+        Filters of `filter_named`, beside that of the environment.
     seed
-        Of the reset, and of random actions.
+        Seed of the reset and of random actions.
     act
-        Called with the environment and its observation, returns an action; None: random ones.
+        Called with the environment and its observation, returns an action; None: random actions.
 
     Raises
     ------
     ValueError
-        If it is no environment, or one that shows nothing; at the first frame, on a filter that
-        does not fit.
+        If `env` is not an environment, or has nothing to show; at the first frame, if a filter does
+        not fit.
     """
     if not isinstance(env, gym.Env):
         raise ValueError(f"env must be a gymnasium.Env, got {env!r:.80}")
@@ -84,7 +84,7 @@ def _frames(
     else:
         for count, info in enumerate(steps):
             told = np.asarray(info.get("score_m", np.nan))
-            # Several bodies have several.
+            # An environment of several bodies has several worlds.
             score = float(told) if told.ndim == 0 else np.nan
             nothing = np.empty((0, 3))
             picture: Any = env.render()
@@ -92,7 +92,7 @@ def _frames(
 
 
 def _steps(env: gym.Env[Any, Any], seed: int, act: Act) -> Iterator[dict[str, Any]]:
-    """The infos of an episode, from its reset on."""
+    """Yield the infos of an episode, from its reset on."""
     observation, info = env.reset(seed=seed)
     yield info
     over = False
@@ -103,7 +103,7 @@ def _steps(env: gym.Env[Any, Any], seed: int, act: Act) -> Iterator[dict[str, An
 
 
 def world_of(env: gym.Env[Any, Any]) -> TrackingEnv | None:
-    """The world below an environment in which a body is tracked; None: there is none."""
+    """Return the world below an environment that tracks a body; None if there is none."""
     base: Any = env.unwrapped
     if isinstance(base, TaskEnv):
         base = base.inner.unwrapped
@@ -111,7 +111,7 @@ def world_of(env: gym.Env[Any, Any]) -> TrackingEnv | None:
 
 
 def own_filter(env: gym.Env[Any, Any]) -> Named | None:
-    """The filter of the `EstimatePose` that an environment has; None: it has none."""
+    """Return the filter of the environment's `EstimatePose`; None if there is none."""
     layer: Any = env
     while layer is not None:
         if isinstance(layer, EstimatePose):
@@ -131,7 +131,7 @@ def _moments(env: gym.Env[Any, Any], infos: Iterator[dict[str, Any]]) -> Iterato
         quality = simulation.link_quality(scene, at, anchors) if scene.obstacles else None
         measured = simulation.measure_epoch(scene, at, anchors, quality)
         if isinstance(base, TaskEnv) and base.seen is not None:
-            # Which anchors measure may be the policy's choice.
+            # The policy may choose which anchors measure.
             chosen: BoolArray = unpadded(base.seen, scene)["links"].astype(np.bool_)
             ranges = np.where(chosen, measured.ranges, 0.0)
             measured = measured._replace(ranges=ranges, links=chosen, nlos=measured.nlos & chosen)
@@ -144,12 +144,12 @@ def _moments(env: gym.Env[Any, Any], infos: Iterator[dict[str, Any]]) -> Iterato
 
 
 def places_anchors(env: gym.Env[Any, Any]) -> bool:
-    """Whether an environment places anchors in one scene."""
+    """Return whether an environment places anchors in one scene."""
     return isinstance(getattr(env.unwrapped, "task", None), placement.PlacementTask)
 
 
 def _placed(env: gym.Env[Any, Any], count: int, info: dict[str, Any]) -> Frame:
-    """The anchors of a placement so far, and the score of these."""
+    """Return the anchors placed so far, and their score."""
     base: Any = env.unwrapped
     one_shot = base._batch.mode == "one-shot"
     anchors: FloatArray = info["anchors"][: None if one_shot and count else count].copy()

@@ -1,4 +1,4 @@
-"""Programs: what is watched, where it is, and how its frames begin."""
+"""Programs: what to watch, its surroundings, and how its frames start."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ __all__ = [
     "recorded_program",
 ]
 
-# Room around anchors and track of a recording, metres.
+# Margin around the anchors and the track of a recording, metres.
 _MARGIN_M = 0.5
 
 Disturb = Callable[[int], Disturbances]
@@ -46,22 +46,22 @@ Disturb = Callable[[int], Disturbances]
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """What is watched.
+    """A program to watch.
 
     Parameters
     ----------
     title
-        Above the figures.
+        Title above the figures.
     room
-        What is drawn around the body.
+        Surroundings of the body.
     tags
         (N, 3) on the body, metres.
     start
-        Makes the frames of filters by their labels, of a seed, under disturbances.
+        Makes frames from labels of filters, a seed and disturbances.
     filters
-        Labels of the filters at first.
+        Initial labels of the filters.
     seed
-        At first.
+        Initial seed.
     can_disturb, can_choose, can_seed
         Whether disturbances, the filters and the seed can be changed.
     """
@@ -77,24 +77,24 @@ class Program:
     can_seed: bool = False
 
 
-# Filters that are watched where none is named: in a simulation, of a recording.
+# Default filters: of a simulation, of a recording.
 LIVE, RECORDED = ("iekf", "iekf-robust"), ("iekf-log",)
 
 
 def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:
-    """The program of what `rbl_gym.app.studio.show` is given, but for problems.
+    """Return the program of any argument of `rbl_gym.app.studio.show` except problems.
 
     Parameters
     ----------
     what, beside
-        As of `rbl_gym.app.studio.show`.
+        Arguments as in `rbl_gym.app.studio.show`.
     seed
-        Of an episode.
+        Seed of an episode.
 
     Raises
     ------
     ValueError
-        On what cannot be watched.
+        If `what` cannot be watched.
     """
     if isinstance(what, Program):
         return what
@@ -116,18 +116,18 @@ def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:
 
 
 def live_program(stage: Stage, filters: tuple[str, ...], room: Problem, seed: int = 0) -> Program:
-    """A simulated episode with filters side by side.
+    """Return the program of a simulated episode with filters side by side.
 
     Parameters
     ----------
     stage
-        Where it is played.
+        The world of the episode.
     filters
-        Their labels.
+        Labels of the filters.
     room
-        What is drawn around the body.
+        Surroundings of the body.
     seed
-        Of the episode.
+        Seed of the episode.
     """
 
     def start(labels: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
@@ -140,12 +140,12 @@ def live_program(stage: Stage, filters: tuple[str, ...], room: Problem, seed: in
 def recorded_program(
     recording: Recording, tracks: Mapping[str, Track], settings: Settings | None = None
 ) -> Program:
-    """A recording with its tracks.
+    """Return the program of a recording with its tracks.
 
     Parameters
     ----------
     recording, tracks, settings
-        As of `recorded_frames`.
+        Arguments as in `recorded_frames`.
     """
 
     def start(labels: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
@@ -162,20 +162,20 @@ def env_program(
     seed: int = 0,
     act: Act | None = None,
 ) -> Program:
-    """An episode of an environment.
+    """Return the program of an episode of an environment.
 
     Parameters
     ----------
     env
-        Scalar, raw or wrapped.
+        A scalar environment, raw or wrapped.
     filters
-        Labels of filters beside the environment's own; None: where it has none, ``"iekf"``.
+        Labels of filters beside the environment's own; None: ``"iekf"`` if it has none.
     seed
-        Of the episode.
+        Seed of the episode.
     act
-        As of `env_frames`.
+        As in `env_frames`.
     """
-    # It refuses what cannot be shown before it is reset.
+    # Raises for an environment that cannot be shown, before its reset.
     env_frames(env)
     _, info = env.reset(seed=seed)
     world, own = world_of(env), own_filter(env)
@@ -207,7 +207,7 @@ def env_program(
 
 
 def room_of(scene: Scene) -> Problem:
-    """A scene as it is drawn."""
+    """Return the drawing of a scene."""
     low, high = scene.volume.bounds()
     return Problem(
         scene.name,
@@ -224,9 +224,9 @@ def room_of(scene: Scene) -> Problem:
 
 
 def room_around(name: str, places: FloatArray, tags: FloatArray) -> Problem:
-    """Nothing but a floor below places (K, 3)."""
+    """Return only a floor below points (K, 3)."""
     found = places[np.isfinite(places).all(axis=1)]
-    # A filter that was lost for a while does not make the room any larger.
+    # A filter that was lost for a while does not enlarge the room.
     low, high = np.quantile(found, [0.01, 0.99], axis=0)
     low, high = low - _MARGIN_M, high + _MARGIN_M
     region = Box(tuple(low.tolist()), tuple(high.tolist()))

@@ -19,19 +19,20 @@ __all__ = ["recorded_frames", "track_all"]
 def track_all(
     recording: Recording, filters: tuple[Named, ...], settings: Settings
 ) -> dict[str, Track]:
-    """Tracks of a recording by several filters, by their labels.
+    """Return tracks of a recording by several filters, by label.
 
     Parameters
     ----------
     recording, settings
-        As of `replay.track_recording`.
+        Arguments as in `replay.track_recording`.
     filters
-        Of `filter_named`: another filter than that of the settings, and its loss where it has one.
+        Filters of `filter_named`. Each replaces the filter of the settings, and their loss if it
+        has one.
 
     Raises
     ------
     ValueError
-        As `replay.check_replay`.
+        As in `replay.check_replay`.
     """
     tracks = {}
     for one in filters:
@@ -43,21 +44,22 @@ def track_all(
 def recorded_frames(
     recording: Recording, tracks: Mapping[str, Track], settings: Settings | None = None
 ) -> Iterator[Frame]:
-    """A recording, a frame an epoch, with its tracks by their labels.
+    """Yield one frame per epoch of a recording, with its tracks by label.
 
     Parameters
     ----------
     recording
-        Of `rbl_gym.recordings`.
+        A recording of `rbl_gym.recordings`.
     tracks
-        Of `track_all` or `replay.track_recording`, at the recording's epochs.
+        Tracks of `track_all` or `replay.track_recording`, at the recording's epochs.
     settings
-        How truth and tracks are compared; None: the defaults.
+        Settings of the comparison with the truth; None: the defaults.
 
     Raises
     ------
     ValueError
-        If there is no track, or one that is not of the recording's epochs; before the first frame.
+        If there is no track, or the epochs of one differ from the recording's; before the first
+        frame.
     """
     if not tracks:
         raise ValueError("tracks must hold a track, got none")
