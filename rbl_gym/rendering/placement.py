@@ -43,17 +43,10 @@ class Layout(NamedTuple):
     placed: np.ndarray
 
 
-def film_of(render_mode: str | None, task: PlacementTask) -> Film | None:
-    """Return a film of a task; None without rendering."""
-    if check_mode(render_mode) is None:
-        return None
-    return Film(functools.partial(_frame, task), task.n_anchors)
-
-
-def film_of_many(
+def film_of(
     render_mode: str | None, task_of: Callable[[int], PlacementTask], steps: int
 ) -> Film | None:
-    """Return a film of worlds with different tasks, whose anchors and boxes are padded."""
+    """Return a film of the tasks of worlds, whose anchors and boxes are padded; or None."""
     if check_mode(render_mode) is None:
         return None
     return Film(functools.partial(_frame_of_many, task_of), steps)
