@@ -49,28 +49,19 @@ def film_of(
     """Return a film of the tasks of worlds, whose anchors and boxes are padded; or None."""
     if check_mode(render_mode) is None:
         return None
-    return Film(functools.partial(_frame_of_many, task_of), steps)
+    return Film(functools.partial(_frame, task_of), steps)
 
 
-def _frame_of_many(
+def _frame(
     task_of: Callable[[int], PlacementTask],
     world: int,
     epochs: np.ndarray,
     shots: Sequence[Layout],
     beliefs: Any,
 ) -> Image:
-    last = shots[-1]
-    centre, half, racks = (field[[world]] for field in last.context)
-    context = Context(centre, half, racks[:, racks[0, :, 3] > 0])
-    own = Layout(context, last.anchors[[world]], last.placed[[world]])
-    return _frame(task_of(world), 0, epochs, [own], beliefs)
-
-
-def _frame(
-    task: PlacementTask, world: int, epochs: np.ndarray, shots: Sequence[Layout], beliefs: Any
-) -> Image:
-    last = shots[-1]
-    context = Context(*(field[world] for field in last.context))
+    last, task = shots[-1], task_of(world)
+    centre, half, boxes = (field[world] for field in last.context)
+    context = Context(centre, half, boxes[boxes[:, 3] > 0])
     anchors = last.anchors[world, : int(last.placed[world])]
     errors = _errors(task, context, anchors)
     # One-shot tasks place all anchors at once: the curve adds them in their order.
