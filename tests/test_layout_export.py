@@ -105,7 +105,7 @@ def test_dxf_is_a_layer_in_a_copy_of_the_drawing(problem, tmp_path):
 
 @needs("ezdxf")
 def test_without_a_drawing_the_dxf_has_the_building(problem, tmp_path):
-    from rbl_gym.placement.plans.drawing import read_drawing
+    from rbl_gym.placement.plans.reading import read_drawing
 
     path = str(tmp_path / "l.dxf")
     write_layout(problem, ANCHORS, path)

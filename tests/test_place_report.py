@@ -19,7 +19,7 @@ from rbl_gym.app.cli import main
 from rbl_gym.geometry import polygons
 from rbl_gym.placement import scene_files
 from rbl_gym.placement.plans import layers, toml_text
-from rbl_gym.placement.plans.drawing import read_drawing
+from rbl_gym.placement.plans.reading import read_drawing
 from rbl_gym.studies.placing import accuracy, answer, choosing, judging
 from tests.helpers import needs
 from tests.plan_files import write_dxf, write_geojson, write_png
@@ -133,7 +133,7 @@ def test_plan_lists_layers_that_are_not_used_and_what_was_not_read(tmp_path, cap
     [
         (["plan", "x.png"], "x.png: a picture needs --metres-per-pixel or --width"),
         (["plan", "nowhere.geojson"], "nowhere.geojson: No such file or directory"),
-        (["plan", "x.dwg"], "x.dwg: DWG cannot be read: save the drawing as DXF"),
+        (["plan", "x.dwg"], "x.dwg: DWG files cannot be read: save the drawing as DXF"),
         (["plan", "x.png", "--walls", "A"], "a picture has no layers: --walls means nothing"),
         (["plan", "x.geojson", "--walls", "A,x=1"], "'x=1' must be KEY=VALUE"),
         (["plan", "office.geojson", "-o", "x.json"], "--out must end in .toml, got x.json"),

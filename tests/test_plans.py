@@ -9,14 +9,23 @@ import numpy as np
 import pytest
 
 from rbl_gym.geometry import polygons
-from rbl_gym.placement.plans import drawing, geojson, layers, pairs, pictures, rings, toml_text
+from rbl_gym.placement.plans import (
+    drawing,
+    geojson,
+    layers,
+    pairs,
+    pictures,
+    reading,
+    rings,
+    toml_text,
+)
 from rbl_gym.placement.plans.uses import KEYS, KINDS, MATERIALS, Use, parse_use
 from tests.helpers import needs
 from tests.plan_files import DESK, INNER, MEETING, OUTER, write_dxf, write_geojson, write_png
 
 
 def read(path, **options):
-    return drawing.read_drawing(path, **options)
+    return reading.read_drawing(path, **options)
 
 
 def uses(*texts):
@@ -112,7 +121,7 @@ def test_what_is_no_drawing_is_named(tmp_path):
     bad.write_text("no group codes here\n")
     with pytest.raises(ValueError, match=r"bad\.dxf: this is no DXF"):
         read(str(bad))
-    with pytest.raises(ValueError, match="DWG cannot be read: save the drawing as DXF"):
+    with pytest.raises(ValueError, match="DWG files cannot be read: save the drawing as DXF"):
         read("x.dwg")
     with pytest.raises(FileNotFoundError):
         read(str(tmp_path / "nowhere.dxf"))
@@ -179,7 +188,7 @@ def test_the_tangent_plane_agrees_with_the_ellipsoid():
         ('{"type": "FeatureCollection", "features": 3}', "'features' must be a list"),
         ('{"type": "Polygon", "coordinates": [[[0, 0], [1, 1]]]}', "feature 0: a Polygon needs 4"),
         ('{"type": "LineString", "coordinates": [[0, "a"], [1, 1]]}', "lists of \\[x, y\\]"),
-        ('{"type": "Blob", "coordinates": []}', "there is no line in it; it holds 1 Blob"),
+        ('{"type": "Blob", "coordinates": []}', "no line that can be read; it contains 1 Blob"),
     ],
 )
 def test_bad_geojson_is_named(text, message, tmp_path):

@@ -81,7 +81,7 @@ def is_plan(path: str) -> bool:
 
 def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = None) -> Plan:
     """Return the plan of a file and the options; a ValueError says what is wrong."""
-    from rbl_gym.placement.plans import drawing, layers, pictures, uses
+    from rbl_gym.placement.plans import layers, pictures, reading, uses
 
     told = [uses.parse_use(kind, text) for kind in uses.KINDS for text in getattr(options, kind)]
     if not 0 < options.height < float("inf"):
@@ -93,7 +93,7 @@ def read_plan(path: str, options: argparse.Namespace, n_anchors: int | None = No
         shown = pictures.backdrop(path, scale(path, options), options.origin)
         made = pictures.of_picture(shown, options.height, n_anchors)
         return Plan(made.tables, made.said, made.used, None)
-    found = drawing.read_drawing(path, options.units, options.zero, options.layer_property)
+    found = reading.read_drawing(path, options.units, options.zero, options.layer_property)
     made = layers.building(found, told, options.height, n_anchors)
     if options.picture:
         made.tables["plan"] |= picture(options)

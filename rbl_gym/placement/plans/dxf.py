@@ -26,7 +26,7 @@ _DEPTH = 16
 
 
 def read_dxf(path: str, units: str | None, zero: tuple[float, float] | None) -> Drawing:
-    """Shapes of the model space. Arguments and errors as `drawing.read_drawing`."""
+    """Shapes of the model space. Arguments and errors as `reading.read_drawing`."""
     document = _open(path)
     code = int(document.header.get("$INSUNITS", 0))
     named = _INSUNITS.get(code)

@@ -24,7 +24,7 @@ _DEGREES = ("4326", "CRS84", "4979")
 def read_geojson(
     path: str, units: str | None, zero: tuple[float, float] | None, layer_property: str | None
 ) -> Drawing:
-    """Shapes of all features. Arguments and errors as `drawing.read_drawing`."""
+    """Shapes of all features. Arguments and errors as `reading.read_drawing`."""
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:

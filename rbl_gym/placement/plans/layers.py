@@ -62,7 +62,7 @@ def building(
     Parameters
     ----------
     drawing
-        From `drawing.read_drawing`.
+        From `reading.read_drawing`.
     uses
         What layers are taken for; of several for one layer and kind, the first. None at all:
         layers that are called as `KINDS`, in any case, with or without the last letter.
