@@ -17,6 +17,7 @@ from rbl_gym.estimators.filter import (
     PoseBelief,
     make,
     names,
+    parse_filter,
     register,
 )
 from rbl_gym.estimators.iekf.augmented import AugmentedEkf, AugmentedState
@@ -76,6 +77,7 @@ __all__ = [
     "methods",
     "names",
     "orientations",
+    "parse_filter",
     "register",
     "ring_least_squares",
     "smooth",

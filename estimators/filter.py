@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple, Protocol
 
@@ -92,6 +93,8 @@ def register(name: str, factory: Callable[..., Filter]) -> None:
     """
     if not name or not isinstance(name, str) or not callable(factory):
         raise ValueError(f"name and factory must be a string and a callable, got {name!r}")
+    if "/" in name or "," in name:
+        raise ValueError(f"name must have no '/' and no ',', got {name!r}")
     if _FACTORIES.setdefault(name, factory) is not factory:
         raise ValueError(f"filter {name!r} is already registered")
 
@@ -117,6 +120,7 @@ def make(
         ``"kf"``, ``"uc-kf"``, ``"et-kf"``, ``"kf-ortho"``, ``"iekf"``, ``"iekf-cv"``,
         ``"iekf-bias"``, ``"iekf-imu"``, ``"iekf-bank"``; a name from the entry-point group
         ``rbl_gym.filters`` of another package; or ``"package.module:factory"``, which is imported.
+        Options may follow it, as in ``"iekf/robust=true"`` (`parse_filter`).
     tags
         (N, 3), positions in the body frame, metres.
     noise
@@ -130,8 +134,9 @@ def make(
     Raises
     ------
     ValueError
-        If the name or an option is unknown, or an argument is out of range.
+        If the name or an option is unknown or given twice, or an argument is out of range.
     """
+    name, options = parse_filter(name, options)
     factory = factory_of(name)
     tags = check_array("tags", tags, ("N", 3))
     of_ranges = options.get("measurement", "ranges") == "ranges"
@@ -143,11 +148,60 @@ def make(
             raise ValueError(f"{label} must have {' and '.join(methods)}, got {value!r:.80}")
     parameters = inspect.signature(factory).parameters
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    unknown = [] if takes_any else [key for key in options if key not in parameters]
+    laws = ("tags", "noise", "process")
+    known = [key for key in parameters if key not in laws]
+    unknown = [key for key in options if key in laws or not (takes_any or key in known)]
     if unknown:
-        known = [key for key in parameters if key not in ("tags", "noise", "process")]
         raise ValueError(f"filter {name!r} has no option {unknown[0]!r}; it has {', '.join(known)}")
     return factory(tags=tags, noise=noise, process=process, **options)
+
+
+def parse_filter(text: str, options: Mapping[str, Any] | None = None) -> tuple[str, dict[str, Any]]:
+    """Parse ``name/option=value/option=value`` to the name of a filter and its options.
+
+    Parameters
+    ----------
+    text
+        Name of a filter, with or without options. A value is JSON (``true``, ``0.05``,
+        ``[1, 2]``), or else text (``late``).
+    options
+        Further options.
+
+    Raises
+    ------
+    ValueError
+        If a part is not ``option=value``, or an option is given twice.
+
+    Examples
+    --------
+    >>> parse_filter("iekf-log/robust=late/iterations=2")
+    ('iekf-log', {'robust': 'late', 'iterations': 2})
+    """
+    name, *parts = text.strip().split("/") if isinstance(text, str) else (text,)
+    result: dict[str, Any] = dict(options or {})
+    for part in parts:
+        key, equals, value = part.partition("=")
+        if not key or not equals:
+            raise ValueError(f"filter {text!r:.80} must be name/option=value/..., got {part!r}")
+        if key in result:
+            raise ValueError(f"filter {text!r:.80} has the option {key!r} twice")
+        try:
+            result[key] = json.loads(_PYTHON.get(value, value))
+        except json.JSONDecodeError:
+            result[key] = value
+    return name, result
+
+
+# Values as Python writes them.
+_PYTHON = {"True": "true", "False": "false", "None": "null"}
+
+
+def filter_text(name: str, options: Mapping[str, Any]) -> str:
+    """Return the text of a filter with options; `parse_filter` reads it if they are JSON-able."""
+    values = {
+        key: x if isinstance(x, str) else json.dumps(x, default=str) for key, x in options.items()
+    }
+    return "/".join((name, *(f"{key}={value}" for key, value in values.items())))
 
 
 def factory_of(name: str) -> Callable[..., Filter]:

@@ -79,6 +79,10 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
         ("kf", {"noise": 0.1}, "noise must have variance and squared_range_variance, got 0.1"),
         ("kf", {"process": None}, "process must have covariance and std"),
         ("iekf", {"tags": np.zeros((5, 2))}, r"tags must have shape \(..., N, 3\), got \(5, 2\)"),
+        ("iekf/robust", {}, "filter 'iekf/robust' must be name/option=value/..., got 'robust'"),
+        ("iekf/robust=true/robust=late", {}, "has the option 'robust' twice"),
+        ("iekf/robust=true", {"robust": True}, "has the option 'robust' twice"),
+        ("iekf/tags=3", {}, "filter 'iekf' has no option 'tags'; it has"),
         ("iekf", {"iterations": 0}, "iterations must be a positive int, got 0"),
         ("et-kf", {"threshold": -1}, "threshold must be a finite number"),
         (
@@ -92,6 +96,30 @@ def test_register_keeps_the_first_holder_of_a_name(monkeypatch):
 def test_wrong_names_and_options_are_named(name, changes, message):
     with pytest.raises(ValueError, match=message):
         estimators.make(name, **{**LAWS, **changes})
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "options"),
+    [
+        ("kf", "kf", {}),
+        (" iekf/robust=late ", "iekf", {"robust": "late"}),
+        ("iekf/robust=True/offset=None", "iekf", {"robust": True, "offset": None}),
+        ("a.b:make/count=2/std_m=[0.1,2e-3]", "a.b:make", {"count": 2, "std_m": [0.1, 2e-3]}),
+    ],
+)  # fmt: skip
+def test_options_after_a_name(text, name, options):
+    assert estimators.parse_filter(text) == (name, options)
+    assert estimators.parse_filter(belief.filter_text(name, options)) == (name, options)
+    merged = {**options, "gain": 3}
+    assert estimators.parse_filter(text, {"gain": 3}) == (name, merged)
+
+
+def test_options_after_a_name_are_those_of_the_filter():
+    told = estimators.make("iekf/robust=late/iterations=3", **LAWS)
+    assert isinstance(told, estimators.IteratedEkf)
+    assert (told.robust, told.iterations) == ("late", 3)
+    with pytest.raises(ValueError, match="name must have no '/'"):
+        estimators.register("iekf/robust", Standstill)
 
 
 @pytest.mark.parametrize("name", estimators.names())

@@ -198,3 +198,18 @@ def test_one_range_of_a_stream_has_its_own_law():
         state = filter.update(state, ranges, anchors, mask, noise)
     np.testing.assert_allclose(links.belief(stream).covariance, state.covariance, rtol=1e-12)
     np.testing.assert_allclose(links.belief(stream).translation, state.translation, rtol=1e-12)
+
+
+def test_options_of_a_filter_by_name_and_by_settings_give_the_same_track():
+    told = replay.track_recording(log(0.02), replay.Settings.of(filter="iekf/robust=late"))
+    same = replay.track_recording(log(0.02), replay.Settings.of(filter="iekf", robust="late"))
+    np.testing.assert_array_equal(told.translation, same.translation)
+    once = replay.Settings.of(filter="iekf/iterations=1")
+    assert replay.recording_filter(log(0.02), once).iterations == 1  # pyright: ignore[reportAttributeAccessIssue]
+    assert once.changed(filter="iekf-cv").filter_options == ()
+    supposed = replay.Settings.of(filter="iekf/robust=false").changed(robust=True)
+    assert replay.recording_filter(log(0.02), supposed).robust is True  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ValueError, match="'kf' has no option 'robust'"):
+        replay.check_replay(log(0.02), replay.Settings.of(filter="kf/robust=true"))
+    with pytest.raises(ValueError, match="robust is given twice"):
+        replay.Settings.of(filter="iekf/robust=true", robust=True)

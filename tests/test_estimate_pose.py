@@ -362,6 +362,8 @@ def test_environment_that_hides_its_measurements_is_named():
         ({"filter": None}, "filter must be one of .*, got None"),
         ({"options": {"iteration": 3}}, "'iekf' has no option 'iteration'; it has iterations"),
         ({"filter": "kf", "options": {"robust": True}}, "'kf' has no option 'robust'"),
+        ({"filter": "kf/robust=true"}, "'kf' has no option 'robust'"),
+        ({"filter": "iekf/robust=true", "options": {"robust": True}}, "option 'robust' twice"),
         ({"options": {"iterations": 0}}, "iterations"),
         ({"options": {"iterations": "many"}}, "iterations.*many"),
         ({"filter": "kf", "options": {"engine": "steam"}}, "engine must be one of .*'steam'"),

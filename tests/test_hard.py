@@ -35,7 +35,7 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(part, tmp
     arguments = ["reproduce", "hard", "--trials", "4", "--plot", str(picture)]
     assert main([*arguments, "--csv", str(table), "--json", str(figures)]) == 0
     text = capsys.readouterr().out
-    assert "bank, volume" in text
+    assert "iekf-bank, volume" in text
     assert "10 % NLOS" in text
     assert picture.stat().st_size > 20_000
     result = json.loads(figures.read_text())
@@ -54,8 +54,8 @@ def test_reproduce_prints_plots_and_writes_the_same_figures_everywhere(part, tmp
     of_nlos = result["links"]["uwb_room"]["10 % NLOS"]
     assert of_nlos["share_good"] == pytest.approx(0.9, abs=0.02)
     assert of_nlos["filters"]["iekf"]["lost_ever"] == 1.0
-    assert of_nlos["filters"]["iekf, robust"]["lost_ever"] == 0.0
-    assert result["starts"]["scenes"]["auv_buoys"]["wrong"]["bank"]["back"][-1] == 1.0
+    assert of_nlos["filters"]["iekf/robust=true"]["lost_ever"] == 0.0
+    assert result["starts"]["scenes"]["auv_buoys"]["wrong"]["iekf-bank"]["back"][-1] == 1.0
 
 
 def test_the_bound_of_good_links_by_hand():

@@ -607,7 +607,7 @@ def test_scenes_with_other_sensors_bring_the_filters_made_for_them():
         further = leaderboard.further_filters(task.scene)
         assert task.filters == (*usual, *further)
         for text in task.filters:
-            leaderboard.parse_filter(text)
+            estimators.parse_filter(text)
     assert leaderboard.further_filters("uwb_room") == []
     assert leaderboard.further_filters(specs["uwb_room-imu"]) == [
         "iekf-imu", "iekf-imu/robust=true",

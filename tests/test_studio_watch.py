@@ -40,7 +40,7 @@ from rbl_gym.wrappers import EstimatePose, controllers
 from tests.helpers import ROOT
 
 ROOM = stage_of_scene(scenes.get("uwb_room"), 80)
-BOTH = [filter_named("iekf"), Named("iekf-robust", "iekf", {"robust": True})]
+BOTH = [filter_named("iekf"), Named("iekf/robust=true", "iekf", {"robust": True})]
 # Disturbances set in here, and have settled so many epochs later.
 SET_IN, SETTLED = 30, 40
 
@@ -152,8 +152,8 @@ def test_twice_the_noise_is_four_times_the_nis():
 
 
 def test_a_filter_by_its_label():
-    assert filter_named(" iekf-robust") == BOTH[1]
-    assert filter_named("iekf-late").options == {"robust": "late"}
+    assert filter_named(" iekf/robust=true") == BOTH[1]
+    assert filter_named("iekf/robust=late").options == {"robust": "late"}
     assert filter_named("uc-kf") == Named("uc-kf", "uc-kf", {})
 
 
@@ -244,7 +244,7 @@ def test_an_environment_is_shown_with_its_own_filter_and_others():
     made = gym.make("rbl_gym:RBL/Tracking-v0", scene={"name": "uwb_room", "steps": 8})
     env = EstimatePose(made, {"name": "iekf", "robust": True}, observation="flat")
     run = [*env_frames(env, (filter_named("uc-kf"),), seed=4)]
-    assert [track.label for track in run[0].tracks] == ["iekf", "uc-kf"]
+    assert [track.label for track in run[0].tracks] == ["iekf/robust=true", "uc-kf"]
     assert len(run) == 9
     _, info = env.reset(seed=4)
     for frame in run[1:]:

@@ -123,7 +123,7 @@ def test_the_ellipsoid_holds_95_percent():
 
 
 def test_links_go_from_anchors_to_tags_by_their_kinds():
-    program = program_of(scenes.get("uwb_room"), ("iekf-robust",), 3)
+    program = program_of(scenes.get("uwb_room"), ("iekf/robust=true",), 3)
     told = Disturbances(nlos=0.3, lost=0.3)
     frame: Frame = next(program.start(program.filters, 3, lambda _: told))
     drawn = link_lines(frame, 0, program.tags, 1.0)
@@ -194,7 +194,7 @@ def test_in_a_browser_a_filter_breaks_and_the_robust_one_holds(served):
         window.get_by_role("button", name="Play").dispatch_event("click")
         until(lambda: len(page.frames) > 8)
         window.get_by_role("button", name="Pause").dispatch_event("click")
-        assert "iekf-robust" in window.content()
+        assert "iekf/robust=true" in window.content()
         browser.close()
     assert page.settle()
     told = page.frames[-1].told - page.frames[-1].anchors
@@ -206,7 +206,7 @@ def test_in_a_browser_a_filter_breaks_and_the_robust_one_holds(served):
 def test_the_command_plays_environments_and_policies(tmp_path, monkeypatch):
     opened = asked(tmp_path, monkeypatch, "--env", "RBL/AnchorSelection-v0", "--filter", "uc-kf")
     program: Program = opened.page.program
-    assert program.filters == ("iekf", "uc-kf")
+    assert program.filters == ("iekf/iterations=2", "uc-kf")
     opened.stop()
     policy = random_policy("auv_buoys", tmp_path)
     opened = asked(tmp_path, monkeypatch, "--policy", policy, "--reference", "ring")

@@ -86,6 +86,14 @@ def test_filters_of_an_unknown_twist_have_their_acceleration_tuned():
     assert [float(value) for value in options[3::2]] == list(tuned.found.values())
 
 
+def test_options_of_the_filter_are_kept_and_printed():
+    settings = DEFAULTS.changed(filter="iekf/iterations=2/robust=late", walk_m=0.0, walk_deg=0.0)
+    tuned = replay.tune(recording(RANGES[:12]), settings)
+    assert tuned.options.startswith("--filter iekf/robust=late/iterations=2 --range-std-m ")
+    assert tuned.settings.filter_text == settings.filter_text
+    assert tuned.settings.loss.robust == "late"
+
+
 def test_a_log_too_short_to_tune_by_is_refused():
     with pytest.raises(ValueError, match=r"first 0\.5 s must have 10 epochs to tune by, got 6"):
         replay.tune(recording(RANGES), SETTINGS, seconds=0.5)

@@ -13,7 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 from rbl_gym import estimators, metrics, rendering
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.estimators import Filter, PoseBelief
-from rbl_gym.estimators.filter import check_takes_noise, factory_of, reads
+from rbl_gym.estimators.filter import check_takes_noise, factory_of, parse_filter, reads
 from rbl_gym.measurements.bearing import AngleNoise
 from rbl_gym.measurements.noise_laws import LinkNoise, WeakenedNoise
 from rbl_gym.worlds.families import SceneFamily
@@ -44,10 +44,11 @@ class EstimatePose(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     env
         The environment.
     filter
-        Name of a filter (`rbl_gym.estimators.names`), or a dict with its `name` and options, for
-        example ``{"name": "iekf", "robust": True}``.
+        Name of a filter (`rbl_gym.estimators.names`), with options as in ``"iekf/robust=true"``
+        (`rbl_gym.estimators.parse_filter`); or a dict with its `name` and options, for example
+        ``{"name": "iekf", "robust": True}``.
     options
-        Options of the filter, a JSON-able dict, for example ``{"robust": True}``.
+        Further options of the filter, a JSON-able dict, for example ``{"robust": True}``.
     reward
         ``"belief"``: ``-log b``, where b is the root mean square tag error in metres expected by
         the posterior belief (`rbl_gym.bounds.score`). ``"error"``: minus the actual root mean
@@ -200,16 +201,16 @@ def with_bound(info: Mapping[str, Any]) -> dict[str, Any]:
 def named_filter(
     filter: FilterLike, options: Mapping[str, Any] | None
 ) -> tuple[str, Mapping[str, Any] | None]:
-    """Return name and options of a filter given by its name, or by a dict with both."""
+    """Return name and options of a filter given by its name and options, or by a dict with both."""
     if not isinstance(filter, Mapping):
-        return filter, options
+        return parse_filter(filter, check_options_of(options))
     if options is not None:
         raise ValueError(f"options must be in the dict of the filter, got {options!r:.80} besides")
     told = dict(filter)
     name = told.pop("name", None)
     if not isinstance(name, str):
         raise ValueError(f"filter must be a name, or a dict with a name, got {filter!r:.80}")
-    return name, told
+    return parse_filter(name, told)
 
 
 def make_filter(env: Any, scene: Scene, name: str, options: Mapping[str, Any] | None) -> Filter:

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from rbl_gym.app.terminal import (
+    FILTER_HELP,
     add_html,
     add_json,
     add_trials,
     check_html,
+    names,
     positive,
     print_files,
     progress,
@@ -30,19 +32,19 @@ def add_bench(commands: Any) -> None:
     )
     bench.add_argument(
         "--filters",
-        type=_names,
+        type=names,
         metavar="A,B",
-        help="names, NAME/OPTION=VALUE or MODULE:FACTORY; default all but "
-        "iekf-bank, iekf-bias, iekf-cv, iekf-imu and iekf-log, and those made for a scene",
+        help=f"{FILTER_HELP}; default all but iekf-bank, iekf-bias, iekf-cv, iekf-imu and "
+        "iekf-log, with iekf/robust=true, and those made for a scene",
     )
     bench.add_argument(
         "--scenes",
-        type=_names,
+        type=names,
         metavar="A,B",
         help="names, or files .toml or .json: a scene with changes, or a recording; default all "
         "named ones, and those with an inertial sensor, time differences or a survey",
     )
-    bench.add_argument("--conditions", type=_names, metavar="A,B", help="default all")
+    bench.add_argument("--conditions", type=names, metavar="A,B", help="default all")
     add_trials(bench, 200)
     bench.add_argument(
         "--out",
@@ -130,10 +132,3 @@ def _workers(options: argparse.Namespace) -> backends.Workers:
     workers = backends.Workers(options.jobs, options.backend, options.address)
     backends.check(workers)
     return workers
-
-
-def _names(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",")]
-    if "" in names or len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(f"must be different names with commas, got {text!r}")
-    return names

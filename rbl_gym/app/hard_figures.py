@@ -12,10 +12,10 @@ from rbl_gym.app.tables import new_console, new_table
 
 _COLOURS = {
     "iekf": "#d1495b",
-    "iekf, robust": "#2e86ab",
-    "bank, robust": "#1b7f5c",
-    "bank": "#2e86ab",
-    "bank, volume": "#1b7f5c",
+    "iekf/robust=true": "#2e86ab",
+    "iekf-bank/robust=true": "#1b7f5c",
+    "iekf-bank": "#2e86ab",
+    "iekf-bank, volume": "#1b7f5c",
 }
 
 

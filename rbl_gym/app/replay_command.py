@@ -15,6 +15,7 @@ from rbl_gym.app.sensor_options import (
     told_clocks,
 )
 from rbl_gym.app.terminal import (
+    FILTER_HELP,
     add_html,
     add_json,
     check_html,
@@ -96,24 +97,10 @@ def _add_filter(group: Any) -> None:
     group.add_argument(
         "--filter",
         metavar="NAME",
-        help="default iekf-log; iekf with --walk-..., iekf-bias with --raw or --bias-...",
+        help=f"{FILTER_HELP}; default iekf-log, with --walk-... iekf, with --raw or --bias-... "
+        "iekf-bias, with --imu iekf-imu; robust is late of iekf-log and iekf-imu, else true",
     )
     _add_number(group, "--range-std-m", "of a range; default the recording's own, else 0.12")
-    group.add_argument(
-        "--loss",
-        dest="robust",
-        type=_loss,
-        metavar="NAME",
-        help="squares, huber, or late: for ranges that err late rather than early; default late "
-        "of iekf-log, else huber",
-    )
-    group.add_argument(
-        "--no-robust",
-        dest="robust",
-        action="store_false",
-        default=None,
-        help="as --loss squares",
-    )
 
 
 def _add_motion(group: Any) -> None:
@@ -294,6 +281,7 @@ def _replay_runs(
 
 def _settings(options: argparse.Namespace) -> Any:
     """Return the `rbl_gym.studies.replay.Settings` of the arguments."""
+    from rbl_gym import estimators
     from rbl_gym.studies import replay
 
     given = {
@@ -307,7 +295,8 @@ def _settings(options: argparse.Namespace) -> Any:
         if options.calibration:
             raise ValueError("--raw means ranges without --calibration")
         biases = {**_RAW, **biases}
-    name = options.filter or ("iekf-imu" if options.imu else _filter_for(given, biases))
+    filter = options.filter or ("iekf-imu" if options.imu else _filter_for(given, biases))
+    name, _ = estimators.parse_filter(filter)
     if biases and name != "iekf-bias":
         raise ValueError(
             f"{name} knows no biases of that law: --raw and --bias-... are of iekf-bias"
@@ -316,7 +305,7 @@ def _settings(options: argparse.Namespace) -> Any:
     if of_log and name not in ("iekf-log", "iekf-imu"):
         option = of_log[0].replace("_", "-")
         raise ValueError(f"--{option} is of iekf-log, not of {name}")
-    return replay.Settings.of(**{**given, **biases, "filter": name})
+    return replay.Settings.of(**{**given, **biases, "filter": filter})
 
 
 def _filter_for(given: Mapping[str, Any], biases: Mapping[str, Any]) -> str:
@@ -324,13 +313,6 @@ def _filter_for(given: Mapping[str, Any], biases: Mapping[str, Any]) -> str:
     if biases:
         return "iekf-bias"
     return "iekf" if "walk_m" in given or "walk_deg" in given else "iekf-log"
-
-
-def _loss(text: str) -> bool | str:
-    losses: dict[str, bool | str] = {"squares": False, "huber": True, "late": "late"}
-    if text not in losses:
-        raise argparse.ArgumentTypeError(f"must be squares, huber or late, got {text!r}")
-    return losses[text]
 
 
 def _start(text: str) -> tuple[float, ...]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from rbl_gym.app.plan_options import add_plan_options, is_plan, read_plan, read_problem
 from rbl_gym.app.reading_options import add_reading, read_runs
-from rbl_gym.app.terminal import add_seed, natural, positive
+from rbl_gym.app.terminal import FILTER_HELP, add_seed, names, natural, positive
 from rbl_gym.studies.extras import require
 
 
@@ -61,9 +61,11 @@ def add_studio(commands: Any) -> None:
     )
     watch.add_argument(
         "--filter",
-        metavar="NAME[,NAME]",
-        help="one or several side by side; NAME-robust and NAME-late are NAME with that loss; "
-        "default iekf,iekf-robust, of a recording iekf-log",
+        type=names,
+        default=[],
+        metavar="A,B",
+        help=f"one or several side by side: {FILTER_HELP}; default iekf,iekf/robust=true, of a "
+        "recording iekf-log",
     )
     add_plan_options(studio)
     add_reading(studio, left_out=("anchors",))
@@ -129,7 +131,7 @@ def _program(options: argparse.Namespace) -> Any:
     from rbl_gym.studies.watching.frames import filter_named
     from rbl_gym.studies.watching.recorded import track_all
 
-    labels = tuple(filter(None, (options.filter or "").split(",")))
+    labels = tuple(options.filter)
     if options.policy:
         from rbl_gym.studies.watching import learned
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,11 @@ from typing import Any
 from rbl_gym.app.tables import has_rich
 from rbl_gym.studies.extras import require
 from rbl_gym.studies.progress import Advance
+
+FILTER_HELP = (
+    "NAME, NAME/option=value/option=value or MODULE:FACTORY (docs/estimators.md, Filters with "
+    "options)"
+)
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -121,6 +127,14 @@ def print_files(**files: str | None) -> None:
     for label, path in files.items():
         if path:
             print(f"{label}: {path}")
+
+
+def names(text: str) -> list[str]:
+    """Parse different names with commas; a comma inside brackets is part of a name."""
+    found = [name.strip() for name in re.split(r",(?![^\[]*\])", text)]
+    if "" in found or len(set(found)) < len(found):
+        raise argparse.ArgumentTypeError(f"must be different names with commas, got {text!r}")
+    return found
 
 
 def window(text: str) -> tuple[float, float]:

@@ -26,15 +26,13 @@ CONDITIONS: dict[str, dict[str, float]] = {
     "50 % lost": {"drop_probability": 0.5},
     "50 % lost, 10 % NLOS": {"drop_probability": 0.5, "nlos_probability": 0.1},
 }
-FILTERS: dict[str, tuple[str, dict[str, Any]]] = {
-    "iekf": ("iekf", {}),
-    "iekf, robust": ("iekf", {"robust": True}),
-    "bank, robust": ("iekf-bank", {"robust": True}),
-}
+FILTERS = ("iekf", "iekf/robust=true", "iekf-bank/robust=true")
 START_SCENES = ("uwb_room", "drone_yard", "satellite", "auv_buoys")
 STARTS = ("wrong", "nothing", "outage", "wrong, 10 % NLOS")
-START_FILTERS = ("iekf", "bank")
-# If coplanar anchors leave a mirror pose, also a bank that knows the side.
+START_FILTERS = ("iekf", "iekf-bank")
+# If coplanar anchors leave a mirror pose, also a bank that knows the side: the option `volume` with
+# the limits of the scene.
+_WITH_VOLUME = "iekf-bank, volume"
 _COPLANAR = ("auv_buoys",)
 # An error whose square, normalised by the bound, exceeds this is not random (mean 6).
 LOST = 100.0
@@ -54,7 +52,7 @@ class _Case(NamedTuple):
 
 
 def _start_filters(scene: str) -> tuple[str, ...]:
-    return (*START_FILTERS, "bank, volume") if scene in _COPLANAR else START_FILTERS
+    return (*START_FILTERS, _WITH_VOLUME) if scene in _COPLANAR else START_FILTERS
 
 
 def compare_hard_conditions(trials: int, seed: int, advance: Advance = silent) -> dict[str, Any]:
@@ -103,8 +101,8 @@ def _links(scene: Scene, count: int, rng: np.random.Generator, advance: Advance)
     clean = monte_carlo.bound_of(scene, trials.episode, np.ones_like(good))
     straight = monte_carlo.bound_of(scene, trials.episode, good)
     row: dict[str, Any] = {"share_good": float(np.mean(good)), "filters": {}}
-    for label, (name, options) in FILTERS.items():
-        trace = monte_carlo.track_trials(trials, name, options)
+    for label in FILTERS:
+        trace = monte_carlo.track_trials(trials, label, {})
         distance = _squared_distance(trace.error, straight)
         row["filters"][label] = {
             "clean": _ratios(trace.error, clean),
@@ -180,11 +178,9 @@ def _start(name: str, start: str, trials: int, rng: np.random.Generator) -> _Cas
 def _back(case: _Case, label: str, robust: bool, advance: Advance) -> dict[str, Any]:
     """Return the recovery of filters over epochs, and the time of a step."""
     options: dict[str, Any] = {"robust": robust}
-    if label == "bank, volume":
+    if label == _WITH_VOLUME:
         options["volume"] = case.trials.scene.volume.bounds()
-    trace = monte_carlo.track_trials(
-        case.trials, "iekf" if label == "iekf" else "iekf-bank", options
-    )
+    trace = monte_carlo.track_trials(case.trials, label.partition(",")[0], options)
     distance = np.einsum("...i,...ij,...j->...", trace.error, case.information, trace.error)
     share = (distance < LOST).mean(axis=1)
     advance()

@@ -174,6 +174,7 @@ def scene_filter(scene: Scene, name: str, options: dict[str, Any]) -> estimators
         As in `estimators.make`, and if the filter does not support a law per epoch, which scenes
         with obstacles need.
     """
+    name, options = estimators.parse_filter(name, options)
     options = {**scene.links.options, **inertial_options(name, scene), **options}
     filter = estimators.make(
         name, tags=scene.tags, noise=scene.noise, process=scene.process, **options

@@ -102,8 +102,8 @@ def show(
     beside
         For a problem, anchors (M, 3) in metres; None: its own, or a usual layout. For a recording,
         its `Track` or a mapping of tracks by labels; None: the track of the filter ``"iekf-log"``.
-        For a scene or environment, labels of filters; None: ``"iekf"`` and ``"iekf-robust"``, or
-        the environment's own.
+        For a scene or environment, labels of filters; None: ``"iekf"`` and ``"iekf/robust=true"``,
+        or the environment's own.
     tables
         Tables of the file from which the problem was read, for saving; None: derived from the
         problem.

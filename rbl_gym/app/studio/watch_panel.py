@@ -19,7 +19,16 @@ from rbl_gym.studies.watching.program import Program
 CHARTS_WIDTH = 270
 NONE = "none"
 # Filters on offer; the command accepts any other name.
-OFFERED = ("iekf", "iekf-robust", "iekf-late", "uc-kf", "kf", "et-kf", "iekf-bias", "iekf-bank")
+OFFERED = (
+    "iekf",
+    "iekf/robust=true",
+    "iekf/robust=late",
+    "uc-kf",
+    "kf",
+    "et-kf",
+    "iekf-bias",
+    "iekf-bank",
+)
 # Error of the wrong anchor position in metres, and the factor on the noise.
 WRONG_M, NOISIER = 0.5, 2.0
 # Epochs over which the table averages NIS, and the maximum length of the charts.

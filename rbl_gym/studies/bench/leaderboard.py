@@ -35,7 +35,6 @@ __all__ = [
     "Task",
     "default_filters",
     "further_filters",
-    "parse_filter",
     "run_task",
     "summary",
     "tasks",
@@ -84,21 +83,6 @@ def further_filters(spec: str | Mapping[str, Any]) -> list[str]:
     return further
 
 
-def parse_filter(text: str) -> tuple[str, dict[str, Any]]:
-    """Parse ``name/option=value/...`` to a name and options; values are JSON, or else text."""
-    name, *parts = text.split("/")
-    options: dict[str, Any] = {}
-    for part in parts:
-        key, equals, value = part.partition("=")
-        if not key or not equals:
-            raise ValueError(f"filter {text!r} must be name/option=value/..., got {part!r}")
-        try:
-            options[key] = json.loads(value)
-        except json.JSONDecodeError:
-            options[key] = value
-    return name, options
-
-
 def tasks(
     specs: Mapping[str, str | dict[str, Any]],
     conditions: Sequence[str],
@@ -115,8 +99,8 @@ def tasks(
     conditions
         Names in `CONDITIONS`.
     filters
-        Names, with options as `parse_filter` reads them; None: `default_filters`, and of every
-        scene its `further_filters`.
+        Names, with options as `estimators.parse_filter` reads them; None: `default_filters`, and
+        of every scene its `further_filters`.
     trials, seed
         Number of trials of simulated scenes, and seed of all randomness.
 
@@ -128,9 +112,8 @@ def tasks(
     for condition in conditions:
         check_one_of("condition", condition, list(CONDITIONS))
     for text in filters or ():
-        name, options = parse_filter(text)
         scene = scenes.get("uwb_room")
-        estimators.make(name, tags=scene.tags, noise=scene.noise, process=scene.process, **options)
+        estimators.make(text, tags=scene.tags, noise=scene.noise, process=scene.process)
     for spec in specs.values():
         digest_of(spec)
     usual = default_filters() if filters is None else filters
@@ -182,7 +165,7 @@ def run_task(task: Task) -> list[tuple[dict[str, Any], float | None]]:
         stage = stages.scene_stage(task.scene, task.condition, task.trials, task.seed)
     results = []
     for text in task.filters:
-        found, microseconds = stages.run_filter(stage, *parse_filter(text))
+        found, microseconds = stages.run_filter(stage, *estimators.parse_filter(text))
         results.append((_head(task, text) | found, microseconds))
     return results
 
@@ -195,7 +178,7 @@ def _head(task: Task, filter: str) -> dict[str, Any]:
         "scene_hash": digest_of(task.scene),
         "condition": task.condition,
         "filter": filter,
-        "filter_source": source_of(parse_filter(filter)[0]),
+        "filter_source": source_of(estimators.parse_filter(filter)[0]),
         "trials": task.trials,
         "seed": task.seed,
         "versions": versions(),

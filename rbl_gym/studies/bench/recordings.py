@@ -26,7 +26,8 @@ from rbl_gym.studies.bench.worlds import (
 
 FILES = ("ranges", "anchors", "tags", "truth", "calibration")
 # What of `replay.Settings` a recording sets; filters are the benchmark's.
-SETTINGS = tuple(name for name in replay.Settings().flat() if name not in ("filter", "robust"))
+_OF_FILTER = ("filter", "filter_options", "robust")
+SETTINGS = tuple(name for name in replay.Settings().flat() if name not in _OF_FILTER)
 # Stretches of equal length that stand for trials: errors within one are correlated.
 SEGMENTS = 20
 

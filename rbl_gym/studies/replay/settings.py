@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from rbl_gym.checks import check_number, check_one_of
+from rbl_gym.estimators.filter import filter_text, parse_filter
 from rbl_gym.measurements.link_bias import LinkBias
 from rbl_gym.recordings.align import ALIGNMENTS
 from rbl_gym.studies.replay.sensors import Inertial, Odometry
@@ -240,7 +241,11 @@ class Settings:
     Parameters
     ----------
     filter
-        Name of the filter.
+        Name of the filter. Options may follow it, as in ``"iekf/robust=late"``
+        (`rbl_gym.estimators.parse_filter`).
+    filter_options
+        Options of the filter that the other settings do not give it, as a dict or as pairs. The
+        options after the name are added to it. `robust` is also that of `loss`.
     range_std_m
         Standard deviation of a range; None: that of the recording if given, else
         `DEFAULT_RANGE_STD_M`, which includes link biases that change with the pose.
@@ -254,6 +259,7 @@ class Settings:
     """
 
     filter: str = "iekf"
+    filter_options: tuple[tuple[str, Any], ...] = ()
     range_std_m: float | None = None
     motion: Motion = Motion()
     biases: Biases = Biases()
@@ -267,6 +273,20 @@ class Settings:
     def __post_init__(self) -> None:
         if self.range_std_m is not None:
             check_number("range_std_m", self.range_std_m, low=1e-6)
+        name, options = parse_filter(self.filter, dict(self.filter_options))
+        if "robust" in options:
+            object.__setattr__(self, "loss", Loss(options["robust"]))
+        # Settings are keys of dicts.
+        pairs = ((key, tuple(x) if isinstance(x, list) else x) for key, x in options.items())
+        object.__setattr__(self, "filter", name)
+        object.__setattr__(self, "filter_options", tuple(pairs))
+
+    @property
+    def filter_text(self) -> str:
+        """The filter with its options, as `parse_filter` reads them."""
+        robust = self.loss.robust
+        options = {} if robust is None else {"robust": robust}
+        return filter_text(self.filter, options | dict(self.filter_options))
 
     @classmethod
     def of(cls, **fields: Any) -> Settings:
@@ -281,7 +301,8 @@ class Settings:
         ValueError
             If a field is unknown, or a value is invalid for its group.
         """
-        usual = _INERTIAL_BIASES if fields.get("filter") == "iekf-imu" else {}
+        inertial = parse_filter(fields.get("filter", ""))[0] == "iekf-imu"
+        usual = _INERTIAL_BIASES if inertial else {}
         return cls().changed(**{**usual, **fields})
 
     def changed(self, **fields: Any) -> Settings:
@@ -290,6 +311,15 @@ class Settings:
         unknown = [name for name in fields if name not in known]
         if unknown:
             raise ValueError(f"settings have no {unknown[0]!r}; they have {', '.join(known)}")
+        # The options were those of the other filter.
+        options = dict(
+            fields.get("filter_options", () if "filter" in fields else self.filter_options)
+        )
+        if "robust" in fields:
+            if "robust" in parse_filter(fields.get("filter", ""))[1]:
+                raise ValueError(f"robust is given twice, got {fields!r:.200}")
+            options |= {"robust": fields["robust"]} if "robust" in options else {}
+        fields["filter_options"] = tuple(options.items())
         groups = {name: getattr(self, name) for name in vars(self)}
         for name, group in groups.items():
             if dataclasses.is_dataclass(group):

@@ -169,7 +169,7 @@ def _of_settings(trial: Trial) -> Iterator[Supposition]:
     for more in _NOISIER:
         yield _noisier(trial, more)
     if not robust_of(settings):
-        yield supposed("outliers", "some ranges are far off: leave out --no-robust", robust=True)
+        yield supposed("outliers", "some ranges are far off: leave out robust=false", robust=True)
 
 
 def _noisier(trial: Trial, more: float) -> Supposition:

@@ -219,6 +219,7 @@ def recording_filter(recording: Recording, settings: Settings) -> estimators.Fil
                 f"directions are read by {', '.join(_DIRECTED)}, not by {settings.filter!r}"
             )
         options["directions"] = recording.directions
+    options |= dict(settings.filter_options)
     return named_filter(recording, settings, settings.filter, options)
 
 

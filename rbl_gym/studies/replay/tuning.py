@@ -107,14 +107,14 @@ def tune(
     given = local_trial(cut(recording, slice(count)), settings)
     ranges = given.recording.links.sum()
     before = float(evidence([given]).log_likelihood.sum() / ranges)
-    names = dict.fromkeys(filters or (settings.filter,))
+    names = dict.fromkeys(filters or (settings.filter_text,))
     tried = {
         name: _climbed(given._replace(settings=given.settings.changed(filter=name)), advance)
         for name in names
     }
     best = max(tried, key=lambda name: tried[name][0])
     value, found = tried[best]
-    if best != settings.filter or len(names) > 1:
+    if best != settings.filter_text or len(names) > 1:
         found = {"filter": best, **found}
     if recording.odometry is not None:
         # The smoother uses the same laws.

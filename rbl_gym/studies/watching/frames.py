@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.checks import BoolArray, FloatArray
-from rbl_gym.estimators import Filter, Innovations, PoseBelief
+from rbl_gym.estimators import Filter, Innovations, PoseBelief, parse_filter
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.studies.epochs import Step, innovations_of, pose_errors
 
@@ -124,23 +124,9 @@ class Named(NamedTuple):
     options: dict[str, Any]
 
 
-# Suffixes of labels and the options that they set.
-_LOSSES: dict[str, dict[str, Any]] = {
-    "-robust": {"robust": True},
-    "-late": {"robust": "late"},
-}
-
-
 def filter_named(label: str) -> Named:
-    """Return a filter by label: its name, optionally with the suffix ``-robust`` or ``-late``.
-
-    ``iekf-robust`` is the filter ``iekf`` with the option ``robust=True``.
-    """
-    label = label.strip()
-    for end, options in _LOSSES.items():
-        if label.endswith(end):
-            return Named(label, label.removesuffix(end), dict(options))
-    return Named(label, label, {})
+    """Return a filter by a label that `rbl_gym.estimators.parse_filter` reads."""
+    return Named(label.strip(), *parse_filter(label))
 
 
 def link_kinds(links: Links, refused: BoolArray | None = None) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray
 from rbl_gym.envs.tracking import TrackingEnv
+from rbl_gym.estimators.filter import filter_text
 from rbl_gym.placement.problem import Context
 from rbl_gym.studies.watching.frames import Frame, Links, Named, Pose
 from rbl_gym.studies.watching.live import Moment, make_filters, moment_of, tracked_moments
@@ -116,7 +117,7 @@ def own_filter(env: gym.Env[Any, Any]) -> Named | None:
     while layer is not None:
         if isinstance(layer, EstimatePose):
             name, options = layer._named
-            return Named(name, name, dict(options or {}))
+            return Named(filter_text(name, options or {}), name, dict(options or {}))
         layer = getattr(layer, "inner", None) or getattr(layer, "env", None)
     return None
 

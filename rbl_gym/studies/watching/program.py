@@ -78,7 +78,7 @@ class Program:
 
 
 # Default filters: of a simulation, of a recording.
-LIVE, RECORDED = ("iekf", "iekf-robust"), ("iekf-log",)
+LIVE, RECORDED = ("iekf", "iekf/robust=true"), ("iekf-log",)
 
 
 def program_of(what: Any, beside: Any = None, seed: int = 0) -> Program:

@@ -26,8 +26,7 @@ def track_all(
     recording, settings
         Arguments as in `replay.track_recording`.
     filters
-        Filters of `filter_named`. Each replaces the filter of the settings, and their loss if it
-        has one.
+        Filters of `filter_named`. Each replaces the filter of the settings.
 
     Raises
     ------
@@ -36,7 +35,7 @@ def track_all(
     """
     tracks = {}
     for one in filters:
-        own = settings.changed(filter=one.name, **one.options)
+        own = settings.changed(filter=one.name, filter_options=one.options)
         tracks[one.label] = replay.track_recording(recording, replay.check_replay(recording, own))
     return tracks
 
