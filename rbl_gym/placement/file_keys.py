@@ -80,7 +80,11 @@ def _size(doc: str, **more: Any) -> Key:
 
 
 _NEEDED: dict[str, Any] = {"needed": True}
-_POLYGON = Key("polygon", "corners [[x, y], ...] in the plan, metres, in either sense", **_NEEDED)
+_POLYGON = Key(
+    "polygon",
+    "corners [[x, y], ...] in the plan, metres, clockwise or counter-clockwise",
+    **_NEEDED,
+)
 _LINE = Key("line", "points [[x, y], ...] in the plan, metres", **_NEEDED)
 _CLOSED = Key("flag", "whether the last point is joined to the first", default=False)
 _LOW = _metres("lower height, metres", default=0.0)
@@ -92,14 +96,14 @@ _BOX = {
 }
 _SHARE: dict[str, Any] = {"low": 0.0, "high": 1.0}
 _LOSS = {
-    "material": Key("text", "one of [materials]; without it and information: opaque"),
-    "information": Key("number", "the share itself, in place of material", **_SHARE),
+    "material": Key("text", "one of [materials]; opaque without material and information"),
+    "information": Key(
+        "number", "share of the information that remains, in place of material", **_SHARE
+    ),
 }
 _NAME = Key("text", "name in the results")
 _REACH = {
-    "max_range_m": _size(
-        "a longer link carries no information, metres; without it there is no limit"
-    ),
+    "max_range_m": _size("a longer link has no information, metres; default: no limit"),
     "range_edge_m": _metres(
         "width over which the information falls to zero before max_range_m, metres; 0: at once",
         default=0.0,
@@ -107,7 +111,7 @@ _REACH = {
     ),
     "half_angle_deg": Key(
         "number",
-        "half angle of the field of view about the mount's normal, degrees; without it all round",
+        "half angle of view about the mount's normal, degrees; default: all directions",
         low=0.1,
         high=180,
     ),
@@ -122,31 +126,36 @@ _REACH = {
 _ANCHORS = {
     "number": Key(
         "count",
-        "how many, the fixed ones included; --anchors overrides it",
+        "number of anchors, with the fixed ones; --anchors overrides it",
         low=MIN_ANCHORS,
         high=MAX_ANCHORS,
     ),
-    "fixed": Key("places", "anchors [[x, y, z], ...] that stay, metres", default=[]),
+    "fixed": Key("places", "anchors [[x, y, z], ...] that are already mounted, metres", default=[]),
     **_REACH,
 }
-_KIND = Key("choice", "shape of the space in which they may stand", needed=True)
+_KIND = Key("choice", "shape of the space for anchors", needed=True)
 _ZONE = {
     "name": _NAME,
     "weight": Key("number", "weight in the score", default=1.0, low=1e-6, high=1e6),
     "attitude": Key(
         "choice",
-        "what the body's attitude can be",
+        "possible rotations of the body",
         default="free",
         choices=ATTITUDES,
     ),
-    "position_m": _size("requirement: one sigma of the horizontal position, metres"),
-    "height_m": _size("requirement: one sigma of the height, metres"),
+    "position_m": _size(
+        "requirement: largest standard deviation of the horizontal position, metres"
+    ),
+    "height_m": _size("requirement: largest standard deviation of the height, metres"),
     "heading_deg": Key(
-        "number", "requirement: one sigma of the heading, degrees", low=1e-3, high=180.0
+        "number",
+        "requirement: largest standard deviation of the heading, degrees",
+        low=1e-3,
+        high=180.0,
     ),
     "share": Key(
         "number",
-        "share of the zone in which the requirements must hold; 0.95 without it",
+        "share of the zone in which the requirements must hold; default 0.95",
         low=0.01,
         high=0.9999,
     ),
@@ -154,16 +163,16 @@ _ZONE = {
 _MOUNT = {
     "kind": Key("choice", "wall, ceiling, column, area or points", needed=True),
     "name": _NAME,
-    "cost": Key("number", "cost of an anchor on it", default=1.0, low=0.0, high=1e9),
+    "cost": Key("number", "cost of an anchor on this mount", default=1.0, low=0.0, high=1e9),
 }
-_AXIS = {"axis": Key("place", "direction [x, y, z] in which anchors look; without it all round")}
+_AXIS = {"axis": Key("place", "direction [x, y, z] in which anchors look; default: all directions")}
 
 
 _OF_LAWS = {
     "floor_m": "standard deviation of a short range, metres",
     "proportional": "growth of the standard deviation with the range, metres per metre",
-    "reference_tag": "index of the tag whose range counts for all tags of an anchor",
-    "sigma_m": "deviation of a squared range, as a multiple of the range to the first tag, metres",
+    "reference_tag": "index of the tag on whose range the noise of an anchor depends",
+    "sigma_m": "standard deviation of a squared range over the range to the first tag, metres",
 }
 
 
@@ -175,10 +184,10 @@ def _noise_form(kind: str, law: Any) -> Form:
     return Form(
         {
             **fields,
-            "kind": Key("choice", "law of the ranges", default="range"),
+            "kind": Key("choice", "noise law", default="range"),
             "blocked_information": Key(
                 "number",
-                "share of a link's information that opaque obstacles leave, however many",
+                "share of a link's information that remains behind opaque obstacles",
                 default=0.01,
                 **_SHARE,
             ),
@@ -188,10 +197,10 @@ def _noise_form(kind: str, law: Any) -> Form:
     )
 
 
-MATERIALS_DOC = "share of a link's information that one crossing leaves, by name"
+MATERIALS_DOC = "share of a link's information that remains after one crossing, by name"
 FORMAT: dict[str, Table] = {
     "anchors": Table(
-        "the anchors: how many, how far they reach, and where they may stand without [[mounts]]",
+        "the anchors: their number, their range, and without [[mounts]] where they may be mounted",
         (
             Form({"kind": _KIND, **_BOX, **_ANCHORS}, "kind", "room"),
             Form({"kind": _KIND, **_BOX, **_ANCHORS}, "kind", "box"),
@@ -209,7 +218,7 @@ FORMAT: dict[str, Table] = {
         ),
     ),
     "mounts": Table(
-        "surfaces, spaces and points where anchors may stand",
+        "surfaces, spaces and points where anchors may be mounted",
         (
             Form(
                 {
@@ -218,7 +227,7 @@ FORMAT: dict[str, Table] = {
                     "closed": _CLOSED,
                     "side": Key(
                         "choice",
-                        "side of the line; left of a closed one is inside",
+                        "side of the line; the left of a closed line is its inside",
                         default="left",
                         choices=("left", "right", "both"),
                     ),
@@ -247,7 +256,9 @@ FORMAT: dict[str, Table] = {
             Form(
                 {
                     **_MOUNT,
-                    "points": Key("places", "candidates [[x, y, z], ...], metres", **_NEEDED),
+                    "points": Key(
+                        "places", "possible positions [[x, y, z], ...], metres", **_NEEDED
+                    ),
                     **_AXIS,
                 },
                 "kind",
@@ -257,17 +268,13 @@ FORMAT: dict[str, Table] = {
         many=True,
     ),
     "forbidden": Table(
-        "prisms in which no anchor may stand",
+        "prisms in which no anchor may be mounted",
         (
             Form(
                 {
                     "polygon": _POLYGON,
-                    "low_m": _metres(
-                        "lower height, metres; without it there is none", default=-MOST_M
-                    ),
-                    "high_m": _metres(
-                        "upper height, metres; without it there is none", default=MOST_M
-                    ),
+                    "low_m": _metres("lower height, metres; default: no limit", default=-MOST_M),
+                    "high_m": _metres("upper height, metres; default: no limit", default=MOST_M),
                 }
             ),
         ),
@@ -292,7 +299,7 @@ FORMAT: dict[str, Table] = {
         many=True,
     ),
     "obstacles": Table(
-        "obstacles: boxes or prisms that take from links, and hold neither the body nor anchors",
+        "obstacles: boxes or prisms that weaken links; the body and the anchors are outside",
         (
             Form({"polygon": _POLYGON, "low_m": _LOW, "high_m": _HIGH, **_LOSS}, "polygon"),
             Form({**_BOX, **_LOSS}),
@@ -305,8 +312,8 @@ FORMAT: dict[str, Table] = {
             Form(
                 {
                     "polygon": _POLYGON,
-                    "z_m": _metres("height of its lower side, metres", **_NEEDED),
-                    "thickness_m": _size("thickness upwards from there, metres", default=0.3),
+                    "z_m": _metres("height of the lower side, metres", **_NEEDED),
+                    "thickness_m": _size("thickness upwards from z_m, metres", default=0.3),
                     **_LOSS,
                 }
             ),
@@ -323,7 +330,7 @@ FORMAT: dict[str, Table] = {
         many=True,
     ),
     "body": Table(
-        "the tags on the body: their places, or a shape",
+        "the tags on the body: their positions, or a shape",
         (
             Form({"tags": Key("places", "tags [[x, y, z], ...], metres", **_NEEDED)}, "tags"),
             Form(
@@ -337,11 +344,11 @@ FORMAT: dict[str, Table] = {
         ),
     ),
     "noise": Table(
-        "noise of the ranges, and what opaque obstacles leave",
+        "noise of the ranges, and the information that remains behind opaque obstacles",
         tuple(_noise_form(kind, law) for kind, law in NOISE_LAWS.items()),
     ),
     "prior": Table(
-        "what is known of the pose before the first range: one sigma of each axis",
+        "pose before the first epoch: standard deviation of each axis",
         (
             Form(
                 {
@@ -354,7 +361,7 @@ FORMAT: dict[str, Table] = {
         ),
     ),
     "plan": Table(
-        "a drawing behind the results",
+        "a picture or drawing behind the results",
         (
             Form(
                 {
@@ -364,14 +371,14 @@ FORMAT: dict[str, Table] = {
                     ),
                     "origin": Key(
                         "spot",
-                        "place [x, y] of the lower left corner of the picture, metres",
+                        "position [x, y] of the lower left corner of the picture, metres",
                         default=[0, 0],
                     ),
                     "drawing": Key("text", "path of the imported drawing, relative to the file"),
                     "units": Key("text", "units of the drawing", default="m"),
                     "zero": Key(
                         "spot",
-                        "point [x, y] of the drawing that is the origin here, in its units",
+                        "point [x, y] of the drawing, in its units, that is the origin of the file",
                         default=[0, 0],
                     ),
                 }
