@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rbl_gym.studies.learning import policies
-from rbl_gym.studies.learning.policies import Policy
+from rbl_gym.studies.learning.policies import Policy, Scaling
 
 SIZES = (5, 8, 3)
 
@@ -64,6 +64,35 @@ def test_files_give_the_same_policy_back(tmp_path, kind, sizes):
     assert path.stat().st_size < 200_000
 
 
+def test_scaled_observations_and_relu_by_hand_and_through_a_file(tmp_path):
+    rng = np.random.default_rng(4)
+    scaling = Scaling(rng.integers(-3, 4, 5) / 4, rng.integers(1, 5, 5) / 4, 1.5)
+    policy = random_policy()._replace(activation="relu", scaling=scaling)
+    policies.save(policy, tmp_path / "policy.npz")
+    again = policies.load(tmp_path / "policy.npz")
+    assert isinstance(again, Policy)
+    assert (again.activation, again.meta) == ("relu", policy.meta)
+    seen = rng.standard_normal((7, 5))
+    clipped = 0
+    for observation, got, one in zip(seen, again(seen), policy(seen), strict=True):
+        ratio = [(x - m) / s for x, m, s in zip(observation, *scaling[:2], strict=True)]
+        clipped += sum(abs(x) > 1.5 for x in ratio)
+        hidden = policy.weights[0] @ [min(max(x, -1.5), 1.5) for x in ratio] + policy.biases[0]
+        wanted = policy.weights[1] @ [max(x, 0.0) for x in hidden] + policy.biases[1]
+        np.testing.assert_allclose(got, np.clip(wanted, -1, 1), atol=1e-12)
+        np.testing.assert_allclose(one, got, atol=1e-12)
+    assert 0 < clipped < seen.size
+
+
+def test_masks_of_a_multi_binary_policy_forbid_choices():
+    policy = random_policy("multi-binary")
+    seen = np.random.default_rng(5).standard_normal((20, 5))
+    free, mask = policy(seen), np.ones((20, 6), dtype=bool)
+    mask[:, 3] = False  # the second of three may not be 1
+    np.testing.assert_array_equal(policy(seen, mask), free * [1, 0, 1])
+    assert free[:, 1].any()
+
+
 def test_a_wrong_observation_is_named():
     with pytest.raises(ValueError, match="must have 5 entries for this policy, got 6"):
         random_policy()(np.zeros((2, 6)))
@@ -79,6 +108,11 @@ def arrays(**changes):
         "meta": np.array(json.dumps({"kind": "box", "task": "auv_buoys"})),
     }
     return {key: value for key, value in {**good, **changes}.items() if value is not None}
+
+
+def scaled(**changes):
+    good = {"mean": np.zeros(5), "scale": np.ones(5), "clip": np.array(10.0)}
+    return {f"scaling_{name}": array for name, array in {**good, **changes}.items()}
 
 
 @pytest.mark.parametrize(
@@ -97,6 +131,11 @@ def arrays(**changes):
         ({"weight_0": np.zeros(5)}, "weight_0 must have shape"),
         ({"weight_0": np.full((8, 5), np.nan)}, "weight_0 must be finite"),
         ({"bias_0": np.full(8, np.inf)}, "bias_0 must be finite"),
+        ({"meta": np.array('{"kind": "box", "activation": "elu"}')}, "activation must be one of"),
+        ({"scaling_clip": np.array(1.0)}, "is no policy of rbl-gym"),
+        (scaled(scale=np.zeros(5)), "must be positive"),
+        (scaled(clip=np.array(-1.0)), "must be positive"),
+        (scaled(mean=np.zeros(4)), "scaling_mean must have shape"),
         ({"weight_0": np.array("text")}, "is no policy of rbl-gym"),
     ],
 )

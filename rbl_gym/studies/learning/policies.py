@@ -15,10 +15,35 @@ from rbl_gym.checks import FloatArray, check_array, check_finite, check_one_of
 from rbl_gym.studies.learning.deep_sets import DeepSets
 from rbl_gym.studies.learning.set_policies import SET_KINDS, SetPolicy
 
-__all__ = ["KINDS", "Lstm", "Policy", "load", "save"]
+__all__ = ["ACTIVATIONS", "KINDS", "Lstm", "Policy", "Scaling", "load", "save"]
 
 _META = "meta"
 KINDS = ("box", "discrete", "multi-binary")
+# Activation functions between the layers.
+ACTIVATIONS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0.0),
+}
+
+
+class Scaling(NamedTuple):
+    """Scaling of observations: (observation - mean) / scale, clipped.
+
+    Attributes
+    ----------
+    mean, scale
+        (n_in,); scale is positive.
+    clip
+        Scaled observations are clipped to [-clip, clip].
+    """
+
+    mean: FloatArray
+    scale: FloatArray
+    clip: float
+
+    def __call__(self, observation: FloatArray) -> FloatArray:
+        """Return scaled observations (..., n_in)."""
+        return np.clip((observation - self.mean) / self.scale, -self.clip, self.clip)
 
 
 class Lstm(NamedTuple):
@@ -45,7 +70,7 @@ class Lstm(NamedTuple):
 
 
 class Policy(NamedTuple):
-    """A deterministic policy: tanh layers, then a linear one.
+    """A deterministic policy: layers with tanh between them, the last one linear.
 
     Attributes
     ----------
@@ -59,6 +84,10 @@ class Policy(NamedTuple):
         "maskable-ppo"`` the policy uses the environment's action masks.
     lstm
         A layer with a memory before the others, or None.
+    activation
+        Activation function between the layers, one of `ACTIVATIONS`.
+    scaling
+        Scaling of the observations before the first layer, or None.
     """
 
     weights: tuple[FloatArray, ...]
@@ -66,6 +95,8 @@ class Policy(NamedTuple):
     kind: str
     meta: dict[str, Any]
     lstm: Lstm | None = None
+    activation: str = "tanh"
+    scaling: Scaling | None = None
 
     @property
     def n_inputs(self) -> int:
@@ -76,11 +107,12 @@ class Policy(NamedTuple):
     def __call__(self, observation: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
         """Return actions (...,) or (..., n) for observations (..., n_in).
 
-        `mask` (..., n), for a discrete policy, is True for the allowed actions.
+        `mask` is True for the allowed actions: (..., n) for a discrete policy, (..., 2 n) for a
+        multi-binary one (for each entry whether it may be 0 and whether it may be 1).
         """
         if self.lstm is not None:
             raise ValueError("a policy with a memory is played by player(), one for each episode")
-        return self._action(self._checked(observation), mask)
+        return self._action(self._read(observation), mask)
 
     def player(self) -> Callable[[Any, np.ndarray], np.ndarray]:
         """Return a function ``(env, observation) -> actions`` for one episode."""
@@ -89,7 +121,7 @@ class Policy(NamedTuple):
 
         def play(env: Any, observation: np.ndarray) -> np.ndarray:
             nonlocal state
-            hidden = self._checked(observation)
+            hidden = self._read(observation)
             if self.lstm is not None:
                 if state is None:
                     state = (np.zeros((*hidden.shape[:-1], self.lstm.recalls.shape[1])),) * 2
@@ -99,24 +131,30 @@ class Policy(NamedTuple):
 
         return play
 
-    def _checked(self, observation: np.ndarray) -> FloatArray:
+    def _read(self, observation: np.ndarray) -> FloatArray:
+        """Return a checked and scaled observation."""
         seen = np.asarray(observation, dtype=np.float64)
         if seen.shape[-1] != self.n_inputs:
             raise ValueError(
                 f"observation must have {self.n_inputs} entries for this policy, "
                 f"got {seen.shape[-1]}: it was trained on {self.meta.get('task')!r}"
             )
-        return seen
+        return seen if self.scaling is None else self.scaling(seen)
 
-    def _action(self, hidden: FloatArray, mask: np.ndarray | None) -> np.ndarray:
+    def _outputs(self, hidden: FloatArray) -> FloatArray:
+        """Return the outputs (..., n_out) of the last layer."""
         *inner, (weight, bias) = zip(self.weights, self.biases, strict=True)
         for w, b in inner:
-            hidden = np.tanh(hidden @ w.T + b)
-        output = hidden @ weight.T + bias
+            hidden = ACTIVATIONS[self.activation](hidden @ w.T + b)
+        return hidden @ weight.T + bias
+
+    def _action(self, hidden: FloatArray, mask: np.ndarray | None) -> np.ndarray:
+        output = self._outputs(hidden)
         if self.kind == "discrete":
             return (output if mask is None else np.where(mask, output, -np.inf)).argmax(axis=-1)
         if self.kind == "multi-binary":
-            return (output > 0).astype(np.int8)
+            there = True if mask is None else np.asarray(mask)[..., 1::2]
+            return ((output > 0) & there).astype(np.int8)
         return np.clip(output, -1.0, 1.0)
 
 
@@ -139,8 +177,14 @@ def save(policy: AnyPolicy, path: str | Path) -> None:
             arrays[f"weight_{k}"], arrays[f"bias_{k}"] = weight, bias
         if policy.lstm is not None:
             arrays.update({f"lstm_{name}": one for name, one in policy.lstm._asdict().items()})
+        if policy.scaling is not None:
+            scaling = policy.scaling._asdict()
+            arrays.update({f"scaling_{name}": np.asarray(one) for name, one in scaling.items()})
     arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
-    arrays[_META] = np.array(json.dumps({"kind": policy.kind, **policy.meta}))
+    form = {"kind": policy.kind}
+    if isinstance(policy, Policy) and policy.activation != "tanh":
+        form["activation"] = policy.activation
+    arrays[_META] = np.array(json.dumps({**form, **policy.meta}))
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with open(path, "wb") as file:
         np.savez_compressed(file, **arrays)
@@ -167,13 +211,17 @@ def load(path: str | Path) -> AnyPolicy:
             policy.check()
             return policy
         layers = _layers(arrays, "")
-        lstm = None
+        lstm = scaling = None
         if "lstm_bias" in arrays:
             lstm = Lstm(*(arrays[f"lstm_{name}"] for name in Lstm._fields))
+        if "scaling_clip" in arrays:
+            mean, scale, clip = (arrays[f"scaling_{name}"] for name in Scaling._fields)
+            scaling = Scaling(mean, scale, float(clip))
+        activation = check_one_of("activation", meta.pop("activation", "tanh"), [*ACTIVATIONS])
         weights, biases = (
             (tuple(part) for part in zip(*layers, strict=True)) if layers else ((), ())
         )
-        policy = Policy(weights, biases, kind, meta, lstm)
+        policy = Policy(weights, biases, kind, meta, lstm, activation, scaling)
         _check_layers(policy)
     # zipfile and numpy raise unrelated exceptions for a broken archive.
     except Exception as error:
@@ -203,6 +251,12 @@ def _check_layers(policy: Policy) -> None:
         check_finite(f"bias_{k}", check_array(f"bias_{k}", bias, ("n_out",)))
         check_finite(f"weight_{k}", check_array(f"weight_{k}", weight, (len(bias), n_in)))
         n_in = len(bias)
+    if policy.scaling is not None:
+        for name, array in policy.scaling._asdict().items():
+            shape = () if name == "clip" else (policy.n_inputs,)
+            check_finite(f"scaling_{name}", check_array(f"scaling_{name}", array, shape))
+        if not (policy.scaling.scale > 0).all() or not policy.scaling.clip > 0:
+            raise ValueError("scaling_scale and scaling_clip must be positive")
 
 
 def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:

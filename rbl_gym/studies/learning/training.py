@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from rbl_gym.checks import check_one_of
-from rbl_gym.studies.learning.policies import AnyPolicy, Lstm, Policy, kind_and_outputs
+from rbl_gym.studies.learning.policies import AnyPolicy, Policy, kind_and_outputs
 from rbl_gym.studies.learning.rl_tasks import HELD_OUT_SEED, SEED_STRIDE, RlTask
+from rbl_gym.studies.learning.sb3_models import policy_of
 from rbl_gym.studies.learning.set_policies import SetPolicy
 
 __all__ = ["ALGORITHMS", "train"]
@@ -158,7 +159,8 @@ def _explored(
         "env_share": envs.seconds / (time.process_time() - cpu),
         "curve": curve.points,
     }
-    return lambda meta: _policy(model, meta), figures
+    policy = policy_of(model)
+    return lambda meta: policy._replace(meta=meta), figures
 
 
 def _model(algorithm: str, task: RlTask, envs: Any, seed: int) -> Any:
@@ -252,32 +254,3 @@ class _Curve:
                     curve._returns = []
 
         return Callback()
-
-
-def _policy(model: Any, meta: dict[str, Any]) -> Policy:
-    """Return the policy network of a model as arrays."""
-    import torch  # pyright: ignore[reportMissingImports]
-
-    def array(tensor: Any) -> Any:
-        return tensor.detach().numpy().astype(float)
-
-    layers = [m for m in model.policy.mlp_extractor.policy_net if isinstance(m, torch.nn.Linear)]
-    layers.append(model.policy.action_net)
-    weights = [array(layer.weight) for layer in layers]
-    biases = [array(layer.bias) for layer in layers]
-    kind, n_outputs = kind_and_outputs(model.action_space)
-    if kind == "multi-binary" and len(biases[-1]) == 2 * n_outputs:
-        # With masks an anchor has one output for leaving it out, and one for choosing it.
-        weights[-1] = weights[-1][1::2] - weights[-1][::2]
-        biases[-1] = biases[-1][1::2] - biases[-1][::2]
-    lstm, memory = getattr(model.policy, "lstm_actor", None), None
-    if lstm is not None:
-        reads, recalls, *both = (array(one) for one in lstm.parameters())
-        memory = Lstm(reads, recalls, np.sum(both, axis=0))
-    return Policy(
-        tuple(weights),
-        tuple(biases),
-        kind,
-        meta,
-        memory,
-    )
