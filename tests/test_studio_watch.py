@@ -24,7 +24,7 @@ from rbl_gym.studies.watching.frames import (
     filter_named,
     link_kinds,
 )
-from rbl_gym.studies.watching.learned import learned_frames, learned_program
+from rbl_gym.studies.watching.learned import learned_frames, learned_program, played_program
 from rbl_gym.studies.watching.live import (
     CALM,
     Disturbances,
@@ -304,6 +304,23 @@ def test_a_policy_steers_beside_a_reference_as_it_is_evaluated(tmp_path):
     returns, steps = rollouts.returns(short, lambda env, _: controllers.orbit(env, rng), 1, 0)
     assert run[-1].scores["orbit"] == pytest.approx(float(np.exp(-returns / steps)[0]), rel=1e-6)
     assert run[-1].ghosts["orbit"].shape == run[-1].anchors.shape == (3, 3)
+
+
+def test_a_policy_plays_an_environment_of_its_own_again_and_again(tmp_path):
+    path = random_policy("mobile-easy", tmp_path)
+    env = gym.make("rbl_gym:RBL/MobileAnchors-v0", scene={"name": "auv_craft", "steps": 4})
+    program = played_program(path, env, seed=3)
+    runs = [[*program.start((), 3, lambda _: CALM)] for _ in range(2)]
+    observation, _ = env.reset(seed=3)
+    play = policies.load(path).player()
+    for step in range(4):
+        observation, *_, info = env.step(play(env, observation))
+        for run in runs:
+            assert run[step + 1].score_m == info["score_m"]
+    with pytest.raises(ValueError, match="does not fit"):
+        played_program(path, gym.make("rbl_gym:RBL/AnchorPlacement-v0"))
+    with pytest.raises(ValueError, match="does not fit"):
+        played_program(path, gym.make("rbl_gym:RBL/Tracking-v0"))
 
 
 def test_a_policy_that_cannot_be_played_is_refused(tmp_path):

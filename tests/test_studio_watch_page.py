@@ -161,6 +161,9 @@ def test_the_command_watches_buildings_and_recordings(tmp_path, monkeypatch):
     opened.stop()
 
 
+ID = "RBL/AnchorPlacement-v0"
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [
@@ -172,6 +175,7 @@ def test_the_command_watches_buildings_and_recordings(tmp_path, monkeypatch):
         (["uwb_room", "--watch", "--filter", "kalmann"], "filter must be one of"),
         (["--env", "RBL/Nothing-v0"], "--env RBL/Nothing-v0"),
         (["--policy", "none.npz"], "none.npz"),
+        (["--policy", "none.npz", "--env", ID, "--reference", "ring"], "--reference must be left"),
     ],
 )
 def test_the_command_says_what_is_wrong(options, says, capsys):
@@ -203,6 +207,14 @@ def test_in_a_browser_a_filter_breaks_and_the_robust_one_holds(served):
     assert errors[:, 1].mean() < errors[:, 0].mean()
 
 
+def test_the_command_plays_a_policy_in_another_scene(tmp_path, capsys):
+    policy = random_policy("auv_buoys", tmp_path)
+    scene = tmp_path / "five.json"
+    scene.write_text('{"name": "auv_buoys", "n_anchors": 5}')
+    assert main(["studio", str(scene), "--policy", policy, "--no-browser"]) != 0
+    assert "does not fit" in capsys.readouterr().err
+
+
 def test_the_command_plays_environments_and_policies(tmp_path, monkeypatch):
     opened = asked(tmp_path, monkeypatch, "--env", "RBL/AnchorSelection-v0", "--filter", "uc-kf")
     program: Program = opened.page.program
@@ -215,6 +227,12 @@ def test_the_command_plays_environments_and_policies(tmp_path, monkeypatch):
     opened.page.settle()
     assert [len(frame.anchors) for frame in opened.page.frames] == [0, 1, 2, 3, 4]
     assert opened.page.status == ""
+    opened.stop()
+    opened = asked(tmp_path, monkeypatch, "auv_buoys", "--policy", policy, "--env", ID)
+    assert opened.page.program.title == f"{ID}: auv_buoys-0"
+    opened.page.step()
+    opened.page.settle()
+    assert len(opened.page.frames[1].anchors) == 1
     opened.stop()
 
 

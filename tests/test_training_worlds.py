@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -51,6 +52,17 @@ def test_files_that_hold_no_scenes_are_named(tmp_path, name, text, message):
     (tmp_path / name).write_text(text)
     with pytest.raises(ValueError, match=message):
         read_scenes(tmp_path / name)
+
+
+def test_a_building_file_is_for_the_environment(tmp_path):
+    """With a name of its own, too; and overrides of a building."""
+    building = str(Path(__file__).parents[1] / "examples" / "warehouse.toml")
+    assert read_scene(building) == building
+    task = rl_task("selection").in_worlds(read_scene(building))
+    assert len(task.make(1).scene.obstacles) == 4
+    (tmp_path / "short.json").write_text(json.dumps({"name": building, "steps": 7}))
+    task = rl_task("selection").in_worlds(read_scene(str(tmp_path / "short.json")))
+    assert task.make(1).episode_steps == 7
 
 
 def test_a_scene_file_without_a_name_is_refused(tmp_path):

@@ -54,7 +54,9 @@ def add_studio(commands: Any) -> None:
         "--env", metavar="ID", help="an episode of an environment, as RBL/AnchorSelection-v0"
     )
     watch.add_argument(
-        "--policy", metavar="F", help="a policy of rbl-gym train in a held-out world of its task"
+        "--policy",
+        metavar="F",
+        help="a policy of rbl-gym train in a held-out world of its task, or in an episode of --env",
     )
     watch.add_argument(
         "--reference", metavar="NAME", help="beside the policy; default the strongest"
@@ -133,11 +135,9 @@ def _program(options: argparse.Namespace) -> Any:
 
     labels = tuple(options.filter)
     if options.policy:
-        from rbl_gym.studies.watching import learned
-
-        return learned.learned_program(options.policy, options.reference, options.seed)
+        return _learned(options, labels)
     if options.env:
-        return _episode(options, labels)
+        return program.env_program(_env(options), labels or None, options.seed)
     if not options.ranges:
         _check_scene(options)
         return _simulation(options, labels or program.LIVE)
@@ -154,19 +154,32 @@ def _program(options: argparse.Namespace) -> Any:
     return program.recorded_program(recording, tracks, settings)
 
 
-def _episode(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
-    """Return an episode of an environment, in SCENE if given."""
+def _learned(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:
+    """Return a policy in its task, or in the environment of --env; in SCENE if given."""
+    from rbl_gym.studies.watching import learned
+    from rbl_gym.worlds.scene_source import read_scene
+
+    if options.env:
+        if options.reference:
+            raise ValueError("--reference must be left out with --env, it is for the tasks")
+        env = _env(options)
+        return learned.played_program(options.policy, env, labels or None, options.seed)
+    scene = read_scene(options.scene) if options.scene else None
+    return learned.learned_program(options.policy, options.reference, options.seed, scene)
+
+
+def _env(options: argparse.Namespace) -> Any:
+    """Return the environment of --env, in SCENE if given."""
     import gymnasium as gym
 
-    from rbl_gym.studies.watching import program
+    from rbl_gym.worlds.scene_source import read_scene
 
-    scene = {} if options.scene is None else {"scene": options.scene}
+    scene = {} if options.scene is None else {"scene": read_scene(options.scene)}
     name = options.env.removeprefix("rbl_gym:")
     try:
-        env = gym.make(f"rbl_gym:{name}", render_mode="rgb_array", **scene)
+        return gym.make(f"rbl_gym:{name}", render_mode="rgb_array", **scene)
     except (gym.error.Error, ModuleNotFoundError, TypeError) as error:
         raise ValueError(f"--env {options.env}: {error}") from error
-    return program.env_program(env, labels or None, options.seed)
 
 
 def _simulation(options: argparse.Namespace, labels: tuple[str, ...]) -> Any:

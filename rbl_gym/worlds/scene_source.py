@@ -48,17 +48,25 @@ def read_scene(name: str) -> Any:
     Parameters
     ----------
     name
-        Name of a scene, or of a JSON or TOML file with a table of overrides and the key ``name``.
-        Names of files without that key are returned unchanged, for the environment.
+        Name of a scene; of a JSON or TOML file with a table of overrides and the key ``name``; or
+        of a building file, which is returned unchanged, for the environment.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read (with line and column) or has neither.
     """
     if not name.endswith(SUFFIXES):
         return name
     found = _parsed(name)
+    if isinstance(found, Mapping) and "body" in found:
+        return name
     if isinstance(found, Mapping) and "name" in found:
         return dict(found)
-    if name.endswith(".json"):
-        raise ValueError(f"{name} must hold a table with the key 'name', got {found!r:.80}")
-    return name
+    raise ValueError(
+        f"{name} must hold a table with the key 'name' (overrides of a scene) or 'body' (a "
+        f"building file), got {found!r:.80}"
+    )
 
 
 def _parsed(path: str | Path) -> Any:

@@ -268,16 +268,17 @@ def kind_and_outputs(space: gym.Space[Any]) -> tuple[str, int]:
 
 
 def check_fit(policy: AnyPolicy, label: str, envs: Any) -> None:
-    """Raise ValueError unless a policy fits the spaces of a vector environment."""
+    """Raise ValueError unless a policy fits the spaces of an environment, vector or scalar."""
     trained = f"policy {label!r} does not fit: it was trained on {policy.meta.get('task')!r}"
     if isinstance(policy, SetPolicy):
         wanted = SET_KINDS[policy.kind][0]
         if envs.unwrapped.spec.id != wanted:
             raise ValueError(f"{trained} and plays {wanted}, not {envs.unwrapped.spec.id}")
         return
-    n_in, n_out = envs.single_observation_space.shape[0], len(policy.biases[-1])
-    asked = (n_in, *kind_and_outputs(envs.single_action_space))
-    got = (policy.n_inputs, policy.kind, n_out)
+    seen = getattr(envs, "single_observation_space", envs.observation_space)
+    acted = getattr(envs, "single_action_space", envs.action_space)
+    asked = (*(seen.shape or (None,)), *kind_and_outputs(acted))
+    got = (policy.n_inputs, policy.kind, len(policy.biases[-1]))
     if got != asked:
         raise ValueError(
             f"{trained} and has (observation, kind, outputs) = {got}, the task's are {asked}"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,14 @@ from rbl_gym.studies.watching.played import env_frames
 from rbl_gym.studies.watching.program import Disturb, Program, env_program
 from rbl_gym.wrappers import controllers
 
-__all__ = ["learned_frames", "learned_program"]
+__all__ = ["learned_frames", "learned_program", "played_program"]
 
 Policy = policies.AnyPolicy
 
 
-def learned_program(path: str, reference: str | None = None, seed: int = 0) -> Program:
+def learned_program(
+    path: str, reference: str | None = None, seed: int = 0, scene: Any = None
+) -> Program:
     """Return the program of a trained policy in a held-out world, beside a reference.
 
     Parameters
@@ -35,6 +38,8 @@ def learned_program(path: str, reference: str | None = None, seed: int = 0) -> P
         A name of `evaluation.references`; None: the strongest, for placement ``"gradient"``.
     seed
         Seed of the world, the first one of `rbl-gym evaluate` with this seed.
+    scene
+        Scene in place of the task's own, as in `RlTask.in_worlds`.
 
     Raises
     ------
@@ -42,7 +47,7 @@ def learned_program(path: str, reference: str | None = None, seed: int = 0) -> P
         If the file is not a policy, its task or the reference is unknown, or it does not fit.
     """
     policy = policies.load(path)
-    task = rl_task(str(policy.meta.get("task")))
+    task = rl_task(str(policy.meta.get("task"))).in_worlds(scene)
     known = evaluation.references(task)
     if reference is None:
         reference = "gradient" if "gradient" in known else known[-1]
@@ -56,6 +61,39 @@ def learned_program(path: str, reference: str | None = None, seed: int = 0) -> P
     shown = env_program(env, None, _held_out(seed))
     title = f"{policy.meta.get('task')}: {Path(path).stem}"
     return Program(title, shown.room, shown.tags, start, shown.filters, seed)
+
+
+def played_program(
+    path: str, env: gym.Env[Any, Any], filters: Iterable[str] | None = None, seed: int = 0
+) -> Program:
+    """Return the program of a trained policy in an environment of its own.
+
+    Parameters
+    ----------
+    path
+        File of a policy (`policies.save`).
+    env
+        Environment, scalar, with the observation and the actions of the policy.
+    filters, seed
+        As for `env_program`.
+
+    Raises
+    ------
+    ValueError
+        If the file is not a policy, or does not fit.
+    """
+    policy = policies.load(path)
+    policies.check_fit(policy, Path(path).name, env)
+    play = policy.player()
+    shown = env_program(env, filters, seed, lambda env, seen: play(env, seen))
+
+    def start(labels: tuple[str, ...], seed: int, disturb: Disturb) -> Iterator[Frame]:
+        nonlocal play
+        # A policy with a memory forgets it.
+        play = policy.player()
+        return shown.start(labels, seed, disturb)
+
+    return dataclasses.replace(shown, title=f"{shown.title}: {Path(path).stem}", start=start)
 
 
 def learned_frames(task: RlTask, policy: Policy, reference: str, seed: int) -> Iterator[Frame]:
