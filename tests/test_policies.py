@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 
 import gymnasium as gym
 import numpy as np
@@ -64,21 +65,23 @@ def test_files_give_the_same_policy_back(tmp_path, kind, sizes):
     assert path.stat().st_size < 200_000
 
 
-def test_scaled_observations_and_relu_by_hand_and_through_a_file(tmp_path):
+@pytest.mark.parametrize("activation", policies.ACTIVATIONS)
+def test_scaled_observations_and_activations_by_hand_and_through_a_file(activation, tmp_path):
+    function = {"tanh": math.tanh, "relu": lambda x: max(x, 0.0)}[activation]
     rng = np.random.default_rng(4)
     scaling = Scaling(rng.integers(-3, 4, 5) / 4, rng.integers(1, 5, 5) / 4, 1.5)
-    policy = random_policy()._replace(activation="relu", scaling=scaling)
+    policy = random_policy()._replace(activation=activation, scaling=scaling)
     policies.save(policy, tmp_path / "policy.npz")
     again = policies.load(tmp_path / "policy.npz")
     assert isinstance(again, Policy)
-    assert (again.activation, again.meta) == ("relu", policy.meta)
+    assert (again.activation, again.meta) == (activation, policy.meta)
     seen = rng.standard_normal((7, 5))
     clipped = 0
     for observation, got, one in zip(seen, again(seen), policy(seen), strict=True):
         ratio = [(x - m) / s for x, m, s in zip(observation, *scaling[:2], strict=True)]
         clipped += sum(abs(x) > 1.5 for x in ratio)
         hidden = policy.weights[0] @ [min(max(x, -1.5), 1.5) for x in ratio] + policy.biases[0]
-        wanted = policy.weights[1] @ [max(x, 0.0) for x in hidden] + policy.biases[1]
+        wanted = policy.weights[1] @ [function(x) for x in hidden] + policy.biases[1]
         np.testing.assert_allclose(got, np.clip(wanted, -1, 1), atol=1e-12)
         np.testing.assert_allclose(one, got, atol=1e-12)
     assert 0 < clipped < seen.size
