@@ -175,16 +175,17 @@ def is_plain_epoch(ranges: Any, anchors: Any, tags: FloatArray, batch: tuple[int
 
     Ranges (*batch, M, N), anchors (*batch, M, 3), tags (N, 3); their values are not checked.
     """
+    if not (type(ranges) is type(anchors) is np.ndarray):
+        return False
+    shape = ranges.shape
     return (
-        type(ranges) is type(anchors) is np.ndarray
+        anchors.shape == (*shape[:-1], 3)
+        and shape[:-2] == batch
+        and shape[-1:] == tags.shape[:-1]
+        and len(shape) > 1
+        and ranges.size > 0
         # Not by identity, because pickled arrays have their own dtype object.
         and ranges.dtype == anchors.dtype == _FLOAT64
-        and anchors.ndim == len(batch) + 2
-        and tags.ndim == 2
-        and anchors.shape[-1] == 3
-        and anchors.shape[:-2] == batch
-        and ranges.shape == (*batch, anchors.shape[-2], len(tags))
-        and ranges.size > 0
     )
 
 

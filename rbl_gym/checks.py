@@ -203,7 +203,9 @@ def as_tuples(value: FloatArray) -> Any:
 
 def check_duration(name: str, value: ArrayLike) -> Any:
     """Return nonnegative seconds, a float or an array (...) of trials; or raise ValueError."""
-    if type(value) is float or not (getattr(value, "ndim", 0) or isinstance(value, list | tuple)):
+    if type(value) is float and 0 <= value < HUGE:
+        return value
+    if not (getattr(value, "ndim", 0) or isinstance(value, list | tuple)):
         return check_number(name, value, low=0.0)
     array = check_array(name, value, ())
     if (array < 0).any():

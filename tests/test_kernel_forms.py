@@ -313,12 +313,17 @@ def test_a_plain_linear_epoch_in_one_call(batch, law, m, n):
     want = engines.update_covariance.textbook(P, linear.anchors, linear.tags, weights)
     np.testing.assert_allclose(found[1], want, rtol=1e-9, atol=1e-12)
     assert np.isfinite(found[0]).all()
+    law_and_anchors = told[0], told[1], told[3]
+    assert_equal_forms(kalman._weigh, P, linear.ranges, *law_and_anchors)
     spoiled = linear.ranges.copy()
     spoiled[..., 0, 0] = 0.0
     for prior, ranges in ((P, spoiled), (30 * P, linear.ranges)):
         for form in (kalman._update.kernel, kalman._update.textbook):
             with np.errstate(all="ignore"):
                 assert np.isnan(form(linear.mean, prior, ranges, *told)[0]).all()
+        for form in (kalman._weigh.kernel, kalman._weigh.textbook):
+            with np.errstate(all="ignore"):
+                assert np.isnan(form(prior, ranges, *law_and_anchors)).all()
 
 
 @every_batch

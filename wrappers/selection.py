@@ -75,24 +75,23 @@ class _AnchorSelection(Task):
         """Return whether the observation has the memory of the anchors."""
         return self.family is not None or self._viewer is not None
 
-    def _choice(self, action: np.ndarray) -> np.ndarray:
-        """Return the anchors (..., M) that an action chooses, int8; ties go to the lower number."""
-        there = None if self.family is None else self._told()["anchor_mask"]
+    def _choice(self, action: np.ndarray) -> BoolArray:
+        """Return whether an action chooses each anchor (..., M); ties go to the lower number."""
+        there = None if self.family is None else self._told()["anchor_mask"].astype(np.bool_)
         if self._subsets is not None:
             chosen = self._subsets[action]
-            return chosen if there is None else chosen & there
-        if self.mode == "priced":
-            return action if there is None else action & there
-        if there is not None:
-            action = np.where(there, action, -np.inf)
-        best = (-action).argsort(axis=-1, kind="stable")[..., : self.k]
-        chosen = np.zeros(action.shape, dtype=np.int8)
-        chosen[(*worlds_of(action.shape[:-1]), best)] = 1
-        return chosen
+        elif self.mode == "priced":
+            chosen = action.view(np.bool_)
+        else:
+            score = action if there is None else np.where(there, action, -np.inf)
+            best = (-score).argsort(axis=-1, kind="stable")[..., : self.k]
+            chosen = np.zeros(action.shape, dtype=np.bool_)
+            chosen[(*worlds_of(action.shape[:-1]), best)] = True
+        return chosen if there is None else chosen & there
 
     def subset_of(self, chosen: BoolArray) -> np.ndarray:
         """Return the action (...) of ``mode="subset"`` that chooses these k anchors (..., M)."""
-        alike = self._subsets == np.asarray(chosen, dtype=np.int8)[..., None, :]
+        alike = self._subsets == np.asarray(chosen, dtype=np.bool_)[..., None, :]
         return alike.all(axis=-1).argmax(axis=-1)
 
     def action_masks(self) -> BoolArray:
@@ -113,7 +112,7 @@ class _AnchorSelection(Task):
         if self.family is not None:
             there = told["anchor_mask"].astype(np.bool_)
         if self._subsets is not None:
-            missing = ~there[..., None, :] & self._subsets.astype(np.bool_)
+            missing = ~there[..., None, :] & self._subsets
             return np.asarray(~missing.any(axis=-1))
         both = np.stack([np.ones_like(there), there], axis=-1)
         return both.reshape(*there.shape[:-1], -1)
@@ -164,7 +163,7 @@ class AnchorSelectionVectorEnv(_AnchorSelection, VectorTaskEnv):
         selected = VectorSelectAnchors(envs, self._remembers)
         self._compose(VectorEstimatePose(selected, *filter_of_task(filter, options), reward))
 
-    def _command(self, action: Any) -> np.ndarray:
+    def _command(self, action: Any) -> BoolArray:
         self._told()
         space = self.single_action_space
         return self._choice(check_actions("actions", action, space, self.num_envs))
@@ -258,20 +257,20 @@ class AnchorSelectionEnv(_AnchorSelection, TaskEnv):
         env = SelectAnchors(world, self._remembers)
         self._compose(EstimatePose(env, *filter_of_task(filter, options), reward))
 
-    def _command(self, action: Any) -> np.ndarray:
+    def _command(self, action: Any) -> BoolArray:
         self._told()
         return self._choice(check_actions("action", action, self.action_space))
 
 
-def _subsets(m: int, k: int) -> np.ndarray:
-    """Return the subsets of k of M anchors, (n, M), int8."""
+def _subsets(m: int, k: int) -> BoolArray:
+    """Return the subsets of k of M anchors, (n, M)."""
     count = math.comb(m, k)
     if count > _MOST_SUBSETS:
         raise ValueError(
             f"mode 'subset' must have at most {_MOST_SUBSETS} subsets, {k} of {m} anchors have "
             f"{count}"
         )
-    found = np.zeros((count, m), np.int8)
+    found = np.zeros((count, m), np.bool_)
     for row, chosen in zip(found, itertools.combinations(range(m), k), strict=True):
-        row[list(chosen)] = 1
+        row[list(chosen)] = True
     return found

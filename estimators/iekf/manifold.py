@@ -8,7 +8,6 @@ filters of the tracking paper cannot, because they project ``|s|^2`` out.
 from __future__ import annotations
 
 import functools
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +56,7 @@ from rbl_gym.motion.kinematics import ProcessNoise
 
 # With fewer ranges in an epoch, no search is made.
 _FEWEST_SOUGHT = 3
+_BOOL = np.dtype(np.bool_)
 # Internal functions without checks: their arguments were checked, or made here.
 _TAG_POSITIONS, _DISTANCES = kernel(ranging.tag_positions), kernel(ranging.distances)
 
@@ -99,9 +99,10 @@ class IteratedEkf:
         offsets.check_offset(self.offset)
 
     @functools.cached_property
-    def _loss(self) -> int:
-        """Return the kernel code of `robust`."""
-        return check_robust(self.robust)
+    def _codes(self) -> tuple[np.ndarray, ...]:
+        """Return the last arguments of `update_pose`, as arrays that a kernel need not convert."""
+        codes = offsets.code_of(self.offset), self.iterations, check_robust(self.robust)
+        return tuple(map(np.asarray, codes))
 
     @functools.cached_property
     def _variance(self) -> FloatArray:
@@ -180,9 +181,7 @@ class IteratedEkf:
                 anchors,
                 self.tags,
                 *start,
-                offsets.code_of(self.offset),
-                self.iterations,
-                self._loss,
+                *self._codes,
             )[:3]
         )
 
@@ -194,8 +193,8 @@ class IteratedEkf:
         Other epochs need the general code, which also raises the errors. `update_pose` checks the
         values.
         """
-        P = state.covariance
-        if self.offset is not None or not is_plain_epoch(ranges, anchors, self.tags, P.shape[:-2]):
+        tags, P = self.tags, state.covariance
+        if self.offset is not None or not is_plain_epoch(ranges, anchors, tags, P.shape[:-2]):
             return None
         shares, numbers = self._plain_law(ranges, links, noise)  # pyright: ignore[reportArgumentType]
         if P.ndim == 2:
@@ -206,9 +205,8 @@ class IteratedEkf:
         if numbers is None or wide:
             return None
         rotation, translation, P, cost = update_pose(
-            *state, ranges, shares, numbers, anchors, self.tags,
-            state.rotation, state.translation, 0, self.iterations, self._loss,
-        )  # fmt: skip
+            *state, ranges, shares, numbers, anchors, tags, *state[:2], *self._codes
+        )
         # One number suffices: it is finite if the covariance is.
         if not all_finite(cost):
             return None
@@ -220,13 +218,7 @@ class IteratedEkf:
         """Return shares and law for `update_pose`; None if the general code must compute them."""
         if links is None and noise is None:
             return all_links(*ranges.shape[-2:]), numbers_of(self.noise, len(self.tags))
-        if (
-            type(links) is not np.ndarray
-            or links.dtype != np.bool_
-            or links.shape != ranges.shape
-            # A lost range may have any value: the general code replaces it by zero.
-            or not math.isfinite(np.vdot(ranges, ranges))
-        ):
+        if type(links) is not np.ndarray or links.dtype != _BOOL or links.shape != ranges.shape:
             return None, None
         if type(noise) is LinkNoise and noise.std_m.shape == ranges.shape and noise.std_m.min() > 0:
             return links / (noise.std_m * noise.std_m), WEIGHTS
@@ -237,7 +229,7 @@ class IteratedEkf:
         elif noise is not None:
             return None, None
         numbers = numbers_of(law, len(self.tags))
-        if numbers is None or numbers[3] >= 0:
+        if numbers is None or numbers.item(3) >= 0:
             # The range of a reference tag may be lost.
             return None, None
         return links * share, numbers

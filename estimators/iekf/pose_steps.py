@@ -95,6 +95,8 @@ def update_pose(
     Rotation, translation, covariance, cost (...). The last two are NaN if a matrix is not
     positive definite, a used range is not positive, or a value is not finite.
     """
+    # The range of a lost link may have any value.
+    ranges = np.where(shares == 0, 0.0, ranges)
     weights = shares if law[0] == WEIGHTS[0] else shares / law_of(law).variance(ranges)
     prior = plain(PoseState(rotation, translation, covariance))
     data = RangeCost(ranges, weights, anchors, tags, SQUARES, offset=offsets.name_of(offset))

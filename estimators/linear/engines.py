@@ -171,7 +171,7 @@ class FilterPy:
         twist, dt, rate = motion
         # F is the effect of the rotation alone on the unit vectors.
         turn = twist * _TURN
-        kf.F, kf.Q = predict_mean(_EYE, turn, dt).T, np.diag(dt * rate)
+        kf.F, kf.Q = predict_mean(_EYE, turn, dt).T, _EYE * (dt * rate)
         kf.predict(u=twist[3:, None] * dt)
         return cls._result(kf)
 
@@ -190,9 +190,9 @@ class FilterPy:
     def _filter(mean: FloatArray, P: FloatArray) -> Any:
         ready = _kalman_filter()
         kf = object.__new__(type(ready))
-        # It never writes into its arrays, so a shallow copy can share the unchanged ones.
+        # It never writes into its arrays, so they can be shared.
         kf.__dict__.update(ready.__dict__)
-        kf.x, kf.P = mean[:, None].copy(), P.copy()
+        kf.x, kf.P = mean[:, None], P
         return kf
 
     @staticmethod
@@ -202,7 +202,7 @@ class FilterPy:
             raise RuntimeError(f"filterpy returned shapes {mean.shape} and {P.shape}")
         if not math.isfinite(np.vdot(mean, mean) + np.vdot(P, P)):
             raise ValueError("the filter's state is no longer finite")
-        return mean[:, 0].copy(), symmetric(P)
+        return mean[:, 0], symmetric(P)
 
 
 ENGINES = ("auto", "batched", "filterpy")

@@ -40,6 +40,7 @@ from rbl_gym.estimators.inputs import (
 from rbl_gym.estimators.linear.engines import (
     ENGINES,
     Batched,
+    FilterPy,
     LinearEpoch,
     Motion,
     engine_for,
@@ -224,7 +225,7 @@ class KalmanFamily:
     def _update_plain(
         self, state: KalmanState, ranges: ArrayLike, anchors: ArrayLike, links: Any, noise: Any
     ) -> KalmanState | None:
-        """Return the KF update with a plain epoch in one call; None for other epochs.
+        """Return the KF update with a plain epoch, in few calls; None for other epochs.
 
         Other epochs need the general code, which also raises the errors.
         """
@@ -236,17 +237,23 @@ class KalmanFamily:
             or self.constraint != "none"
             or state.covariance.shape[:-2] != batch
             or not is_plain_epoch(ranges, anchors, self.tags, batch)
-            or engine_for(self.engine, state=batch) is not Batched
         ):
             return None
-        numbers = numbers_of(self.noise, len(self.tags))
-        if numbers is None:
+        law = numbers_of(self.noise, len(self.tags))
+        if law is None:
             return None
-        mean, covariance = _update(
-            state.mean, state.covariance, ranges, numbers, anchors, self.tags, VAGUE_ENTRY_VARIANCE
-        )
-        if not all_finite(mean):
-            return None
+        if engine_for(self.engine, state=batch) is Batched:
+            mean, covariance = _update(
+                state.mean, state.covariance, ranges, law, anchors, self.tags, VAGUE_ENTRY_VARIANCE
+            )
+            if not all_finite(mean):
+                return None
+        else:
+            weights = _weigh(state.covariance, ranges, law, anchors, VAGUE_ENTRY_VARIANCE)
+            if not all_finite(weights):
+                return None
+            epoch = LinearEpoch(ranges, anchors, self.tags, weights)
+            mean, covariance = FilterPy.update(*plain(state)[:2], epoch)
         return KalmanState(mean, covariance, np.zeros(batch, bool))
 
     def belief(self, state: KalmanState) -> PoseBelief:
@@ -304,15 +311,29 @@ def _update(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean and covariance after an epoch without lost links, from the law's numbers.
 
-    NaN if a range is not positive or the prior is uninformative (`_is_vague`).
+    NaN if `_weigh` is.
     """
-    weights = 1 / law_of(law).squared_range_variance(ranges)
+    weights = _weigh.textbook(P, ranges, law, anchors, vague_entry)
+    sound = np.isfinite(weights).all(axis=(-2, -1))[..., None]
+    weights = np.where(sound[..., None], weights, 1.0)
     new_P = update_covariance.textbook(P, anchors, tags, weights)
     new_mean = update_mean.textbook(mean, new_P, ranges, anchors, tags, weights)
+    return np.where(sound, new_mean, np.nan), np.where(sound[..., None], new_P, np.nan)
+
+
+@compiled("linear_filter:weigh")
+def _weigh(
+    P: FloatArray, ranges: FloatArray, law: FloatArray, anchors: FloatArray, vague_entry: float
+) -> FloatArray:
+    """Return weights (..., M, N) of the squared ranges of an epoch without lost links.
+
+    NaN if a range is not positive or the prior is uninformative (`_is_vague`).
+    """
+    variance = law_of(law).squared_range_variance(ranges)
     sound = ((ranges > 0) & (ranges < HUGE)).all(axis=(-2, -1))
     sound = sound & ~_is_vague.textbook(P, anchors, vague_entry)
-    new_P = np.where(sound[..., None, None], new_P, np.nan)
-    return np.where(sound[..., None], new_mean, np.nan), new_P
+    weights = np.where(sound[..., None, None], 1 / variance, np.nan)
+    return np.broadcast_to(weights, ranges.shape)
 
 
 # --- constraints on the rotation after the linear update --------------------

@@ -264,8 +264,8 @@ def check_actions(
         raise ValueError(f"{name} must be finite, got {array[~np.isfinite(array)][0]}")
     if isinstance(space, gym.spaces.Box):
         return array.astype(np.float64)
-    if not whole and array.dtype == np.int8 and not np.count_nonzero(array & ~1):
-        return array.copy()
+    if array.dtype.kind == "b" and not whole:
+        return array.astype(space.dtype)
     # Check before the cast: a narrow type would wrap large numbers into the space.
     if isinstance(space, gym.spaces.Discrete):
         legal = (array >= space.start) & (array < space.start + space.n)

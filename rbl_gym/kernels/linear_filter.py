@@ -232,14 +232,14 @@ def update_mean(
 def _weigh(ranges: Any, law: Any, weights: Any) -> bool:
     """Compute inverse variances of the squared ranges; return whether all ranges are positive.
 
-    `weights` has shape (M, 1) for a law with a reference tag, otherwise (M, N).
+    `weights` has shape (M, N), or (M, 1) for a law with a reference tag.
     """
-    sound, first = True, max(int(law[3]), 0)
+    sound, reference = True, int(law[3])
     for m in range(ranges.shape[0]):
         for n in range(ranges.shape[1]):
             sound = sound and 0.0 < ranges[m, n] < HUGE
         for n in range(weights.shape[1]):
-            square = ranges[m, first + n] ** 2
+            square = ranges[m, n if reference < 0 else reference] ** 2
             if law[0] == 1:
                 weights[m, n] = 1 / (law[1] * law[1] * square)
             else:
@@ -280,6 +280,15 @@ def update(
     fill(math.nan, new_P)
     for i in range(_STATES):
         new_mean[i] = math.nan
+
+
+@gufunc("(p,p),(m,n),(l),(m,d),()->(m,n)")
+def weigh(
+    P: Any, ranges: Any, law: Any, anchors: Any, vague_entry: float, weights: Any
+) -> None:  # fmt: skip
+    """Compute inverse variances of the squared ranges; NaN in the cases of `update`."""
+    if not _weigh(ranges, law, weights) or _says_nothing(P, anchors, vague_entry):
+        fill(math.nan, weights)
 
 
 @gufunc("(m,n),(m,d),(n,d),(m,w),(p)->(p),(p,p)")

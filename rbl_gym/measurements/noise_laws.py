@@ -332,7 +332,7 @@ def numbers_of(noise: NoiseLaw, n_tags: int) -> FloatArray | None:
         If the reference tag does not exist.
     """
     numbers = getattr(noise, "numbers", None)
-    if numbers is not None and numbers.ndim == 1 and numbers[3] >= n_tags:
+    if numbers is not None and numbers.ndim == 1 and numbers.item(3) >= n_tags:
         _check_reference(int(numbers[3]), n_tags)
     return numbers
 

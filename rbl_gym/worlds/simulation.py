@@ -100,6 +100,8 @@ class Motion(NamedTuple):
     twist: FloatArray
 
 
+# Number of fields of an `Episode` with a time axis.
+_TIMED = len(Epoch._fields)
 # Standard normals of an episode besides those of steps and ranges: rotation, spin, prior.
 _START_NORMALS = 4 + 3 + 6
 # Number of steps for which a random twist is constant.
@@ -280,14 +282,14 @@ def _trajectory(
 
 def epoch_of(episode: Episode, epoch: int) -> Epoch:
     """Return views of an episode at one epoch, the same for the whole batch."""
-    at = (slice(None),) * (episode.rotation.ndim - 3) + (epoch,)
-    fields = episode[: len(Epoch._fields)]
-    return Epoch(*[None if field is None else field[at] for field in fields])  # pyright: ignore[reportArgumentType]
+    batch = episode.rotation.ndim - 3
+    at: Any = (slice(None),) * batch + (epoch,) if batch else epoch
+    return Epoch(*[None if field is None else field[at] for field in episode[:_TIMED]])  # pyright: ignore[reportArgumentType]
 
 
 def whole(episode: Episode) -> Epoch:
     """Return all epochs of an episode at once: the time axis is the last batch axis."""
-    return Epoch(*episode[: len(Epoch._fields)])  # pyright: ignore[reportArgumentType]
+    return Epoch(*episode[:_TIMED])  # pyright: ignore[reportArgumentType]
 
 
 def measure_epoch(
