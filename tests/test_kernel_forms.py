@@ -10,7 +10,7 @@ import pytest
 from rbl_gym import kernels, metrics
 from rbl_gym.bounds import information, pose, posterior
 from rbl_gym.estimators import inputs
-from rbl_gym.estimators.linear import engines, kalman, least_squares, unitary
+from rbl_gym.estimators.linear import engines, least_squares, unitary
 from rbl_gym.geometry import obstacles, regions, rotations
 from rbl_gym.measurements import bearing, noise_laws, ranging
 from rbl_gym.metrics import Figures
@@ -308,20 +308,22 @@ def test_a_plain_linear_epoch_in_one_call(batch, law, m, n):
     linear = Linear(batch, m, n, "common")
     P = 0.1 * linear.P / np.abs(linear.P).max()
     told = [np.array(law, dtype=float), linear.anchors, linear.tags, 1 / 3]
-    found = assert_equal_forms(kalman._update, linear.mean, P, linear.ranges, *told, atol=1e-8)
+    found = assert_equal_forms(
+        engines.update_plain, linear.mean, P, linear.ranges, *told, atol=1e-8
+    )
     weights = 1 / noise_laws.law_of(told[0]).squared_range_variance(linear.ranges)
     want = engines.update_covariance.textbook(P, linear.anchors, linear.tags, weights)
     np.testing.assert_allclose(found[1], want, rtol=1e-9, atol=1e-12)
     assert np.isfinite(found[0]).all()
     law_and_anchors = told[0], told[1], told[3]
-    assert_equal_forms(kalman._weigh, P, linear.ranges, *law_and_anchors)
+    assert_equal_forms(engines.weigh_plain, P, linear.ranges, *law_and_anchors)
     spoiled = linear.ranges.copy()
     spoiled[..., 0, 0] = 0.0
     for prior, ranges in ((P, spoiled), (30 * P, linear.ranges)):
-        for form in (kalman._update.kernel, kalman._update.textbook):
+        for form in (engines.update_plain.kernel, engines.update_plain.textbook):
             with np.errstate(all="ignore"):
                 assert np.isnan(form(linear.mean, prior, ranges, *told)[0]).all()
-        for form in (kalman._weigh.kernel, kalman._weigh.textbook):
+        for form in (engines.weigh_plain.kernel, engines.weigh_plain.textbook):
             with np.errstate(all="ignore"):
                 assert np.isnan(form(prior, ranges, *law_and_anchors)).all()
 
@@ -347,8 +349,8 @@ def test_vague_states(batch, factor):
     linear = Linear(batch, 4, 5, "common")
     for spread in (np.ones(12), np.repeat([1e-3, 1.0], [9, 3]), np.repeat([1.0, 1e-3], [9, 3])):
         P = factor * linear.P * np.sqrt(spread[:, None] * spread)
-        got = kalman._is_vague.kernel(P, linear.anchors, 1 / 3)
-        np.testing.assert_array_equal(got, kalman._is_vague.textbook(P, linear.anchors, 1 / 3))
+        got = engines.is_vague.kernel(P, linear.anchors, 1 / 3)
+        np.testing.assert_array_equal(got, engines.is_vague.textbook(P, linear.anchors, 1 / 3))
 
 
 @every_batch

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rbl_gym.bounds.pose import symmetric
-from rbl_gym.checks import FloatArray, kernel
+from rbl_gym.checks import HUGE, BoolArray, FloatArray, kernel
 from rbl_gym.estimators.filter import inverse
 from rbl_gym.estimators.linear.squared_range import (
     Statistic,
@@ -22,6 +22,7 @@ from rbl_gym.estimators.linear.squared_range import (
 )
 from rbl_gym.geometry import rotations
 from rbl_gym.kernels import compiled
+from rbl_gym.measurements.noise_laws import law_of
 
 # Internal functions without checks: their arguments were checked.
 _EXP = kernel(rotations.exp)
@@ -127,6 +128,52 @@ def update_mean(
     matrix, vector = information(statistic(ranges, anchors, tags, weights))
     innovation = vector[..., None] - matrix @ mean[..., None]
     return mean + (P @ innovation)[..., 0]
+
+
+@compiled("linear_filter:is_vague")
+def is_vague(P: FloatArray, anchors: FloatArray, vague_entry: float) -> BoolArray:
+    """Return whether a covariance is uninformative (...) on an entry of Q, or on the position."""
+    variance = np.diagonal(P, axis1=-2, axis2=-1)
+    extent = np.ptp(anchors, axis=-2).max(axis=-1)
+    vague = variance[..., :9].max(axis=-1) > vague_entry
+    return vague | (variance[..., 9:].max(axis=-1) > extent**2)
+
+
+@compiled("linear_filter:update")
+def update_plain(
+    mean: FloatArray,
+    P: FloatArray,
+    ranges: FloatArray,
+    law: FloatArray,
+    anchors: FloatArray,
+    tags: FloatArray,
+    vague_entry: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance after an epoch without lost links, from the law's numbers.
+
+    NaN if `weigh_plain` is.
+    """
+    weights = weigh_plain.textbook(P, ranges, law, anchors, vague_entry)
+    sound = np.isfinite(weights).all(axis=(-2, -1))[..., None]
+    weights = np.where(sound[..., None], weights, 1.0)
+    new_P = update_covariance.textbook(P, anchors, tags, weights)
+    new_mean = update_mean.textbook(mean, new_P, ranges, anchors, tags, weights)
+    return np.where(sound, new_mean, np.nan), np.where(sound[..., None], new_P, np.nan)
+
+
+@compiled("linear_filter:weigh")
+def weigh_plain(
+    P: FloatArray, ranges: FloatArray, law: FloatArray, anchors: FloatArray, vague_entry: float
+) -> FloatArray:
+    """Return weights (..., M, N) of the squared ranges of an epoch without lost links.
+
+    NaN if a range is not positive or the prior is uninformative (`is_vague`).
+    """
+    variance = law_of(law).squared_range_variance(ranges)
+    sound = ((ranges > 0) & (ranges < HUGE)).all(axis=(-2, -1))
+    sound = sound & ~is_vague.textbook(P, anchors, vague_entry)
+    weights = np.where(sound[..., None, None], 1 / variance, np.nan)
+    return np.broadcast_to(weights, ranges.shape)
 
 
 def transition(step: FloatArray) -> FloatArray:

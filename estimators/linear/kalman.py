@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rbl_gym.checks import (
-    HUGE,
     BoolArray,
     FloatArray,
     all_finite,
@@ -44,8 +43,9 @@ from rbl_gym.estimators.linear.engines import (
     LinearEpoch,
     Motion,
     engine_for,
-    update_covariance,
-    update_mean,
+    is_vague,
+    update_plain,
+    weigh_plain,
 )
 from rbl_gym.estimators.linear.least_squares import unvec, vec
 from rbl_gym.estimators.linear.squared_range import geometric_rank
@@ -56,8 +56,7 @@ from rbl_gym.estimators.linear.unitary import (
     projected_belief,
 )
 from rbl_gym.geometry import rotations
-from rbl_gym.kernels import compiled
-from rbl_gym.measurements.noise_laws import law_of, numbers_of
+from rbl_gym.measurements.noise_laws import numbers_of
 from rbl_gym.measurements.ranging import NoiseLaw
 from rbl_gym.motion.kinematics import ProcessNoise
 
@@ -243,13 +242,13 @@ class KalmanFamily:
         if law is None:
             return None
         if engine_for(self.engine, state=batch) is Batched:
-            mean, covariance = _update(
+            mean, covariance = update_plain(
                 state.mean, state.covariance, ranges, law, anchors, self.tags, VAGUE_ENTRY_VARIANCE
             )
             if not all_finite(mean):
                 return None
         else:
-            weights = _weigh(state.covariance, ranges, law, anchors, VAGUE_ENTRY_VARIANCE)
+            weights = weigh_plain(state.covariance, ranges, law, anchors, VAGUE_ENTRY_VARIANCE)
             if not all_finite(weights):
                 return None
             epoch = LinearEpoch(ranges, anchors, self.tags, weights)
@@ -277,7 +276,7 @@ class KalmanFamily:
         return np.concatenate([np.full(9, sigma_q**2), std[3:] ** 2])
 
     def _check_determined(self, state: KalmanState, anchors: FloatArray) -> None:
-        vague = _is_vague(state.covariance, anchors, VAGUE_ENTRY_VARIANCE)
+        vague = is_vague(state.covariance, anchors, VAGUE_ENTRY_VARIANCE)
         if not np.count_nonzero(vague):
             return
         rank = geometric_rank(anchors, self.tags)
@@ -288,52 +287,6 @@ class KalmanFamily:
                 f"too vague to stand in; got {anchors.shape[-2]} anchors, "
                 f"{self.tags.shape[-2]} tags. Use 'iekf', or a tighter prior covariance"
             )
-
-
-@compiled("linear_filter:is_vague")
-def _is_vague(P: FloatArray, anchors: FloatArray, vague_entry: float) -> BoolArray:
-    """Return whether a covariance is uninformative (...) on an entry of Q, or on the position."""
-    variance = np.diagonal(P, axis1=-2, axis2=-1)
-    extent = np.ptp(anchors, axis=-2).max(axis=-1)
-    vague = variance[..., :9].max(axis=-1) > vague_entry
-    return vague | (variance[..., 9:].max(axis=-1) > extent**2)
-
-
-@compiled("linear_filter:update")
-def _update(
-    mean: FloatArray,
-    P: FloatArray,
-    ranges: FloatArray,
-    law: FloatArray,
-    anchors: FloatArray,
-    tags: FloatArray,
-    vague_entry: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance after an epoch without lost links, from the law's numbers.
-
-    NaN if `_weigh` is.
-    """
-    weights = _weigh.textbook(P, ranges, law, anchors, vague_entry)
-    sound = np.isfinite(weights).all(axis=(-2, -1))[..., None]
-    weights = np.where(sound[..., None], weights, 1.0)
-    new_P = update_covariance.textbook(P, anchors, tags, weights)
-    new_mean = update_mean.textbook(mean, new_P, ranges, anchors, tags, weights)
-    return np.where(sound, new_mean, np.nan), np.where(sound[..., None], new_P, np.nan)
-
-
-@compiled("linear_filter:weigh")
-def _weigh(
-    P: FloatArray, ranges: FloatArray, law: FloatArray, anchors: FloatArray, vague_entry: float
-) -> FloatArray:
-    """Return weights (..., M, N) of the squared ranges of an epoch without lost links.
-
-    NaN if a range is not positive or the prior is uninformative (`_is_vague`).
-    """
-    variance = law_of(law).squared_range_variance(ranges)
-    sound = ((ranges > 0) & (ranges < HUGE)).all(axis=(-2, -1))
-    sound = sound & ~_is_vague.textbook(P, anchors, vague_entry)
-    weights = np.where(sound[..., None, None], 1 / variance, np.nan)
-    return np.broadcast_to(weights, ranges.shape)
 
 
 # --- constraints on the rotation after the linear update --------------------
