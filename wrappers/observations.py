@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -12,7 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from rbl_gym import metrics
-from rbl_gym.checks import FloatArray, all_finite
+from rbl_gym.checks import FloatArray
+from rbl_gym.envs.custom import FAR, chosen_view, fitted, space_like
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.worlds.scene import Scene
 
@@ -21,8 +21,6 @@ __all__ = ["OBSERVATIONS", "Seen", "flat", "tokens", "viewer_of"]
 OBSERVATIONS = ("dict", "flat", "tokens")
 # Observations of policies are of order one. Values far outside carry no more information.
 _LIMIT = 10.0
-# Beliefs and custom views have no bounds. These bounds are finite and never reached.
-_FAR = 1e9
 # Numbers of features of the tokens.
 _BODY, _ANCHOR, _TAG, _BOX = 26, 6, 4, 6
 
@@ -194,28 +192,7 @@ def viewer_of(observation: ViewLike) -> Viewer:
     ValueError
         If the name is unknown, the path cannot be imported, or the type is wrong.
     """
-    if callable(observation):
-        return Viewer("own", observation)
-    if isinstance(observation, str) and observation in OBSERVATIONS:
-        return Viewer(observation)
-    if isinstance(observation, str) and ":" in observation:
-        return Viewer("own", imported("observation", observation))
-    raise ValueError(
-        f"observation must be one of {', '.join(map(repr, OBSERVATIONS))}, 'module:function' or a "
-        f"function, got {observation!r:.80}"
-    )
-
-
-def imported(name: str, path: str) -> Callable[..., Any]:
-    """Return the function of ``"module:function"``; a ValueError names the argument `name`."""
-    module, _, attribute = path.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{name} {path!r:.80} cannot be imported: {error}") from error
-    if not callable(found):
-        raise ValueError(f"{name} {path!r:.80} must be callable, got {found!r:.80}")
-    return found
+    return Viewer(*chosen_view(observation, OBSERVATIONS))
 
 
 @dataclass
@@ -286,30 +263,17 @@ class Viewer:
         if isinstance(declared, spaces.Space):
             return declared
         with np.errstate(all="ignore"):
-            shown = self.function(_example(env, inner))
-        if isinstance(shown, Mapping):
-            return spaces.Dict({key: _box_like(value) for key, value in shown.items()})
-        return _box_like(shown)
+            return space_like(self.function(_example(env, inner)))
 
     def _own(self, seen: Seen) -> Any:
         assert self.function is not None
-        shown, batch = self.function(seen), seen.belief.translation.shape[:-1]
-        if not isinstance(self.space, spaces.Dict):
-            return _fitted("observation", shown, batch, self.space)
-        if not isinstance(shown, Mapping) or set(shown) != set(self.space):
-            raise ValueError(
-                f"observation must return a dict with {', '.join(self.space)}, got {shown!r:.80}"
-            )
-        return {
-            key: _fitted(f"observation[{key!r}]", shown[key], batch, space)
-            for key, space in self.space.items()
-        }
+        return fitted(self.function(seen), seen.belief.translation.shape[:-1], self.space)
 
 
 _BELIEF: dict[str, spaces.Space[Any]] = {
     "belief_rotation": spaces.Box(-1.001, 1.001, (3, 3), np.float64),
-    "belief_translation": spaces.Box(-_FAR, _FAR, (3,), np.float64),
-    "belief_covariance": spaces.Box(-(_FAR**2), _FAR**2, (6, 6), np.float64),
+    "belief_translation": spaces.Box(-FAR, FAR, (3,), np.float64),
+    "belief_covariance": spaces.Box(-(FAR**2), FAR**2, (6, 6), np.float64),
 }
 
 
@@ -343,25 +307,3 @@ def _example(env: Any, inner: spaces.Dict) -> Seen:
     rotation = info["prior_rotation"]
     belief = PoseBelief(rotation, info["prior_translation"], info["prior_covariance"], rotation)
     return Seen({**nothing, **observation}, belief, scene)
-
-
-def _box_like(value: Any) -> spaces.Box:
-    """Return a box for arrays like this one: floating-point numbers become float32."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "fiub":
-        raise ValueError(f"observation must return numbers, got {value!r:.80}")
-    if array.dtype.kind == "f":
-        return spaces.Box(-_FAR, _FAR, array.shape, np.float32)
-    info = np.iinfo(np.int8 if array.dtype.kind == "b" else array.dtype)
-    return spaces.Box(info.min, info.max, array.shape, info.dtype.type)
-
-
-def _fitted(name: str, value: Any, batch: tuple[int, ...], space: Any) -> np.ndarray:
-    """Return a view's result as a copy in the type of its space; may raise ValueError."""
-    array = np.array(value)
-    shape = (*batch, *space.shape)
-    if array.shape != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {array.shape}")
-    if array.dtype.kind not in "fiub" or not all_finite(array.astype(np.float64)):
-        raise ValueError(f"{name} must hold finite numbers, got {value!r:.80}")
-    return array.astype(space.dtype)

@@ -11,10 +11,10 @@ import numpy as np
 
 from rbl_gym import bounds
 from rbl_gym.checks import FloatArray, all_finite, check_number
+from rbl_gym.envs.custom import imported
 from rbl_gym.estimators import PoseBelief
 from rbl_gym.metrics import Figures
 from rbl_gym.worlds.scene import Scene
-from rbl_gym.wrappers.observations import imported
 
 __all__ = ["REWARDS", "Outcome", "reward_of"]
 

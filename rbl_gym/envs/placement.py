@@ -17,6 +17,7 @@ from rbl_gym.envs.placement_batch import (
     View,
     is_symmetric,
 )
+from rbl_gym.envs.placement_views import PlacementViewLike
 from rbl_gym.placement.problem import Context, information_of_fixed, score_of_checked
 
 
@@ -39,6 +40,7 @@ class AnchorPlacementVectorEnv(PlacementBatchEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        observation: PlacementViewLike = "flat",
     ) -> None:
         self.task = placement.task(scene, n_anchors, racks)
         self._check_flags(mode, mirror, sight)
@@ -56,6 +58,7 @@ class AnchorPlacementVectorEnv(PlacementBatchEnv):
         self._own = len(self.task.scene.obstacles)
         if self.mode == "mounts":
             self._information = np.zeros((num_envs, self.task.n_poses, 6, 6))
+        self._look_by(observation)
 
     def _task_of(self, world: int) -> placement.PlacementTask:
         return self.task
@@ -81,6 +84,7 @@ class AnchorPlacementVectorEnv(PlacementBatchEnv):
             parts.append(self._view.boxes(shown.racks[:, self._own :]).reshape(len(parts[0]), -1))
         features = np.concatenate(parts, axis=-1)
         self._features[rows] = np.minimum(np.maximum(features, -1.0), 1.0)
+        self._remember(rows, shown, self._view, self.task)
         self._clear(rows)
         if self.sight:
             self._seen[rows] = placement.sight_fractions(self.task, fresh, self._mounts)
@@ -172,6 +176,10 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     y, so that the region lies towards +x and +y. Racks are then in the order of x, and actions are
     mirrored back. ``mirror=False`` turns this off.
 
+    The above is ``observation="flat"``. ``"dict"`` has positions in metres, ``"tokens"`` a token
+    for each anchor, obstacle and mount, with masks; a function gets a `Placing`. All of them are
+    mirrored in the same way.
+
     ## Reward
     ``-log score`` with the last anchor, 0 before. ``mode="mounts"``: the decrease of the log score
     with every anchor, starting from a score of 3 m. ``gym.make(..., reward="filter")`` rewards the
@@ -199,7 +207,22 @@ class AnchorPlacementEnv(PlacementScalarEnv):
     env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", racks=2, sight=True)
     env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", scene="uwb_room", mode="mounts", n_anchors=4)
     env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", reward="filter", filter="iekf")
+    env = gym.make("rbl_gym:RBL/AnchorPlacement-v0", observation="tokens")
     ```
+
+    * `scene`: a name or overrides, see `rbl_gym.worlds.scenes.get`. Fixed anchors of a building
+      file stay, and the others are placed.
+    * `scenes`, instead of `scene`: a family of scenes, see below.
+    * `mode`: ``"sequential"``, ``"one-shot"`` or ``"mounts"``, see the action space.
+    * `racks`: number of racks in a room, 0 to 2.
+    * `n_anchors`: number of placed anchors M; None for the default of
+      `rbl_gym.placement.task`.
+    * `mirror`: whether problems of symmetric scenes are observed mirrored.
+    * `sight`: whether to observe what each mount sees; only with racks or obstacles.
+    * `observation`: ``"flat"``, ``"dict"``, ``"tokens"``, ``"module:function"`` or a function, see
+      below.
+    * `reward`: ``"bound"`` or ``"filter"``.
+    * `filter`, `options`: with ``reward="filter"``, as in `EstimatePose`.
 
     ## Version history
     * v0: first version.
@@ -216,10 +239,11 @@ class AnchorPlacementEnv(PlacementScalarEnv):
         mirror: bool = True,
         sight: bool = False,
         render_mode: str | None = None,
+        observation: PlacementViewLike = "flat",
     ) -> None:
         self._configure(
             render_mode, scene=scene, mode=mode, racks=racks, n_anchors=n_anchors, mirror=mirror,
-            sight=sight,
+            sight=sight, observation=observation,
         )  # fmt: skip
 
     @property

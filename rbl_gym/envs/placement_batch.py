@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 from rbl_gym import placement
 from rbl_gym.checks import BoolArray, FloatArray, check_one_of
 from rbl_gym.envs.batch import BatchEnv
+from rbl_gym.envs.placement_views import PlacementViewer, PlacementViewLike, Placing
 from rbl_gym.envs.scalar import ScalarEnv
 from rbl_gym.geometry.regions import Region
+from rbl_gym.placement.families import DESCRIBED, described
 from rbl_gym.placement.problem import Context, PlacementTask
 from rbl_gym.rendering import placement as rendering
 
@@ -30,13 +34,15 @@ class PlacementBatchEnv(BatchEnv):
     """Base of `AnchorPlacementVectorEnv` and `PlacementFamilyVectorEnv`.
 
     The ``__init__`` of a subclass calls `_check_flags`, `_plan` and `_configure`, then sets
-    `_contexts` and `_counts`.
+    `_contexts` and `_counts`, and ends with `_look_by`.
     """
 
     render_fps = 2
     # The problems of the worlds, and their numbers of anchors (B,).
     _contexts: Context
     _counts: np.ndarray
+    # None: the flat observation.
+    _viewer: PlacementViewer | None = None
 
     def _check_flags(self, mode: str, mirror: bool, sight: bool) -> None:
         for name, value in (("mirror", mirror), ("sight", sight)):
@@ -92,6 +98,32 @@ class PlacementBatchEnv(BatchEnv):
         self._seen = np.zeros((num_envs, len(self._mounts)))
         self._taken = np.zeros((num_envs, len(self._mounts)), dtype=np.bool_)
 
+    def _look_by(self, observation: PlacementViewLike) -> None:
+        """Set the observation to one of `PLACEMENT_OBSERVATIONS` or a custom view."""
+        viewer = PlacementViewer(observation)
+        if viewer.kind == "flat":
+            return
+        # The problems as they are observed, and the fixed points of their mirroring.
+        self._observed = Context(*(np.zeros_like(field) for field in self._contexts))
+        self._middle = np.zeros((self.num_envs, 3))
+        self._description = np.zeros((self.num_envs, DESCRIBED))
+        self._viewer = viewer
+        example = copy.deepcopy(self)
+        example._generators = []
+        example._viewer = PlacementViewer("dict")
+        example.reset(seed=0)
+        self.single_observation_space = viewer.space_of(example._placing())
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    def _remember(self, rows: Any, shown: Context, view: View, task: PlacementTask) -> None:
+        """Store the observed problems of worlds that have just begun, for the viewer."""
+        if self._viewer is not None:
+            self._description[rows] = described(task)
+            self._observed.centre[rows], self._observed.half[rows] = shown.centre, shown.half
+            self._observed.racks[rows] = 0.0
+            self._observed.racks[rows, : shown.racks.shape[-2]] = shown.racks
+            self._middle[rows] = view.middle
+
     @property
     def episode_steps(self) -> int:
         """Number of steps of an episode, in the worlds with most anchors."""
@@ -102,9 +134,12 @@ class PlacementBatchEnv(BatchEnv):
         raise NotImplementedError
 
     def _shot(self) -> tuple[Any, None]:
+        return rendering.Layout(self._contexts, self._anchors, self._placed()), None
+
+    def _placed(self) -> np.ndarray:
+        """Return the number of anchors (B,) that are placed."""
         placed = self._counts * self._epochs if self.mode == "one-shot" else self._epochs
-        placed = np.minimum(placed, self._counts)
-        return rendering.Layout(self._contexts, self._anchors, placed), None
+        return np.minimum(placed, self._counts)
 
     def _clear(self, rows: Any) -> None:
         """Remove all anchors of some worlds."""
@@ -123,7 +158,10 @@ class PlacementBatchEnv(BatchEnv):
         """Return the one-hot number (B, M) of the next anchor."""
         return self._next[self._epochs]
 
-    def _observe(self) -> np.ndarray:
+    def _observe(self) -> Any:
+        return self._flat() if self._viewer is None else self._viewer(self._placing())
+
+    def _flat(self) -> np.ndarray:
         parts: list[np.ndarray] = [self._features]
         if self.mode == "sequential":
             parts.append(self._actions.reshape(self.num_envs, -1))
@@ -134,6 +172,32 @@ class PlacementBatchEnv(BatchEnv):
         if self.mode != "one-shot":
             parts.append(self._next_anchor())
         return np.concatenate(parts, axis=-1, dtype=np.float32)
+
+    def _placing(self) -> Placing:
+        """Return what a viewer converts; positions are mirrored as the problem is."""
+        number = np.arange(self._shape[0])
+        there = number < self._counts[:, None]
+        placed = number < self._placed()[:, None]
+        middle, signs = self._middle[:, None], self._signs[:, None]
+        told = {
+            "region": np.concatenate(self._observed[:2], axis=-1),
+            "anchors": np.where(placed[..., None], middle + signs * (self._anchors - middle), 0.0),
+            "anchor_mask": there.astype(np.int8),
+            "placed": placed.astype(np.int8),
+            "next": np.zeros_like(placed, np.int8),
+        }
+        if self.mode != "one-shot":
+            told["next"] = self._next_anchor().astype(np.int8)
+        if self._observed.racks.shape[-2]:
+            mask = self._observed.racks[..., 3] > 0
+            told["racks"], told["rack_mask"] = self._observed.racks.copy(), mask.astype(np.int8)
+        if self.sight:
+            order = self._shown()
+            told["mounts"] = np.broadcast_to(self._mounts, (*order.shape, 3)).copy()
+            told["sight"] = np.take_along_axis(self._seen, order, axis=-1)
+            told["taken"] = np.take_along_axis(self._taken, order, axis=-1).astype(np.int8)
+        tasks = tuple(map(self._task_of, range(self.num_envs)))
+        return Placing(told, self._flat(), self._description.copy(), tasks)
 
     def _inform(self) -> dict[str, np.ndarray]:
         contexts = self._contexts
@@ -199,12 +263,17 @@ class View:
         The task.
     low, high
         Corners (3,) of the space to which boxes are scaled.
+
+    Attributes
+    ----------
+    middle
+        Fixed point (3,) of the mirroring.
     """
 
     def __init__(self, task: PlacementTask, low: FloatArray, high: FloatArray) -> None:
         volume = task.scene.volume
         self._centre = _centre(volume)
-        self._middle = _centre(task.scene.anchor_region) * _LEVEL
+        self.middle = _centre(task.scene.anchor_region) * _LEVEL
         half = _half(*volume.bounds())
         # Of the region: the half size lies between zero and that of the volume.
         self._shift = np.concatenate([self._centre, 0.5 * half])
@@ -220,11 +289,11 @@ class View:
 
     def mirrored(self, context: Context, signs: FloatArray) -> Context:
         """Return the problem mirrored by signs (B, 3), with its racks in descending order of x."""
-        centre, racks = self._middle + signs * (context.centre - self._middle), context.racks
+        centre, racks = self.middle + signs * (context.centre - self.middle), context.racks
         if not racks.shape[-2]:
             return Context(centre, context.half, racks)
         racks = racks.copy()
-        racks[..., :3] = self._middle + signs[:, None] * (racks[..., :3] - self._middle)
+        racks[..., :3] = self.middle + signs[:, None] * (racks[..., :3] - self.middle)
         if racks.shape[-2] > 1:
             order = (-racks[..., 0]).argsort(axis=-1, kind="stable")
             racks = racks[np.arange(len(racks))[:, None], order]

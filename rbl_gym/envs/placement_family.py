@@ -17,6 +17,7 @@ from rbl_gym.envs.placement_batch import (
     View,
     is_symmetric,
 )
+from rbl_gym.envs.placement_views import PlacementViewLike
 from rbl_gym.geometry.regions import Walls
 from rbl_gym.placement.families import (
     DESCRIBED,
@@ -46,6 +47,7 @@ class PlacementFamilyVectorEnv(PlacementBatchEnv):
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        observation: PlacementViewLike = "flat",
     ) -> None:
         self.family = task_family(scenes, n_anchors, racks)
         self._check_flags(mode, mirror, sight)
@@ -60,6 +62,7 @@ class PlacementFamilyVectorEnv(PlacementBatchEnv):
         self._mounts = np.zeros((num_envs, *self._mounts.shape))
         self.stack = StackedTasks(self.family, num_envs)
         self._contexts, self._counts = self.stack.contexts, self.stack.arrays.n_anchors
+        self._look_by(observation)
 
     @property
     def tasks(self) -> tuple[placement.PlacementTask, ...]:
@@ -96,6 +99,7 @@ class PlacementFamilyVectorEnv(PlacementBatchEnv):
         if self.mirror and is_symmetric(one):
             self._signs[world] = signs = view.signs(shown)
             shown = view.mirrored(shown, signs)
+        self._remember([world], shown, view, one)
         boxes, count = np.zeros((self.family.most_boxes, 7)), len(problem.racks)
         boxes[:count, :6], boxes[:count, 6] = view.boxes(shown.racks[0]), 1.0
         parts = view.region(shown)[0], boxes.ravel(), described(one), self.stack.anchor_mask[world]
@@ -183,10 +187,11 @@ class PlacementFamilyEnv(PlacementScalarEnv):
         mirror: bool = True,
         sight: bool = False,
         render_mode: str | None = None,
+        observation: PlacementViewLike = "flat",
     ) -> None:
         self._configure(
             render_mode, scenes=scenes, mode=mode, racks=racks, n_anchors=n_anchors,
-            mirror=mirror, sight=sight,
+            mirror=mirror, sight=sight, observation=observation,
         )  # fmt: skip
 
     @property
