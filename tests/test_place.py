@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("plotly", reason="needs the extra viz")
 
 from rbl_gym import bounds, placement
-from rbl_gym.app import place_figures, place_html, place_report
+from rbl_gym.app import place_answer, place_figures, place_html, place_report
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import obstacles
 from rbl_gym.placement import criteria, layouts, scene_files
@@ -273,12 +273,16 @@ def test_the_picture_is_the_same_for_the_same_result(placed, tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-def test_coplanar_anchors_are_warned_of():
+def test_coplanar_anchors_are_warned_of_at_the_top(capsys):
     problem = scene_files.problem("auv_buoys", 3)
     result = place_anchors(problem, Question(range(3, 4), trials=20)).result
     assert result["coplanar"]
     assert result["criteria"]["conditioning"] is None
-    assert any("mirror image" in note for note in place_report.notes(result))
+    (warning,) = place_answer.warnings(result)
+    assert "mirror image" in warning
+    place_report.print_place(result)
+    top, _, _ = capsys.readouterr().out.partition("margin")
+    assert "Note: All anchors lie in one plane." in top
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from typing import Any
 from scipy import stats
 
 from rbl_gym import estimators
-from rbl_gym.app import place_report
+from rbl_gym.app import place_answer, place_report
 from rbl_gym.app.cli import main
 from rbl_gym.geometry import rotations
 from rbl_gym.measurements import ranging
@@ -31,6 +31,7 @@ from rbl_gym.studies.placing import (
     links,
     requirements,
 )
+from tests.helpers import Told
 
 # Ten brackets in a room of 12 x 8 m with a cupboard and a thin wall.
 BRACKETS = [
@@ -287,7 +288,9 @@ def test_fixed_anchors_count_and_stay():
     tables = copy.deepcopy(ROOM)
     tables["anchors"]["fixed"] = [[6.0, 4.0, 2.9]]
     problem = scene_files.of_mapping(tables)
-    found = choosing.fewest_anchors(problem, range(3, 11), 0)
+    told = Told()
+    found = choosing.fewest_anchors(problem, range(3, 11), 0, 0, told)
+    assert told.done == told.announced > 0
     assert found.met
     np.testing.assert_array_equal(found.anchors[0], [6, 4, 2.9])
 
@@ -345,7 +348,7 @@ def test_my_layout_is_judged(files, capsys):
     assert main([*command, "--layout", layout]) == 0
     shown = capsys.readouterr().out
     assert shown.startswith(place_report.verdict(result))
-    assert shown.split(":")[0] in ("PASS", "FAIL", "UNDECIDED")
+    assert shown.split(":")[0] in ("PASS", "FAIL", "TOO CLOSE TO TELL")
     for text in ("what each anchor is for", "one more would help most", "cost of the mounts"):
         assert text in shown
 
@@ -393,6 +396,20 @@ def test_a_layout_that_survives(files, capsys):
     for zone in result["zones"]:
         assert 1 <= zone["without_anchor"] <= 8
     assert "with any one anchor missing" in place_report.verdict(result)
+
+
+def test_a_zone_that_is_too_close_to_tell_is_explained():
+    row = {
+        "name": "aisle", "verdict": "undecided", "places": 9600, "share": 0.9506,
+        "share_low": 0.9461, "share_high": 0.9548, "required": {"share": 0.95},
+    }  # fmt: skip
+    (warning,) = place_answer.warnings({"coplanar": False, "zones": [row, {"verdict": "pass"}]})
+    assert warning.startswith(
+        "aisle is too close to tell: 95.1 % of 9600 places are within the limits (95 % interval "
+        "94.61 to 95.48 %), and 95 % must be."
+    )
+    result = {"survive": 0, "n_anchors": 6, "verdict": "undecided", "zones": [row], "layouts": {}}
+    assert place_report.verdict(result) == "TOO CLOSE TO TELL: 6 anchors, 0 of 1 zones pass."
 
 
 def test_the_verdict_says_what_to_do_next():

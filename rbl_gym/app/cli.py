@@ -23,17 +23,44 @@ from rbl_gym.app import (
 )
 from rbl_gym.studies.extras import MissingExtraError
 
+# Status of a program whose reader has gone (`| head`): 128 + SIGPIPE, as of git.
+READER_GONE = 141
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status (2: invalid input, with a message)."""
+    try:
+        try:
+            return _run(arguments)
+        finally:
+            # When Python itself flushes, at its end, a closed pipe gives a traceback.
+            _flush()
+    except BrokenPipeError:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(nowhere, stream.fileno())
+        return READER_GONE
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            stream.flush()
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     options = _parser().parse_args(arguments)
     # MODULE:FACTORY may be in a file of the working folder, which only `python -m` would search.
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
     try:
-        return options.run(options)
+        status = options.run(options)
+        _flush()
+        return status
     except MissingExtraError as error:
         print(f"rbl-gym: {error}", file=sys.stderr)
+    except BrokenPipeError:
+        raise
     except OSError as error:
         said = f"{error.filename}: {error.strerror}" if error.filename else error
         print(f"rbl-gym {options.command}: {said}", file=sys.stderr)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 # Verdicts also have a sign and a word, because not everyone can distinguish colours.
-SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? UNDECIDED", "no requirement": "-"}
+SIGNS = {"pass": "✓ PASS", "fail": "✗ FAIL", "undecided": "? TOO CLOSE", "no requirement": "-"}
+# Verdicts as tables show them.
+WORDS = {name: name for name in SIGNS} | {"undecided": "too close"}
 HOW_TO_ASK = (
     "To set one, use [[zones]] in the file, in place of [region], each with low, high, position_m "
     "or heading_deg, and share."
@@ -49,13 +51,35 @@ def headline(result: dict[str, Any]) -> str:
         words = {
             "pass": "the zone gets what it asks for",
             "fail": "the zone does not get what it asks for",
-            "undecided": "too close to tell",
+            "undecided": "too close to the requirement to tell",
         }[overall]
         return f"{count}: {words}"
     if met == len(asked):
         every = "both" if met == 2 else f"all {met}"
         return f"{count}: {every} zones get what they ask for"
     return f"{count}: {met} of {len(asked)} zones get what they ask for"
+
+
+def warnings(result: dict[str, Any]) -> list[str]:
+    """Return what a reader has to know beside the verdict: a mirror image, zones too close."""
+    found = []
+    if result["coplanar"]:
+        found.append(
+            "All anchors lie in one plane. Each pose has a mirror image on the other side of the "
+            "plane that fits the ranges as well, so a filter must be told the side (rbl-gym replay "
+            "--volume or --below-anchors). The linear filters (kf, uc-kf, et-kf, kf-ortho) do not "
+            "work. An anchor outside the plane removes the mirror image."
+        )
+    for zone in result["zones"]:
+        if zone["verdict"] == "undecided":
+            found.append(
+                f"{zone['name']} is too close to tell: {percent(zone['share'])} of "
+                f"{zone['places']} places are within the limits (95 % interval "
+                f"{100 * zone['share_low']:.2f} to {100 * zone['share_high']:.2f} %), and "
+                f"{percent(zone['required']['share'])} must be. Treat it as not met: add an "
+                "anchor, or require a little less."
+            )
+    return found
 
 
 def typical(zones: list[dict[str, Any]]) -> str:

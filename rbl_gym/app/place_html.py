@@ -28,6 +28,7 @@ def write_place(placed: Placed, path: str) -> None:
     parts = [
         f"<style>{STYLE}</style>",
         f"<p>{place_answer.headline(result)}</p>",
+        *(page.note(text) for text in place_answer.warnings(result)),
         answer_part(result),
         plan_part(placed),
         page.table("mounting list", headings, rows),

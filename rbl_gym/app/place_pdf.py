@@ -108,6 +108,10 @@ def _title_page(result: dict[str, Any]) -> Figure:
         fontsize=14,
         va="center",
     )
+    for line in place_answer.warnings(result):
+        for part in textwrap.wrap(line, 130):
+            y -= 0.028
+            page.text(_LEFT, y - 0.01, part, fontsize=9, va="center")
     y -= 0.06
     for zone in place_answer.zone_answers(result):
         if y < 0.12:

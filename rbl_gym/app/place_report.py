@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from rbl_gym.app.page import digits
-from rbl_gym.app.place_answer import HOW_TO_ASK
+from rbl_gym.app.place_answer import HOW_TO_ASK, WORDS, warnings
 from rbl_gym.app.place_survey import survey_table
 from rbl_gym.app.tables import new_console, new_table
 
@@ -51,7 +51,7 @@ def verdict(result: dict[str, Any]) -> str:
     count = f"{result['n_anchors']} anchors{survives}"
     if result["verdict"] == "no requirement":
         return f"{count}: no zone has a requirement. {HOW_TO_ASK}"
-    words = {"pass": "PASS", "fail": "FAIL", "undecided": "UNDECIDED"}
+    words = {"pass": "PASS", "fail": "FAIL", "undecided": "TOO CLOSE TO TELL"}
     zones = [row for row in result["zones"] if row["verdict"] != "no requirement"]
     passed = sum(row["verdict"] == "pass" for row in zones)
     text = f"{words[result['verdict']]}: {count}, {passed} of {len(zones)} zones pass."
@@ -98,11 +98,6 @@ def notes(result: dict[str, Any]) -> list[str]:
                 + _figure(figures.get("position_ratio_found"), 3)
                 + "."
             )
-    if result["coplanar"]:
-        found.append(
-            "These anchors lie in one plane: the mirror image behind it can fit the ranges as "
-            "well, so a filter must know the side; the linear filters (KF family) lose rank here."
-        )
     if result["obstacles"]:
         found.append(
             "'Told': the radio reports which links are blocked, and the filter weighs them less."
@@ -111,9 +106,11 @@ def notes(result: dict[str, Any]) -> list[str]:
 
 
 def print_place(result: dict[str, Any]) -> None:
-    """Print the answer, every table, and the notes."""
+    """Print the answer with its warnings, every table, and the notes."""
     console = new_console()
     console.print(verdict(result))
+    for warning in warnings(result):
+        console.print(f"Note: {warning}")
     for rows in tables(result):
         table = new_table(rows.title)
         for index, heading in enumerate(rows.headings):
@@ -134,7 +131,7 @@ def _zones(result: dict[str, Any]) -> Rows:
             for what in ("median", "p95")
         ]
         rows.append(
-            [row["name"], row["verdict"], *_share(row), *figures, row.get("without_anchor")]
+            [row["name"], WORDS[row["verdict"]], *_share(row), *figures, row.get("without_anchor")]
         )
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
@@ -193,7 +190,7 @@ def _fewest(fewest: dict[str, Any]) -> Iterator[Rows]:
         needs = row["would_pass"]
         limits = [_figure(needs.get(key), 3) for key in ("position_m", "height_m", "heading_deg")]
         factor = f"{needs['factor']:.3f}"
-        rows.append([row["name"], row["verdict"], *_share(row), *limits, factor])
+        rows.append([row["name"], WORDS[row["verdict"]], *_share(row), *limits, factor])
     headings = [
         "zone", "verdict", "within", "95 % interval", "required", "margin",
         "would pass: position (m)", "height (m)", "heading (deg)", "all times",
@@ -244,7 +241,7 @@ def _next(result: dict[str, Any]) -> Rows:
         rows.append(
             [
                 row["name"],
-                row["verdict"],
+                WORDS[row["verdict"]],
                 *(_percent(one["share"]) if "share" in one else "-" for one in (now, row)),
                 *(digits(one["rms_position_m"], 3) for one in (now, row)),
                 *(digits(one["rms_heading_deg"], 3) for one in (now, row)),
@@ -388,7 +385,7 @@ def _numbers(numbers: list[dict[str, Any]]) -> Rows:
     rows = [
         [
             str(row["n_anchors"]),
-            row["verdict"],
+            WORDS[row["verdict"]],
             *(digits(row[key], n) for _, key, n in _FIGURES),
             *(_percent(zone["share"]) for zone in row["zones"] if "share" in zone),
         ]

@@ -14,14 +14,25 @@ def has_rich() -> bool:
     return True
 
 
-def new_console(width: int = 130) -> Any:
+def new_console(width: int | None = 130) -> Any:
     """Return a console for standard output: rich's, or one that prints plain text."""
     if not has_rich():
         return _PlainConsole()
+    # Piped tables keep all of their columns.
+    width = None if rich_console().is_terminal else width
+    return rich_console(width=width, highlight=False, markup=False)
+
+
+def rich_console(**arguments: Any) -> Any:
+    """Return a console of rich that raises BrokenPipeError if its reader has gone."""
     from rich.console import Console
 
-    # Piped tables keep all of their columns.
-    return Console(width=None if Console().is_terminal else width, highlight=False, markup=False)
+    class RichConsole(Console):
+        def on_broken_pipe(self) -> None:
+            """Leave it to the command line; rich would exit with status 1."""
+            raise BrokenPipeError
+
+    return RichConsole(**arguments)
 
 
 def new_table(title: str | None = None) -> Any:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rbl_gym.app.tables import has_rich
+from rbl_gym.app.tables import has_rich, rich_console
 from rbl_gym.studies.extras import require
 from rbl_gym.studies.progress import Advance
 
@@ -60,11 +60,10 @@ def progress(label: str, total: int = 0) -> Iterator[Advance]:
     if not has_rich():
         yield from _plain_progress(label, total)
         return
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*columns, console=rich_console(stderr=True)) as bar:
         task = bar.add_task(label, total=total)
 
         def advance(steps: int = 1, *, more: int = 0) -> None:

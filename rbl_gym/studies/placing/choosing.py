@@ -239,7 +239,7 @@ def fewest_anchors(
         return best, judged, is_met(judged)
 
     count = _first_count(stock, starts, numbers, survive)
-    advance(0, more=2)
+    advance(0, more=1)
     best, judged, met = attempt(count, [])
     while not met and count < min(numbers[-1], len(points)):
         count += 1
