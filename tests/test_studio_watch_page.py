@@ -13,6 +13,7 @@ from rbl_gym import recordings
 from rbl_gym.app import studio
 from rbl_gym.app.cli import main
 from rbl_gym.app.studio import Studio
+from rbl_gym.app.studio.watch_panel import chosen
 from rbl_gym.app.studio.watch_view import ellipsoid, letterbox, link_lines
 from rbl_gym.studies import replay
 from rbl_gym.studies.watching.frames import Frame
@@ -234,6 +235,15 @@ def test_the_command_plays_environments_and_policies(tmp_path, monkeypatch):
     opened.page.settle()
     assert len(opened.page.frames[1].anchors) == 1
     opened.stop()
+
+
+def test_a_client_cannot_name_a_filter_that_is_not_offered():
+    own = ("uc-kf", "mine:make")
+    assert chosen(["iekf", "os:system"], own) == ("iekf",)
+    assert chosen(["os:system", "none"], own) == own
+    assert chosen(["mine:make", "iekf/robust=late", "mine:make"], own) == (
+        "mine:make", "iekf/robust=late",
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("aspect", [0.5, 2.0, 3.0])

@@ -47,6 +47,20 @@ CHARTS: Mapping[str, tuple[float, Callable[[Any], float]]] = {
 }
 
 
+def offered(filters: Sequence[str]) -> tuple[str, ...]:
+    """Return the labels that the page offers: those of the program, then `OFFERED`."""
+    return tuple(dict.fromkeys((*filters, *OFFERED)))
+
+
+def chosen(labels: Sequence[str], filters: Sequence[str]) -> tuple[str, ...]:
+    """Return the different labels that are offered, or `filters` if there are none.
+
+    A client may send any text, and ``MODULE:FACTORY`` would be imported.
+    """
+    known = [label for label in labels if label in offered(filters)]
+    return tuple(dict.fromkeys(known)) or tuple(filters)
+
+
 class WatchPanel:
     """Controls of the panel.
 
@@ -135,7 +149,7 @@ class WatchPanel:
     def _add_beginning(self, gui: Any, begin: Callable[..., None]) -> None:
         program, boxes = self._program, []
         if program.can_choose:
-            names = tuple(dict.fromkeys((*program.filters, *OFFERED)))
+            names = offered(program.filters)
             boxes = [
                 gui.add_dropdown("Filter", names, initial_value=program.filters[0]),
                 gui.add_dropdown(
@@ -145,8 +159,7 @@ class WatchPanel:
         seed = gui.add_number("Seed", program.seed, min=0, max=2**31 - 1, step=1)
 
         def changed() -> None:
-            labels = [box.value for box in boxes if box.value != NONE]
-            begin(tuple(dict.fromkeys(labels)) or program.filters, int(seed.value))
+            begin(chosen([box.value for box in boxes], program.filters), int(seed.value))
 
         for handle in (*boxes, seed):
             _input(handle, changed)
