@@ -392,3 +392,15 @@ def test_numbers_out_of_range_are_usage_errors(bad, capsys):
     with pytest.raises(SystemExit, match="2"):
         main(["demo", *bad])
     assert "must be" in capsys.readouterr().err
+
+
+def test_the_option_of_version_0_1_for_squares_still_works(capsys):
+    log = ROOT / "examples" / "log"
+    command = ["replay", "--filter", "iekf", "--json"]
+    for name in ("ranges", "anchors", "tags"):
+        command += [f"--{name}", str(log / f"{name}.csv")]
+    settings = []
+    for extra in (["--no-robust"], ["--filter", "iekf/robust=false"]):
+        assert main([*command, *extra]) == 0
+        settings.append(json.loads(capsys.readouterr().out)["settings"]["robust"])
+    assert settings == [False, False]

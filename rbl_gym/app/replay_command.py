@@ -100,6 +100,10 @@ def _add_filter(group: Any) -> None:
         help=f"{FILTER_HELP}; default iekf-log, with --walk-... iekf, with --raw or --bias-... "
         "iekf-bias, with --imu iekf-imu; robust is late of iekf-log and iekf-imu, else true",
     )
+    # Of 0.1: --filter NAME/robust=false.
+    group.add_argument(
+        "--no-robust", dest="robust", action="store_false", default=None, help=argparse.SUPPRESS
+    )
     _add_number(group, "--range-std-m", "of a range; default the recording's own, else 0.12")
 
 
